@@ -1,0 +1,57 @@
+# play, test, check and bench set up .venv by themselves, and again only when pyproject.toml or constraints.txt change.
+VENV := .venv
+BIN := $(VENV)/bin
+PIP = $(BIN)/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt
+# The first Python between 3.11 and 3.13 that runs; choose another with `make PYTHON=/path/to/python3.12 ...`.
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
+	&& { echo $$python; break; }; done)
+
+.PHONY: help play test check format bench clean
+help:
+	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
+	@echo "make test    run the tests, in a real browser too"
+	@echo "make check   format, lint, types and the directions of imports"
+	@echo "make format  put the code into the form that make check asks for"
+	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
+	@echo "make clean   remove .venv and caches"
+
+play: $(VENV)/.ready-play
+	$(BIN)/terrella play doom-maze $(ARGS)
+
+test: $(VENV)/.ready-dev
+	@sh tests/browser_setup.sh $(BIN)/python
+	$(BIN)/python -m pytest $(ARGS)
+
+check: $(VENV)/.ready-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(VENV)/.ready-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.ready-dev
+	$(BIN)/python benchmarks/play.py $(ARGS)
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "Terrella needs Python 3.11, 3.12 or 3.13: install one, or run make PYTHON=/path/to/it." >&2; exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); \
+		echo "$(PYTHON) cannot make a virtual environment; on Debian and Ubuntu: apt-get install python3-venv." >&2; exit 1; }
+
+# Torch comes first and alone: its version is what the rest must live with. A CPU build of it that is already in .venv stays.
+$(VENV)/.ready-play: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "setting up $(VENV) (once; again when pyproject.toml or constraints.txt change)"
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade
+	@$(PIP) -q torch
+	@$(PIP) -q -e '.[sim]'
+	@touch $@
+
+$(VENV)/.ready-dev: $(VENV)/.ready-play
+	@$(PIP) -q -e '.[dev]'
+	@touch $@

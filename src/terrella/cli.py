@@ -1,0 +1,395 @@
+"""The command line: the only place that knows every room. Each command is thin, and imports its rooms when it runs."""
+
+from __future__ import annotations
+
+import errno
+import json as json_text
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import Positional, arg
+from tyro.extras import SubcommandApp
+
+from . import progress
+
+if TYPE_CHECKING:
+    from .core.world import World
+
+Json = Annotated[bool, arg(name="json", help="Print one JSON document on stdout instead of text.")]
+Seed = Annotated[int, arg(help="The same seed gives the same result.")]
+Device = Annotated[str, arg(help="cpu, cuda, or auto: a GPU where there is one.")]
+Port = Annotated[int, arg(help="Port of the page; 0 takes a free one.")]
+Host = Annotated[str, arg(help="Address to listen on; any other than this machine's own needs a token.")]
+Token = Annotated[str | None, arg(help="Secret that the page's address must carry.")]
+
+DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
+CONTEXT = 4  # frames that a world is shown before it dreams, when it is scored
+MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; the exit code is 0, its own, 2 with one sentence on stderr, or 130 after Ctrl-C."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _app(given).cli(prog="terrella", description=DESCRIPTION, args=given, config=MARKERS)
+    except KeyboardInterrupt:
+        print("terrella: stopped; what was finished is kept.", file=sys.stderr)
+        return 130
+    except Exception as error:
+        sentence = _sentence(error)
+        if sentence is None:
+            raise
+        print(f"terrella: {sentence}", file=sys.stderr)
+        return 2
+    return code or 0
+
+
+def _sentence(error: Exception) -> str | None:
+    """What to tell a person of an error that is theirs or their disk's; None for a fault of ours: that needs its trace."""
+    from .core.errors import TerrellaError
+
+    if isinstance(error, TerrellaError):
+        return str(error)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+        where = f" ({error.filename})" if error.filename else ""
+        return f"{error.strerror}{where}; free some space or choose another folder."
+    return None
+
+
+def _app(given: Sequence[str]) -> SubcommandApp:
+    recording, training, data, app = SubcommandApp(), SubcommandApp(), SubcommandApp(), SubcommandApp()
+    recording.command(name="doom")(record_doom)
+    recording.command(name="world")(record_world)
+    training.command(name="video")(_train_video_command() if given[:1] == ["train"] else play)
+    data.command(doctor)
+    app.command(recording, name="record", help="Record a world's episodes: scripted, or played by a person.")
+    app.command(training, name="train", help="Train a world on a recording.")
+    app.command(play)
+    app.command(score)
+    app.command(name="list")(list_worlds)
+    app.command(data, name="data", help="Look after recordings.")
+    return app
+
+
+# -- record ---------------------------------------------------------------------------------------------------------
+
+
+def record_doom(
+    out: Path,
+    scenario: str = "my_way_home",
+    frames: int = 100_000,
+    height: int = 192,
+    human: bool = False,
+    seed: Seed = 0,
+    port: Port = 8765,
+    json: Json = False,
+) -> None:
+    """Record the real game: pictures, depth, the camera's pose, actions and rewards.
+
+    Args:
+        out: Folder of the dataset (LeRobot v3); an unfinished recording there goes on.
+        scenario: Name of a ViZDoom scenario.
+        frames: Rows to record in all (by the script; a person plays as long as they like).
+        height: Height of the pictures; their width is 4/3 of it.
+        human: Play yourself, in the browser, instead of watching a script explore.
+    """
+    from . import library
+
+    depth = (min(height, 96), min(height, 96) * 4 // 3)
+    world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth)
+    _record(world, out, frames, human, seed, port, json)
+
+
+def record_world(
+    name: Positional[str],
+    out: Path,
+    frames: int = 10_000,
+    human: bool = False,
+    seed: Seed = 0,
+    port: Port = 8765,
+    json: Json = False,
+) -> None:
+    """Record any world: a Gymnasium environment ("gym:CartPole-v1"), a learned world, a checkpoint folder.
+
+    Args:
+        name: What `terrella list` shows, or a path.
+        out: Folder of the dataset (LeRobot v3); an unfinished recording there goes on.
+        frames: Rows to record in all (by the script; a person plays as long as they like).
+        human: Play yourself, in the browser, instead of watching a script explore.
+    """
+    from . import library
+
+    _record(library.load(name), out, frames, human, seed, port, json)
+
+
+def _record(world: World, out: Path, frames: int, human: bool, seed: int, port: int, json: bool) -> None:
+    from .core.errors import DatasetError
+    from .core.world import make_rng
+    from .data import Dataset, Layout, Recorder, record
+    from .data.explore import Explorer
+
+    if human:
+        from .serve import serve
+
+        def ready(address: str) -> None:
+            _say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
+
+        layout = Layout.of(world.spec)
+        serve([world], port=port, sink_factory=lambda: Recorder(out, layout, "play"), on_ready=ready, seed=seed)
+        if not out.exists():
+            raise DatasetError("nothing was recorded: press the record button on the page before you play.")
+    else:
+        with progress.shown("recording") as report:
+            record(world, Explorer(world.spec), out, frames, make_rng(seed), progress=report)
+    dataset = Dataset(out)
+    facts = {"dataset": str(out), "frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
+    if dataset.has("rgb"):
+        facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
+    _result(facts, json)
+
+
+def _contact_sheet(dataset, path: Path) -> Path:
+    """Twelve pictures from the whole recording, to see at a glance what it holds."""
+    from .measure import strip
+
+    rows = [dataset.length * (2 * place + 1) // 24 for place in range(12)]
+    pictures = dataset.rgb_at(rows).reshape(3, 4, *dataset.rgb_at(rows[:1]).shape[1:])
+    lines = {f"from {rows[4 * line]:,}": pictures[line] for line in range(3)}
+    strip(lines, [""] * 4).convert("RGB").save(path, quality=88)
+    return path
+
+
+# -- train ----------------------------------------------------------------------------------------------------------
+
+
+def _train_video_command() -> Callable[..., None]:
+    from .learn.train_video import TrainConfig, train_video
+
+    defaults = TrainConfig()
+
+    def video(data: Positional[Path], out: Path, config: TrainConfig = defaults, json: Json = False) -> None:
+        """Train a world of pictures on a recording; the same command goes on where it was stopped.
+
+        Args:
+            data: Folder of the dataset.
+            out: Folder of the run: checkpoint, log, and pictures of truth against dream.
+        """
+        with progress.shown("training") as report:
+            facts = train_video(data, out, config, report)
+        _result({"run": str(out), **(facts or {})}, json)
+
+    video.__annotations__["config"] = TrainConfig  # it lives in a room that is slow to import, so not in this module
+    return video
+
+
+# -- play -----------------------------------------------------------------------------------------------------------
+
+
+def play(
+    name: Positional[str],
+    compare: bool = False,
+    truth: str = "doom:my_way_home",
+    memory: bool = True,
+    record: Path | None = None,
+    port: Port = 8765,
+    host: Host = "127.0.0.1",
+    token: Token = None,
+    device: Device = "auto",
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Step inside a world: a learned one or a real game, in the browser.
+
+    Args:
+        name: What `terrella list` shows, or the path of a checkpoint.
+        compare: Show the truth beside the dream, driven by the same keys.
+        truth: The real game that --compare shows.
+        memory: --no-memory plays a learned world without its keyframes.
+        record: Folder of a dataset to which the page may record.
+    """
+    from .serve import serve
+
+    learned = _load(name, device, memory)
+    worlds = [learned]
+    if compare:
+        worlds = [_game_like(learned, truth), learned]
+    sink = None
+    if record is not None:
+        from .data import Layout, Recorder
+
+        layout, folder = Layout.of(worlds[0].spec), record
+        sink = lambda: Recorder(folder, layout, "play")  # noqa: E731
+    names = [world.spec.name for world in worlds]
+
+    def ready(address: str) -> None:
+        _result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
+
+    serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed)
+
+
+def _game_like(learned: World, name: str) -> World:
+    """The real game, with pictures of the size that the learned world shows."""
+    from . import library
+
+    shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
+    return library.load(name, **({"size": shape[:2]} if shape and name.startswith("doom") else {}))
+
+
+def _load(name: str, device: str, memory: bool = True) -> World:
+    """A world by name; only learned worlds have a device and a memory."""
+    from . import library
+
+    if name.startswith(("doom", "gym:")) and not (library.BUNDLED / name).exists():
+        return library.load(name)
+    return library.load(name, device=_device(device), memory=memory)
+
+
+def _device(name: str) -> str:
+    import torch
+
+    from .core.errors import TerrellaError
+
+    if name != "auto":
+        if name.startswith("cuda") and not torch.cuda.is_available():
+            raise TerrellaError(f"--device {name}: this PyTorch finds no GPU here; use --device cpu, or auto.")
+        return name
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+# -- score ----------------------------------------------------------------------------------------------------------
+
+
+def score(
+    name: Positional[str],
+    data: Path,
+    new: Path | None = None,
+    out: Path = Path("scores"),
+    clips: int = 50,
+    horizons: tuple[int, ...] = (1, 8, 32, 64),
+    long_steps: int = 1000,
+    device: Device = "auto",
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Hold a learned world's dreams against what really happened, with its memory and without.
+
+    Args:
+        name: What `terrella list` shows, or the path of a checkpoint.
+        data: The recording it was trained on; only the episodes kept out of training are used.
+        new: A recording of places that it never saw; without one, the part of the map that training kept out.
+        out: Folder for scorecard.json and scorecard.html.
+        clips: Clips of each kind of place; intervals want 50 or more.
+        horizons: Steps after which figures are given; a clip is as long as the largest.
+        long_steps: Length of the long dream; 0 leaves it out.
+    """
+    from .core.world import make_rng
+    from .data import split
+    from .measure import (
+        Album,
+        ExamConfig,
+        ScoreConfig,
+        as_dict,
+        bars,
+        clips_from_cache,
+        examine,
+        in_box,
+        outside_box,
+        write_report,
+    )
+    from .measure.bars import summary
+
+    arms = {"memory": _load(name, device), "no memory": _load(name, device, memory=False)}
+    world, rng, steps = arms["memory"], make_rng(seed), max(horizons, default=1)
+    cache = _cache(data, world)
+    held_out, every = split(len(cache.episodes))[1], range(len(cache.episodes))
+    box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
+    known = outside_box(*box) if box else None
+    places = {"recorded": clips_from_cache(cache, held_out, CONTEXT, steps, clips, rng, known)}
+    if new is not None:
+        unseen = _cache(new, world)
+        places["new"] = clips_from_cache(unseen, range(len(unseen.episodes)), CONTEXT, steps, clips, rng)
+    elif box:
+        places["new"] = clips_from_cache(cache, every, CONTEXT, steps, clips, rng, in_box(*box))
+    obeying = tuple(step for step in ScoreConfig().control_horizons if step <= steps) or (steps,)
+    scoring = ScoreConfig(horizons=tuple(sorted(horizons)), control_horizons=obeying)
+    config = ExamConfig(score=scoring, long_steps=long_steps)
+    album = None if cache.pose is None else Album.of_cache(cache)
+    with progress.shown("scoring") as report:
+        card = examine(arms, places, rng, config, album, lambda share, words: report(share, 1, words))
+    found = bars(card, "memory")
+    files = write_report(card, found, out, f"{world.spec.name}: the scorecard")
+    lines = [
+        f"{bar.status:>6}  {bar.name}, {bar.place}: {bar.figure} {bar.unit} (bar: {bar.target})"
+        for bar in found
+        if bar.figure and not bar.side
+    ]
+    facts = {**as_dict(card, found), "files": [str(file) for file in files]}
+    _result(facts, json, "\n".join([*lines, summary(found), f"the page: {files[1]}"]))
+
+
+def _cache(data: Path, world: World) -> Any:
+    """The recording's ClipCache at the size that the world shows."""
+    from .core.errors import TerrellaError
+    from .data import ClipCache
+
+    if "rgb" not in world.spec.channels:
+        raise TerrellaError(f"{world.spec.name} shows no pictures, so it cannot be scored; score a learned world.")
+    height, width = world.spec.channels["rgb"].shape[:2]
+    with progress.shown(f"reading {data}") as report:
+        return ClipCache.open(data, size=(height, width), progress=report)
+
+
+# -- list and data --------------------------------------------------------------------------------------------------
+
+
+def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) -> None:
+    """Show the worlds at hand with their cards.
+
+    Args:
+        folders: Folders that hold checkpoints of your own.
+    """
+    from . import library
+
+    entries = library.worlds(folders)
+    if json:
+        print(json_text.dumps([entry.as_dict() for entry in entries], indent=1))
+        return
+    for entry in entries:
+        print(f"{entry.name}  [{entry.source}]")
+        for fact, value in entry.card.items():
+            print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
+
+
+def doctor(folder: Positional[Path], json: Json = False) -> int:
+    """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
+
+    Args:
+        folder: Folder of the dataset.
+    """
+    from .data.doctor import doctor as examine
+
+    faults = examine(folder)
+    facts = {"dataset": str(folder), "sound": not faults, "faults": [asdict(fault) for fault in faults]}
+    lines = [
+        f"{fault.file}{'' if fault.row is None else f', row {fault.row}'}: {fault.what}.\n    mend: {fault.mend}."
+        for fault in faults
+    ]
+    _result(facts, json, "\n".join([*lines, f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}"]))
+    return 1 if faults else 0
+
+
+# -- what every command says ----------------------------------------------------------------------------------------
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)
+
+
+def _result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:
+    """One JSON document, or the same for people, on stdout."""
+    shown = json_text.dumps(facts, indent=1, default=str) if json else text
+    print(shown or "\n".join(f"{name}: {value}" for name, value in facts.items()), flush=True)

@@ -1,0 +1,267 @@
+"""check_world: proves any World, ours or a stranger's, against the contract."""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .errors import ActionError, ChannelError, ContractError, ObservationError, StaleStateError, TerrellaError
+from .spec import Spec, dtype_of, shape_of
+from .state import State
+from .world import Observation, World, make_rng
+
+# The channels whose meaning every tool knows: dtype, and number of axes of one entry.
+_WELL_KNOWN = {
+    "rgb": (np.uint8, 3),
+    "depth": (np.float32, 2),
+    "pose": (np.float32, 1),
+    "reward": (np.float32, 0),
+    "done": (np.bool_, 0),
+}
+
+
+def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
+    """Runs every law; gives the names of those that held, raises ContractError at the first that does not.
+
+    The laws begin several stories, so a world that cannot fork is left at a place of its own. `steps` is the length
+    of a story; laws about `done` are only proven where a story gets there.
+    """
+    if not isinstance(world, World) or not isinstance(world.spec, Spec):
+        raise ContractError("a World has `spec` (a terrella.Spec) and the verbs start, observe, imagine, render.")
+    laws = [
+        _spec_is_sound,
+        _starts_and_renders,
+        _refuses_other_batches,
+        _acts_deterministically,
+        _refuses_junk,
+        _observes,
+    ]
+    laws += [_states_are_values, _states_can_be_saved, _batches] if world.spec.forkable else [_stale_states_are_refused]
+    for law in laws:
+        law(world, seed, steps)
+    return [law.__name__.strip("_") for law in laws]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ContractError(message)
+
+
+def _require_raises(error: type[Exception], message: str, verb, *args) -> None:
+    try:
+        verb(*args)
+    except error:
+        return
+    except Exception as other:
+        raise ContractError(f"{message} It raised {type(other).__name__}: {other}") from other
+    raise ContractError(message)
+
+
+def _same(a: Observation, b: Observation) -> bool:
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def _copy(tensors: Observation) -> Observation:
+    return {name: tensor.clone() for name, tensor in tensors.items()}
+
+
+def _check_observation(world: World, seen: Observation, channels: Sequence[str], batch: int) -> None:
+    _require(set(seen) == set(channels), f"render was asked for {sorted(channels)} and gave {sorted(seen)}.")
+    for name in channels:
+        space, tensor = world.spec.channels[name], seen[name]
+        _require(isinstance(tensor, torch.Tensor), f"channel '{name}' is not a tensor.")
+        want = (batch, *shape_of(space))
+        _require(
+            tuple(tensor.shape) == want, f"channel '{name}' has shape {tuple(tensor.shape)}, its spec says {want}."
+        )
+        rows = tensor.cpu().numpy()
+        _require(rows.dtype == space.dtype, f"channel '{name}' is {rows.dtype}, its spec says {space.dtype}.")
+        _require(all(space.contains(np.asarray(row)) for row in rows), f"channel '{name}' leaves its space {space}.")
+    if "pose" in channels:
+        lengths = seen["pose"][:, 3:].norm(dim=1)
+        _require(bool((lengths - 1).abs().max() < 1e-3), "the quaternion of channel 'pose' must have length 1.")
+
+
+def _spec_is_sound(world: World, seed: int, steps: int) -> None:
+    spec = world.spec
+    _require(0 < spec.dt_s < float("inf"), "spec.dt_s must be positive seconds.")
+    _require(bool(spec.channels), "a world renders at least one channel.")
+    for name, (dtype, axes) in _WELL_KNOWN.items():
+        space = spec.channels.get(name)
+        fits = space is None or (dtype_of(space) == dtype and len(shape_of(space)) == axes)
+        _require(
+            fits, f"channel '{name}' must be {np.dtype(dtype)} with {axes} axes after the batch; its space is {space}."
+        )
+    for what, names in (("observes", spec.observes), ("units", spec.units)):
+        strangers = sorted(set(names) - set(spec.channels))
+        _require(not strangers, f"spec.{what} names {strangers}, which are not among spec.channels.")
+    _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
+    _require(
+        spec.camera is None or (len(spec.camera) == 4 and min(spec.camera) > 0), "spec.camera is four positive numbers."
+    )
+    for key, flat in spec.keys.items():
+        try:
+            spec.check_action(torch.tensor(flat).reshape(1, *shape_of(spec.action)), 1)
+        except (ActionError, RuntimeError, TypeError, ValueError) as error:
+            raise ContractError(f"key '{key}' stands for {flat}, which is no action: {error}") from error
+
+
+def _starts_and_renders(world: World, seed: int, steps: int) -> None:
+    channels = tuple(world.spec.channels)
+    state = world.start(1, make_rng(seed))
+    _require(isinstance(state, State) and state.batch == 1, "start(1, rng) gives a State with batch 1.")
+    together = _copy(world.render(state, channels))
+    _check_observation(world, together, channels, 1)
+    for name in channels:
+        alone = world.render(state, (name,))
+        _check_observation(world, alone, (name,), 1)
+        _require(
+            torch.equal(alone[name], together[name]),
+            f"channel '{name}' rendered alone differs from it rendered with others.",
+        )
+    _require(not world.render(state, ()), "render of no channels must give no channels.")
+    _require_raises(
+        ChannelError, "render of an unknown channel must raise ChannelError.", world.render, state, ("no such channel",)
+    )
+
+
+def _refuses_other_batches(world: World, seed: int, steps: int) -> None:
+    rng, most = make_rng(seed), world.spec.max_batch
+    _require_raises(TerrellaError, "start(0, rng) must raise a TerrellaError.", world.start, 0, rng)
+    if most is not None:
+        message = f"start({most + 1}, rng) must raise a TerrellaError, for spec.max_batch is {most}."
+        _require_raises(TerrellaError, message, world.start, most + 1, rng)
+
+
+def _story(world: World, seed: int, steps: int) -> list[Observation]:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    state = world.start(1, rng)
+    frames = [_copy(world.render(state, channels))]
+    for _ in range(steps):
+        state = world.imagine(state, world.spec.sample_action(1, rng), rng)
+        _require(isinstance(state, State) and state.batch == 1, "imagine gives a State of the batch that it was given.")
+        frames.append(_copy(world.render(state, channels)))
+        _check_observation(world, frames[-1], channels, 1)
+    return frames
+
+
+def _global_chance() -> tuple:
+    """Where the generators stand that belong to nobody."""
+    numpy_state = np.random.get_state(legacy=True)
+    return torch.get_rng_state().tolist(), [np.asarray(part).tolist() for part in numpy_state], random.getstate()
+
+
+def _acts_deterministically(world: World, seed: int, steps: int) -> None:
+    _ = torch.rand(1), np.random.random(), random.random()  # moves them on, so that seeding one again shows
+    chance = _global_chance()
+    first, second = _story(world, seed, steps), _story(world, seed, steps)
+    _require(all(_same(a, b) for a, b in zip(first, second, strict=True)), "the same seed must tell the same story.")
+    _require(chance == _global_chance(), "chance must come from the rng alone, not from global generators.")
+    for now, then in zip(first, first[1:]):
+        if "done" in now and bool(now["done"]):
+            paid = float(then["reward"]) if "reward" in then else 0.0
+            _require(bool(then["done"]), "a story that is done must stay done.")
+            _require(paid == 0, "a story that is done must give no more reward.")
+
+
+def _refuses_junk(world: World, seed: int, steps: int) -> None:
+    rng = make_rng(seed)
+    state = world.start(1, rng)
+    good = world.spec.sample_action(1, rng)
+    junk = [good[None], torch.cat([good, good]), torch.full(good.shape, float("nan")), "forward"]
+    low, high = world.spec.action_limits
+    if np.isfinite(high).all():
+        junk.append(torch.from_numpy(np.broadcast_to(high.astype(np.float64) + 1, good.shape).copy()))
+    if high.dtype.kind != "f":
+        junk.append(good.double() + 0.5)
+    for action in junk:
+        message = f"imagine must raise ActionError for the action {action!r}."
+        _require_raises(ActionError, message, world.imagine, state, action, rng)
+    world.imagine(state, good, rng)
+
+
+def _observes(world: World, seed: int, steps: int) -> None:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    state = world.start(1, rng)
+    held = _copy(state)
+    seen = _copy(world.render(state, world.spec.observes))
+    for prior in (state, None):
+        posterior = world.observe(seen, prior, rng)
+        _require(
+            isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the evidence's batch."
+        )
+        _check_observation(world, world.render(posterior, channels), channels, 1)
+        _require(_same(held, state), "observe must leave the prior that it was given unchanged.")
+    if world.spec.observes:
+        message = f"observe without {', '.join(world.spec.observes)} must raise ObservationError."
+        _require_raises(ObservationError, message, world.observe, {}, None, rng)
+
+
+def _states_are_values(world: World, seed: int, steps: int) -> None:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    state = world.start(1, rng)
+    held, before = _copy(state), _copy(world.render(state, channels))
+    action = world.spec.sample_action(1, rng)
+    branch = world.imagine(state, action, make_rng(seed + 1))
+    expected = _copy(world.render(branch, channels))
+    ahead = branch
+    for _ in range(steps):
+        ahead = world.imagine(ahead, world.spec.sample_action(1, rng), rng)
+    unchanged = _same(held, state) and _same(before, world.render(state, channels))
+    _require(unchanged, "imagine must leave the state that it was given unchanged.")
+    again = world.imagine(state, action, make_rng(seed + 1))
+    _require(_same(expected, world.render(again, channels)), "a state must be able to branch twice alike.")
+
+
+def _states_can_be_saved(world: World, seed: int, steps: int) -> None:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    state = world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng)
+    before = _copy(world.render(state, channels))
+    with tempfile.TemporaryDirectory() as folder:
+        state.save(Path(folder) / "state.safetensors")
+        action = world.spec.sample_action(1, rng)
+        expected = _copy(world.render(world.imagine(state, action, make_rng(seed + 1)), channels))
+        world.start(1, make_rng(seed + 2))  # a world that keeps the state anywhere but in the State has lost it now
+        device = next(iter(state.values())).device
+        restored = State.load(Path(folder) / "state.safetensors").to(device)
+    _require(_same(before, world.render(restored, channels)), "a saved and restored state must render the same.")
+    after = world.imagine(restored, action, make_rng(seed + 1))
+    _require(_same(expected, world.render(after, channels)), "a restored state must go on as the original.")
+
+
+def _batches(world: World, seed: int, steps: int) -> None:
+    if world.spec.max_batch == 1:
+        return
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    states = world.start(2, rng)
+    _require(isinstance(states, State) and states.batch == 2, "start(2, rng) gives a State with batch 2.")
+    states = world.imagine(states, world.spec.sample_action(2, rng), rng)
+    _require(isinstance(states, State) and states.batch == 2, "imagine gives a State of the batch that it was given.")
+    seen = _copy(world.render(states, channels))
+    _check_observation(world, seen, channels, 2)
+    for entry in range(2):
+        alone = world.render(states.at(entry), channels)
+        for name in channels:
+            slack = 1.01 if alone[name].dtype == torch.uint8 else 1e-3  # a sum in another order may round otherwise
+            alike = torch.allclose(alone[name].double(), seen[name][entry : entry + 1].double(), rtol=1e-3, atol=slack)
+            _require(alike, f"channel '{name}' of a batch entry depends on its neighbour.")
+    turned = world.imagine(states.at([1, 0]), world.spec.sample_action(2, rng), rng)
+    _check_observation(world, world.render(turned, channels), channels, 2)
+
+
+def _stale_states_are_refused(world: World, seed: int, steps: int) -> None:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    action = world.spec.sample_action(1, rng)
+    left = world.start(1, rng)
+    world.imagine(left, action, rng)
+    ended = world.start(1, rng)
+    world.start(1, rng)
+    for stale in (left, ended):
+        message = "a world with forkable=False must raise StaleStateError for a state that it has left."
+        _require_raises(StaleStateError, f"imagine: {message}", world.imagine, stale, action, rng)
+        _require_raises(StaleStateError, f"render: {message}", world.render, stale, channels)

@@ -1,0 +1,184 @@
+"""as_env: any World as a Gymnasium vector environment, for whatever library trains in those."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from .errors import TerrellaError
+from .state import State
+from .world import World, make_rng
+
+
+def as_env(
+    world: World,
+    num_envs: int = 1,
+    max_steps: int | None = None,
+    observation: str | Sequence[str] | None = None,
+    seed: int = 0,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> WorldEnv:
+    """`num_envs` stories of `world` side by side.
+
+    max_steps:      a story is truncated after that many steps.
+    observation:    a channel's name, whose arrays are the observations; or several names, for a dictionary of arrays.
+                    By default "observation" where the world has it, else "rgb".
+    seed:           of the first `reset()`; later resets go on from there unless they are given one.
+    autoreset_mode: as Gymnasium defines them. NEXT_STEP: the step after the end begins anew and ignores its action.
+                    SAME_STEP: the last observation is in infos["final_obs"], its infos in infos["final_info"].
+                    DISABLED: call reset(options={"reset_mask": bool [num_envs]}).
+
+    Reward is the channel `reward` (0 where the world has none), terminated the channel `done`.
+    Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` stories.
+    """
+    return WorldEnv(world, num_envs, max_steps, observation, seed, autoreset_mode)
+
+
+class WorldEnv(VectorEnv):
+    """What `as_env` gives. Arrays lead with num_envs; the world is not closed with it."""
+
+    def __init__(
+        self,
+        world: World,
+        num_envs: int,
+        max_steps: int | None,
+        observation: str | Sequence[str] | None,
+        seed: int,
+        autoreset_mode: AutoresetMode,
+    ):
+        spec = world.spec
+        most = spec.max_batch if spec.forkable else 1
+        if num_envs < 1 or (most is not None and num_envs > most):
+            raise TerrellaError(
+                f"{spec.name} holds 1 to {most or 'any number of'} stories at once; num_envs is {num_envs}."
+            )
+        if max_steps is not None and max_steps < 1:
+            raise TerrellaError(f"max_steps is a number of steps from 1 on, or None for no end; got {max_steps}.")
+        if observation is None:
+            observation = "observation" if "observation" in spec.channels else "rgb"
+        self._single = isinstance(observation, str)
+        self._names = (observation,) if isinstance(observation, str) else tuple(observation)
+        spec.check_channels(self._names)
+        self._asked = tuple(
+            dict.fromkeys((*self._names, *(name for name in ("reward", "done") if name in spec.channels)))
+        )
+        self.world, self.num_envs, self.max_steps = world, num_envs, max_steps
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        shown = {name: spec.channels[name] for name in self._names}
+        self.single_observation_space = shown[self._names[0]] if self._single else spaces.Dict(shown)
+        self.single_action_space = spec.action
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.render_mode = "rgb_array" if "rgb" in spec.channels else None
+        self.metadata = {
+            "render_modes": ["rgb_array"] if self.render_mode else [],
+            "render_fps": max(1, round(1 / spec.dt_s)),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self._rng = make_rng(seed)
+        self._state: State | None = None
+        self._steps = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+
+    @property
+    def state(self) -> State:
+        """The world's state, batch entry i for environment i."""
+        if self._state is None:
+            raise TerrellaError("the environment has not begun: call reset() first.")
+        return self._state
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """New stories in all environments, or in those of options["reset_mask"]; `seed` restarts all chance."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._rng = make_rng(seed)
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.shape != (self.num_envs,)
+            or mask.dtype != np.bool_
+            or not mask.any()
+        ):
+            raise TerrellaError(
+                f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, one or more of them True."
+            )
+        if mask.all():
+            self._begin(mask)
+        else:
+            self._state = self._restarted(self.state, mask)
+        return self._observations(self._look()), {}
+
+    def step(self, actions):
+        """Observations, rewards float64, terminated, truncated, infos; each leads with num_envs."""
+        state, actions = self.state, torch.as_tensor(np.asarray(actions))
+        fresh = self._ended.copy()
+        if fresh.any() and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise TerrellaError(
+                f"environments {np.flatnonzero(fresh).tolist()} have ended: reset them with a reset_mask first."
+            )
+        self.world.spec.check_action(actions, self.num_envs)
+        if fresh.all():
+            self._begin(fresh)
+        elif fresh.any():
+            live = torch.from_numpy(np.flatnonzero(~fresh))
+            self._state = self._restarted(state, fresh, self.world.imagine(state.at(live), actions[live], self._rng))
+        else:
+            self._state = self.world.imagine(state, actions, self._rng)
+        self._steps = np.where(fresh, 0, self._steps + 1)
+        seen = self._look()
+        rewards = (
+            np.where(fresh, 0.0, seen["reward"].astype(np.float64)) if "reward" in seen else np.zeros(self.num_envs)
+        )
+        terminated = seen["done"] & ~fresh if "done" in seen else np.zeros(self.num_envs, np.bool_)
+        truncated = np.zeros(self.num_envs, np.bool_) if self.max_steps is None else self._steps >= self.max_steps
+        self._ended = terminated | truncated
+        observations, infos = self._observations(seen), {}
+        if self._ended.any() and self.autoreset_mode == AutoresetMode.SAME_STEP:
+            for place in np.flatnonzero(self._ended).tolist():
+                self._add_info(infos, {"final_obs": self._entry(observations, place), "final_info": {}}, place)
+            observations = self._restart_ended()
+        return observations, rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One uint8 [H, W, 3] picture an environment; None for a world without `rgb`."""
+        if self.render_mode is None:
+            return None
+        return tuple(np.array(frame) for frame in self.world.render(self.state, ("rgb",))["rgb"].cpu().numpy())
+
+    def _begin(self, mask: np.ndarray) -> None:
+        self._state = self.world.start(self.num_envs, self._rng)
+        self._steps[mask], self._ended[mask] = 0, False
+
+    def _restarted(self, state: State, mask: np.ndarray, live: State | None = None) -> State:
+        """`state` with new starts where `mask`; `live` are the other entries, where they have moved on."""
+        keep, renew = np.flatnonzero(~mask), np.flatnonzero(mask)
+        live = state.at(torch.from_numpy(keep)) if live is None else live
+        started = self.world.start(len(renew), self._rng)
+        self._steps[mask], self._ended[mask] = 0, False
+        back = torch.from_numpy(np.argsort(np.concatenate([keep, renew])))
+        return State.stack([live, started]).at(back)
+
+    def _restart_ended(self):
+        ended = self._ended.copy()
+        if ended.all():
+            self._begin(ended)
+        else:
+            self._state = self._restarted(self.state, ended)
+        return self._observations(self._look())
+
+    def _look(self) -> dict[str, np.ndarray]:
+        seen = self.world.render(self.state, self._asked)
+        return {name: np.array(seen[name].cpu().numpy()) for name in self._asked}
+
+    def _observations(self, seen: dict[str, np.ndarray]):
+        return seen[self._names[0]] if self._single else {name: seen[name] for name in self._names}
+
+    def _entry(self, observations, place: int):
+        if self._single:
+            return np.array(observations[place])
+        return {name: np.array(array[place]) for name, array in observations.items()}

@@ -1,0 +1,45 @@
+"""Every error that Terrella raises on purpose: one sentence that says what is wrong and what to do."""
+
+
+class TerrellaError(Exception):
+    """Base of all deliberate errors; the command line prints it as one line and exits with 2."""
+
+
+class ContractError(TerrellaError):
+    """A World broke the contract that `check_world` proves."""
+
+
+class ActionError(TerrellaError):
+    """An action has the wrong shape, type or range for the world it was given to."""
+
+
+class ObservationError(TerrellaError):
+    """An observation lacks a channel that the world needs, or one has the wrong shape."""
+
+
+class ChannelError(TerrellaError):
+    """A channel was asked for that the world cannot render."""
+
+
+class StaleStateError(TerrellaError):
+    """A state of a world that cannot fork was used after the world had moved on."""
+
+
+class DatasetError(TerrellaError):
+    """A recording is missing, foreign, truncated or inconsistent."""
+
+
+class CheckpointError(TerrellaError):
+    """A checkpoint is missing, of another kind, or of a version this release does not read."""
+
+
+class TrainingError(TerrellaError):
+    """Training cannot go on: not-a-number losses, a full disk, or a run folder of another recipe."""
+
+
+class ServeError(TerrellaError):
+    """A world cannot be served: the port is in use, the address needs a token, or the world shows no picture."""
+
+
+class ProtocolError(TerrellaError):
+    """A browser sent a message that the server does not understand."""

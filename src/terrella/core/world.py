@@ -1,0 +1,44 @@
+"""The contract: whatever has these four verbs is a World, and every tool takes any World."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+
+from .spec import Spec
+from .state import State
+
+# name -> tensor that leads with the batch axis. rgb: uint8 [B, H, W, 3]; depth: float32 [B, h, w], metres along the
+# optical axis; pose: float32 [B, 7] = x, y, z in metres and quaternion w, x, y, z of T_world_cam, world z up, camera
+# x forward, y left, z up; reward: float32 [B]; done: bool [B].
+Observation = Mapping[str, torch.Tensor]
+
+
+@runtime_checkable
+class World(Protocol):
+    """Folds observations into a state, moves the state under an action, shows what can be seen from it."""
+
+    spec: Spec
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        """`batch` states in which a story may begin."""
+        ...
+
+    def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
+        """Evidence into state. Filtering is `observe(obs, imagine(state, action, rng), rng)`."""
+        ...
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        """The state one step (`spec.dt_s`) later under `action` [B, *spec.action.shape]."""
+        ...
+
+    def render(self, state: State, channels: Sequence[str]) -> Observation:
+        """The asked channels, and no work for the others."""
+        ...
+
+
+def make_rng(seed: int, device: str = "cpu") -> torch.Generator:
+    """A generator to hand to the verbs."""
+    return torch.Generator(device=device).manual_seed(seed)

@@ -1,0 +1,258 @@
+"""Explorer: a scripted player that walks a first-person world by what it sees, so that recordings cover all of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+
+import torch
+
+from ..core.spec import Spec
+from ..core.world import Observation
+
+LEGS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
+_BODY_M = 0.55  # half the width that must be free to walk
+_CELL_M = 1.5  # of the grid in which visits are counted
+_Moves = Generator[tuple[str, ...], "_View", "_View"]  # yields the buttons of a step, is sent what is seen after it
+
+
+@dataclass(frozen=True)
+class _View:
+    """What the walker uses of an observation: where it stands and how far it can see in each direction of the picture."""
+
+    x: float
+    y: float
+    yaw: float  # radians, counter-clockwise
+    bearing: torch.Tensor  # [C] radians from straight ahead, left positive
+    free_m: torch.Tensor  # [C] level distance to the first obstacle
+
+    def walkable_m(self) -> torch.Tensor:
+        """[C] metres that a body with width can go in each direction, as far as is seen."""
+        apart = self.bearing[None, :] - self.bearing[:, None]
+        along, across = self.free_m * torch.cos(apart), (self.free_m * torch.sin(apart)).abs()
+        blocks = (across < _BODY_M) | (apart == 0)
+        return torch.where(blocks, along, torch.inf).amin(1)
+
+    def ahead_m(self) -> float:
+        """The same straight ahead."""
+        across = (self.free_m * torch.sin(self.bearing)).abs()
+        blocks = (across < _BODY_M) | (self.bearing.abs() < 0.05)
+        return float((self.free_m * torch.cos(self.bearing))[blocks].min())
+
+
+class Explorer:
+    """A policy for `record`: policy(observation, info, rng) -> action [1, ...].
+
+    In worlds with depth, pose and Doom's six movement buttons it goes where it has been least in this episode, by ways
+    that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Elsewhere it
+    holds random actions for 3 to 40 steps. It knows nothing but the observations since info["step"] was 0.
+    """
+
+    def __init__(self, spec: Spec):
+        self.spec = spec
+        self._walks = set(LEGS) <= set(spec.action_names) and {"depth", "pose"} <= set(spec.channels)
+        self._moves: _Moves | None = None
+        self._held: torch.Tensor | None = None
+        self._hold = 0
+
+    def __call__(self, observation: Observation, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
+        if not self._walks:
+            return self._random(info, rng)
+        view = _look(self.spec, observation)
+        if info["step"] == 0 or self._moves is None:
+            self._moves = _Walk(rng).story(view)
+            buttons = next(self._moves)
+        else:
+            buttons = self._moves.send(view)
+        action = [[float(name in buttons) for name in self.spec.action_names]]
+        return torch.tensor(action).to(torch.int8)
+
+    def _random(self, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
+        if info["step"] == 0 or self._hold <= 0 or self._held is None:
+            self._held, self._hold = self.spec.sample_action(1, rng), _whole(rng, 3, 40)
+        self._hold -= 1
+        return self._held
+
+
+class _Walk:
+    """One episode of walking: endless moves, each a few steps to a few dozen long."""
+
+    def __init__(self, rng: torch.Generator):
+        self.rng = rng
+        self.visits: dict[tuple[int, int], int] = {}
+        self.boredom = 0.0  # grows while nothing new is found, and lowers what counts as promising
+
+    def story(self, view: _View) -> _Moves:
+        kinds = [self.seek, self.run, self.turn, self.strafe, self.back, self.stop, self.look_around, self.mash]
+        weights = torch.tensor([10.0, 2.0, 1.0, 1.5, 0.6, 0.4, 0.3, 1.0])
+        while True:
+            kind = kinds[int(torch.multinomial(weights, 1, generator=self.rng))]
+            view = yield from kind(view)
+
+    def step(self, *buttons: str) -> _Moves:
+        view = yield buttons
+        cell = (math.floor(view.x / _CELL_M), math.floor(view.y / _CELL_M))
+        self.visits[cell] = self.visits.get(cell, 0) + 1
+        return view
+
+    # -- moves: each takes the present view, yields buttons and returns the last view ----------------------------
+
+    def seek(self, view: _View) -> _Moves:
+        """Turns to the most promising open direction in sight and runs there, steering clear of walls."""
+        score = self.promise(view)
+        side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
+        along = [(), (), ("MOVE_BACKWARD",), ("MOVE_LEFT",), ("MOVE_RIGHT",)][_whole(self.rng, 0, 4)]
+        for _ in range(100):  # while all in sight is a wall or well known, look elsewhere
+            if float(score.max()) > 0.3 - self.boredom:
+                break
+            self.boredom += 0.005
+            view = yield from self.step(side, *(("MOVE_FORWARD",) if view.ahead_m() > 2.0 else along))
+            score = self.promise(view)
+        self.boredom *= 0.5
+        goal, stuck = self.choose(view, score), 0
+        for step in range(1, _whole(self.rng, 12, 40)):
+            if step % 8 == 0:  # look again, and keep to the way taken unless another is clearly better
+                apart = (view.yaw + view.bearing - goal + math.pi) % (2 * math.pi) - math.pi
+                goal = self.choose(view, self.promise(view) + 0.3 * torch.exp(-((apart / 0.3) ** 2)))
+            off, ahead = _wrapped(goal - view.yaw), view.ahead_m()
+            buttons = ["MOVE_FORWARD"] if abs(off) < 0.3 or ahead > 1.2 else list(along)
+            if abs(off) > 0.06:
+                buttons.append("TURN_LEFT" if off > 0 else "TURN_RIGHT")
+            elif ahead < 1.2:
+                break
+            before = view
+            view = yield from self.step(*buttons)
+            stood = math.dist((before.x, before.y), (view.x, view.y)) < 0.02
+            stuck = stuck + 1 if stood and buttons[:1] == ["MOVE_FORWARD"] else 0
+            if stuck > 5:
+                return (yield from self.dodge(view))
+        return view
+
+    def choose(self, view: _View, score: torch.Tensor) -> float:
+        """A heading (radians in the world), likelier where the score is high."""
+        likelihood = torch.exp(10 * (score - score.max()))
+        return view.yaw + float(view.bearing[int(torch.multinomial(likelihood, 1, generator=self.rng))])
+
+    def dodge(self, view: _View) -> _Moves:
+        """Away from a wall: towards the more open half, now and then by a strafe or a step back."""
+        left = float(view.free_m[view.bearing > 0].mean()) > float(view.free_m[view.bearing <= 0].mean())
+        if _chance(self.rng, 0.15):
+            left = not left
+        if _chance(self.rng, 0.25):
+            for _ in range(_whole(self.rng, 3, 10)):
+                view = yield from self.step("MOVE_BACKWARD")
+        side = (
+            ("MOVE_LEFT" if left else "MOVE_RIGHT")
+            if _chance(self.rng, 0.2)
+            else ("TURN_LEFT" if left else "TURN_RIGHT")
+        )
+        for _ in range(_whole(self.rng, 8, 30)):
+            view = yield from self.step(side)
+            if side.startswith("TURN") and view.ahead_m() > 2.0:
+                break
+        return view
+
+    def run(self, view: _View) -> _Moves:
+        """Straight on, at times diagonally or while turning, until a wall is near."""
+        extra = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)][_whole(self.rng, 0, 6)]
+        bump = _chance(self.rng, 0.15)  # walls are to be felt too
+        for _ in range(_whole(self.rng, 8, 40)):
+            view = yield from self.step("MOVE_FORWARD", *extra)
+            if not bump and view.ahead_m() < 0.9:
+                return (yield from self.dodge(view))
+        return view
+
+    def turn(self, view: _View) -> _Moves:
+        return (yield from self.hold(("TURN_LEFT",) if _chance(self.rng, 0.5) else ("TURN_RIGHT",), 3, 30))
+
+    def strafe(self, view: _View) -> _Moves:
+        buttons = ("MOVE_LEFT",) if _chance(self.rng, 0.5) else ("MOVE_RIGHT",)
+        if _chance(self.rng, 0.4):  # circle around what is seen
+            buttons += ("TURN_RIGHT",) if buttons[0] == "MOVE_LEFT" else ("TURN_LEFT",)
+        return (yield from self.hold(buttons, 5, 25))
+
+    def back(self, view: _View) -> _Moves:
+        buttons = ("MOVE_BACKWARD",)
+        if _chance(self.rng, 0.3):
+            buttons += ("TURN_LEFT",) if _chance(self.rng, 0.5) else ("TURN_RIGHT",)
+        return (yield from self.hold(buttons, 4, 20))
+
+    def stop(self, view: _View) -> _Moves:
+        return (yield from self.hold((), 3, 12))
+
+    def look_around(self, view: _View) -> _Moves:
+        """A quarter to a full turn, sometimes there and back (memory has to close the loop)."""
+        side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
+        sides = [side, "TURN_RIGHT" if side == "TURN_LEFT" else "TURN_LEFT"] if _chance(self.rng, 0.4) else [side]
+        angle = math.pi * (0.5 + 1.5 * _unit(self.rng))
+        for side in sides:
+            turned = 0.0
+            for _ in range(140):
+                before = view.yaw
+                view = yield from self.step(side)
+                turned += abs(_wrapped(view.yaw - before))
+                if turned >= angle:
+                    break
+        return view
+
+    def mash(self, view: _View) -> _Moves:
+        """Random key combinations, as a person tries a keyboard."""
+        for _ in range(_whole(self.rng, 2, 6)):
+            pressed = torch.rand(len(LEGS), generator=self.rng) < 0.3
+            buttons = tuple(name for name, down in zip(LEGS, pressed.tolist()) if down)
+            view = yield from self.hold(buttons, 3, 12)
+        return view
+
+    def hold(self, buttons: tuple[str, ...], least: int, most: int) -> _Moves:
+        for _ in range(_whole(self.rng, least, most)):
+            view = yield from self.step(*buttons)
+        return view
+
+    def promise(self, view: _View) -> torch.Tensor:
+        """[C] of 0..1: how far one could go in each direction, and how new the places on the way are."""
+        free = view.walkable_m().clamp(0, 12.0)
+        news = torch.zeros_like(free)
+        for index, (distance, bearing) in enumerate(zip(free.tolist(), view.bearing.tolist())):
+            direction = view.yaw + bearing
+            reach = [0.5 + i for i in range(1, 12) if 0.5 + i < distance - 0.4]
+            cells = [
+                (
+                    math.floor((view.x + r * math.cos(direction)) / _CELL_M),
+                    math.floor((view.y + r * math.sin(direction)) / _CELL_M),
+                )
+                for r in reach
+            ]
+            if cells:
+                news[index] = sum(1 / (1 + self.visits.get(cell, 0) / 3) for cell in cells) / len(cells)
+        return news * (free / 5.0).clamp(max=1.0)
+
+
+def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
+    """Bearings and free distances from the depth picture's rows about the horizon, and the pose."""
+    focal, _, centre, horizon = spec.camera or (0.5, 0.8, 0.5, 0.5)
+    depth = observation["depth"][0].float()
+    height = depth.shape[0]
+    top = min(int(height * (horizon - 0.04)), height - 1)
+    bottom = max(top + 1, int(height * (horizon + 0.05)))
+    level = torch.nn.functional.adaptive_max_pool1d(-depth[top:bottom].amin(0)[None], bins)[0].neg()
+    bearing = -torch.atan(((torch.arange(bins) + 0.5) / bins - centre) / focal)
+    x, y, _, w, qx, qy, qz = observation["pose"][0].tolist()
+    yaw = math.atan2(2 * (w * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return _View(x, y, yaw, bearing, level / torch.cos(bearing))
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _unit(rng: torch.Generator) -> float:
+    return float(torch.rand(1, generator=rng))
+
+
+def _chance(rng: torch.Generator, likelihood: float) -> bool:
+    return _unit(rng) < likelihood
+
+
+def _whole(rng: torch.Generator, least: int, most: int) -> int:
+    return int(torch.randint(least, most + 1, (1,), generator=rng))

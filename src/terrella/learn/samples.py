@@ -1,0 +1,121 @@
+"""Training samples of a VideoWorld: which rows may be learned from, which become its memory, and what it is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..space.camera import Intrinsics, unproject, yaw
+from ..space.keyframes import Keyframes, look, retrieve
+from ..worlds.video import VideoConfig, carry
+
+Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres on the map
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rows of a clip cache as tensors on demand; `start[row]` is the first row of its episode."""
+
+    cache: object
+    start: np.ndarray
+    usable: np.ndarray  # rows that training may see
+
+    def rgb(self, rows) -> torch.Tensor:
+        """uint8 [n, 3, H, W]"""
+        return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
+
+    def depth(self, rows) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(self.cache.depth[rows], np.float32)).clamp(0.1, 60.0)
+
+    def pose(self, rows) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
+
+    def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
+        return Keyframes.of(self.rgb(rows), self.depth(rows), self.pose(rows), camera)
+
+
+def usable_rows(cache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
+    """Rows of `episodes` in which the eye neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
+    usable = np.zeros(cache.length, bool)
+    for episode in episodes:
+        usable[slice(*cache.episodes[episode])] = True
+    if keep_out is None:
+        return usable
+    x0, y0, x1, y1 = keep_out
+    pose = torch.from_numpy(np.array(cache.pose))
+    usable &= ~((pose[:, 0] > x0) & (pose[:, 0] < x1) & (pose[:, 1] > y0) & (pose[:, 1] < y1)).numpy()
+    rows = np.flatnonzero(usable)
+    height, width = cache.depth.shape[1:]
+    horizon = min(int(camera[3] * height), height - 1)
+    for some in np.array_split(rows, max(1, len(rows) // 4096)):
+        depth = torch.from_numpy(np.asarray(cache.depth[some, horizon], np.float32))[:, None]
+        flat = (camera[0], camera[1], camera[2], 0.5)  # the horizon's row alone
+        x, y = unproject(depth, pose[some], flat)[:, 0, :, :2].unbind(-1)
+        inside = (x > x0 + 0.5) & (x < x1 - 0.5) & (y > y0 + 0.5) & (y < y1 - 0.5)
+        usable[some[inside.any(1).numpy()]] = False
+    return usable
+
+
+def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_turn: float = 6.0) -> np.ndarray:
+    """`count` of `rows` that cover places and headings evenly: farthest-point sampling of (x, y, heading)."""
+    turn = yaw(torch.from_numpy(np.array(pose[rows]))).numpy()
+    scale = metres_per_turn / (2 * np.pi)
+    points = np.concatenate([pose[rows][:, :2], scale * np.cos(turn)[:, None], scale * np.sin(turn)[:, None]], 1)
+    picks, gap = [0], np.full(len(rows), np.inf)
+    while len(picks) < min(count, len(rows)):
+        gap = np.minimum(gap, np.square(points - points[picks[-1]]).sum(1))
+        picks.append(int(gap.argmax()))
+    return np.sort(rows[picks])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the generator is shown for B target rows, and the truth."""
+
+    chosen: list[Keyframes]
+    before: np.ndarray  # the row before each target
+    target: np.ndarray
+
+
+def draw(recording: Recording, memory: Keyframes, config: VideoConfig, batch: int, rng: np.random.Generator) -> Shown:
+    """Half of the samples stand in recorded places (memory, thinned at random), half see only their own episode's past.
+
+    Both learn to complete: the first where memory is dense, the second where it is sparse.
+    """
+    rows = recording.usable & np.roll(recording.usable, 1)
+    rows &= np.arange(len(rows)) - recording.start >= 2
+    target = rng.choice(np.flatnonzero(rows), batch)
+    chosen = []
+    for index, row in enumerate(target):
+        pose = recording.pose([row])[0]
+        if index % 2 == 0:
+            picks = retrieve([memory], pose, config.camera, config.size, config.sources)[0]
+            if rng.random() < 0.4:
+                picks = [pick for pick in picks if rng.random() < 0.6]
+            chosen.append(memory.at(picks))
+        else:
+            past = _past(recording, int(row), rng)
+            own = recording.keyframes(past, config.camera)
+            chosen.append(own.at(retrieve([own], pose, config.camera, config.size, config.sources)[0]))
+    return Shown(chosen, target - 1, target)
+
+
+def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarray:
+    """A few rows of the same episode's past, the newest some steps ago, as a dream far from its keyframes has them."""
+    newest = row - int(rng.choice([2, 4, 8, 16, 32]))
+    gaps = rng.integers(3, 24, size=int(rng.integers(1, 7))).cumsum() - 3
+    past = np.maximum(newest - gaps, recording.start[row])
+    return np.unique(np.minimum(past, row - 1))
+
+
+def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: VideoConfig):
+    """What the chosen keyframes know of the views at `rows`."""
+    return look(shown.chosen, recording.pose(rows), config.camera, config.size, config.sources, config.slots)
+
+
+def carried(rgb, depth, from_rows, to_rows, glimpse, recording: Recording, config: VideoConfig) -> torch.Tensor:
+    """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
+    poses = recording.pose(from_rows), recording.pose(to_rows)
+    return carry(rgb, depth, poses[0], glimpse.depth, poses[1], config.camera)

@@ -1,0 +1,323 @@
+"""train_video: a recording into a VideoWorld, by flow matching with the last frame dreamt and a sharpness critic."""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import nn
+
+from ..core.errors import DatasetError, TrainingError
+from ..core.world import make_rng
+from ..data import ClipCache, Dataset, split
+from ..space.keyframes import Glimpse, Keyframes
+from ..worlds.folder import save_video_world, video_spec
+from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, decode_depth, encode_depth, generate, merge
+from .motion import train_motion
+from .run_folder import load_run, save_run
+from .samples import Box, Recording, carried, choose_keyframes, draw, glimpse_of, usable_rows
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """steps, hours: whichever ends first; batch: frames a step (more on a GPU); keep_out: a box x0 y0 x1 y1 of the map,
+    in metres, that training never sees (to score new places); keyframes: of the recording that become the memory."""
+
+    name: str = "world"
+    size: tuple[int, int] = (96, 128)
+    steps: int = 8000
+    hours: float = 24.0
+    batch: int = 8
+    learning_rate: float = 8e-4
+    motion_steps: int = 6000
+    keyframes: int = 480
+    keep_out: Box | None = None
+    critic_from: int = 1500
+    critic_weight: float = 0.02
+    save_every_s: float = 120.0
+    strip_every_s: float = 300.0
+    seed: int = 0
+    device: str = "auto"
+
+
+class Critic(nn.Module):
+    """Judges 16-pixel patches: real or dreamt, given what memory knew (hinge loss)."""
+
+    def __init__(self):
+        super().__init__()
+        widths = (3 + 3 + 1, 32, 48, 64)
+        self.layers = nn.ModuleList(
+            nn.utils.parametrizations.spectral_norm(nn.Conv2d(a, b, 4, 2, 1)) for a, b in zip(widths, widths[1:])
+        )
+        self.judge = nn.utils.parametrizations.spectral_norm(nn.Conv2d(widths[-1], 1, 3, 1, 1))
+
+    def forward(self, rgb: torch.Tensor, glimpse) -> torch.Tensor:
+        x = torch.cat([rgb, merge(glimpse) * 2 - 1, glimpse.known[:, None]], 1)
+        for layer in self.layers:
+            x = F.leaky_relu(layer(x), 0.2)
+        return self.judge(x)
+
+
+def train_video(
+    data: str | Path, out: str | Path, config: TrainConfig, report: Callable[[float, float, str], None]
+) -> dict:
+    """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    dataset = Dataset(data)
+    cache = ClipCache.open(dataset, config.size, lambda done, total: report(done, total, "building the clip cache"))
+    if cache.depth is None or cache.pose is None or not cache.world.get("camera"):
+        raise DatasetError(f"{data} lacks depth, pose or the camera; record it with them (terrella record doom does).")
+    run = _Run(dataset, cache, out, config)
+    run.learn(report)
+    return run.finish()
+
+
+class _Run:
+    """The pieces of one training run."""
+
+    def __init__(self, dataset: Dataset, cache: ClipCache, out: Path, config: TrainConfig):
+        self.dataset, self.cache, self.out, self.config = dataset, cache, out, config
+        self.device = torch.device(_device(config.device))
+        torch.manual_seed(config.seed)
+        self.video = VideoConfig(tuple(cache.world["camera"]), cache.action.shape[1], config.size)
+        train, self.held_out = split(len(cache.episodes))
+        start = np.zeros(cache.length, np.int64)
+        for first, last in cache.episodes:
+            start[first:last] = first
+        usable = usable_rows(cache, train, config.keep_out, self.video.camera)
+        if usable.sum() < 64:
+            raise DatasetError(
+                f"{dataset.root} leaves {usable.sum()} frames to train on; record more, or a smaller keep_out."
+            )
+        self.recording = Recording(cache, start, usable)
+        rows = choose_keyframes(cache.pose, np.flatnonzero(usable), config.keyframes)
+        rgb = torch.from_numpy(dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
+        depth, pose = self.recording.depth(rows), self.recording.pose(rows)
+        self.memory = Keyframes.of(rgb, depth, pose, self.video.camera)
+        self.generator, self.motion, self.critic = Generator(self.video), Motion(self.video), Critic()
+        self.smooth = copy.deepcopy(self.generator).eval().requires_grad_(False)
+        self.modules = {
+            "generator": self.generator,
+            "smooth": self.smooth,
+            "motion": self.motion,
+            "critic": self.critic,
+        }
+        self.optimisers = {
+            "optimiser": torch.optim.AdamW(
+                self.generator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4
+            ),
+            "critic_optimiser": torch.optim.Adam(self.critic.parameters(), 3e-4, (0.0, 0.99)),
+        }
+        self.facts = {"recipe": _recipe(config, dataset), "step": 0, "seconds": 0.0, "motion": None}
+
+    def learn(self, report) -> None:
+        found = load_run(self.out, self.modules, self.optimisers)
+        if found:
+            if found["recipe"] != self.facts["recipe"]:
+                raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
+            self.facts = found
+        if self.facts["motion"] is None:
+            self.facts["motion"] = train_motion(
+                self.motion, self.recording, self.memory, self.video, self.config.motion_steps, self.config.seed, report
+            )
+            self._save()
+        began = saved = drawn = time.monotonic()
+        before = self.facts["seconds"]
+        recent: list[dict] = []
+        try:
+            while self.facts["step"] < self.config.steps and self.facts["seconds"] < 3600 * self.config.hours:
+                recent.append(self._step(self.facts["step"]))
+                self.facts["step"] += 1
+                now = time.monotonic()
+                self.facts["seconds"] = before + now - began
+                if len(recent) == 20:
+                    self._log(recent, report)
+                    recent = []
+                if now - saved > self.config.save_every_s:
+                    self._save()
+                    saved = now
+                if now - drawn > self.config.strip_every_s:
+                    self.draw_strip()
+                    drawn = time.monotonic()
+        finally:  # also on Ctrl-C
+            self._save()
+
+    def _step(self, step: int) -> dict[str, float]:
+        """One step; all its randomness comes from (seed, step), so a resumed run sees what an unbroken one would."""
+        config, video = self.config, self.video
+        rng = np.random.default_rng([config.seed, step])
+        noise_rng = make_rng(int(rng.integers(2**62)))
+        for group in self.optimisers["optimiser"].param_groups:
+            group["lr"] = config.learning_rate * min(1, (step + 1) / 200) * (0.05 + 0.95 * _cosine(step / config.steps))
+        with torch.no_grad():
+            shown = draw(self.recording, self.memory, video, config.batch, rng)
+            last_rgb, last_depth = self._frames_before(shown, rng, noise_rng)
+            glimpse = glimpse_of(shown, shown.target, self.recording, video)
+            last = carried(last_rgb, last_depth, shown.before, shown.target, glimpse, self.recording, video)
+            forget = torch.from_numpy(rng.random(config.batch) < 0.1)
+            last[forget] = 0
+            rgb = self.recording.rgb(shown.target).float() / 127.5 - 1
+            truth = torch.cat([rgb, encode_depth(self.recording.depth(shown.target))[:, None]], 1)
+            time_ = torch.from_numpy(np.where(rng.random(config.batch) < 0.5, 0, rng.random(config.batch))).float()
+            noise = torch.randn(truth.shape, generator=noise_rng)
+            glimpse, last, truth, time_, noise = _to(self.device, glimpse, last, truth, time_, noise)
+            noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
+        with _half(self.device):
+            clean = self.generator(noisy, time_, glimpse, last).float()
+            losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
+            losses["edges"] = sum(_l1(clean[:, :3].diff(dim=axis), truth[:, :3].diff(dim=axis)) for axis in (2, 3))
+            total = losses["rgb"] + 0.5 * losses["depth"] + 0.5 * losses["edges"]
+            if step >= config.critic_from:
+                self.critic.requires_grad_(False)
+                total = total - config.critic_weight * self.critic(clean[:, :3], glimpse).mean()
+                self.critic.requires_grad_(True)
+        if not torch.isfinite(total):
+            raise TrainingError(
+                f"the loss is not a number at step {step}; the last save is good: lower --learning-rate."
+            )
+        self._descend("optimiser", self.generator, total)
+        if step >= config.critic_from - 200:
+            with _half(self.device):
+                real, fake = self.critic(truth[:, :3], glimpse), self.critic(clean[:, :3].detach(), glimpse)
+                losses["critic"] = F.relu(1 - real).mean() + F.relu(1 + fake).mean()
+            self._descend("critic_optimiser", self.critic, losses["critic"])
+        keep = min(0.999, (step + 1) / (step + 20))
+        with torch.no_grad():
+            for smooth, raw in zip(self.smooth.parameters(), self.generator.parameters()):
+                smooth.lerp_(raw, 1 - keep)
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    def _frames_before(self, shown, rng, noise_rng):
+        """The frames before the targets: recorded in half of the steps, else dreamt by the model itself."""
+        rgb, depth = self.recording.rgb(shown.before), self.recording.depth(shown.before)
+        if rng.random() < 0.5:
+            return rgb, depth
+        glimpse = glimpse_of(shown, shown.before, self.recording, self.video)
+        earlier = shown.before - 1
+        last = carried(
+            self.recording.rgb(earlier),
+            self.recording.depth(earlier),
+            earlier,
+            shown.before,
+            glimpse,
+            self.recording,
+            self.video,
+        )
+        last[torch.from_numpy(rng.random(len(last)) < 0.5)] = 0
+        noise = torch.randn(len(last), 4, *self.video.size, generator=noise_rng)
+        glimpse, last, noise = _to(self.device, glimpse, last, noise)
+        with _half(self.device):
+            clean = generate(self.generator, noise, glimpse, last, 1).float().cpu()
+        return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8), decode_depth(clean[:, 3])
+
+    def _descend(self, name: str, module: nn.Module, loss: torch.Tensor) -> None:
+        self.optimisers[name].zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        self.optimisers[name].step()
+
+    def _log(self, recent: list[dict], report) -> None:
+        mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
+        line = {"step": self.facts["step"], "seconds": round(self.facts["seconds"]), **mean}
+        with open(self.out / "log.jsonl", "a") as file:
+            file.write(json.dumps(line) + "\n")
+        share = max(self.facts["step"] / self.config.steps, self.facts["seconds"] / (3600 * self.config.hours))
+        report(share, 1.0, " ".join(f"{name} {value:.4f}" for name, value in mean.items()))
+
+    def _save(self) -> None:
+        save_run(self.out, self.modules, self.optimisers, self.facts)
+
+    def world(self) -> VideoWorld:
+        about = self.cache.world
+        card = {
+            "what": f"Learned from {self.dataset.length:,} frames of {about['name']}",
+            "data": f"{self.recording.usable.sum():,} frames, {len(self.cache.episodes) - len(self.held_out)} episodes",
+            "steps": self.facts["step"],
+            "hours": round(self.facts["seconds"] / 3600, 2),
+            "keep_out": self.config.keep_out,
+            "keyframes": len(self.memory),
+            "parameters": sum(p.numel() for p in (*self.generator.parameters(), *self.motion.parameters())),
+            **(self.facts["motion"] or {}),
+        }
+        spec = video_spec(self.config.name, self.video, about["dt_s"], self.cache.action_names, about["keys"], card)
+        reward, done = np.array(self.cache.reward), np.array(self.cache.done)
+        usual = float(np.median(reward))
+        rewards = (usual, float(reward[done].mean() - usual) if done.any() else 0.0)
+        starts = self.memory.at(slice(None, None, max(1, len(self.memory) // 32)))
+        generator = copy.deepcopy(self.smooth).cpu().float()
+        return VideoWorld(spec, self.video, generator, self.motion, self.memory, starts, rewards)
+
+    def draw_strip(self) -> None:
+        """Truth above dream (recorded motion, 64 steps from a held-out episode), with the memory and without; and the
+        world as it now is, so that it can be played while it learns."""
+        world, rng = self.world(), make_rng(1)
+        first, last = self.cache.episodes[self.held_out[0]]
+        rows = np.arange(first + 40, min(first + 105, last))
+        lines = [self.recording.rgb(rows[::8])]
+        for memory in (world.memory, world.memory.at(slice(0, 0))):
+            dreaming = VideoWorld(
+                world.spec, world.config, world.generator, world.motion, memory, world.starts, world.rewards
+            )
+            seen = {"rgb": self.recording.rgb(rows[:1]).permute(0, 2, 3, 1), "depth": self.recording.depth(rows[:1])}
+            state = dreaming.observe({**seen, "pose": self.recording.pose(rows[:1])}, None, rng)
+            frames = [state["rgb"]]
+            for row in rows[1:]:
+                state = dreaming.observe({"pose": self.recording.pose([row])}, state, rng)
+                frames.append(state["rgb"])
+            lines.append(torch.cat(frames)[::8])
+        picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
+        Image.fromarray(picture).save(self.out / f"strip-{self.facts['step']:06d}.png")
+        save_video_world(world, self.out / "world", dict(world.spec.card))
+
+    def finish(self) -> dict:
+        self.draw_strip()
+        return {"world": str(self.out / "world"), **{k: v for k, v in self.facts.items() if k != "recipe"}}
+
+
+def _recipe(config: TrainConfig, dataset: Dataset) -> dict:
+    """What must not change within a run; how long it goes on, and where, may."""
+    fixed = asdict(replace(config, hours=0.0, device="", save_every_s=0, strip_every_s=0))
+    return json.loads(json.dumps({**fixed, "frames": dataset.length}))
+
+
+def _cosine(share: float) -> float:
+    return 0.5 + 0.5 * float(np.cos(np.pi * min(share, 1.0)))
+
+
+def _l1(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return (a - b).abs().mean()
+
+
+def _device(name: str) -> str:
+    return name if name != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _half(device: torch.device):
+    """bfloat16 where the device computes it natively."""
+    native = device.type == "cuda" or torch.backends.cpu.get_cpu_capability() == "AVX512" and _cpu_has_bf16()
+    return torch.autocast(device.type, torch.bfloat16, enabled=native)
+
+
+def _cpu_has_bf16() -> bool:
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+def _to(device: torch.device, *values):
+    """Tensors and Glimpses moved to the device."""
+    if device.type == "cpu":
+        return values
+    return tuple(
+        value.to(device)
+        if isinstance(value, torch.Tensor)
+        else Glimpse(*(part.to(device) for part in vars(value).values()))
+        for value in values
+    )

@@ -1,0 +1,114 @@
+"""Finds and opens worlds by name or path: the composition root for Python, which the command line imports too."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from .core.errors import CheckpointError, TerrellaError
+from .core.world import World
+
+BUNDLED = Path(__file__).parent / "bundled"
+GAME = "doom:my_way_home"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One world at hand: `load(name)` opens it. source: "bundled", "game" or "checkpoint"; card: facts for people."""
+
+    name: str
+    source: str
+    card: Mapping[str, object]
+
+    def as_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def load(name: str | Path, **options: Any) -> World:
+    """Opens a world.
+
+    name:    a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment
+             ("gym:CartPole-v1"), or the path of a checkpoint folder or of a training run.
+    options: for a learned world what its `load` takes (memory=False, device="cuda"), for the game the fields of
+             DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
+    Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
+    """
+    text = str(name)
+    if text == "doom" or text.startswith("doom:"):
+        return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
+    if text.startswith("gym:"):
+        from .sim.gymnasium import GymnasiumWorld
+
+        return GymnasiumWorld(text.partition(":")[2], **options)
+    if (BUNDLED / text / "world.json").is_file():
+        return _open_checkpoint(BUNDLED / text, options)
+    if Path(text).exists():
+        run = Path(text) / "world"  # where `terrella train` leaves the world of a run
+        return _open_checkpoint(run if (run / "world.json").is_file() else Path(text), options)
+    bundled = ", ".join(sorted(_bundled())) or "none"
+    raise TerrellaError(
+        f"There is no world '{text}': bundled are {bundled}; the real game is {GAME}, an environment gym:CartPole-v1; "
+        "or give the path of a checkpoint folder."
+    )
+
+
+def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
+    """The bundled worlds, the real games that are installed, and the checkpoints in or directly below `folders`."""
+    entries = [Entry(name, "bundled", _read_card(BUNDLED / name)) for name in sorted(_bundled())]
+    if find_spec("vizdoom"):
+        entries.append(Entry(GAME, "game", {"what": "ViZDoom with Freedoom's art: the game that doom-maze learned"}))
+    entries.append(Entry("gym:CartPole-v1", "game", {"what": "any Gymnasium environment, by its id"}))
+    for folder in map(Path, folders):
+        if not folder.is_dir():
+            raise TerrellaError(f"{folder} is not a folder; give one that holds checkpoints (each has a world.json).")
+        patterns = ("world.json", "world/world.json", "*/world.json", "*/world/world.json")  # checkpoints, and runs
+        found = sorted({file.parent for pattern in patterns for file in folder.glob(pattern)})
+        entries += [Entry(str(path), "checkpoint", _read_card(path)) for path in found]
+    return entries
+
+
+def _bundled() -> list[str]:
+    return [file.parent.name for file in BUNDLED.glob("*/world.json")]
+
+
+def _read(folder: Path) -> dict:
+    path = folder / "world.json"
+    if not path.is_file():
+        raise CheckpointError(
+            f"{folder} is not a checkpoint: it holds no world.json; `terrella train` writes such folders when it ends."
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); take the checkpoint from its source again.") from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path} is not the description of a world; take the checkpoint from its source again.")
+    return content
+
+
+def _read_card(folder: Path) -> Mapping[str, object]:
+    card = _read(folder).get("card")
+    return card if isinstance(card, dict) else {}
+
+
+def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
+    kind = _read(folder).get("kind")
+    if kind == "video":
+        from .worlds.folder import load_video_world
+
+        return load_video_world(folder, **options)
+    raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
+
+
+def _open_doom(scenario: str, options: Mapping[str, Any]) -> World:
+    if not find_spec("vizdoom"):
+        raise TerrellaError(
+            "The real game needs ViZDoom, which is not installed: pip install 'terrella[sim]' (or -e '.[sim]')."
+        )
+    from .sim.doom import Doom, DoomConfig
+
+    return Doom(DoomConfig(scenario=scenario, **options))

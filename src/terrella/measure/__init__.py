@@ -1,0 +1,40 @@
+"""The scorecard: asks any World what its dreams are worth, and writes the answer as JSON and as a page."""
+
+from .album import Album
+from .bars import Bar, bars
+from .clips import Clip, clips_from_cache, in_box, outside_box
+from .closure import Closure, closure
+from .endurance import Endurance, long_rollout
+from .examine import ExamConfig, examine, write_report
+from .page import page
+from .scorecard import Scorecard, ScoreConfig, as_dict, score, to_json
+from .speed import Speed, speed
+from .statistics import Figure
+from .strip import strip
+
+__all__ = [
+    "Album",
+    "Bar",
+    "Clip",
+    "Closure",
+    "Endurance",
+    "ExamConfig",
+    "Figure",
+    "ScoreConfig",
+    "Scorecard",
+    "Speed",
+    "as_dict",
+    "bars",
+    "clips_from_cache",
+    "closure",
+    "examine",
+    "in_box",
+    "long_rollout",
+    "outside_box",
+    "page",
+    "score",
+    "speed",
+    "strip",
+    "to_json",
+    "write_report",
+]

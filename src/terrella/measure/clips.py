@@ -1,0 +1,145 @@
+"""Clips: windows of held-out recordings that every arm of a scorecard is asked to dream again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..core.errors import DatasetError, ObservationError
+from ..core.spec import Spec
+
+Where = Callable[[np.ndarray], np.ndarray]  # pose [N, 7] -> bool [N]: which rows may be in a clip
+
+
+@dataclass(frozen=True)
+class Clip:
+    """T = context + horizon rows of one episode; row t's action led from observation t to t + 1.
+
+    rgb uint8 [T, H, W, 3]; depth [T, h, w] metres or None; pose float32 [T, 7] or None; action [T, A]; reward [T] and
+    done [T] are what followed each action. The first `context` frames are shown to a world, the rest are the truth.
+    Arrays may be views of a memory-mapped file.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray | None
+    pose: np.ndarray | None
+    action: np.ndarray
+    reward: np.ndarray | None
+    done: np.ndarray | None
+    context: int
+    episode: int
+    start: int
+
+    @property
+    def horizon(self) -> int:
+        return len(self.rgb) - self.context
+
+    def walked_m(self) -> np.ndarray:
+        """Length of the true path from the last context frame to each later frame: metres, float64 [horizon]."""
+        places = np.asarray(self.pose, np.float64)[self.context - 1 :, :3]
+        return np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()
+
+    def moves(self) -> bool:
+        """True where the player walks more than half a metre or turns more than 20 degrees after the context."""
+        if self.pose is None:
+            return bool((self.rgb[self.context :] != self.rgb[self.context - 1]).any())
+        turned = 2 * np.arccos(np.clip(np.abs(self.pose[self.context :, 3:] @ self.pose[self.context - 1, 3:]), 0, 1))
+        return bool(self.walked_m()[-1] > 0.5 or turned.max() > np.deg2rad(20))
+
+
+def in_box(x0: float, y0: float, x1: float, y1: float) -> Where:
+    """Rows whose place lies inside the box on the map, metres."""
+    return lambda pose: (pose[:, 0] >= x0) & (pose[:, 0] <= x1) & (pose[:, 1] >= y0) & (pose[:, 1] <= y1)
+
+
+def outside_box(x0: float, y0: float, x1: float, y1: float) -> Where:
+    """Rows whose place lies outside the box on the map, metres."""
+    inside = in_box(x0, y0, x1, y1)
+    return lambda pose: ~inside(pose)
+
+
+def clips_from_cache(
+    cache,
+    episodes: Sequence[int],
+    context: int,
+    horizon: int,
+    count: int,
+    rng: torch.Generator,
+    where: Where | None = None,
+) -> list[Clip]:
+    """Up to `count` windows that do not overlap, drawn at random from `episodes` of a clip cache.
+
+    No window holds a row without a valid action or an end (`done`), nor a row that `where` refuses. Still windows are
+    kept: Clip.moves tells them apart. Fewer come back where the recording has no more; DatasetError where it has none.
+    """
+    length = context + horizon
+    starts: list[tuple[int, int]] = []
+    for episode in episodes:
+        begin, end = cache.episodes[episode]
+        for first, stop in _runs(cache, begin, end, where):
+            spare = (stop - first) % length
+            if stop - first < length:
+                continue
+            offset = int(torch.randint(spare + 1, (1,), generator=rng))
+            starts += [(episode, row) for row in range(first + offset, stop - length + 1, length)]
+    if not starts:
+        raise DatasetError(
+            f"no window of {length} rows ({context} of context, {horizon} of horizon) fits in these {len(episodes)} "
+            "episodes; record longer episodes or ask for a shorter horizon."
+        )
+    order = torch.randperm(len(starts), generator=rng).tolist()[:count]
+    return [_cut(cache, starts[pick], length, context) for pick in order]
+
+
+def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Tensor]:
+    """What `spec` observes of row `row` of each clip: name -> tensor [B, ...]; ObservationError where it cannot."""
+    seen = {}
+    for name in spec.observes:
+        arrays = [array for clip in clips if (array := getattr(clip, name, None)) is not None]
+        if len(arrays) < len(clips):
+            raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
+        stacked = torch.from_numpy(np.stack([np.asarray(array[row]) for array in arrays]))
+        wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
+        if tuple(stacked.shape[1:]) != wanted:
+            raise ObservationError(
+                f"{spec.name} observes '{name}' of shape {wanted}, the clips hold {tuple(stacked.shape[1:])}; "
+                "open the clip cache at the world's size."
+            )
+        seen[name] = stacked if stacked.dtype in (torch.uint8, torch.bool) else stacked.float()
+    return seen
+
+
+def _runs(cache, first: int, stop: int, where: Where | None):
+    """Stretches [first, stop) of consecutive rows, each reached from the one before by a valid action."""
+    if where is not None and cache.pose is None:
+        raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
+    allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache.pose[first:stop]), bool)
+    linked = np.asarray(cache.action_valid[first : stop - 1], bool).copy()
+    if cache.done is not None:
+        linked &= ~np.asarray(cache.done[first : stop - 1], bool)
+    linked &= allowed[1:] & allowed[:-1]
+    breaks = np.flatnonzero(~linked) + 1
+    edges = [0, *breaks.tolist(), stop - first]
+    return [(first + a, first + b) for a, b in zip(edges[:-1], edges[1:]) if allowed[a]]
+
+
+def _cut(cache, start: tuple[int, int], length: int, context: int) -> Clip:
+    episode, row = start
+
+    def part(array):
+        return None if array is None else array[row : row + length]
+
+    return Clip(
+        rgb=cache.rgb[row : row + length],
+        depth=part(cache.depth),
+        pose=part(cache.pose),
+        action=cache.action[row : row + length],
+        reward=part(cache.reward),
+        done=part(cache.done),
+        context=context,
+        episode=episode,
+        start=row,
+    )

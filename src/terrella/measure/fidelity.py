@@ -1,0 +1,70 @@
+"""How alike two pictures are and how a picture looks: PSNR, SSIM, gradient energy (sharpness), colour statistics."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+PSNR_CAP_DB = 60.0  # identical 8-bit frames would be infinite and spoil every mean
+_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
+
+
+def psnr(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Peak signal-to-noise ratio in dB of uint8 frames [..., H, W, 3] -> float64 [...], peak 255, one figure a frame.
+
+    Capped at PSNR_CAP_DB. A mean over frames is the mean of their dB, not the dB of their mean error.
+    """
+    _check_alike(first, second)
+    error = (first.double() - second.double()).square().mean((-3, -2, -1))
+    floor = 255.0**2 / 10 ** (PSNR_CAP_DB / 10)
+    return 10 * torch.log10(255.0**2 / error.clamp_min(floor))
+
+
+def ssim(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Structural similarity of the luma of uint8 frames [..., H, W, 3] -> float64 [...].
+
+    Wang et al. 2004: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, L 255, only where the window fits.
+    """
+    _check_alike(first, second)
+    if min(first.shape[-3:-1]) < 11:
+        raise ValueError(f"SSIM needs frames of at least 11x11 pixels; got {tuple(first.shape[-3:-1])}.")
+    lead = first.shape[:-3]
+    a, b = (luma(frame).reshape(-1, 1, *frame.shape[-3:-1]) for frame in (first, second))
+    mean_a, mean_b = _window(a), _window(b)
+    var_a, var_b = _window(a * a) - mean_a.square(), _window(b * b) - mean_b.square()
+    cov = _window(a * b) - mean_a * mean_b
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    top = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
+    bottom = (mean_a.square() + mean_b.square() + c1) * (var_a + var_b + c2)
+    return (top / bottom).mean((-3, -2, -1)).reshape(lead)
+
+
+def luma(frames: torch.Tensor) -> torch.Tensor:
+    """Brightness of uint8 [..., H, W, 3] -> float64 [..., H, W] in 0..255."""
+    return frames.double() @ torch.tensor(_LUMA, dtype=torch.float64, device=frames.device)
+
+
+def gradient_energy(frames: torch.Tensor) -> torch.Tensor:
+    """Sharpness: mean squared step of luma across plus that down: uint8 [..., H, W, 3] -> float64 [...]."""
+    brightness = luma(frames)
+    return brightness.diff(dim=-1).square().mean((-2, -1)) + brightness.diff(dim=-2).square().mean((-2, -1))
+
+
+def colour_statistics(frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and standard deviation over the pixels of each channel: uint8 [..., H, W, 3] -> two float64 [..., 3]."""
+    pixels = frames.double().flatten(-3, -2)
+    return pixels.mean(-2), pixels.std(-2, correction=0)
+
+
+def _window(image: torch.Tensor) -> torch.Tensor:
+    taps = torch.exp(-((torch.arange(11, dtype=image.dtype, device=image.device) - 5) ** 2) / (2 * 1.5**2))
+    taps = taps / taps.sum()
+    return F.conv2d(F.conv2d(image, taps.view(1, 1, 1, 11)), taps.view(1, 1, 11, 1))
+
+
+def _check_alike(first: torch.Tensor, second: torch.Tensor) -> None:
+    if first.dtype != torch.uint8 or second.dtype != torch.uint8:
+        raise ValueError(f"frames are compared as uint8; got {first.dtype} and {second.dtype}.")
+    if first.shape[-3:] != second.shape[-3:] or first.shape[-1] != 3:
+        shapes = f"{tuple(first.shape)} and {tuple(second.shape)}"
+        raise ValueError(f"frames to compare must be [..., H, W, 3] of one size; got {shapes}.")

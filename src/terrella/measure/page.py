@@ -1,0 +1,286 @@
+"""One self-contained HTML page of a scorecard: bars, curves, strips of truth against dream, and how it was measured."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from .bars import Bar, summary
+from .plot import Line, line_chart, y_span
+from .roll import PREDICTED
+from .scorecard import COPY_LAST, Curve, Picture, Scorecard
+from .statistics import Figure
+from .strip import join_row, jpeg
+
+COLOURS = ("#6fd3c1", "#e3a857", "#8ea6ff", "#e07a9b", "#b6d36f")
+_QUIET = "#8b93a3"
+_HERE = Path(__file__).parent
+
+
+def page(card: Scorecard, bars: Sequence[Bar], title: str) -> str:
+    """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it."""
+    style = (_HERE / "page.css").read_text(encoding="utf-8")
+    sections = [_bars(bars), _strips(card), _psnr(card), _sharpness(card), _control(card), _position(card)]
+    sections += [_closures(card), _endurance(card), _speeds(card), _method(card)]
+    places = " &middot; ".join(
+        f"{place.clips} clips of {escape(place.name)} places ({place.moving_share:.0%} moving)" for place in card.places
+    )
+    worlds = " &middot; ".join(f"{escape(arm)}: {escape(name)}" for arm, name in card.worlds.items())
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1>"
+        f"<p>{places}</p><p>{worlds}</p></header><main>{''.join(sections)}</main></body></html>\n"
+    )
+
+
+def _section(heading: str, lead: str, inside: str) -> str:
+    return f"<section><h2>{escape(heading)}</h2><p>{lead}</p>{inside}</section>" if inside else ""
+
+
+def _bars(bars: Sequence[Bar]) -> str:
+    if not bars:
+        return ""
+    mine = [bar for bar in bars if not bar.side and (bar.motion == PREDICTED or bar.name.startswith("closure"))]
+    others = {
+        "The same pictures at the true poses": [bar for bar in bars if not bar.side and bar not in mine],
+        "Over the same seconds as 8 and 32 steps at frame-skip 4": [bar for bar in bars if bar.side],
+    }
+    inside = _bar_table(mine)
+    for heading, rest in others.items():
+        inside += f"<details><summary>{heading}</summary>{_bar_table(rest)}</details>" if rest else ""
+    lead = f"{summary(mine)}. An outlined status means that the 95% interval reaches over the target."
+    return _section("Bars", lead[0].upper() + lead[1:], inside)
+
+
+def _bar_table(bars: Sequence[Bar]) -> str:
+    rows = []
+    for bar in bars:
+        where = [f"{bar.place} places", "motion given" if bar.motion == "true" else "motion predicted"]
+        if bar.horizon and bar.seconds is not None:
+            where.append(f"{bar.horizon:,} steps, {bar.seconds:.2f} s")
+        words = [escape(" \N{MIDDLE DOT} ".join(where)), *([escape(bar.note)] if bar.note else [])]
+        kind = bar.status.replace(" ", "-") + ("" if bar.sure else " unsure")
+        rows.append(
+            f"<tr><td>{escape(bar.name[0].upper() + bar.name[1:])}{''.join(f'<small>{line}</small>' for line in words)}</td>"
+            f"<td class=n>{_figure(bar.figure, unit=bar.unit)}</td><td class=n>{escape(bar.target)}</td>"
+            f"<td><span class='status {kind}'>{bar.status}</span></td></tr>"
+        )
+    head = "<tr><th>bar</th><th class=n>measured</th><th class=n>target</th><th></th></tr>"
+    return f"<table class=bars><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _figure(figure: Figure | None, digits: int = 2, unit: str = "") -> str:
+    if figure is None or not math.isfinite(figure.value):
+        return "&ndash;"
+    value = f"{figure.value:.{digits}f} {escape(unit)}".rstrip()
+    if not math.isfinite(figure.low):
+        return value
+    return f"{value}<small>{figure.low:.{digits}f} to {figure.high:.{digits}f}</small>"
+
+
+def _psnr(card: Scorecard) -> str:
+    tables = "".join(_fidelity_table(card, place.name) for place in card.places)
+    lead = (
+        "How close each dreamt frame is to the recorded one. "
+        "The grey line only repeats the last frame that was shown; shades are 95% intervals."
+    )
+    return _section("Likeness over time", lead, _charts(card, "psnr", "PSNR, dB") + tables)
+
+
+def _fidelity_table(card: Scorecard, place: str) -> str:
+    kinds = (("PSNR", "psnr"), ("gain over copy last", "gain"), ("SSIM", "ssim"), ("sharpness", "sharpness"))
+    found = sorted((row for row in card.fidelity if row.place == place), key=lambda row: row.horizon)
+    if not found:
+        return ""
+    rows = []
+    for arm, motion in dict.fromkeys((row.arm, row.motion) for row in found):
+        mine = [row for row in found if (row.arm, row.motion) == (arm, motion)]
+        name = escape(f"{arm}, {motion} motion")
+        rows += [
+            [f"{name}<small>{label}</small>", *(_figure(getattr(row, kind)) for row in mine)] for label, kind in kinds
+        ]
+    rows.append(["copy last<small>PSNR</small>", *(_figure(row.copy_last) for row in mine)])
+    table = _table(["steps", *(_steps(row.horizon, row.seconds) for row in mine)], rows)
+    return f"<details><summary>All figures, {escape(place)} places</summary>{table}</details>"
+
+
+def _sharpness(card: Scorecard) -> str:
+    charts = _charts(card, "sharpness", "gradient energy, dream / game", (0.7, 1.0, 1.3))
+    lead = "Gradient energy of the dreams over the game's: below 1 is blurred, above 1 too rough. Dotted: 0.7, 1, 1.3."
+    return _section("Sharpness over time", lead, charts)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> str:
+    """A table of ready-made cells; the first `texts` columns are words, the others numbers set to the right."""
+
+    def cells(tag: str, row: Sequence[str]) -> str:
+        return "".join(f"<{tag}{'' if k < texts else ' class=n'}>{cell}</{tag}>" for k, cell in enumerate(row))
+
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f"<div class=scroll><table><thead><tr>{cells('th', heads)}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _steps(horizon: int, seconds: float) -> str:
+    return f"{horizon}<small>{seconds:.2f} s</small>"
+
+
+def _control(card: Scorecard) -> str:
+    rows = []
+    for row in card.control:
+        figures = [_figure(figure) for figure in (row.difference, row.true_actions, row.other_actions)]
+        rows.append([escape(f"{row.place}, {row.arm}"), _steps(row.horizon, row.seconds), *figures])
+    heads = ("places, arm", "steps", "difference", "true actions", "another's")
+    lead = "PSNR in dB when the world is given the player's own actions, and when it is given those of another clip."
+    return _section("Does it obey?", lead, _table(heads, rows) if rows else "")
+
+
+def _position(card: Scorecard) -> str:
+    charts = _charts(card, "position", "distance from the true place, m")
+    rows = []
+    for row in card.position:
+        figures = [_percent(row.mean_share), _percent(row.median_share), _figure(row.heading_deg)]
+        rows.append([escape(f"{row.place}, {row.arm}"), _steps(row.horizon, row.seconds), *figures])
+    heads = ("places, arm", "steps", "mean, %", "median, %", "heading, degrees")
+    lead = (
+        "Where the world believes the player to be under the true actions; "
+        "the table gives it as a share of the distance walked."
+    )
+    return _section("Position", lead, charts + (_table(heads, rows) if rows else ""))
+
+
+def _percent(figure: Figure) -> str:
+    return _figure(Figure(figure.value * 100, figure.low * 100, figure.high * 100, figure.count), 1)
+
+
+def _endurance(card: Scorecard) -> str:
+    if not card.endurance:
+        return ""
+    first = card.endurance[0]
+    boxes = []
+    for name, pick in (("sharpness", _sharp_of), ("brightness", _bright_of), ("contrast", _contrast_of)):
+        lines = []
+        for run in card.endurance:
+            band = [pick(bucket) for bucket in run.buckets]
+            y, low, high = ([getattr(figure, key) for figure in band] for key in ("value", "low", "high"))
+            lines.append(Line(run.arm, [bucket.last for bucket in run.buckets], y, low, high, _colour(card, run.arm)))
+        ticks = [(x, f"{x:g}") for x in sorted({lines[0].x[0], first.steps // 2, first.steps})]
+        svg = line_chart(lines, ticks, "steps", "dream / game", guides=(0.7, 1.0, 1.3))
+        boxes.append(_figure_box(name, svg, lines))
+    pictures = ""
+    for run in card.endurance:
+        columns = ["1", *(str(bucket.last) for bucket in run.buckets)]
+        pictures += _picture(Picture(f"{run.arm}: one story, by steps", columns, {run.arm: run.picture}))
+    low, high = first.natural
+    lead = escape(
+        f"{first.stories} dreams of {first.steps:,} steps on end, by stretches, each frame against {first.reference}; "
+        f"brightness and contrast are those of green. As many real stretches of that length stray to {low:.2f} to "
+        f"{high:.2f} in sharpness and to {first.natural_colour[0]:.2f} to {first.natural_colour[1]:.2f} in a colour "
+        "statistic by themselves."
+    )
+    return _section("A long dream", lead, f"<div class=charts>{''.join(boxes)}</div>{pictures}")
+
+
+def _sharp_of(bucket) -> Figure:
+    return bucket.sharpness
+
+
+def _bright_of(bucket) -> Figure:
+    return bucket.colour_mean[1]
+
+
+def _contrast_of(bucket) -> Figure:
+    return bucket.colour_std[1]
+
+
+def _strips(card: Scorecard) -> str:
+    lead = "The first column is the last frame that was shown to the world; everything to its right is dreamt."
+    return _section("Truth against dream", lead, "".join(map(_picture, card.pictures)))
+
+
+def _closures(card: Scorecard) -> str:
+    parts = []
+    for done in card.closures:
+        columns = [f"{share * done.far_deg:.0f}\N{DEGREE SIGN}" for share in (0, 0.5, 1, 0.5, 0)]
+        closed = f"closes at {done.closed.value:.1f} dB ({done.closed.low:.1f} to {done.closed.high:.1f})"
+        verdict = "void, the far view is not different" if done.void else closed
+        title = f"{done.place} places, {done.arm}, {done.far_deg:.0f}\N{DEGREE SIGN} and back: {verdict}"
+        parts.append(_picture(Picture(title, columns, {f"far view {done.far.value:.1f} dB": done.picture})))
+    lead = (
+        "The camera turns away and back in small steps; the last picture should be the first one again. "
+        "Where the view never changed on the way, that proves nothing and is called void."
+    )
+    return _section("Does it remember?", lead, "".join(parts))
+
+
+def _speeds(card: Scorecard) -> str:
+    if not card.speeds:
+        return ""
+    rows = []
+    for run in card.speeds:
+        times = [f"{value:.1f}" for value in (run.median_ms, run.p95_ms, run.first_ms, run.last_ms)]
+        rows.append([escape(run.arm), *times, f"{run.growth:+.1%}", str(run.threads)])
+    heads = ("arm", "median", "95%", "first tenth", "last tenth", "growth", "threads")
+    lead = f"Milliseconds for one imagined and drawn step of one story, over {card.speeds[0].steps:,} steps on end."
+    return _section("Speed", lead, _table(heads, rows))
+
+
+def _method(card: Scorecard) -> str:
+    text = (_HERE / "method.html").read_text(encoding="utf-8")
+    context = card.places[0].context if card.places else 0
+    filled = text.format(context=context, dt_ms=card.dt_s * 1e3, rate=1 / card.dt_s)
+    return f"<section><h2>How this was measured</h2>{filled}</section>"
+
+
+def _charts(card: Scorecard, what: str, y_label: str, guides: Sequence[float] = ()) -> str:
+    """One chart of every arm and motion for each place, all on one scale."""
+    curves = [curve for curve in card.curves if curve.what == what]
+    if not curves:
+        return ""
+    span = y_span([value for c in curves for value in (*c.band.value, *c.band.low, *c.band.high)] + list(guides))
+    steps = sorted({row.horizon for row in card.fidelity})
+    boxes = []
+    for place in card.places:
+        lines = [_line(card, curve) for curve in curves if curve.place == place.name]
+        svg = line_chart(lines, [(s, str(s)) for s in steps], "steps", y_label, True, span, guides)
+        boxes.append(_figure_box(f"{place.name} places", svg, lines))
+    return f"<div class=charts>{''.join(boxes)}</div>"
+
+
+def _line(card: Scorecard, curve: Curve) -> Line:
+    label = f"{curve.arm}, {curve.motion} motion" if curve.motion else curve.arm
+    dash = "" if curve.motion == PREDICTED else "5 4" if curve.motion else "2 3"
+    x = list(range(1, len(curve.band.value) + 1))
+    return Line(label, x, curve.band.value, curve.band.low, curve.band.high, _colour(card, curve.arm), dash)
+
+
+def _figure_box(title: str, svg: str, lines: Sequence[Line]) -> str:
+    keys = "".join(
+        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{line.colour}" stroke-width="2.5"'
+        + (f' stroke-dasharray="{line.dash}"' if line.dash else "")
+        + f"/></svg>{escape(line.label)}</span>"
+        for line in lines
+    )
+    return f"<figure><h3>{escape(title)}</h3>{svg}<figcaption>{keys}</figcaption></figure>"
+
+
+def _colour(card: Scorecard, arm: str) -> str:
+    return _QUIET if arm == COPY_LAST else COLOURS[list(card.worlds).index(arm) % len(COLOURS)]
+
+
+def _picture(picture: Picture) -> str:
+    least, most = 116 * len(picture.columns), 160 * len(picture.columns)
+    heads = "".join(f"<span>{escape(column)}</span>" for column in picture.columns)
+    rows = "".join(f"<h4>{escape(label)}</h4>{_image(frames, label)}" for label, frames in picture.rows.items())
+    inside = f'<div style="min-width:{least}px;max-width:{most}px"><div class=columns>{heads}</div>{rows}</div>'
+    return f"<div class=strip><h3>{escape(picture.title)}</h3><div class=scroll>{inside}</div></div>"
+
+
+def _image(frames: np.ndarray, label: str) -> str:
+    data = base64.b64encode(jpeg(join_row(frames))).decode()
+    return f'<img alt="{escape(label)}" src="data:image/jpeg;base64,{data}">'

@@ -1,0 +1,99 @@
+"""Small plain SVG plots: lines with interval bands, on a dark page, legible on a phone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+_WIDTH, _HEIGHT = 380, 250
+_LEFT, _RIGHT, _TOP, _BOTTOM = 40, 12, 14, 40
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve: y at each x, with low and high of its band (equal to y for none); dash as in SVG, "" for solid."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    colour: str
+    dash: str = ""
+
+
+def line_chart(
+    lines: Sequence[Line],
+    x_ticks: Sequence[tuple[float, str]],
+    x_label: str,
+    y_label: str,
+    log_x: bool = False,
+    y_range: tuple[float, float] | None = None,
+    guides: Sequence[float] = (),
+) -> str:
+    """An <svg> of the lines; `guides` are dotted horizontals (targets). Its title and legend are the page's affair."""
+    warp = math.log2 if log_x else float
+    xs = [warp(x) for line in lines for x in line.x]
+    bottom, top = y_range or y_span([v for line in lines for v in (*line.y, *line.low, *line.high)] + list(guides))
+    left, right = min(xs), max(max(xs), min(xs) + 1e-9)
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        across = _LEFT + (warp(x) - left) / (right - left) * (_WIDTH - _LEFT - _RIGHT)
+        share = (min(max(y, bottom), top) - bottom) / (top - bottom)
+        return round(across, 1), round(_HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM), 1)
+
+    about = f"{escape(y_label)} against {escape(x_label)}"
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{about}">']
+    for value in _ticks(bottom, top):
+        y = at(lines[0].x[0], value)[1]
+        parts.append(f'<path class="grid" d="M{_LEFT} {y}H{_WIDTH - _RIGHT}"/>')
+        parts.append(f'<text x="{_LEFT - 6}" y="{y + 4}" text-anchor="end">{value:g}</text>')
+    for value, label in x_ticks:
+        x = at(value, bottom)[0]
+        parts.append(f'<path class="grid" d="M{x} {_HEIGHT - _BOTTOM}v4"/>')
+        parts.append(f'<text x="{x}" y="{_HEIGHT - _BOTTOM + 17}" text-anchor="middle">{escape(label)}</text>')
+    for value in guides:
+        parts.append(f'<path class="guide" d="M{_LEFT} {at(lines[0].x[0], value)[1]}H{_WIDTH - _RIGHT}"/>')
+    for line in lines:
+        parts.append(_band_path(line, at))
+    for line in lines:
+        points = [at(x, y) for x, y in zip(line.x, line.y) if math.isfinite(y)]
+        dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
+        name = f"<title>{escape(line.label)}</title>"
+        parts.append(f'<path class="line" d="{_path(points)}" stroke="{line.colour}"{dash}>{name}</path>')
+    middle = (_LEFT + _WIDTH - _RIGHT) / 2
+    parts.append(f'<text x="{middle}" y="{_HEIGHT - 5}" text-anchor="middle">{escape(x_label)}</text>')
+    parts.append(f'<text x="{_LEFT + 4}" y="{_TOP - 3}">{escape(y_label)}</text></svg>')
+    return "".join(parts)
+
+
+def _band_path(line: Line, at) -> str:
+    known = [k for k in range(len(line.x)) if math.isfinite(line.low[k]) and math.isfinite(line.high[k])]
+    if not known:
+        return ""
+    up = [at(line.x[k], line.high[k]) for k in known]
+    down = [at(line.x[k], line.low[k]) for k in reversed(known)]
+    return f'<path d="{_path(up + down)}Z" fill="{line.colour}" fill-opacity="0.14"/>'
+
+
+def _path(points: Sequence[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:g} {y:g}" for x, y in points) if points else ""
+
+
+def y_span(values: Sequence[float]) -> tuple[float, float]:
+    """A range that holds all finite values with a little air."""
+    known = [value for value in values if math.isfinite(value)] or [0.0]
+    low, high = min(known), max(known)
+    air = 0.06 * (high - low) or 0.5
+    return low - air, high + air
+
+
+def _ticks(low: float, high: float, about: int = 5) -> list[float]:
+    """Round numbers inside the range."""
+    raw = (high - low) / about
+    scale = 10 ** math.floor(math.log10(raw))
+    step = next(factor * scale for factor in (1, 2, 2.5, 5, 10) if factor * scale >= raw)
+    first = math.ceil(low / step - 1e-9)
+    return [round(k * step, 10) for k in range(first, math.floor(high / step + 1e-9) + 1)]

@@ -1,0 +1,87 @@
+"""Figures with 95% intervals, by a seeded bootstrap over clips."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number: its value, the 95% interval (NaN where fewer than two clips) and the count of clips."""
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}] (n={self.count})"
+
+
+@dataclass(frozen=True)
+class Band:
+    """A curve: value, low and high at each step."""
+
+    value: list[float]
+    low: list[float]
+    high: list[float]
+    count: int
+
+
+def mean_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
+    """Mean of values [n] with the percentile bootstrap interval (Efron 1979)."""
+    return _only(mean_band(values[:, None], rng))
+
+
+def mean_band(values: torch.Tensor, rng: torch.Generator) -> Band:
+    """Mean over clips of values [n, T], with an interval at each step."""
+    values = values.double()
+    return _band(values.mean(0), lambda weights: weights @ values / weights.sum(1, keepdim=True), len(values), rng)
+
+
+def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
+    """sum(top) / sum(bottom) over clips [n], both resampled together: no clip with a tiny denominator rules it."""
+    return _only(ratio_band(top[:, None], bottom[:, None], rng))
+
+
+def ratio_band(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Band:
+    """sum(top) / sum(bottom) over clips [n, T], with an interval at each step."""
+    top, bottom = top.double(), bottom.double()
+    return _band(top.sum(0) / bottom.sum(0), lambda weights: (weights @ top) / (weights @ bottom), len(top), rng)
+
+
+def median_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
+    """Median of values [n] with the percentile bootstrap interval."""
+    values = values.double()
+    if not len(values):
+        return Figure(math.nan, math.nan, math.nan, 0)
+    picks = torch.randint(len(values), (RESAMPLES, len(values)), generator=rng)
+    return _figure(values.quantile(0.5), values[picks].quantile(0.5, dim=1), len(values))
+
+
+def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Generator) -> Band:
+    if count < 2:
+        nothing = [math.nan] * len(centre)
+        return Band(centre.tolist() if count else nothing, nothing, nothing, count)
+    picks = torch.randint(count, (RESAMPLES, count), generator=rng)
+    ones = torch.ones(RESAMPLES, count, dtype=torch.float64)
+    weights = torch.zeros_like(ones).scatter_add_(1, picks, ones)
+    low, high = resample(weights).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    return Band(centre.tolist(), low.tolist(), high.tolist(), count)
+
+
+def _figure(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figure:
+    if count < 2:
+        return Figure(float(centre), math.nan, math.nan, count)
+    low, high = resampled.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    return Figure(float(centre), low, high, count)
+
+
+def _only(band: Band) -> Figure:
+    return Figure(band.value[0], band.low[0], band.high[0], band.count)

@@ -1,0 +1,50 @@
+"""Progress with the time left, on stderr: a bar on a terminal, now and then a line in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+LINE_EVERY_S = 15.0
+
+
+@contextmanager
+def shown(what: str) -> Iterator[Callable[..., None]]:
+    """Gives `report(done, total, words)`; the bar goes away cleanly, also when the body raises."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%")
+        times = TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+        with Progress(*columns, *times, TextColumn("{task.fields[words]}"), console=Console(stderr=True)) as bar:
+            task = bar.add_task(what, total=None, words="")
+
+            def report(done: float, total: float, words: str = "") -> None:
+                if total != bar.tasks[task].total:  # another stage begins
+                    bar.reset(task, total=total)
+                bar.update(task, completed=done, words=words)
+
+            yield report
+    else:
+        yield _lines(what)
+
+
+def _lines(what: str) -> Callable[..., None]:
+    began = said = time.monotonic()
+    first = of = 0.0
+
+    def report(done: float, total: float, words: str = "") -> None:
+        nonlocal began, said, first, of
+        now = time.monotonic()
+        if total != of:  # a stage begins; what an earlier run had done says nothing of this one's speed
+            began, first, of = now, done, total
+        if now - said < LINE_EVERY_S and done < total:
+            return
+        said = now
+        left = f"{(total - done) * (now - began) / (done - first) / 60:.1f} min left" if first < done < total else ""
+        print(" ".join(filter(None, [what, f"{done / total:.0%}" if total else "", left, words])), file=sys.stderr)
+
+    return report

@@ -1,0 +1,87 @@
+"""Who may speak to the server: host and origin checks, the token, rates, and the headers of every page."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import time
+from urllib.parse import urlsplit
+
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' blob: data:; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether `host` (a name or an address, without port) is this machine speaking to itself."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def refusal(headers: dict[str, str], host: str, token: str | None, given: str | None) -> str:
+    """Why a request is refused, in one sentence; empty where it may pass.
+
+    A server on this machine only answers to this machine's names (a page elsewhere cannot reach it by pointing a name
+    of its own here), a browser must come from our own page (`Origin` is our `Host`), and the token must be right.
+    """
+    asked = headers.get("host", "")
+    if is_loopback(host) and not is_loopback(urlsplit(f"//{asked}").hostname or ""):
+        return "this server answers to localhost only; open the address that it printed."
+    origin = headers.get("origin")
+    if origin is not None and (urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc != asked):
+        return "another site's page may not use this server; open the address that it printed."
+    if token is not None and not hmac.compare_digest(token.encode(), (given or "").encode()):
+        return "the token is missing or wrong; open the whole address that the server printed, with ?token=."
+    return ""
+
+
+class RateLimit:
+    """At most `per_s` messages a second in the long run, `burst` at once."""
+
+    def __init__(self, per_s: float, burst: float, clock=time.monotonic):
+        self._per_s, self._burst, self._clock = per_s, burst, clock
+        self._left, self._then = burst, clock()
+
+    def allows(self) -> bool:
+        now = self._clock()
+        self._left = min(self._burst, self._left + (now - self._then) * self._per_s)
+        self._then = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class SafeHeaders:
+    """ASGI middleware: `HEADERS` on every answer, and no answer at all to a foreign Host or Origin."""
+
+    def __init__(self, app: ASGIApp, host: str):
+        self._app, self._host = app, host
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *extra]}
+            await send(message)
+
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        why = refusal(headers, self._host, None, None)
+        answer = PlainTextResponse(why, 403) if why else self._app
+        await answer(scope, receive, send_with_headers)

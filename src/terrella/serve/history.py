@@ -1,0 +1,108 @@
+"""The recent past of a session: pictures for the eye and states to go back to, within fixed budgets."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import torch
+
+from ..core.state import State
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One step: its JPEGs (one per world) and, where the worlds can fork, all that is needed to go on from it."""
+
+    step: int
+    images: tuple[bytes, ...]
+    flags: int = 0
+    episode_return: float = 0.0
+    states: tuple[State, ...] | None = None
+    rng: torch.Tensor | None = None  # the generator's state after this step
+
+
+class History:
+    """Moments in order. At most `frames` pictures; states only for the newest moments that fit in `state_bytes`.
+
+    Memory that states share (a cache appended to, keyframes) is counted once, by storage.
+    """
+
+    def __init__(self, frames: int, state_bytes: int):
+        if frames < 1:
+            raise ValueError("a history holds at least one moment")
+        self._frames, self._budget = frames, state_bytes
+        self._pictures: deque[Moment] = deque()
+        self._stateful: deque[Moment] = deque()
+        self._storages: dict[int, list[int]] = {}  # address -> [moments that use it, bytes]
+        self.state_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    @property
+    def newest(self) -> Moment:
+        return self._pictures[-1]
+
+    @property
+    def oldest_step(self) -> int:
+        """The oldest step that can be returned to; the newest one where no states are kept."""
+        return self._stateful[0].step if self._stateful else self.newest.step
+
+    def pictures(self) -> list[tuple[bytes, ...]]:
+        return [moment.images for moment in self._pictures]
+
+    def push(self, moment: Moment) -> None:
+        if self._pictures and moment.step != self.newest.step + 1:
+            raise ValueError("moments follow one another")
+        self._pictures.append(moment)
+        if moment.states is not None:
+            self._stateful.append(moment)
+            self._count(moment, +1)
+        while len(self._pictures) > self._frames:
+            gone = self._pictures.popleft()
+            if self._stateful and self._stateful[0] is gone:
+                self._drop_oldest_state()
+        while self.state_bytes > self._budget and len(self._stateful) > 1:
+            self._drop_oldest_state()
+
+    def at(self, step: int) -> Moment:
+        """The moment at `step`, clamped to those that can be returned to."""
+        if not self._stateful:
+            return self.newest
+        first = self._stateful[0].step
+        return self._stateful[min(max(step - first, 0), len(self._stateful) - 1)]
+
+    def forget_after(self, step: int) -> None:
+        while self.newest.step > step:
+            gone = self._pictures.pop()
+            if self._stateful and self._stateful[-1] is gone:
+                self._count(self._stateful.pop(), -1)
+
+    def clear(self) -> None:
+        self._pictures.clear()
+        self._stateful.clear()
+        self._storages.clear()
+        self.state_bytes = 0
+
+    def _drop_oldest_state(self) -> None:
+        gone = self._stateful.popleft()
+        self._count(gone, -1)
+        if self._pictures and self._pictures[0].step <= gone.step:  # the picture stays, without its state
+            index = gone.step - self._pictures[0].step
+            self._pictures[index] = Moment(gone.step, gone.images, gone.flags, gone.episode_return)
+
+    def _count(self, moment: Moment, sign: int) -> None:
+        seen = {}
+        for state in moment.states or ():
+            for tensor in state.values():
+                storage = tensor.untyped_storage()
+                seen[storage.data_ptr()] = storage.nbytes()
+        for address, size in seen.items():
+            entry = self._storages.setdefault(address, [0, size])
+            if sign > 0 and entry[0] == 0:
+                self.state_bytes += size
+            entry[0] += sign
+            if entry[0] == 0:
+                self.state_bytes -= entry[1]
+                del self._storages[address]

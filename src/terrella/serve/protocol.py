@@ -1,0 +1,221 @@
+"""The one WebSocket's language: binary frames to the page, small JSON messages both ways."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..core.errors import ProtocolError
+
+VERSION = 1
+MAX_MESSAGE = 4096  # bytes of one message from a page
+MAX_HELD = 16  # keys held at once
+U32 = 2**32 - 1
+
+# flags of a frame
+DONE = 1  # the episode ended with this frame
+FRESH = 2  # first frame of an episode
+REPLAY = 4  # a frame out of the history: the session stands in the past
+
+# version u8, flags u8, images u16, seq u32, step u32, oldest u32, newest u32, action id u32,
+# generation ms f32, episode return f32, client's time of that action f64, server's time f64; little endian
+_HEADER = struct.Struct("<BBHIIIIIffdd")
+_LENGTH = struct.Struct("<I")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment as the page gets it.
+
+    seq counts messages (the page acknowledges it); step is the world's; oldest..newest is what can be rewound to;
+    action_id and client_ms echo the latest keys message that this step obeyed; images are JPEGs, one per world.
+    """
+
+    seq: int
+    step: int
+    oldest: int
+    newest: int
+    images: tuple[bytes, ...]
+    flags: int = 0
+    action_id: int = 0
+    generation_ms: float = 0.0
+    episode_return: float = 0.0
+    client_ms: float = 0.0
+    server_s: float = 0.0
+
+
+def encode_frame(frame: Frame) -> bytes:
+    parts = [
+        _HEADER.pack(
+            VERSION, frame.flags, len(frame.images), frame.seq & U32, frame.step, frame.oldest, frame.newest,
+            frame.action_id, frame.generation_ms, frame.episode_return, frame.client_ms, frame.server_s,
+        )
+    ]  # fmt: skip
+    for image in frame.images:
+        parts += [_LENGTH.pack(len(image)), image]
+    return b"".join(parts)
+
+
+def decode_frame(data: bytes) -> Frame:
+    """What `encode_frame` wrote; ProtocolError where the bytes are cut short or of another version."""
+    try:
+        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server = _HEADER.unpack_from(
+            data
+        )
+        if version != VERSION:
+            raise ProtocolError(
+                f"a frame of protocol version {version} came, this side speaks {VERSION}; reload the page."
+            )
+        images, at = [], _HEADER.size
+        for _ in range(count):
+            (length,) = _LENGTH.unpack_from(data, at)
+            at += _LENGTH.size
+            images.append(data[at : at + length])
+            at += length
+    except struct.error as error:
+        raise ProtocolError(f"a frame of {len(data)} bytes is cut short; reload the page.") from error
+    if at != len(data):
+        raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
+    return Frame(seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server)
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys held from now on, in the order they were pressed; `id` grows with each message, `t` is the page's clock."""
+
+    id: int
+    held: tuple[str, ...]
+    t: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ack:
+    seq: int
+
+
+@dataclass(frozen=True)
+class Pause:
+    pass
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Goes on; out of the past, back to the newest moment."""
+
+
+@dataclass(frozen=True)
+class Restart:
+    """A new episode; with a seed, the story of that seed."""
+
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Rewind:
+    """`steps` back from the moment shown (negative: forward), and stand there."""
+
+    steps: int
+
+
+@dataclass(frozen=True)
+class Seek:
+    """Stand at `step`, or the nearest that is remembered."""
+
+    step: int
+
+
+@dataclass(frozen=True)
+class Branch:
+    """Goes on from the moment shown; what came after it is forgotten."""
+
+
+@dataclass(frozen=True)
+class Sync:
+    """Beside a truth, the dream looks at the truth again."""
+
+
+@dataclass(frozen=True)
+class Record:
+    on: bool
+
+
+Message = Keys | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record
+
+
+def parse_message(data: str | bytes) -> Message:
+    """A message from a page; ProtocolError says what is wrong with it."""
+    if len(data) > MAX_MESSAGE:
+        raise ProtocolError(f"a message of {len(data)} bytes is too long; the limit is {MAX_MESSAGE}.")
+    try:
+        body = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError("a message is not JSON; this is a Terrella play socket, see serve/protocol.py.") from error
+    if not isinstance(body, dict):
+        raise ProtocolError("a message must be a JSON object with a 'type'.")
+    kind = body.get("type")
+    match kind:
+        case "keys":
+            held = body.get("held")
+            if (
+                not isinstance(held, list)
+                or len(held) > MAX_HELD
+                or not all(isinstance(k, str) and len(k) <= 32 for k in held)
+            ):
+                raise ProtocolError(f"'held' must be a list of at most {MAX_HELD} key codes.")
+            return Keys(_integer(body, "id", 0, U32), tuple(held), _number(body, "t"))
+        case "ack":
+            return Ack(_integer(body, "seq", 0, U32))
+        case "pause":
+            return Pause()
+        case "resume":
+            return Resume()
+        case "restart":
+            return Restart(None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1))
+        case "rewind":
+            return Rewind(_integer(body, "steps", -U32, U32))
+        case "seek":
+            return Seek(_integer(body, "step", 0, U32))
+        case "branch":
+            return Branch()
+        case "sync":
+            return Sync()
+        case "record":
+            if not isinstance(body.get("on"), bool):
+                raise ProtocolError("'on' must be true or false.")
+            return Record(body["on"])
+    raise ProtocolError(f"no message is called {str(kind)[:40]!r}.")
+
+
+def _integer(body: dict, name: str, low: int, high: int) -> int:
+    value = body.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ProtocolError(f"'{name}' must be a whole number from {low} to {high}.")
+    return value
+
+
+def _number(body: dict, name: str) -> float:
+    value = body.get(name, 0.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1e15:
+        raise ProtocolError(f"'{name}' must be a finite number.")
+    return float(value)
+
+
+def encode_event(kind: str, **body) -> str:
+    """A JSON message to the page: hello, status or error."""
+    return json.dumps({"type": kind, **body}, allow_nan=False)
+
+
+def plain(value, depth: int = 3):
+    """A world's card as JSON: numbers, strings, lists and objects stay, the rest becomes text."""
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if depth and hasattr(value, "items"):
+        return {str(key): plain(inner, depth - 1) for key, inner in value.items()}
+    if depth and isinstance(value, Sequence):
+        return [plain(inner, depth - 1) for inner in value]
+    return str(value)

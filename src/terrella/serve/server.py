@@ -1,0 +1,339 @@
+"""The web server: the page, its one WebSocket, clips to download, and the sessions behind them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import secrets
+import signal
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import resources
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from ..core.errors import ProtocolError, ServeError
+from ..core.world import World
+from . import protocol
+from .clip import make_clip
+from .guard import RateLimit, SafeHeaders, is_loopback, refusal
+from .session import Session
+from .story import SinkFactory, Story, StoryConfig, check_playable
+
+_FILES = {
+    "/": ("index.html", "text/html"),
+    "/style.css": ("style.css", "text/css"),
+    "/app.js": ("app.js", "text/javascript"),
+    "/link.js": ("link.js", "text/javascript"),
+    "/controls.js": ("controls.js", "text/javascript"),
+    "/card.js": ("card.js", "text/javascript"),
+    "/keycaps.js": ("keycaps.js", "text/javascript"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+}
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """seats: sessions at once (a world that cannot fork has one); grace_s: how long a session outlives its socket;
+    idle_s: how long a silent, paused one keeps its seat; per_s and burst: messages a page may send."""
+
+    seats: int = 4
+    grace_s: float = 120.0
+    idle_s: float = 1800.0
+    per_s: float = 240.0
+    burst: float = 480.0
+    faults: int = 20
+    story: StoryConfig = StoryConfig()
+
+
+class Sessions:
+    """The sessions of one server, their one worker thread and their seats."""
+
+    def __init__(self, worlds: Sequence[World], seed: int, sink_factory: SinkFactory | None, config: ServeConfig):
+        self.worlds, self.seed, self.config = tuple(worlds), seed, config
+        self._sink_factory = sink_factory
+        self._seats = config.seats if all(world.spec.forkable for world in worlds) else 1
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
+        self._open: dict[str, tuple[Session, asyncio.Task]] = {}
+        self._ended: set[asyncio.Task] = set()
+
+    def get(self, name: str | None) -> Session | None:
+        return self._open[name][0] if name in self._open else None
+
+    def open(self) -> Session:
+        """A new session; ServeError where every seat is taken by somebody present."""
+        if len(self._open) >= self._seats:
+            absent = [session for session, _ in self._open.values() if not session.connected]
+            if not absent:
+                raise ServeError(
+                    f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
+                )
+            self._end(min(absent, key=lambda session: session.detached_at or 0.0))
+        session = Session(self._tell_story, self._worker)
+        self._open[session.id] = session, asyncio.create_task(session.run())
+        return session
+
+    def sweep(self) -> None:
+        """Ends the sessions whose socket has been gone, or whose player silent, for too long."""
+        now, config = time.monotonic(), self.config
+        for session, task in list(self._open.values()):
+            gone = session.detached_at is not None and now - session.detached_at > config.grace_s
+            if gone or task.done() or now - session.heard_at > config.idle_s:
+                self._end(session)
+
+    async def end_all(self) -> None:
+        for session, _ in list(self._open.values()):
+            self._end(session)
+        await asyncio.gather(*self._ended, return_exceptions=True)
+        self._worker.shutdown()
+
+    def _end(self, session: Session) -> None:
+        _, task = self._open.pop(session.id)
+        session.close()
+        self._ended.add(task)
+        task.add_done_callback(self._ended.discard)
+
+    def _tell_story(self) -> Story:
+        return Story(self.worlds, self.seed, self._sink_factory, self.config.story)
+
+    def hello(self, session: Session, resumed: bool) -> str:
+        """All that the page needs to know about the worlds."""
+        labels = ("game", "dream") if len(self.worlds) == 2 else ("",)
+        fixed = next((world.spec.name for world in self.worlds if not world.spec.forkable), "")
+        return protocol.encode_event(
+            "hello",
+            version=protocol.VERSION,
+            session=session.id,
+            resumed=resumed,
+            worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
+            no_rewind=f"{fixed} is a running game: it cannot go back in time." if fixed else "",
+            no_record="" if self._sink_factory else "start the server with a folder to record to: --record DIR",
+        )
+
+
+def _describe(world: World, label: str) -> dict:
+    spec = world.spec
+    return {
+        "name": spec.name,
+        "label": label,
+        "size": list(spec.channels["rgb"].shape[:2]),
+        "dt_s": spec.dt_s,
+        "forkable": spec.forkable,
+        "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
+        "action_names": list(spec.action_names),
+        "action_kind": type(spec.action).__name__,
+        "scored": "reward" in spec.channels,
+        "card": protocol.plain(dict(spec.card)),
+    }
+
+
+def build_app(
+    worlds: Sequence[World],
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    sink_factory: SinkFactory | None = None,
+    seed: int = 0,
+    config: ServeConfig | None = None,
+    on_ready: Callable[[], None] | None = None,
+) -> Starlette:
+    """The ASGI application; `host` is the address it is bound to, which decides what Host headers it answers to."""
+    check_playable(worlds)
+    config = config or ServeConfig()
+    page = resources.files("terrella.serve") / "web"
+    files = {path: ((page / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config)
+        sweeper = asyncio.create_task(_sweep(sessions))
+        if on_ready:
+            on_ready()
+        try:
+            yield
+        finally:
+            sweeper.cancel()
+            await sessions.end_all()
+
+    def show(request: Request) -> Response:
+        content, kind = files[request.url.path]
+        return Response(content, media_type=kind)
+
+    def check(request: Request) -> Response:
+        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
+        return PlainTextResponse(why, 403) if why else PlainTextResponse("ok")
+
+    async def clip(request: Request) -> Response:
+        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
+        if why:
+            return PlainTextResponse(why, 403)
+        session = request.app.state.sessions.get(request.path_params["session"])
+        pictures = await session.pictures() if session else []
+        if not pictures:
+            return PlainTextResponse("this session has ended; reload the page.", 404)
+        spec = worlds[0].spec
+        content = await asyncio.get_running_loop().run_in_executor(None, make_clip, pictures, spec.dt_s)
+        name = "".join(letter if letter.isalnum() else "-" for letter in spec.name)[:60]
+        disposition = {"Content-Disposition": f'attachment; filename="{name}.mp4"'}
+        return Response(content, media_type="video/mp4", headers=disposition)
+
+    async def play(websocket: WebSocket) -> None:
+        why = refusal(dict(websocket.headers), host, token, websocket.query_params.get("token"))
+        if why:
+            await websocket.send_denial_response(PlainTextResponse(why, 403))
+        else:
+            await _play(websocket, websocket.app.state.sessions)
+
+    routes = [Route(path, show) for path in files]
+    routes += [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
+    return Starlette(routes=routes, lifespan=lifespan, middleware=[Middleware(SafeHeaders, host=host)])
+
+
+async def _sweep(sessions: Sessions) -> None:
+    while True:
+        await asyncio.sleep(1)
+        sessions.sweep()
+
+
+async def _play(websocket: WebSocket, sessions: Sessions) -> None:
+    await websocket.accept()
+    session = sessions.get(websocket.query_params.get("session"))
+    resumed = session is not None
+    try:
+        session = session or sessions.open()
+    except ServeError as error:
+        await websocket.send_text(protocol.encode_event("error", text=str(error)))
+        return await websocket.close(1013, "no seat")
+    await websocket.send_text(sessions.hello(session, resumed))
+    before = session.attach(websocket)
+    if before is not None:
+        with contextlib.suppress(Exception):  # it may be gone already
+            await before.close(4001, "opened in another page")
+    try:
+        await _listen(websocket, session, sessions.config)
+    except (WebSocketDisconnect, RuntimeError):  # starlette raises the latter where the other task has closed it
+        pass
+    finally:
+        session.detach(websocket)
+
+
+async def _listen(websocket: WebSocket, session: Session, config: ServeConfig) -> None:
+    rate, faults = RateLimit(config.per_s, config.burst), 0
+    while True:
+        message = await websocket.receive()
+        if message["type"] == "websocket.disconnect":
+            return
+        data = message.get("text") or message.get("bytes") or ""
+        if not rate.allows():
+            await websocket.send_text(
+                protocol.encode_event("error", text="too many messages a second; reload the page.")
+            )
+            return await websocket.close(1008, "too many messages")
+        try:
+            session.hear(protocol.parse_message(data))
+        except ProtocolError as error:
+            faults += 1
+            await websocket.send_text(protocol.encode_event("error", text=str(error)))
+            if faults >= config.faults:
+                return await websocket.close(1008, "too many faults")
+
+
+def open_port(host: str, port: int) -> socket.socket:
+    """A listening socket; ServeError where the address cannot be had. Port 0 takes any free one."""
+    if not 0 <= port < 2**16:
+        raise ServeError(f"{port} is no port; choose one from 1 to 65535 with --port (0 takes any that is free).")
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, number)
+    except OSError as error:
+        raise ServeError(f"{host} is no address of this machine ({error.strerror}); use --host 127.0.0.1.") from error
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise ServeError(
+                f"port {port} is in use; stop what uses it or choose another with --port (0 takes any)."
+            ) from error
+        raise ServeError(
+            f"cannot listen on {host}:{port} ({error.strerror}); choose another with --host and --port."
+        ) from error
+    listener.setblocking(False)
+    return listener
+
+
+def serve(
+    worlds: Sequence[World],
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    token: str | None = None,
+    sink_factory: SinkFactory | None = None,
+    on_ready: Callable[[str], None] | None = None,
+    seed: int = 0,
+    config: ServeConfig | None = None,
+) -> None:
+    """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
+
+    `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
+    given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
+    """
+    check_playable(worlds)
+    if token is None and not is_loopback(host):
+        token = secrets.token_urlsafe(16)
+    listener = open_port(host, port)
+    with contextlib.closing(listener):
+        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config)
+        with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
+            server.run(sockets=[listener])
+
+
+@contextlib.contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM end the process as Ctrl-C does, so that worlds with processes of their own can take them along."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn puts it back, then raises it again
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def make_server(
+    worlds: Sequence[World],
+    listener: socket.socket,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    sink_factory: SinkFactory | None = None,
+    on_ready: Callable[[str], None] | None = None,
+    seed: int = 0,
+    config: ServeConfig | None = None,
+) -> uvicorn.Server:
+    """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
+    url = page_address(host, listener.getsockname()[1], token)
+    ready = (lambda: on_ready(url)) if on_ready else None
+    app = build_app(worlds, host, token, sink_factory, seed, config, ready)
+    settings = uvicorn.Config(
+        app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=2**16, ws_max_queue=64,
+        ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False, proxy_headers=False,
+    )  # fmt: skip
+    return uvicorn.Server(settings)
+
+
+def page_address(host: str, port: int, token: str | None) -> str:
+    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    shown = f"[{shown}]" if ":" in shown else shown
+    return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")

@@ -1,0 +1,244 @@
+"""A session: one person's story, paced by the world's clock and by what their browser has acknowledged."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Protocol
+
+from ..core.errors import TerrellaError
+from . import protocol
+from .history import Moment
+from .protocol import Ack, Branch, Frame, Keys, Message, Pause, Record, Restart, Resume, Rewind, Seek, Sync
+from .story import Story
+
+MAX_UNACKED = 2
+
+
+class Socket(Protocol):
+    """What a session needs of a connection; a failed send raises."""
+
+    async def send_bytes(self, data: bytes) -> None: ...
+
+    async def send_text(self, data: str) -> None: ...
+
+    async def close(self, code: int = 1000, reason: str | None = None) -> None: ...
+
+
+class Session:
+    """Steps its story only while fewer than `MAX_UNACKED` frames are on their way; the latest keys win.
+
+    `run` is its one task. Messages other than keys and acknowledgements are obeyed in order between steps, so the
+    story is never touched by two verbs at once. Without a socket it stands still and waits to be attached again.
+    """
+
+    def __init__(self, make_story: Callable[[], Story], worker: Executor):
+        self.id = secrets.token_urlsafe(16)
+        self.story: Story | None = None
+        self.detached_at: float | None = time.monotonic()
+        self.heard_at = time.monotonic()
+        self._make_story, self._worker = make_story, worker
+        self._socket: Socket | None = None
+        self._keys = Keys(0, ())
+        self._commands: deque[Message] = deque()
+        self._wake = asyncio.Event()
+        self._sent = self._acked = 0
+        self._paused = self._closed = False
+        self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
+        self._error = self._told = ""
+        self._due = 0.0
+
+    # -- the socket's side: called on the event loop, never waits ------------------------------------------------
+
+    @property
+    def unacked(self) -> int:
+        return self._sent - self._acked
+
+    @property
+    def connected(self) -> bool:
+        return self._socket is not None
+
+    def attach(self, socket: Socket) -> Socket | None:
+        """Plays on through `socket`; gives the socket that was attached until now."""
+        before, self._socket = self._socket, socket
+        self.detached_at, self._acked, self._told = None, self._sent, "hello"
+        self._keys = Keys(0, ())  # a new page counts its messages anew
+        self.heard_at = time.monotonic()
+        self._unseen = self.story.shown if self.story else None
+        self._wake.set()
+        return before
+
+    def detach(self, socket: Socket) -> None:
+        """The socket is gone; the story waits."""
+        if self._socket is socket:
+            self._socket = None
+            self._keys = replace(self._keys, held=())
+            self.detached_at = time.monotonic()
+
+    def hear(self, message: Message) -> None:
+        self.heard_at = time.monotonic()
+        if isinstance(message, Keys):
+            if message.id >= self._keys.id:
+                self._keys = message
+        elif isinstance(message, Ack):
+            if self._acked < message.seq <= self._sent:
+                self._acked = message.seq
+                self._wake.set()
+            return
+        elif isinstance(message, Seek) and self._commands and isinstance(self._commands[-1], Seek):
+            self._commands[-1] = message  # a scrubbed timeline: only the latest place matters
+        elif len(self._commands) < 64:
+            self._commands.append(message)
+        self._wake.set()
+
+    async def pictures(self) -> list[tuple[bytes, ...]]:
+        """The JPEGs of the recent past; none before the world has started."""
+        return await self._work(self.story.pictures) if self.story else []
+
+    def close(self) -> None:
+        self._closed = True
+        self._wake.set()
+
+    # -- the one task --------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        try:
+            await self._begin()
+            while not self._closed:
+                await self._turn()
+        finally:
+            if self.story:
+                await asyncio.shield(self._work(self.story.close))
+            if self._socket is not None:
+                await self._event(
+                    protocol.encode_event("error", text="this session has ended; reload the page to begin anew.")
+                )
+
+    async def _begin(self) -> None:
+        try:
+            self.story = await self._work(self._make_story)
+            self._unseen = self.story.shown
+        except TerrellaError as error:
+            self._error = str(error)
+        except Exception as error:  # a world is a stranger's code: the server outlives it
+            traceback.print_exc(file=sys.stderr)
+            self._error = f"the world cannot start ({type(error).__name__}: {error})."
+
+    async def _turn(self) -> None:
+        self._wake.clear()
+        while self._commands and self.story:
+            await self._obey(self._commands.popleft(), self.story)
+        story = self.story
+        if self._told != self._status():
+            await self._tell()
+        if self._socket is None or story is None or self.unacked >= MAX_UNACKED:
+            await self._wake.wait()
+        elif self._unseen is not None:
+            await self._send(self._unseen, story, 0.0, self._keys)
+        elif self._paused or self._error or story.rewound:
+            await self._wake.wait()
+        else:
+            await self._step_when_due(story)
+
+    async def _step_when_due(self, story: Story) -> None:
+        loop, now = asyncio.get_running_loop(), time.perf_counter()
+        if self._due - now > 0.0005:
+            alarm = loop.call_later(self._due - now, self._wake.set)
+            await self._wake.wait()
+            alarm.cancel()
+            return
+        dt_s = story.spec.dt_s
+        self._due = max(self._due + dt_s, now - dt_s)  # a late step is caught up, a long wait is not
+        try:
+            keys, moment, made_ms = await self._work(self._step, story)
+        except Exception as error:  # a world is a stranger's code: the server outlives it
+            if not isinstance(error, TerrellaError):
+                traceback.print_exc(file=sys.stderr)
+            self._error = f"the world stopped: {error} Restart to go on."
+            return
+        await self._send(moment, story, made_ms, keys)
+
+    def _step(self, story: Story) -> tuple[Keys, Moment, float]:
+        """In the worker: the keys are read as late as can be."""
+        begun, keys = time.perf_counter(), self._keys
+        moment = story.step(keys.held)
+        return keys, moment, (time.perf_counter() - begun) * 1e3
+
+    async def _obey(self, message: Message, story: Story) -> None:
+        try:
+            match message:
+                case Pause():
+                    self._paused = True
+                case Resume():
+                    self._unseen = await self._work(story.to_newest) if story.rewound else self._unseen
+                    self._paused, self._error = False, ""
+                case Restart(seed):
+                    seed = secrets.randbelow(2**31) if seed is None else seed
+                    self._unseen = await self._work(story.restart, seed)
+                    self._paused, self._error = False, ""
+                case Rewind(steps):
+                    self._unseen = await self._work(story.stand_at, story.shown.step - steps)
+                case Seek(step):
+                    self._unseen = await self._work(story.stand_at, step)
+                case Branch():
+                    self._unseen = await self._work(story.branch)
+                    self._paused, self._error = False, ""
+                case Sync():
+                    self._unseen = await self._work(story.sync)
+                case Record(on):
+                    await self._work(story.record, on)
+        except TerrellaError as error:
+            await self._event(protocol.encode_event("error", text=str(error)))
+        except Exception as error:  # a world is a stranger's code: the server outlives it
+            traceback.print_exc(file=sys.stderr)
+            self._error = f"the world stopped ({type(error).__name__}: {error}). Restart to go on."
+
+    def _work(self, function: Callable, *arguments):
+        return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
+
+    def _status(self) -> str:
+        story = self.story
+        if story is None:
+            return protocol.encode_event("status", text=self._error) if self._error else "hello"
+        return protocol.encode_event(
+            "status", paused=self._paused, rewound=story.rewound, recording=story.recording, seed=story.seed,
+            notice=story.notice, text=self._error,
+        )  # fmt: skip
+
+    async def _tell(self) -> None:
+        status = self._status()
+        if self._socket is not None and status != "hello":
+            await self._event(status)
+            self._told = status
+
+    async def _send(self, moment: Moment, story: Story, made_ms: float, keys: Keys) -> None:
+        self._unseen = None
+        flags = moment.flags | protocol.REPLAY * story.rewound
+        self._sent += 1
+        frame = Frame(
+            self._sent, moment.step, story.oldest_step, story.newest_step, moment.images, flags,
+            keys.id, made_ms, moment.episode_return, keys.t, time.time(),
+        )  # fmt: skip
+        socket = self._socket
+        if socket is None:
+            return
+        try:
+            await socket.send_bytes(protocol.encode_frame(frame))
+        except Exception:  # however a connection breaks, the story waits for the next
+            self.detach(socket)
+
+    async def _event(self, text: str) -> None:
+        socket = self._socket
+        if socket is None:
+            return
+        try:
+            await socket.send_text(text)
+        except Exception:  # as above
+            self.detach(socket)

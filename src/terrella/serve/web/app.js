@@ -1,0 +1,428 @@
+// The page: the picture, what it says about itself, and the buttons.
+
+import { drawCard } from './card.js';
+import { Controls } from './controls.js';
+import { drawKeycaps, keyLabel, keyMeaning } from './keycaps.js';
+import { DONE, FRESH, Link, REPLAY } from './link.js';
+
+const $ = (id) => document.getElementById(id);
+const app = $('app'), glow = $('glow').getContext('2d', { alpha: false });
+const KEPT = 8192;
+const shade = glow.createRadialGradient(16, 10, 3, 16, 10, 17);
+shade.addColorStop(0, '#0b0c0f70');
+shade.addColorStop(1, '#0b0c0f');
+
+const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0 };
+const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
+let worlds = [], screens = [], light = () => {}, status = {}, noRewind = '', noRecord = '';
+let pending = null, keysId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
+let state = 'connecting';
+
+// -- the connection -------------------------------------------------------------------------------------------------
+
+const link = new Link({ frame: onFrame, event: onEvent, state: showState });
+const controls = new Controls((held, time) => {
+  light(held);
+  if (held.length) $('hint').classList.remove('show');
+  if (held.length && status.rewound && rewinding === null) link.send({ type: 'branch' });
+  if (held.length && status.paused && !status.rewound) link.send({ type: 'resume' });
+  sendKeys(time);
+});
+
+function sendKeys(time) {
+  keysId += 1;
+  link.send({ type: 'keys', id: keysId, t: time, held: controls.held });
+}
+
+function onEvent(body) {
+  if (body.type === 'hello') hello(body);
+  if (body.type === 'status') onStatus(body);
+  if (body.type === 'error') toast(body.text);
+}
+
+function hello(body) {
+  const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
+  ({ worlds, no_rewind: noRewind, no_record: noRecord } = body);
+  if (!same) build();
+  now.actionId = keysId;
+  sendKeys(performance.now());
+  showState('starting');
+}
+
+function onStatus(body) {
+  if (body.notice && body.notice !== status.notice) toast(body.notice);
+  if (body.recording && !status.recording) recordSince = performance.now();
+  status = body;
+  app.classList.toggle('recording', !!body.recording);
+  $('record').setAttribute('aria-pressed', !!body.recording);
+  if (body.seed !== undefined && document.activeElement !== $('seed')) $('seed').value = body.seed;
+  const paused = body.paused || body.rewound;
+  $('pause').querySelector('use').setAttribute('href', paused ? '#i-play' : '#i-pause');
+  $('pause').setAttribute('aria-label', paused ? 'Play' : 'Pause');
+  if (body.text) showState('failed', body.text);
+  else if (body.rewound) showState('rewound');
+  else if (body.paused) showState('paused');
+  else if (now.newest || seen.painted) showState('playing');
+}
+
+function onFrame(frame, bitmaps) {
+  if (pending) {
+    seen.dropped += 1;
+    pending.bitmaps.forEach((bitmap) => bitmap.close());
+  } else {
+    requestAnimationFrame(paint);
+  }
+  pending = { frame, bitmaps };
+}
+
+function paint(time) {
+  const { frame, bitmaps } = pending;
+  pending = null;
+  bitmaps.forEach((bitmap, index) => {
+    const screen = screens[index];
+    if (screen) screen.drawImage(bitmap, 0, 0);
+    bitmap.close();
+  });
+  const live = !(frame.flags & REPLAY), at = performance.now();
+  if (frame.actionId > now.actionId && live) {
+    keep(seen.latencies, at - frame.clientMs);
+    seen.latencyCount += 1;
+  }
+  if (frame.step < now.oldest || frame.newest < now.newest) ticks = ticks.filter((step) => step <= frame.newest);
+  if (frame.flags & FRESH && frame.step > 0 && live) {
+    ticks.push(frame.step);
+    flash();
+  }
+  Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags });
+  now.actionId = Math.max(now.actionId, frame.actionId);
+  seen.painted += 1;
+  keep(seen.times, time);
+  keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });
+  if (!live) drawTimeline(); else dirtyTimeline = true;
+  if (state === 'starting' && !status.text) onStatus(status);
+}
+
+function keep(list, value) {
+  list.push(value);
+  if (list.length > KEPT) list.splice(0, KEPT / 2);
+}
+
+// -- the picture ----------------------------------------------------------------------------------------------------
+
+function build() {
+  $('name').textContent = worlds.map((world) => world.name).join('  ·  ');
+  document.title = `${worlds[0].name} · Terrella`;
+  $('what').textContent = worlds[worlds.length - 1].card.what ?? '';
+  $('screens').replaceChildren();
+  screens = worlds.map((world) => {
+    const figure = document.createElement('figure'), canvas = document.createElement('canvas');
+    [canvas.height, canvas.width] = world.size;
+    figure.append(canvas);
+    if (world.label) figure.append(Object.assign(document.createElement('figcaption'), { textContent: world.label }));
+    $('screens').append(figure);
+    return canvas.getContext('2d', { alpha: false });
+  });
+  light = drawKeycaps($('keys'), worlds[0]);
+  controls.setKeys(worlds[0].keys);
+  drawTouch();
+  drawCard($('facts'), worlds);
+  $('score-cell').hidden = !worlds[0].scored;
+  $('sync').hidden = worlds.length < 2;
+  app.classList.toggle('no-rewind', !!noRewind);
+  able($('rewind'), noRewind, 'Hold to rewind (Backspace)');
+  $('timeline').title = noRewind || '';
+  able($('record'), noRecord, 'Record to a dataset');
+  able($('sync'), '', 'The dream looks at the game again');
+  hint();
+  layout();
+}
+
+function able(button, why, title) {
+  button.setAttribute('aria-disabled', !!why);
+  button.title = why ? `${title}: not here, ${why}` : title;
+}
+
+function hint() {
+  const caps = Object.keys(worlds[0].keys).filter((code) => !/^Arrow(Up|Down)/.test(code) || !('KeyW' in worlds[0].keys)).slice(0, 6);
+  const parts = caps.flatMap((code) => [Object.assign(document.createElement('kbd'), { textContent: keyLabel(code) }), ' ']);
+  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : ['Press ', ...parts, 'to step inside']));
+  $('hint').classList.toggle('show', caps.length > 0);
+  setTimeout(() => $('hint').classList.remove('show'), 9000);
+}
+
+/** The largest size that fits, in whole screen pixels per picture pixel where that costs little; side by side or stacked. */
+function layout() {
+  if (!worlds.length) return;
+  const box = $('stage').getBoundingClientRect(), count = worlds.length;
+  const width = Math.max(...worlds.map((world) => world.size[1])), height = Math.max(...worlds.map((world) => world.size[0]));
+  const margin = innerWidth > 700 ? 20 : 0, beside = Math.min((box.width - 2 * margin - 14 * (count - 1)) / (count * width), box.height / height);
+  const stacked = Math.min((box.width - 2 * margin) / width, (box.height - 8 * (count - 1)) / (count * height));
+  $('screens').classList.toggle('stacked', stacked > beside);
+  let scale = Math.max(beside, stacked);
+  const whole = Math.floor(scale * devicePixelRatio) / devicePixelRatio;
+  if (whole / scale > 0.88) scale = whole;
+  const figures = [...$('screens').children];
+  figures.forEach((figure) => { figure.style.width = `${width * scale}px`; figure.style.height = `${height * scale}px`; });
+  const across = stacked > beside ? 1 : count, down = stacked > beside ? count : 1;
+  $('over').style.width = `${across * width * scale + 14 * (across - 1)}px`;
+  $('over').style.height = `${down * height * scale + 8 * (down - 1)}px`;
+}
+
+function flash() {
+  $('screens').querySelectorAll('figure').forEach((figure) => {
+    figure.classList.remove('flash');
+    void figure.offsetWidth;
+    figure.classList.add('flash');
+  });
+}
+
+const STATES = {
+  connecting: ['Connecting', ''], starting: ['Waking the world', ''], playing: ['', ''], paused: ['', ''], rewound: ['', ''],
+  reconnecting: ['Reconnecting', 'The world waits for you.'], elsewhere: ['Playing elsewhere', '', 'Play here'],
+  refused: ['Not connected', '', 'Try again'], failed: ['The world stopped', '', 'Restart'],
+};
+
+function showState(name, text = '') {
+  if (name === 'starting' && seen.painted && status.seed !== undefined && !status.text) name = status.rewound ? 'rewound' : status.paused ? 'paused' : 'playing';
+  state = name;
+  app.dataset.state = name;
+  const [title, more, button] = STATES[name];
+  $('banner').classList.toggle('show', !!title);
+  if (title) [$('banner-text').textContent, $('banner-more').textContent] = [title, text || more];
+  $('banner-button').hidden = !button;
+  $('banner-button').textContent = button ?? '';
+  dirtyTimeline = true;
+}
+
+let toastTimer = 0;
+function toast(text) {
+  $('toast').textContent = text.charAt(0).toUpperCase() + text.slice(1);
+  $('toast').classList.add('show');
+  clearTimeout(toastTimer);
+  toastTimer = setTimeout(() => $('toast').classList.remove('show'), 6000);
+}
+
+// -- figures and the timeline, four times a second ------------------------------------------------------------------
+
+function fps() {
+  const since = performance.now() - 2000, times = seen.times.filter((time) => time > since);
+  return times.length > 1 ? ((times.length - 1) * 1000) / (times[times.length - 1] - times[0]) : 0;
+}
+
+function write(id, value, unit = '') {
+  const node = $(id), text = `${value}${unit}`;
+  if (node.dataset.text === text) return;
+  node.dataset.text = text;
+  node.replaceChildren(String(value));
+  if (unit) node.append(Object.assign(document.createElement('small'), { textContent: unit }));
+}
+
+function drawFigures() {
+  const recent = seen.latencies.slice(-24).sort((a, b) => a - b);
+  write('fps', state === 'playing' ? Math.round(fps()) : '–');
+  if (recent.length) write('latency', Math.round(recent[recent.length >> 1]), 'ms');
+  write('step', now.step.toLocaleString('en'));
+  write('score', +now.score.toFixed(2));
+  if (status.recording) {
+    const s = Math.floor((performance.now() - recordSince) / 1000);
+    write('rec-time', `${Math.floor(s / 60)}:${String(s % 60).padStart(2, '0')}`);
+  }
+  if (dirtyTimeline) drawTimeline();
+}
+
+/** The picture's light on the wall behind it: few pixels, shaded here, for a mask or a blur in CSS costs every frame. */
+function drawGlow() {
+  if (!screens.length || state !== 'playing') return;
+  const { width, height } = glow.canvas;
+  glow.imageSmoothingQuality = 'high';
+  glow.globalAlpha = 0.3;
+  glow.drawImage(screens[screens.length - 1].canvas, 0, 0, width, height);
+  glow.globalAlpha = 1;
+  glow.fillStyle = shade;
+  glow.fillRect(0, 0, width, height);
+}
+
+function drawTimeline() {
+  dirtyTimeline = false;
+  const span = now.newest - now.oldest, part = span ? (now.step - now.oldest) / span : 1, dt = worlds[0]?.dt_s ?? 0;
+  $('fill').style.transform = `scaleX(${part})`;
+  $('thumb').style.left = `${part * 100}%`;
+  const shown = ticks.filter((step) => step > now.oldest && step <= now.newest);
+  while ($('ticks').childElementCount < shown.length) $('ticks').append(document.createElement('i'));
+  while ($('ticks').childElementCount > shown.length) $('ticks').lastChild.remove();
+  shown.forEach((step, index) => { $('ticks').children[index].style.left = `${((step - now.oldest) / span) * 100}%`; });
+  write('time-left', noRewind ? noRewind : !span ? '' : `−${(span * dt).toFixed(0)} s`);
+  write('time-right', noRewind || !span ? '' : 'now');
+  write('past-time', `−${((now.newest - now.step) * dt).toFixed(1)} s`);
+  const line = $('timeline');
+  line.ariaValueMin = now.oldest; line.ariaValueMax = now.newest; line.ariaValueNow = now.step;
+}
+
+// -- verbs ----------------------------------------------------------------------------------------------------------
+
+function togglePause() {
+  link.send({ type: status.paused || status.rewound ? 'resume' : 'pause' });
+}
+
+function seek(step) {
+  aim = Math.min(now.newest, Math.max(now.oldest, Math.round(step)));
+  link.send({ type: 'seek', step: aim });
+}
+
+function startRewind() {
+  if (noRewind) return toast(noRewind);
+  if (rewinding !== null) return;
+  const begun = performance.now(), rate = 1 / worlds[0].dt_s / 30;
+  aim = now.step;
+  $('rewind').classList.add('on');
+  rewinding = setInterval(() => seek(aim - Math.max(1, rate * (1 + Math.min(4, (performance.now() - begun) / 900)))), 33);
+  seek(aim - 1);
+}
+
+function stopRewind() {
+  clearInterval(rewinding);
+  rewinding = null;
+  $('rewind').classList.remove('on');
+}
+
+function restart(seed) {
+  ticks = [];
+  link.send({ type: 'restart', seed });
+}
+
+function seedTyped() {
+  const seed = Number($('seed').value);
+  if (Number.isInteger(seed) && seed >= 0 && seed < 2 ** 31) return seed;
+  toast(`A seed is a whole number from 0 to ${2 ** 31 - 1}.`);
+  return null;
+}
+
+function restartTyped() {
+  const seed = seedTyped();
+  if (seed !== null) restart(seed);
+}
+
+async function clip() {
+  $('clip').setAttribute('aria-busy', 'true');
+  toast('Making a film of the last seconds.');
+  try {
+    const answer = await fetch(link.clipAddress());
+    if (!answer.ok) throw new Error(await answer.text());
+    const name = /filename="([^"]+)"/.exec(answer.headers.get('content-disposition'))?.[1] ?? 'terrella.mp4';
+    const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(await answer.blob()), download: name });
+    anchor.click();
+    setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
+    toast(`Saved ${name}.`);
+  } catch (error) {
+    toast(`No film: ${error.message}`);
+  }
+  $('clip').removeAttribute('aria-busy');
+}
+
+function record() {
+  if (noRecord) return toast(`Not recording: ${noRecord}`);
+  link.send({ type: 'record', on: !status.recording });
+}
+
+function drawTouch() {
+  const { stick, turn, extra } = controls.plan;
+  $('stick').hidden = !Object.values(stick).some(Boolean);
+  $('turn').hidden = !turn;
+  $('extra').replaceChildren(...extra.map((code) => {
+    const button = Object.assign(document.createElement('button'), { textContent: keyMeaning(worlds[0], code) });
+    controls.bindButton(button, code);
+    return button;
+  }));
+}
+
+// -- wiring ---------------------------------------------------------------------------------------------------------
+
+const SHORTCUTS = { KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+
+function fullscreen() {
+  return document.fullscreenElement ? document.exitFullscreen() : app.requestFullscreen?.();
+}
+
+addEventListener('keydown', (event) => {
+  if (event.target.tagName === 'INPUT' || event.ctrlKey || event.metaKey || event.altKey) return;
+  const button = event.target.closest?.('button') && (event.code === 'Enter' || event.code === 'Space');
+  if (controls.press(event.code, event.timeStamp)) event.preventDefault();
+  else if (event.code === 'Backspace') { event.preventDefault(); if (!event.repeat) startRewind(); }
+  else if (!event.repeat && !button && SHORTCUTS[event.code]) { event.preventDefault(); SHORTCUTS[event.code](); }
+});
+addEventListener('keyup', (event) => {
+  controls.lift(event.code, event.timeStamp);
+  if (event.code === 'Backspace') stopRewind();
+});
+
+$('pause').onclick = togglePause;
+$('restart').onclick = restartTyped;
+$('dice').onclick = () => restart(null);
+$('seed').onkeydown = (event) => { if (event.code === 'Enter') { restartTyped(); $('seed').blur(); } if (event.code === 'Escape') $('seed').blur(); };
+$('record').onclick = record;
+$('clip').onclick = clip;
+$('sync').onclick = () => link.send({ type: 'sync' });
+$('full').onclick = fullscreen;
+$('smooth').onclick = () => $('smooth').setAttribute('aria-pressed', app.classList.toggle('smooth'));
+$('branch').onclick = () => link.send({ type: 'branch' });
+$('now').onclick = () => link.send({ type: 'resume' });
+$('banner-button').onclick = () => (state === 'failed' ? restart(status.seed ?? 0) : link.connect());
+$('rewind').onpointerdown = (event) => { event.target.closest('button').setPointerCapture(event.pointerId); startRewind(); };
+for (const name of ['pointerup', 'pointercancel', 'lostpointercapture']) $('rewind').addEventListener(name, stopRewind);
+$('rewind').oncontextmenu = (event) => event.preventDefault();
+const toggleCard = () => { $('card').hidden = !$('card').hidden; $('about').setAttribute('aria-expanded', !$('card').hidden); };
+$('about').onclick = $('card-close').onclick = toggleCard;
+
+let scrubbing = false, scrubbed = 0;
+const scrub = (event) => {
+  const box = $('timeline').getBoundingClientRect(), part = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
+  if (event.timeStamp - scrubbed < 25 && event.type === 'pointermove') return;
+  scrubbed = event.timeStamp;
+  seek(now.oldest + part * (now.newest - now.oldest));
+};
+$('timeline').onpointerdown = (event) => { if (noRewind) return; scrubbing = true; $('timeline').setPointerCapture(event.pointerId); scrub(event); };
+$('timeline').onpointermove = (event) => { if (scrubbing) scrub(event); };
+$('timeline').onpointerup = $('timeline').onpointercancel = (event) => { if (scrubbing && event.type === 'pointerup') { scrubbed = 0; scrub(event); } scrubbing = false; };
+
+controls.bindPad($('stick'), 'stick', (x, y) => controls.axes(x, y));
+controls.bindPad($('turn'), 'turn', (x) => controls.turns(x));
+const coarse = matchMedia('(pointer: coarse)');
+const touchable = () => { app.classList.toggle('touchable', coarse.matches); layout(); };
+coarse.addEventListener('change', touchable);
+addEventListener('touchstart', () => { app.classList.add('touchable'); layout(); }, { once: true, passive: true });
+touchable();
+
+new ResizeObserver(layout).observe($('stage'));
+let leaving = false;  // a page that is closed or reloaded is hidden too, but its story goes on
+addEventListener('pagehide', () => { leaving = true; });
+addEventListener('pageshow', () => { leaving = false; });
+document.addEventListener('visibilitychange', () => {
+  if (document.hidden && !leaving && state === 'playing') { autoPaused = true; link.send({ type: 'pause' }); }
+  if (!document.hidden && autoPaused) { autoPaused = false; link.send({ type: 'resume' }); }
+});
+setInterval(drawFigures, 250);
+setInterval(drawGlow, 500);
+
+/** Read-only figures for tests and benchmarks. */
+window.terrella = Object.freeze({
+  get connected() { return link.connected; },
+  get state() { return state; },
+  get fps() { return fps(); },
+  get step() { return now.step; },
+  get oldest() { return now.oldest; },
+  get newest() { return now.newest; },
+  get painted() { return seen.painted; },
+  get dropped() { return seen.dropped; },
+  get bytes() { return link.bytes; },
+  get keys() { return Object.keys(controls.keys); },
+  get held() { return [...controls.held]; },
+  get recording() { return !!status.recording; },
+  get seed() { return status.seed; },
+  get done() { return !!(now.flags & DONE); },
+  get latencies() { return [...seen.latencies]; },
+  get latencyCount() { return seen.latencyCount; },
+  framesAfter: (seq) => seen.frames.filter((frame) => frame.seq > seq),
+  drop: () => link.socket?.close(4999),
+});
+
+link.connect();

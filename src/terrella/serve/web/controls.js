@@ -1,0 +1,132 @@
+// Keyboard, touch and gamepad, all turned into the keys that the world's spec names.
+
+const UP = ['KeyW', 'ArrowUp'], DOWN = ['KeyS', 'ArrowDown'], LEFT = ['KeyA', 'ArrowLeft'], RIGHT = ['KeyD', 'ArrowRight'];
+const DEAD = 0.35;
+
+/** The keys that a stick, a turn pad and buttons stand for in this world. */
+export function plan(keys) {
+  const pick = (codes) => codes.find((code) => code in keys);
+  const stick = { up: pick(UP), down: pick(DOWN), left: pick(LEFT), right: pick(RIGHT) };
+  const turns = stick.left === 'KeyA' && 'ArrowLeft' in keys && 'ArrowRight' in keys;
+  const turn = turns ? { left: 'ArrowLeft', right: 'ArrowRight' } : null;
+  const same = (a, b) => keys[a].every((value, index) => value === keys[b][index]);
+  const used = [...Object.values(stick), ...Object.values(turn ?? {})].filter(Boolean);
+  const extra = Object.keys(keys).filter((code) => !used.some((other) => same(code, other)));
+  return { stick, turn, extra };
+}
+
+export class Controls {
+  /** `changed(held, time)` is called with the ordered list of held codes whenever it changes. */
+  constructor(changed) {
+    this.changed = changed;
+    this.keys = {};
+    this.sources = { keyboard: [], stick: [], turn: [], extra: [], pad: [] };
+    this.held = [];
+    this.plan = plan({});
+    addEventListener('blur', () => this.release());
+    addEventListener('gamepadconnected', () => this.pollGamepad());
+  }
+
+  setKeys(keys) {
+    this.keys = keys;
+    this.plan = plan(keys);
+    this.release();
+  }
+
+  release() {
+    for (const name of Object.keys(this.sources)) this.sources[name] = [];
+    this.merge(performance.now());
+  }
+
+  /** Whether the key belongs to the world. */
+  press(code, time) {
+    if (!(code in this.keys)) return false;
+    if (!this.sources.keyboard.includes(code)) this.set('keyboard', [...this.sources.keyboard, code], time);
+    return true;
+  }
+
+  lift(code, time) {
+    this.set('keyboard', this.sources.keyboard.filter((other) => other !== code), time);
+  }
+
+  set(source, codes, time) {
+    this.sources[source] = codes.filter((code) => code && code in this.keys);
+    this.merge(time);
+  }
+
+  merge(time) {
+    const all = [...new Set(Object.values(this.sources).flat())];
+    const kept = this.held.filter((code) => all.includes(code));
+    const next = [...kept, ...all.filter((code) => !kept.includes(code))];
+    if (next.length === this.held.length && next.every((code, index) => code === this.held[index])) return;
+    this.held = next;
+    this.changed(next, time);
+  }
+
+  axes(x, y) {
+    const { up, down, left, right } = this.plan.stick;
+    return [y < -DEAD && up, y > DEAD && down, x < -DEAD && left, x > DEAD && right];
+  }
+
+  turns(x) {
+    const turn = this.plan.turn;
+    return turn ? [x < -DEAD && turn.left, x > DEAD && turn.right] : [];
+  }
+
+  /** A round stick or a turn rail: `element` has a `.nub` that follows the finger. */
+  bindPad(element, source, codes) {
+    const nub = element.querySelector('.nub');
+    let finger = null;
+    const move = (event) => {
+      const box = element.getBoundingClientRect(), reach = Math.min(box.width, box.height) / 2;
+      let x = (event.clientX - box.left - box.width / 2) / reach, y = (event.clientY - box.top - box.height / 2) / reach;
+      if (source === 'turn') y = 0;
+      const far = Math.hypot(x, y), cap = source === 'turn' ? box.width / box.height - 0.4 : 1;
+      if (far > cap) { x *= cap / far; y *= cap / far; }
+      nub.style.transform = `translate(${x * reach * 0.62}px, ${y * reach * 0.62}px)`;
+      this.set(source, codes(x, y), event.timeStamp);
+    };
+    element.addEventListener('pointerdown', (event) => {
+      event.preventDefault();
+      finger = event.pointerId;
+      element.setPointerCapture(finger);
+      element.classList.add('on');
+      move(event);
+    });
+    element.addEventListener('pointermove', (event) => { if (event.pointerId === finger) move(event); });
+    const end = (event) => {
+      if (event.pointerId !== finger) return;
+      finger = null;
+      element.classList.remove('on');
+      nub.style.transform = '';
+      this.set(source, [], event.timeStamp);
+    };
+    for (const name of ['pointerup', 'pointercancel', 'lostpointercapture']) element.addEventListener(name, end);
+  }
+
+  bindButton(element, code) {
+    const down = (event) => { event.preventDefault(); element.setPointerCapture(event.pointerId); this.set('extra', [...this.sources.extra, code], event.timeStamp); };
+    const up = (event) => this.set('extra', this.sources.extra.filter((other) => other !== code), event.timeStamp);
+    element.addEventListener('pointerdown', down);
+    for (const name of ['pointerup', 'pointercancel']) element.addEventListener(name, up);
+  }
+
+  pollGamepad() {
+    if (this.polling) return;
+    this.polling = true;
+    const poll = () => {
+      const pad = navigator.getGamepads().find((one) => one?.connected);
+      if (!pad) {
+        this.polling = false;
+        this.set('pad', [], performance.now());
+        return;
+      }
+      const down = (index) => (pad.buttons[index]?.pressed ? 1 : 0);
+      const x = (pad.axes[0] ?? 0) + down(15) - down(14), y = (pad.axes[1] ?? 0) + down(13) - down(12);
+      const buttons = this.plan.extra.slice(0, 4).map((code, index) => down(index) && code);
+      this.set('pad', [...this.axes(x, y), ...this.turns(pad.axes[2] ?? 0), ...buttons], performance.now());
+      requestAnimationFrame(poll);
+    };
+    requestAnimationFrame(poll);
+  }
+}

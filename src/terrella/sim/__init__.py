@@ -1,0 +1,1 @@
+"""Ground truth as Worlds: Doom, Gymnasium, replay of recordings."""

@@ -1,0 +1,66 @@
+"""Pinhole cameras and rigid poses: pixels to rays, depth to points, points to pixels.
+
+Frames: world z up; camera x forward, y left, z up. A pose is float32 [..., 7]: x, y, z in metres, then the quaternion
+w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H).
+"""
+
+from __future__ import annotations
+
+import torch
+
+Intrinsics = tuple[float, float, float, float]
+
+
+def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tensor:
+    """Directions through the pixel centres in the camera frame, scaled so that x (forward) is 1: float32 [H, W, 3]."""
+    fx, fy, cx, cy = camera
+    u = (torch.arange(width, device=device) + 0.5) / width
+    v = (torch.arange(height, device=device) + 0.5) / height
+    left, up = -(u - cx) / fx, -(v - cy) / fy
+    return torch.stack(
+        [torch.ones(height, width, device=device), left.expand(height, width), up[:, None].expand(height, width)], -1
+    )
+
+
+def rotation(pose: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices of T_world_cam: [..., 7] -> [..., 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(pose[..., 3:], dim=-1).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
+    """Depth [..., H, W] seen from `pose` [..., 7] -> world points [..., H, W, 3]."""
+    directions = rays(camera, *depth.shape[-2:], device=depth.device)
+    points = depth[..., None] * directions
+    turned = torch.einsum("...ij,...hwj->...hwi", rotation(pose), points)
+    return turned + pose[..., None, None, :3]
+
+
+def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
+    """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N].
+
+    Points behind the camera come back with depth <= 0 and meaningless coordinates.
+    """
+    fx, fy, cx, cy = camera
+    local = torch.einsum("...ji,...nj->...ni", rotation(pose), points - pose[..., None, :3])
+    depth = local[..., 0]
+    safe = depth.clamp_min(1e-4)
+    return torch.stack([cx - fx * local[..., 1] / safe, cy - fy * local[..., 2] / safe], -1), depth
+
+
+def yaw(pose: torch.Tensor) -> torch.Tensor:
+    """Heading in radians, counter-clockwise from world x: [..., 7] -> [...]."""
+    w, x, y, z = pose[..., 3:].unbind(-1)
+    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:
+    """A level pose at (x, y, z) metres that looks along `heading` radians: [...] each -> [..., 7]."""
+    half = heading / 2
+    zero = torch.zeros_like(half)
+    return torch.stack([x, y, z, torch.cos(half), zero, zero, torch.sin(half)], -1)

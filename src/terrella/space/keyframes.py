@@ -1,0 +1,126 @@
+"""Posed RGB-D keyframes as spatial memory: what is known of a new view, and from which keyframes.
+
+`look` asks the memory for a view: the keyframes' coarse patches say roughly which surfaces the view sees; each keyframe
+then votes for the surfaces that it saw itself (occlusion included), and those that add most are taken greedily; their
+fine patches give the view's depth, and their colours are warped into it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+
+from .camera import Intrinsics, project, rays, rotation
+from .patches import FAR_M, cast, patches
+from .reproject import fill_holes, warp
+
+COARSE, FINE = 8, 2  # strides of the patches for finding keyframes and for the view's depth
+_GRID = 4  # a keyframe votes on every 4th pixel of a half-size view
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], patches [K, n, 9]."""
+
+    rgb: torch.Tensor
+    depth: torch.Tensor
+    pose: torch.Tensor
+    coarse: torch.Tensor
+    fine: torch.Tensor
+
+    @staticmethod
+    def of(rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> Keyframes:
+        depth = depth.float()
+        return Keyframes(rgb, depth, pose, patches(depth, pose, camera, COARSE), patches(depth, pose, camera, FINE))
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def at(self, index) -> Keyframes:
+        return Keyframes(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Glimpse:
+    """What memory knows of B views. `slots` colours are sorted at every pixel, the most trusted first.
+
+    rgb [B, slots, 3, H, W] in [0, 1]; trust [B, slots, H, W] in [0, 1], 0 where the slot saw another surface;
+    depth [B, H, W] metres, holes filled; known [B, H, W] 1 where a patch was hit and some keyframe agrees.
+    """
+
+    rgb: torch.Tensor
+    trust: torch.Tensor
+    depth: torch.Tensor
+    known: torch.Tensor
+
+
+def retrieve(
+    memories: list[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int
+) -> list[list[int]]:
+    """For one view from `pose` [7]: which keyframes of each memory to use, `count` in all, best first.
+
+    Coverage-greedy: a keyframe's vote at a point is how alike its distance is (1 equal, 1/2 at twice or half), 0 where
+    it saw something else there; each pick adds what the picks before it lack.
+    """
+    half = (size[0] // 2, size[1] // 2)
+    depth = torch.stack([cast(m.coarse.flatten(0, 1)[None], pose[None], camera, half)[0] for m in memories]).amin(0)
+    some = slice(_GRID // 2, None, _GRID)
+    there = depth[some, some].flatten()
+    beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
+    points = (there[:, None] * beams) @ rotation(pose).T + pose[:3]
+    votes = torch.cat([_votes(m, points, there, camera) for m in memories])
+    votes = torch.cat([votes, 0.02 * votes.amax(1, keepdim=True)], 1)  # more than nothing, where all is covered
+    best, picks = torch.zeros(votes.shape[1], device=pose.device), []
+    for _ in range(min(count, len(votes))):
+        gain = (votes - best).clamp_min(0).sum(1)
+        pick = int(gain.argmax())
+        if gain[pick] <= 0:
+            break
+        picks.append(pick)
+        best = torch.maximum(best, votes[pick])
+    bounds = [0]
+    for memory in memories:
+        bounds.append(bounds[-1] + len(memory))
+    return [[p - low for p in picks if low <= p < high] for low, high in zip(bounds, bounds[1:])]
+
+
+def _votes(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
+    """[K, P]: what each keyframe has to say of each surface point."""
+    height, width = memory.depth.shape[-2:]
+    where, depth = project(points.expand(len(memory), -1, -1), memory.pose, camera)
+    inside = (depth > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)
+    column, row = (
+        (where[..., 0] * width).long().clamp(0, width - 1),
+        (where[..., 1] * height).long().clamp(0, height - 1),
+    )
+    held = memory.depth.flatten(1).gather(1, row * width + column)
+    same = inside & ((held - depth).abs() < 0.06 * depth)
+    ratio = distance / depth.clamp_min(0.05)
+    return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
+
+
+def look(
+    chosen: list[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int, slots: int
+) -> Glimpse:
+    """The view from `pose` [B, 7] as the `chosen` keyframes (one set a view, at most `count` each) know it."""
+    batch, (height, width) = len(pose), size
+    depth = torch.full((batch, height, width), FAR_M, device=pose.device)
+    for view, keys in enumerate(chosen):
+        if len(keys):
+            depth[view] = cast(keys.fine.flatten(0, 1)[None], pose[view : view + 1], camera, size)[0]
+    hit = depth < FAR_M
+    depth = fill_holes(depth)
+    colours = torch.zeros(batch, count, 3, height, width, device=pose.device)
+    trust = torch.zeros(batch, count, height, width, device=pose.device)
+    for view, keys in enumerate(chosen):
+        if len(keys):
+            rgb = keys.rgb.float().div(255)[None]
+            one = slice(view, view + 1)
+            colour, agreement, closeness = warp(rgb, keys.depth[None], keys.pose[None], depth[one], pose[one], camera)
+            likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
+            colours[view, : len(keys)], trust[view, : len(keys)] = colour[0], (agreement * likeness**2)[0]
+    trust, order = trust.topk(slots, dim=1)
+    colours = colours.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1))
+    known = hit & (trust[:, 0] > 0)
+    return Glimpse(colours, trust, depth, known.float())

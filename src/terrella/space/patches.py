@@ -1,0 +1,92 @@
+"""Patches: the small parallelograms that the pixels of posed depth images cover in the world, cast into a new view.
+
+Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
+the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
+`cast` runs a compiled kernel on a CPU (space/patches_numba.py); `cast_slowly` is its obvious twin, and the way on a GPU.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from .camera import Intrinsics, rays, rotation, unproject
+
+FAR_M = 100.0  # deeper than any depth: "nothing is known there"
+NEAR_M = 0.05
+
+
+def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
+    """Depth [..., H, W] seen from `pose` [..., 7] -> patches [..., N, 9]: centre, half side across, half side down.
+
+    One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
+    their neighbours' by half, and cross(down, across) points towards the eye that saw them. A patch that would reach
+    over an edge in the depth image keeps to its own pixel.
+    """
+    points = unproject(depth, pose, camera)
+    across, down = _shorter_difference(points, -2), _shorter_difference(points, -3)
+    first = stride // 2
+    reach = torch.where(_is_flat(depth, stride), 0.75 * stride, 0.5)[..., None]
+    whole = torch.cat([points, reach * across, reach * down], -1)
+    return whole[..., first::stride, first::stride, :].flatten(-3, -2)
+
+
+def _shorter_difference(points: torch.Tensor, axis: int) -> torch.Tensor:
+    """Of the backward and the forward difference along `axis`, the shorter one: it stays on one surface."""
+    step = points.diff(dim=axis)
+    before = torch.cat([step.narrow(axis, 0, 1), step], axis)
+    after = torch.cat([step, step.narrow(axis, step.shape[axis] - 1, 1)], axis)
+    shorter = before.square().sum(-1, keepdim=True) < after.square().sum(-1, keepdim=True)
+    return torch.where(shorter, before, after)
+
+
+def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
+    """True where the image of 1 / depth is a plane (as that of any flat surface is) out to a patch's rim: [..., H, W]."""
+    inverse = 1 / depth.clamp_min(NEAR_M)
+    rim = max(1, round(0.75 * stride))
+    images = inverse.reshape(-1, 1, *depth.shape[-2:])
+    padded = torch.nn.functional.pad(images, (rim, rim, rim, rim), mode="replicate")
+    bend = torch.zeros_like(images)
+    height, width = depth.shape[-2:]
+    for v, u in ((0, rim), (rim, 0), (rim, rim), (rim, -rim)):
+        ahead = padded[..., rim + v : rim + v + height, rim + u : rim + u + width]
+        behind = padded[..., rim - v : rim - v + height, rim - u : rim - u + width]
+        bend = torch.maximum(bend, (ahead + behind - 2 * images).abs())
+    return (bend < 0.05 * images).view(depth.shape)
+
+
+def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
+    """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9]; FAR_M where it sees none."""
+    if patch.device.type != "cpu":
+        return cast_slowly(patch, pose, camera, size)
+    from .patches_numba import cast_one
+
+    depth = torch.empty(len(pose), *size)
+    turn = rotation(pose).contiguous().numpy()
+    for view in range(len(pose)):
+        cast_one(patch[view].contiguous().numpy(), turn[view], pose[view, :3].numpy(), camera, depth[view].numpy())
+    return depth
+
+
+def cast_slowly(patch, pose, camera, size, chunk: int = 512) -> torch.Tensor:
+    """The same as `cast`, by trying every patch on every pixel."""
+    turn = rotation(pose)
+    centre = torch.einsum("bji,bnj->bni", turn, patch[..., :3] - pose[:, None, :3])
+    across, down = (torch.einsum("bji,bnj->bni", turn, patch[..., k : k + 3]) for k in (3, 6))
+    normal = torch.cross(down, across, dim=-1)
+    facing = (normal * centre).sum(-1) < 0
+    valid = facing & (centre[..., 0] > NEAR_M)
+    beam = rays(camera, *size, patch.device).flatten(0, 1)
+    nearest = torch.full((len(pose), len(beam)), FAR_M, device=patch.device)
+    aa, ad, dd = ((p * q).sum(-1)[:, None] for p, q in ((across, across), (across, down), (down, down)))
+    determinant = (aa * dd - ad * ad).clamp_min(1e-20)
+    for first in range(0, patch.shape[1], chunk):
+        some = slice(first, first + chunk)
+        slope = torch.einsum("bni,pi->bpn", normal[:, some], beam)
+        depth = (normal * centre).sum(-1)[:, None, some] / torch.where(slope.abs() < 1e-12, -1e-12, slope)
+        offset = depth[..., None] * beam[None, :, None] - centre[:, None, some]
+        oa, od = (offset * across[:, None, some]).sum(-1), (offset * down[:, None, some]).sum(-1)
+        s = (oa * dd[..., some] - od * ad[..., some]) / determinant[..., some]
+        t = (od * aa[..., some] - oa * ad[..., some]) / determinant[..., some]
+        hit = valid[:, None, some] & (depth > NEAR_M) & (s.abs() <= 1) & (t.abs() <= 1)
+        nearest = torch.minimum(nearest, torch.where(hit, depth, FAR_M).amin(-1))
+    return nearest.view(-1, *size)

@@ -1,0 +1,67 @@
+"""The compiled kernel of space/patches.py: one view's depth of many patches."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+NEAR_M = 0.05
+
+
+@numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
+def cast_one(patch, turn, eye, camera, depth):
+    """patch [N, 9], turn [3, 3] and eye [3] of T_world_cam, camera intrinsics; fills `depth` [H, W] in place."""
+    height, width = depth.shape
+    fx, fy, cx, cy = camera
+    fx, cx, fy, cy = fx * width, cx * width, fy * height, cy * height
+    depth[:] = 100.0
+    for n in range(len(patch)):
+        x, y, z = patch[n, 0] - eye[0], patch[n, 1] - eye[1], patch[n, 2] - eye[2]
+        c0 = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+        if c0 <= NEAR_M:
+            continue
+        c1 = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
+        c2 = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
+        x, y, z = patch[n, 3], patch[n, 4], patch[n, 5]
+        a0 = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+        a1 = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
+        a2 = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
+        x, y, z = patch[n, 6], patch[n, 7], patch[n, 8]
+        d0 = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+        d1 = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
+        d2 = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
+        n0, n1, n2 = d1 * a2 - d2 * a1, d2 * a0 - d0 * a2, d0 * a1 - d1 * a0
+        lift = n0 * c0 + n1 * c1 + n2 * c2
+        if lift >= 0:  # it shows its back
+            continue
+        left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
+        for corner in range(4):
+            s = 1.0 if corner & 1 else -1.0
+            t = 1.0 if corner & 2 else -1.0
+            q0 = max(c0 + s * a0 + t * d0, NEAR_M)
+            u = cx - fx * (c1 + s * a1 + t * d1) / q0
+            v = cy - fy * (c2 + s * a2 + t * d2) / q0
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+        if right <= 0 or left >= width or bottom <= 0 or top >= height:
+            continue
+        first_u, last_u = max(int(math.ceil(left - 0.5)), 0), min(int(math.floor(right - 0.5)), width - 1)
+        first_v, last_v = max(int(math.ceil(top - 0.5)), 0), min(int(math.floor(bottom - 0.5)), height - 1)
+        if first_u > last_u or first_v > last_v:
+            continue
+        aa, ad, dd = a0 * a0 + a1 * a1 + a2 * a2, a0 * d0 + a1 * d1 + a2 * d2, d0 * d0 + d1 * d1 + d2 * d2
+        determinant = max(aa * dd - ad * ad, 1e-20)
+        for v in range(first_v, last_v + 1):
+            up = -(v + 0.5 - cy) / fy
+            for u in range(first_u, last_u + 1):
+                side = -(u + 0.5 - cx) / fx
+                slope = n0 + n1 * side + n2 * up
+                if abs(slope) < 1e-12:
+                    slope = -1e-12
+                along = lift / slope
+                if along <= NEAR_M or along >= depth[v, u]:
+                    continue
+                o0, o1, o2 = along - c0, along * side - c1, along * up - c2
+                oa, od = o0 * a0 + o1 * a1 + o2 * a2, o0 * d0 + o1 * d1 + o2 * d2
+                if abs(oa * dd - od * ad) <= determinant and abs(od * aa - oa * ad) <= determinant:
+                    depth[v, u] = along

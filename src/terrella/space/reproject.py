@@ -1,0 +1,78 @@
+"""Carrying what posed RGB-D keyframes saw into another view: a z-buffered splat of depth, then a warp of colour.
+
+Depth is splatted forward (which surface does each pixel of the new view see?), and colour is then fetched backward by
+bilinear sampling, so textures come over sharp and without holes. Keyframes that see another surface there are masked.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+from .camera import Intrinsics, project, unproject
+from .patches import FAR_M
+
+
+def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
+    """World points [B, N, 3] -> nearest depth for each pixel of the view from `pose` [B, 7]: [B, H, W], FAR_M in holes."""
+    height, width = size
+    where, depth = project(points, pose, camera)
+    column = (where[..., 0] * width).floor().long()
+    row = (where[..., 1] * height).floor().long()
+    seen = (depth > 0.05) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixel = torch.where(seen, row * width + column, height * width)  # the last cell collects what is out of view
+    canvas = depth.new_full((len(points), height * width + 1), FAR_M)
+    canvas.scatter_reduce_(1, pixel, torch.where(seen, depth, FAR_M), "amin")
+    return canvas[:, :-1].view(-1, height, width)
+
+
+def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
+    """Depth [B, H, W] with FAR_M in holes -> the same with holes filled from coarser averages (pull-push) of 1/depth.
+
+    Single-pixel leaks (a far surface seen through the gaps of a near, sparsely splatted one) are closed first.
+    """
+    near = -F.max_pool2d(-depth[:, None], 3, 1, 1)[:, 0]
+    count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
+    depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
+    inverse, weight = 1 / depth[:, None], (depth[:, None] < FAR_M).float()
+    stack = []
+    values, weights = inverse * weight, weight
+    for _ in range(levels):
+        stack.append((values, weights))
+        values, weights = F.avg_pool2d(values, 2, ceil_mode=True), F.avg_pool2d(weights, 2, ceil_mode=True)
+    filled = values / weights.clamp_min(1e-6)
+    for values, weights in reversed(stack):
+        coarse = F.interpolate(filled, size=values.shape[-2:], mode="bilinear", align_corners=False)
+        filled = torch.where(weights > 1e-6, values / weights.clamp_min(1e-6), coarse)
+    return 1 / filled[:, 0].clamp_min(1 / FAR_M)
+
+
+def warp(
+    rgb: torch.Tensor,
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    target_depth: torch.Tensor,
+    target_pose: torch.Tensor,
+    camera: Intrinsics,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Colour of K keyframes fetched for every pixel of a target view.
+
+    rgb [B, K, 3, H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B, 7].
+    Returns colour [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw that very surface, 0 where it
+    saw another or looked elsewhere), and closeness [B, K, H', W'] (distance in the target over distance in the
+    keyframe: above 1 the keyframe was nearer and has more detail).
+    """
+    batch, keys = rgb.shape[:2]
+    height, width = target_depth.shape[-2:]
+    points = unproject(target_depth, target_pose, camera).flatten(1, 2)
+    where, seen_depth = project(points[:, None].expand(-1, keys, -1, -1), pose, camera)
+    grid = (where * 2 - 1).view(batch * keys, height, width, 2)
+    seen_depth = seen_depth.view(batch, keys, height, width)
+    colour = F.grid_sample(rgb.flatten(0, 1), grid, mode="bilinear", padding_mode="border", align_corners=False)
+    held = F.grid_sample(depth.flatten(0, 1)[:, None], grid, mode="nearest", padding_mode="border", align_corners=False)
+    held = held.view(batch, keys, height, width)
+    inside = (grid.abs().amax(-1) <= 1).view(batch, keys, height, width) & (seen_depth > 0.05)
+    error = (held - seen_depth).abs() / seen_depth.clamp_min(0.05)
+    agreement = torch.where(inside, (1.5 - error / 0.06).clamp(0, 1), 0.0)
+    closeness = target_depth[:, None] / seen_depth.clamp_min(0.05)
+    return colour.view(batch, keys, 3, height, width), agreement, closeness

@@ -1,0 +1,1 @@
+"""Learned worlds: one architecture, one file."""

@@ -1,0 +1,180 @@
+"""The command line from outside: its options are promises, and bad input gets one sentence and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from terrella.cli import main
+
+# Whoever changes an option changes what people have in their scripts: change it here on purpose.
+OPTIONS = {
+    "record doom": "--frames --height --human --json --out --port --scenario --seed",
+    "record world": "--frames --human --json --out --port --seed",
+    "play": "--compare --device --host --json --no-memory --port --record --seed --token --truth",
+    "score": "--clips --data --device --horizons --json --long-steps --new --out --seed",
+    "list": "--json",
+    "data doctor": "--json",
+}
+
+
+def help_of(command: str, capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main([*command.split(), "--help"])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_the_options_are_as_promised(command, capsys):
+    found = set(re.findall(r"^\W+(?:-h, )?(--[a-z][\w-]*)", help_of(command, capsys), re.MULTILINE)) - {"--help"}
+    assert " ".join(sorted(found)) == OPTIONS[command]
+
+
+def test_train_promises_its_main_options(capsys):
+    shown = help_of("train video", capsys)
+    for option in ("--out", "--steps", "--hours", "--device", "--seed", "--json"):
+        assert f"{option} " in shown
+
+
+def test_every_command_is_in_the_help(capsys):
+    shown = help_of("", capsys)
+    assert re.search(r"\{record,train,play,score,list,data\}", shown)
+
+
+def test_help_imports_nothing_heavy():
+    script = (
+        "import sys; from terrella.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "sys.exit(' '.join({'torch', 'numpy', 'av', 'pyarrow', 'starlette'} & set(sys.modules)) or 0)"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 0, f"`terrella --help` imported {run.stderr}"
+
+
+def refusal(arguments: list, capsys) -> str:
+    """The one sentence of a refused command."""
+    assert main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if line.startswith("terrella: ")]
+    assert len(lines) == 1 and "Traceback" not in captured.err, captured.err
+    return lines[0]
+
+
+def test_an_unknown_world_is_named_and_the_known_are_listed(capsys):
+    said = refusal(["play", "no-such-world"], capsys)
+    assert "no-such-world" in said and "doom:my_way_home" in said
+
+
+def test_an_unknown_scenario_is_named(capsys, tmp_path):
+    pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install -e '.[sim]'")
+    assert "no_such_scenario" in refusal(
+        ["record", "doom", "--scenario", "no_such_scenario", "--out", tmp_path], capsys
+    )
+
+
+def test_an_unknown_environment_is_named(capsys, tmp_path):
+    assert "NoSuch-v0" in refusal(["record", "world", "gym:NoSuch-v0", "--out", tmp_path], capsys)
+
+
+def test_a_folder_that_is_no_checkpoint_is_refused(capsys, tmp_path):
+    assert "world.json" in refusal(["play", tmp_path], capsys)
+
+
+@pytest.mark.parametrize("content", ['{"kind": "of another sort"}', "{not json", "[]", '{"kind": 3}', "{}"])
+def test_a_foreign_checkpoint_is_refused(content, capsys, tmp_path):
+    (tmp_path / "world.json").write_text(content)
+    assert str(tmp_path) in refusal(["play", tmp_path], capsys)
+
+
+def test_a_missing_gpu_is_said(capsys, monkeypatch, tmp_path):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    (tmp_path / "world.json").write_text("{}")
+    assert "GPU" in refusal(["play", tmp_path, "--device", "cuda"], capsys)
+
+
+def test_a_port_in_use_is_said(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"port {port}" in refusal(["play", "gym:CartPole-v1", "--port", port], capsys)
+
+
+@pytest.mark.parametrize("command", [["data", "doctor"], ["train", "video"]])
+def test_a_missing_dataset_is_said(command, capsys, tmp_path):
+    extra = ["--out", tmp_path / "run"] if command[0] == "train" else []
+    assert "nowhere" in refusal([*command, tmp_path / "nowhere", *extra], capsys)
+
+
+def test_a_foreign_dataset_is_left_alone(capsys, tmp_path):
+    (tmp_path / "holiday.txt").write_text("mine")
+    refusal(["train", "video", tmp_path, "--out", tmp_path / "run"], capsys)
+    assert (tmp_path / "holiday.txt").read_text() == "mine"
+
+
+def test_a_folder_that_cannot_be_written_is_said(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "file" in refusal(["record", "world", "gym:CartPole-v1", "--out", tmp_path / "file", "--frames", 10], capsys)
+
+
+def test_missing_checkpoints_to_list_are_said(capsys, tmp_path):
+    assert "nowhere" in refusal(["list", tmp_path / "nowhere"], capsys)
+
+
+def test_ctrl_c_exits_with_130(capsys, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("terrella.library.worlds", interrupted)
+    assert main(["list"]) == 130
+
+
+def test_our_own_faults_keep_their_trace(monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("a fault of ours")
+
+    monkeypatch.setattr("terrella.library.worlds", broken)
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        main(["list"])
+
+
+def test_list_shows_checkpoints_with_their_cards(capsys, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "world.json").write_text('{"kind": "video", "card": {"steps": 12}}')
+    assert main(["list", str(tmp_path), "--json"]) == 0
+    entries = json.loads(capsys.readouterr().out)
+    assert {"name": str(tmp_path / "mine"), "source": "checkpoint", "card": {"steps": 12}} in entries
+    assert main(["list", str(tmp_path)]) == 0
+    assert "steps: 12" in capsys.readouterr().out
+
+
+def test_record_then_look(capsys, tmp_path):
+    arguments = ["record", "world", "gym:CartPole-v1", "--out", str(tmp_path / "set"), "--frames", "40", "--json"]
+    assert main(arguments) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["frames"] == 40 and facts["world"] == "gym:CartPole-v1"
+    assert (tmp_path / "set" / "look.jpg").stat().st_size > 0
+    assert main(arguments) == 0, "a finished recording is left as it is"
+    assert json.loads(capsys.readouterr().out)["frames"] == 40
+    assert main(["data", "doctor", str(tmp_path / "set"), "--json"]) == 0
+    json.loads(capsys.readouterr().out)
+
+
+def test_the_doctor_exits_with_1_where_a_recording_is_broken(capsys, tmp_path):
+    folder = tmp_path / "set"
+    assert main(["record", "world", "gym:CartPole-v1", "--out", str(folder), "--frames", "40"]) == 0
+    broken = next(folder.glob("videos/**/*.mp4"))
+    broken.write_bytes(broken.read_bytes()[:100])
+    capsys.readouterr()
+    assert main(["data", "doctor", str(folder)]) == 1
+    assert "mend" in capsys.readouterr().out

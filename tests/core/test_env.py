@@ -1,0 +1,243 @@
+"""as_env: what Gymnasium asks of a vector environment, over worlds of both kinds."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector as wrappers
+
+from terrella.core import WorldEnv, as_env, make_rng
+from terrella.core.errors import ActionError, ChannelError, TerrellaError
+from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.replay import Replay
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    return GymnasiumWorld("CartPole-v1", rgb=False)
+
+
+@pytest.fixture
+def film():
+    """Five frames whose observation is their number; rewards 1 to 4; done at the end."""
+    frames = np.arange(FRAMES, dtype=np.float32)
+    channels = {
+        "observation": frames[:, None],
+        "reward": frames,
+        "rgb": np.zeros((FRAMES, 4, 6, 3), np.uint8) + frames.astype(np.uint8)[:, None, None, None],
+    }
+    given = {"observation": spaces.Box(0, FRAMES, (1,), np.float32)}
+    return Replay(channels, np.zeros(FRAMES - 1), spaces.Discrete(2), 0.1, spaces_given=given)
+
+
+class SingleView(gymnasium.Env):
+    """One environment of a WorldEnv, as Gymnasium's own checker wants to see it."""
+
+    def __init__(self, env: WorldEnv):
+        self.inner, self.render_mode, self.metadata = env, env.render_mode, env.metadata
+        self.observation_space, self.action_space = env.single_observation_space, env.single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        observations, infos = self.inner.reset(seed=seed, options=options)
+        return self._first(observations), infos
+
+    def step(self, action):
+        observations, rewards, terminated, truncated, infos = self.inner.step(np.asarray(action)[None])
+        return self._first(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), infos
+
+    def render(self):
+        return self.inner.render()[0]
+
+    def _first(self, observations):
+        if isinstance(observations, dict):
+            return {name: np.asarray(array[0]) for name, array in observations.items()}
+        return observations[0]
+
+
+@pytest.mark.parametrize("observation", ["observation", ("observation", "done")])
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+def test_gymnasiums_own_checker_passes(name, observation):
+    env = SingleView(as_env(GymnasiumWorld(name), observation=observation, max_steps=50))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*(infinity|symmetric and normalized|alternative render modes).*")
+        check_env(env)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_spaces_arrays_and_metadata_agree(cartpole, mode):
+    env = as_env(cartpole, num_envs=3, max_steps=30, observation=("observation", "reward"), autoreset_mode=mode)
+    assert env.metadata["autoreset_mode"] is mode and env.num_envs == 3
+    for space in (env.observation_space, env.single_observation_space):
+        check_observation_space(space)
+    for space in (env.action_space, env.single_action_space):
+        check_action_space(space)
+    env.action_space.seed(0)
+    observations, infos = env.reset(seed=0)
+    assert observations in env.observation_space and infos == {}
+    for _ in range(60):
+        observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
+        assert observations in env.observation_space and isinstance(infos, dict)
+        assert rewards.shape == terminated.shape == truncated.shape == (3,)
+        assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, np.bool_, np.bool_)
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            env.reset(options={"reset_mask": ended})
+    env.close()
+    assert env.closed
+
+
+def test_the_seed_tells_the_story(cartpole):
+    def story(env, seed):
+        frames = [env.reset(seed=seed)[0]]
+        actions = np.random.default_rng(1)
+        return np.stack(frames + [env.step(actions.integers(0, 2, 2))[0] for _ in range(60)])
+
+    env = as_env(cartpole, num_envs=2, seed=5)
+    first = story(env, 5)
+    assert np.array_equal(first, story(env, 5)) and not np.array_equal(first, story(env, 6))
+    assert np.array_equal(first[0], as_env(cartpole, num_envs=2, seed=5).reset()[0])
+    assert not np.array_equal(first[0, 0], first[0, 1])
+    assert not np.array_equal(env.reset()[0], env.reset()[0])
+
+
+def test_next_step_autoreset_spends_a_step_on_the_new_start(film):
+    env = as_env(film)
+    seen, rewards, ends = [env.reset()[0][0, 0]], [], []
+    for _ in range(6):
+        observations, reward, terminated, truncated, infos = env.step(np.array([1]))
+        seen.append(observations[0, 0])
+        rewards.append(reward[0])
+        ends.append((bool(terminated[0]), bool(truncated[0])))
+        assert infos == {}
+    assert seen == [0, 1, 2, 3, 4, 0, 1] and rewards == [1, 2, 3, 4, 0, 1]
+    assert ends == [(False, False)] * 3 + [(True, False)] + [(False, False)] * 2
+
+
+def test_same_step_autoreset_hands_over_the_final_observation(film):
+    env = as_env(film, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP, observation=("observation",))
+    env.reset()
+    for step in range(1, 9):
+        observations, rewards, terminated, truncated, infos = env.step(np.array([1, 0]))
+        if step % 4:
+            assert infos == {} and observations["observation"][0, 0] == step % 4
+        else:
+            assert terminated.all() and rewards.tolist() == [4, 4] and (observations["observation"] == 0).all()
+            assert infos["_final_obs"].all() and infos["_final_info"].all() and infos["final_info"] == {}
+            assert [entry["observation"].tolist() for entry in infos["final_obs"]] == [[4.0], [4.0]]
+
+
+def test_disabled_autoreset_waits_for_a_reset_mask(cartpole):
+    env = as_env(cartpole, num_envs=3, max_steps=2, autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    env.step(np.array([0, 1, 0]))
+    first = np.array([True, False, False])
+    _, infos = env.reset(options={"reset_mask": first})
+    *_, truncated, infos = env.step(np.array([0, 1, 0]))
+    assert truncated.tolist() == [False, True, True]
+    with pytest.raises(TerrellaError, match=r"\[1, 2\] have ended"):
+        env.step(np.array([0, 1, 0]))
+    before = env.state.at(0)
+    env.reset(options={"reset_mask": ~first})
+    assert env.state.at(0) == before
+    *_, truncated, infos = env.step(np.array([0, 1, 0]))
+    assert truncated.tolist() == [True, False, False]
+    for mask in (np.zeros(3, bool), np.ones(2, bool), [True] * 3, np.ones(3)):
+        with pytest.raises(TerrellaError, match="reset_mask"):
+            env.reset(options={"reset_mask": mask})
+
+
+def test_stories_end_apart_and_their_neighbours_go_on(cartpole):
+    """Under NEXT_STEP, an environment that did not end moves exactly as it would have moved alone."""
+    env = as_env(cartpole, num_envs=2)
+    env.reset(seed=1)
+    alone, rng = env.state.at(1), make_rng(0)
+    resets = 0
+    for step in range(300):
+        balance = int(env.state["observation"][1, 2] + 0.5 * env.state["observation"][1, 3] > 0)
+        _, rewards, terminated, _, _ = env.step(np.array([1, balance]))
+        resets += terminated[0]
+        alone = cartpole.imagine(alone, torch.tensor([balance]), rng)
+        assert torch.equal(env.state["observation"][1], alone["observation"][0]), step
+    assert resets > 5
+
+
+def test_truncation_comes_from_max_steps_alone(film):
+    env = as_env(film, max_steps=2)
+    env.reset()
+    ends = [[bool(flag[0]) for flag in env.step(np.array([0]))[2:4]] for _ in range(5)]
+    assert ends == [[False, False], [False, True], [False, False], [False, False], [False, True]]
+
+
+def test_gymnasiums_wrappers_work_on_it(cartpole):
+    plain = as_env(cartpole, num_envs=2, max_steps=40)
+    env = wrappers.NormalizeObservation(wrappers.RecordEpisodeStatistics(plain))
+    env = wrappers.NormalizeReward(wrappers.ClipReward(env, -1, 1))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    lengths = []
+    for _ in range(120):
+        observations, rewards, *_, infos = env.step(env.action_space.sample())
+        assert np.isfinite(observations).all() and np.isfinite(rewards).all()
+        if "episode" in infos:
+            lengths += infos["episode"]["l"][infos["_episode"]].tolist()
+            assert (infos["episode"]["r"][infos["_episode"]] == infos["episode"]["l"][infos["_episode"]]).all()
+    assert len(lengths) > 4 and max(lengths) <= 40
+
+
+def test_arrays_that_were_handed_out_do_not_change(film):
+    env = as_env(film, num_envs=2, observation=("observation", "rgb"))
+    kept, _ = env.reset()
+    kept["observation"] += 100
+    first = env.step(np.array([0, 0]))[0]
+    copies = {name: array.copy() for name, array in first.items()}
+    env.step(np.array([0, 0]))
+    assert all(np.array_equal(first[name], copies[name]) for name in first) and (first["observation"] == 1).all()
+
+
+def test_it_draws_what_the_world_shows(film, cartpole):
+    env = as_env(film, num_envs=2)
+    env.reset()
+    env.step(np.array([0, 0]))
+    pictures = env.render()
+    assert len(pictures) == 2 and pictures[0].shape == (4, 6, 3) and (pictures[1] == 1).all()
+    assert env.metadata["render_fps"] == 10 and env.metadata["render_modes"] == ["rgb_array"]
+    blind = as_env(cartpole)
+    blind.reset()
+    assert blind.render_mode is None and blind.render() is None
+
+
+def test_a_world_that_cannot_fork_is_one_environment():
+    world = GymnasiumWorld("CartPole-v1", rgb=False, forkable=False)
+    env = as_env(world, max_steps=30)
+    env.reset(seed=0)
+    ends = sum(int((end := env.step(np.array([step % 2])))[2][0] or end[3][0]) for step in range(100))
+    assert ends >= 2
+    with pytest.raises(TerrellaError, match="1 to 1 stories"):
+        as_env(world, num_envs=2)
+
+
+def test_bad_requests_are_answered_in_one_sentence(cartpole):
+    with pytest.raises(ChannelError, match="cannot render 'rgb'"):
+        as_env(cartpole, observation="rgb")
+    with pytest.raises(TerrellaError, match="num_envs is 0"):
+        as_env(cartpole, num_envs=0)
+    with pytest.raises(TerrellaError, match="max_steps"):
+        as_env(cartpole, max_steps=0)
+    env = as_env(cartpole, num_envs=2)
+    with pytest.raises(TerrellaError, match="reset"):
+        env.step(np.array([0, 0]))
+    env.reset()
+    for junk in (np.array([0, 2]), np.array([0]), np.array([0.0, np.nan])):
+        with pytest.raises(ActionError):
+            env.step(junk)

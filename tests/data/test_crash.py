@@ -1,0 +1,209 @@
+"""Killing, cutting, filling the disk: at most the episode in flight is lost, and the reader says what is wrong."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from corridor import Corridor, keys
+
+from terrella.core import make_rng
+from terrella.core.errors import DatasetError
+from terrella.data import ClipCache, Dataset, Layout, Recorder, doctor, durable, record
+
+LAYOUT = Layout(10, ("go",), rgb=(16, 16), pose=True)
+
+
+def _episode(recorder: Recorder, rows: int, value: float = 0.0) -> None:
+    for i in range(rows):
+        frame = np.full((16, 16, 3), 40 + 3 * i, np.uint8)
+        recorder.add({"rgb": frame, "pose": np.full(7, value)}, [float(i)])
+    recorder.end_episode()
+
+
+def _stop_at(monkeypatch, name: str, nth: int, error: BaseException) -> None:
+    """The nth call of durable.NAME raises instead."""
+    real, calls = getattr(durable, name), []
+
+    def failing(*args):
+        calls.append(args)
+        if len(calls) == nth:
+            raise error
+        return real(*args)
+
+    monkeypatch.setattr(durable, name, failing)
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {folder!r})
+from corridor import Corridor, keys
+from terrella.core import make_rng
+from terrella.data import record
+def tell(rows, frames):
+    print(rows, flush=True)
+record(Corridor(), keys, {root!r}, frames=100_000, rng=make_rng(3), progress=tell, max_episode_steps=29)
+"""
+
+
+@pytest.mark.parametrize("rows", [5, 75, 91])
+def test_kill_9_loses_at_most_the_episode_in_flight(tmp_path, rows):
+    root = tmp_path / "killed"
+    script = SCRIPT.format(folder=str(Path(__file__).parent), root=str(root))
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        seen = 0
+        while seen < rows:
+            seen = int(process.stdout.readline())
+        os.kill(process.pid, signal.SIGKILL)
+    before = Dataset(root)
+    assert before.length == 30 * len(before.episodes) >= rows // 30 * 30
+    kept = [before.episode(i) for i in range(len(before.episodes))]
+    goal = before.length + 60
+    record(Corridor(), keys, root, frames=goal, rng=make_rng(3), max_episode_steps=29)
+    after = Dataset(root)
+    assert after.length == goal and doctor(root) == []
+    record(Corridor(), keys, tmp_path / "never", frames=goal, rng=make_rng(3), max_episode_steps=29)
+    for i, episode in enumerate(Dataset(tmp_path / "never").episodes):  # as if it had not been killed
+        never, found = Dataset(tmp_path / "never").episode(episode.number), after.episode(i)
+        assert all(np.array_equal(never[name], found[name]) for name in never)
+        assert i >= len(kept) or all(np.array_equal(kept[i][name], found[name]) for name in found)
+
+
+class Killed(BaseException):
+    """Stands for a power cut: nothing after it runs."""
+
+
+@pytest.mark.parametrize("name", ["sync_file", "move_into_place", "sync_folder"])
+@pytest.mark.parametrize("nth", range(1, 9))
+def test_a_cut_at_any_point_of_a_commit_leaves_what_was_there(tmp_path, monkeypatch, name, nth):
+    recorder = Recorder(tmp_path, LAYOUT)
+    _episode(recorder, 4, 1.0)
+    with monkeypatch.context() as patch:
+        _stop_at(patch, name, nth, Killed())
+        try:
+            _episode(recorder, 6, 2.0)
+        except Killed:
+            pass
+    recorder._lock.close()  # as the system does with a dead process
+    lengths = [episode.length for episode in Dataset(tmp_path).episodes]
+    assert lengths in ([4], [4, 6])
+    assert Dataset(tmp_path).episode(0)["pose"][0, 0] == 1.0
+    with Recorder(tmp_path, LAYOUT) as again:
+        _episode(again, 5, 3.0)
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [*lengths, 5]
+    assert Dataset(tmp_path).episode(len(lengths))["pose"][0, 0] == 3.0
+    assert doctor(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["sync_file", "move_into_place", "write_json"])
+@pytest.mark.parametrize("nth", [1, 2, 3])
+def test_a_full_disk_is_said_clearly_and_loses_nothing(tmp_path, monkeypatch, name, nth):
+    with Recorder(tmp_path, LAYOUT) as recorder:
+        _episode(recorder, 4)
+        with monkeypatch.context() as patch:
+            _stop_at(patch, name, nth, OSError(errno.ENOSPC, "No space left on device"))
+            try:
+                _episode(recorder, 6)
+                assert name == "write_json" and nth == 3  # only two of them in a commit
+            except DatasetError as error:
+                assert "the disk is full" in str(error) and "1 episodes (4 frames) are safe" in str(error)
+                assert [episode.length for episode in Dataset(tmp_path).episodes] == [4]
+        _episode(recorder, 5)  # space was freed: the same recorder goes on
+    assert [episode.length for episode in Dataset(tmp_path).episodes][-1] == 5
+    assert doctor(tmp_path) == []
+
+
+def test_a_file_that_the_system_refuses_to_grow_ends_the_encoder_clearly(tmp_path):
+    """A limit on file size is a full disk to the encoder's thread and to parquet, without a full disk."""
+    script = f"""
+import resource, signal, sys
+import numpy as np
+from terrella.core.errors import DatasetError
+from terrella.data import Dataset, Layout, Recorder
+layout = Layout(10, ("go",), rgb=(64, 64))
+recorder = Recorder({str(tmp_path / "set")!r}, layout)
+rng = np.random.default_rng(0)
+def episode(rows):
+    for _ in range(rows):
+        recorder.add({{"rgb": rng.integers(0, 255, (64, 64, 3), np.uint8)}}, [0.0])
+    recorder.end_episode()
+episode(3)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    episode(400)
+except DatasetError as error:
+    print(error)
+    print([episode.length for episode in Dataset({str(tmp_path / "set")!r}).episodes])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "the disk is full" in done.stdout and done.stdout.strip().endswith("[3]"), done.stdout + done.stderr
+
+
+def test_a_second_recorder_is_refused_until_the_first_is_closed(tmp_path):
+    first = Recorder(tmp_path, LAYOUT)
+    with pytest.raises(DatasetError, match="another recorder"):
+        Recorder(tmp_path, LAYOUT)
+    first.close()
+    Recorder(tmp_path, LAYOUT).close()
+
+
+def test_foreign_folders_are_neither_read_nor_written(tmp_path, recording):
+    with pytest.raises(DatasetError, match="no dataset"):
+        Dataset(tmp_path / "nowhere")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_bytes(b"cat")
+    with pytest.raises(DatasetError, match="not a LeRobot dataset"):
+        Dataset(tmp_path / "photos")
+    with pytest.raises(DatasetError, match="other files"):
+        Recorder(tmp_path / "photos", LAYOUT)
+    assert (tmp_path / "photos" / "cat.jpg").read_bytes() == b"cat"
+    with pytest.raises(DatasetError, match="another layout"):
+        Recorder(recording, LAYOUT)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(DatasetError, match="choose another folder"):
+        Recorder(tmp_path / "file", LAYOUT)
+    info = json.loads((recording / "meta/info.json").read_text())
+    (recording / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    with pytest.raises(DatasetError, match="v2.1.*convert"):
+        Dataset(recording)
+    (recording / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetError, match="info.json"):
+        Dataset(recording)
+
+
+def test_too_short_an_episode_is_dropped(tmp_path):
+    with Recorder(tmp_path, LAYOUT) as recorder:
+        _episode(recorder, 1)
+        _episode(recorder, 2)
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.85])
+@pytest.mark.parametrize("kind", ["mp4", "parquet"])
+def test_truncated_files_are_named(recording, kind, share):
+    folder = "videos" if kind == "mp4" else "data"
+    file = next((recording / folder).rglob(f"file-001.{kind}"))
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * share)])
+    dataset = Dataset(recording)
+    with pytest.raises(DatasetError, match=f"file-001.{kind}"):
+        dataset.episode(1)
+    with pytest.raises(DatasetError, match=f"file-001.{kind}"):
+        ClipCache.open(dataset, (24, 32))
+    assert not list((recording / ".cache").rglob("rgb.npy"))
+    assert dataset.episode(2)["rgb"].shape == (30, 48, 64, 3)
+
+
+def test_truncated_episode_table_is_named(recording):
+    file = recording / "meta/episodes/chunk-000/file-002.parquet"
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(DatasetError, match="file-002.parquet"):
+        Dataset(recording)

@@ -1,0 +1,78 @@
+"""Clips do not overlap, never cross an end or a lost action, and lie where they were asked to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from panorama import Panorama, recording, some_clips
+
+from terrella.core import make_rng
+from terrella.core.errors import DatasetError, ObservationError
+from terrella.measure import clips_from_cache, in_box, outside_box
+from terrella.measure.clips import evidence
+
+
+def rows(clip) -> range:
+    return range(clip.start, clip.start + len(clip.rgb))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_windows_lie_in_their_episodes_and_do_not_overlap(seed):
+    cache = recording(seed=seed)
+    clips = clips_from_cache(cache, [0, 2, 3], 4, 20, 100, make_rng(seed))
+    used = [row for clip in clips for row in rows(clip)]
+    assert len(used) == len(set(used)) and len(clips) >= 3 * (200 // 24 - 1)
+    for clip in clips:
+        first, stop = cache.episodes[clip.episode]
+        assert clip.episode in (0, 2, 3) and first <= clip.start and clip.start + 24 <= stop
+        assert np.array_equal(clip.pose, cache.pose[clip.start : clip.start + 24])
+
+
+def test_no_clip_crosses_a_lost_action_or_an_end():
+    cache = recording()
+    cache.action_valid[60] = False  # row 60 may close a clip but not lead to row 61
+    cache.done[300] = True
+    for seed in range(10):
+        for clip in clips_from_cache(cache, range(4), 3, 20, 100, make_rng(seed)):
+            assert not {60, 61} <= set(rows(clip)) and not {300, 301} <= set(rows(clip))
+
+
+def test_places_can_be_kept_apart():
+    cache = recording(length=400)
+    middle = float(np.median(cache.pose[:, 0]))
+    box = (middle, -1e9, 1e9, 1e9)
+    inside = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), in_box(*box))
+    outside = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), outside_box(*box))
+    assert inside and outside
+    assert all((clip.pose[:, 0] >= middle).all() for clip in inside)
+    assert all((clip.pose[:, 0] < middle).all() for clip in outside)
+
+
+def test_the_draw_repeats_from_its_seed():
+    first, second, other = some_clips(seed=1), some_clips(seed=1), some_clips(seed=2)
+    assert [clip.start for clip in first] == [clip.start for clip in second] != [clip.start for clip in other]
+
+
+def test_too_short_a_recording_is_named():
+    with pytest.raises(DatasetError, match="no window of 304 rows"):
+        clips_from_cache(recording(), range(4), 4, 300, 5, make_rng(0))
+
+
+def test_moving_clips_are_told_from_still_ones():
+    cache = recording()
+    still = clips_from_cache(cache, [0], 3, 20, 1, make_rng(0))[0]
+    cache.pose[still.start : still.start + 23] = cache.pose[still.start]
+    assert not still.moves() and still.walked_m()[-1] == 0
+    assert any(clip.moves() for clip in some_clips())
+
+
+def test_evidence_that_does_not_fit_is_refused():
+    clips = some_clips(2)
+    seen = evidence(clips, Panorama().spec, 0)
+    assert set(seen) == {"rgb", "pose"} and seen["rgb"].shape == (2, 24, 32, 3)
+    lacking = [clip.__class__(**{**clip.__dict__, "pose": None}) for clip in clips]
+    with pytest.raises(ObservationError, match="lacks"):
+        evidence(lacking, Panorama().spec, 0)
+    small = [clip.__class__(**{**clip.__dict__, "rgb": clip.rgb[:, ::2]}) for clip in clips]
+    with pytest.raises(ObservationError, match="size"):
+        evidence(small, Panorama().spec, 0)

@@ -1,0 +1,54 @@
+"""Intervals cover what they should, repeat from their seed, and do not pretend where there is one clip."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from terrella.core import make_rng
+from terrella.measure.statistics import mean_band, mean_interval, median_interval, ratio_interval
+
+
+def test_interval_of_a_normal_sample_is_close_to_the_textbook():
+    values = torch.randn(400, generator=make_rng(3), dtype=torch.float64) * 2 + 7
+    figure = mean_interval(values, make_rng(0))
+    half = 1.96 * float(values.std()) / 20
+    assert math.isclose(figure.value, float(values.mean()))
+    assert figure.low == pytest.approx(figure.value - half, abs=0.15 * half)
+    assert figure.high == pytest.approx(figure.value + half, abs=0.15 * half)
+
+
+def test_intervals_cover_the_true_mean_about_as_often_as_they_say():
+    rng = make_rng(1)
+    covered = 0
+    for trial in range(200):
+        figure = mean_interval(torch.rand(60, generator=rng), make_rng(trial))
+        covered += figure.low <= 0.5 <= figure.high
+    assert 0.88 <= covered / 200 <= 0.99
+
+
+def test_same_seed_same_interval_and_bands_are_columns():
+    values = torch.randn(30, 4, generator=make_rng(0))
+    assert mean_band(values, make_rng(5)) == mean_band(values, make_rng(5))
+    assert mean_band(values, make_rng(5)) != mean_band(values, make_rng(6))
+    assert mean_band(values, make_rng(5)).low[0] == pytest.approx(mean_interval(values[:, 0], make_rng(5)).low)
+
+
+def test_ratio_is_of_the_sums_and_exact_where_clips_agree():
+    bottom = torch.tensor([1e-3, 4.0, 10.0])
+    figure = ratio_interval(bottom * 1.5, bottom, make_rng(0))
+    assert (figure.value, figure.low, figure.high) == pytest.approx((1.5, 1.5, 1.5))
+    assert ratio_interval(torch.tensor([1.0, 4.0]), torch.tensor([0.1, 9.9]), make_rng(0)).value == pytest.approx(0.5)
+
+
+def test_median_ignores_one_wild_clip():
+    values = torch.tensor([1.0] * 20 + [1e6])
+    figure = median_interval(values, make_rng(0))
+    assert (figure.value, figure.high) == (1.0, 1.0)
+
+
+def test_one_clip_has_no_interval():
+    for figure in (mean_interval(torch.tensor([3.0]), make_rng(0)), median_interval(torch.tensor([3.0]), make_rng(0))):
+        assert figure.value == 3.0 and math.isnan(figure.low) and figure.count == 1

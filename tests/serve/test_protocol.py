@@ -1,0 +1,122 @@
+"""Laws of the wire: what is written is read, and junk is named, never believed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from terrella.core.errors import ProtocolError
+from terrella.serve import protocol
+from terrella.serve.protocol import Ack, Branch, Frame, Keys, Pause, Record, Restart, Resume, Rewind, Seek, Sync
+
+u32 = st.integers(0, 2**32 - 1)
+f32 = st.floats(width=32, allow_nan=False)
+f64 = st.floats(allow_nan=False)
+frames = st.builds(
+    Frame,
+    seq=u32,
+    step=u32,
+    oldest=u32,
+    newest=u32,
+    images=st.lists(st.binary(max_size=64), max_size=3).map(tuple),
+    flags=st.integers(0, 255),
+    action_id=u32,
+    generation_ms=f32,
+    episode_return=f32,
+    client_ms=f64,
+    server_s=f64,
+)
+
+
+@given(frames)
+def test_a_frame_survives_the_wire(frame):
+    assert protocol.decode_frame(protocol.encode_frame(frame)) == frame
+
+
+@given(frames, st.integers(0, 200))
+def test_a_cut_frame_is_refused(frame, cut):
+    data = protocol.encode_frame(frame)
+    short = data[: min(cut, len(data) - 1)]
+    with pytest.raises(ProtocolError):
+        protocol.decode_frame(short)
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_crash_the_reader(data):
+    for read in (protocol.parse_message, protocol.decode_frame):
+        try:
+            read(data)
+        except ProtocolError as error:
+            assert str(error)
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text(max_size=8) | st.integers(),
+        lambda inner: st.lists(inner, max_size=3),
+    )
+)
+def test_no_field_crashes_the_reader(value):
+    for kind, name in [
+        ("keys", "id"),
+        ("keys", "held"),
+        ("keys", "t"),
+        ("ack", "seq"),
+        ("seek", "step"),
+        ("record", "on"),
+        ("restart", "seed"),
+    ]:
+        body = {"type": kind, "id": 1, "held": [], "seq": 1, "step": 1, name: value}
+        try:
+            protocol.parse_message(json.dumps(body))
+        except ProtocolError as error:
+            assert str(error)
+
+
+def test_every_message_is_understood():
+    said = {
+        '{"type": "keys", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': Keys(7, ("KeyW", "ArrowLeft"), 12.5),
+        '{"type": "ack", "seq": 3}': Ack(3),
+        '{"type": "pause"}': Pause(),
+        '{"type": "resume"}': Resume(),
+        '{"type": "restart", "seed": 5}': Restart(5),
+        '{"type": "restart"}': Restart(None),
+        '{"type": "rewind", "steps": 9}': Rewind(9),
+        '{"type": "seek", "step": 9}': Seek(9),
+        '{"type": "branch"}': Branch(),
+        '{"type": "sync"}': Sync(),
+        '{"type": "record", "on": true}': Record(True),
+    }
+    for text, message in said.items():
+        assert protocol.parse_message(text) == message
+
+
+@pytest.mark.parametrize(
+    "text, blame",
+    [
+        ("", "not JSON"),
+        ("[1]", "object"),
+        ('{"type": "format"}', "no message is called 'format'"),
+        ('{"type": "keys", "id": -1, "held": []}', "'id'"),
+        ('{"type": "keys", "id": 1, "held": "KeyW"}', "'held'"),
+        ('{"type": "ack", "seq": true}', "'seq'"),
+        ('{"type": "record", "on": 1}', "'on'"),
+        ("[" * 4000, "JSON"),
+        ("x" * 5000, "too long"),
+    ],
+)
+def test_junk_is_named(text, blame):
+    with pytest.raises(ProtocolError, match=blame):
+        protocol.parse_message(text)
+
+
+def test_a_card_becomes_plain_json():
+    class Odd:
+        def __str__(self):
+            return "odd"
+
+    card = {"a": 1, "b": float("nan"), "c": {"d": (1, 2.5, Odd())}, 3: None}
+    assert json.loads(json.dumps(protocol.plain(card))) == {"a": 1, "b": "nan", "c": {"d": [1, 2.5, "odd"]}, "3": None}

@@ -1,0 +1,230 @@
+"""Laws of a session: back-pressure, the latest keys, commands in order, and surviving a dropped socket."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+from terrella.serve.protocol import REPLAY, Ack, Branch, Keys, Pause, Restart, Resume, Rewind, Seek, decode_frame
+from terrella.serve.session import MAX_UNACKED, Session
+from terrella.serve.story import Story
+
+from .panorama import Panorama
+
+
+class FakeSocket:
+    """A browser that acknowledges when it is told to, or at once."""
+
+    def __init__(self, session: Session, prompt: bool = True):
+        self.session, self.prompt = session, prompt
+        self.frames, self.events, self.most_unacked = [], [], 0
+
+    async def send_bytes(self, data: bytes) -> None:
+        self.frames.append(decode_frame(data))
+        self.most_unacked = max(self.most_unacked, self.session.unacked)
+        if self.prompt:
+            self.session.hear(Ack(self.frames[-1].seq))
+
+    async def send_text(self, data: str) -> None:
+        self.events.append(json.loads(data))
+
+    async def close(self, code: int = 1000, reason: str | None = None) -> None:
+        pass
+
+    @property
+    def last(self):
+        return self.frames[-1]
+
+
+async def until(condition, seconds: float = 20.0) -> None:
+    for _ in range(int(seconds / 0.005)):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise AssertionError("it never happened")
+
+
+def play(scenario, world=None) -> None:
+    """Runs scenario(session) beside a session of a fast world."""
+
+    async def main() -> None:
+        with ThreadPoolExecutor(1) as worker:
+            session = Session(lambda: Story([world or Panorama(dt_s=1 / 400)], seed=0), worker)
+            task = asyncio.create_task(session.run())
+            try:
+                await scenario(session)
+            finally:
+                session.close()
+                await task
+
+    asyncio.run(main())
+
+
+def test_a_silent_browser_gets_two_frames_and_no_more():
+    async def scenario(session):
+        socket = FakeSocket(session, prompt=False)
+        session.attach(socket)
+        await until(lambda: len(socket.frames) == MAX_UNACKED)
+        await asyncio.sleep(0.1)
+        assert len(socket.frames) == MAX_UNACKED
+        session.hear(Ack(socket.frames[0].seq))
+        await until(lambda: len(socket.frames) == MAX_UNACKED + 1)
+        await asyncio.sleep(0.05)
+        assert socket.most_unacked == MAX_UNACKED and session.story.newest_step == MAX_UNACKED
+
+    play(scenario)
+
+
+def test_never_more_than_two_on_their_way():
+    async def scenario(session):
+        socket = FakeSocket(session, prompt=False)
+        session.attach(socket)
+        for _ in range(60):
+            await asyncio.sleep(0.003)
+            if socket.frames:
+                session.hear(Ack(socket.last.seq))
+                session.hear(Ack(10**6))  # of a frame that was never sent: means nothing
+        assert socket.most_unacked <= MAX_UNACKED and len(socket.frames) > 10
+
+    play(scenario)
+
+
+def test_the_latest_keys_win_and_are_named_in_the_frame():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: socket.frames)
+        session.hear(Keys(1, ("ArrowLeft",), 5.0))
+        session.hear(Keys(3, ("KeyW",), 7.0))
+        session.hear(Keys(2, ("ArrowLeft",), 6.0))  # late, and older
+        await until(lambda: socket.last.action_id == 3)
+        obeyed = next(frame for frame in socket.frames if frame.action_id == 3)
+        assert obeyed.client_ms == 7.0
+        await until(lambda: socket.last.episode_return > 2)
+        assert socket.last.action_id == 3
+
+    play(scenario)
+
+
+def test_pausing_stops_time():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: len(socket.frames) > 3)
+        session.hear(Pause())
+        await until(lambda: socket.events and socket.events[-1]["paused"])
+        count = len(socket.frames)
+        await asyncio.sleep(0.05)
+        assert len(socket.frames) == count
+        session.hear(Resume())
+        await until(lambda: len(socket.frames) > count + 3)
+
+    play(scenario)
+
+
+def test_rewind_then_branch_goes_on_from_there():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: socket.frames and socket.last.step >= 20)
+        session.hear(Pause())
+        await until(lambda: socket.events[-1]["paused"])
+        shown = {frame.step: frame.images for frame in socket.frames}
+        end = socket.last.step
+        session.hear(Rewind(10))
+        await until(lambda: socket.last.flags & REPLAY)
+        assert socket.last.step == end - 10 and socket.last.images == shown[end - 10] and socket.last.newest == end
+        session.hear(Seek(5))
+        await until(lambda: socket.last.step == 5)
+        session.hear(Branch())
+        await until(lambda: not socket.last.flags & REPLAY and socket.last.step >= 12)
+        again = {frame.step: frame.images for frame in socket.frames[-6:]}
+        assert all(images == shown[step] for step, images in again.items() if step in shown)
+        session.hear(Restart(9))
+        await until(lambda: socket.events[-1]["seed"] == 9)
+
+    play(scenario)
+
+
+def test_a_running_game_says_why_it_cannot_rewind():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: len(socket.frames) > 3)
+        session.hear(Rewind(2))
+        await until(lambda: any(event["type"] == "error" for event in socket.events))
+        assert "running game" in next(event["text"] for event in socket.events if event["type"] == "error")
+        count = len(socket.frames)
+        await until(lambda: len(socket.frames) > count + 3)
+
+    play(scenario, Panorama(forkable=False, dt_s=1 / 400))
+
+
+def test_a_dropped_socket_pauses_the_story_and_another_goes_on():
+    async def scenario(session):
+        first = FakeSocket(session)
+        session.attach(first)
+        session.hear(Keys(50, ("KeyW",)))
+        await until(lambda: first.frames and first.last.step >= 5)
+        session.detach(first)
+        await asyncio.sleep(0.05)
+        step = session.story.newest_step
+        await asyncio.sleep(0.05)
+        assert session.story.newest_step == step
+        second = FakeSocket(session)
+        assert session.attach(second) is None
+        await until(lambda: second.frames and second.last.step > step)
+        assert second.frames[0].step == step and second.frames[0].seq > first.last.seq
+        score = second.last.episode_return
+        session.hear(Keys(1, ("ArrowLeft",)))  # a reloaded page counts anew, and no key of the old page is held
+        await until(lambda: second.last.action_id == 1)
+        assert second.last.episode_return == score
+
+    play(scenario)
+
+
+def test_a_broken_socket_is_let_go():
+    class Broken(FakeSocket):
+        async def send_bytes(self, data):
+            raise ConnectionResetError
+
+    async def scenario(session):
+        session.attach(Broken(session))
+        await until(lambda: not session.connected)
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: len(socket.frames) > 3)
+
+    play(scenario)
+
+
+def test_a_world_that_breaks_is_reported_and_can_be_restarted(capsys):
+    world = Panorama(dt_s=1 / 400)
+    world.breaks_at = 5
+
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: socket.events and "paint is wet" in socket.events[-1]["text"])
+        world.breaks_at = None
+        session.hear(Restart(1))
+        await until(lambda: socket.last.step > 8)
+        assert socket.events[-1]["text"] == ""
+
+    play(scenario, world)
+    assert "RuntimeError" in capsys.readouterr().err
+
+
+def test_a_world_that_cannot_start_is_reported():
+    class NoStart(Panorama):
+        def start(self, batch, rng):
+            raise RuntimeError("no key")
+
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: socket.events)
+        assert "cannot start" in socket.events[-1]["text"]
+
+    play(scenario, NoStart())

@@ -1,0 +1,298 @@
+"""GymnasiumWorld: a saved state goes on exactly as the environment itself would, and chance comes from the rng alone."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.core import State, make_rng
+from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
+from terrella.sim.gymnasium import GymnasiumWorld
+
+COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
+
+
+def plain_env(name: str, world_seed: int) -> gymnasium.Env:
+    """The environment itself, reset as `start(1, make_rng(world_seed))` resets it."""
+    env = gymnasium.make(name, max_episode_steps=-1)
+    env.reset(seed=int(torch.randint(2**31 - 1, (1,), generator=make_rng(world_seed))))
+    return env
+
+
+@pytest.mark.parametrize("name", COPYABLE)
+def test_a_branch_reproduces_the_environments_own_trajectory(name, tmp_path):
+    """While other stories move in between, while the state is saved and loaded: every number as in the plain environment."""
+    world, env = GymnasiumWorld(name, rgb=False), plain_env(name, 5)
+    state, rng = world.start(1, make_rng(5)), make_rng(0)
+    stranger = world.start(2, rng)
+    ended = False
+    for step in range(60):
+        action = world.spec.sample_action(1, rng)
+        stranger = world.imagine(stranger, world.spec.sample_action(2, rng), rng)
+        if step % 7 == 3:
+            state.save(tmp_path / "state")
+            state = State.load(tmp_path / "state")
+        state = world.imagine(state, action, rng)
+        seen, reward, terminated, _, _ = env.step(action[0].numpy())
+        assert np.array_equal(state["observation"][0], seen)
+        assert float(state["reward"]) == np.float32(reward) and bool(state["done"]) == terminated
+        ended = ended or terminated
+        if ended:
+            break
+    assert ended or name != "CartPole-v1"
+
+
+@pytest.mark.parametrize("name", COPYABLE)
+def test_a_batch_is_its_entries_side_by_side(name):
+    world, rng = GymnasiumWorld(name, rgb=False), make_rng(1)
+    together = world.start(3, rng)
+    apart = [together.at(entry) for entry in range(3)]
+    for _ in range(10):
+        actions = world.spec.sample_action(3, rng)
+        together = world.imagine(together, actions, rng)
+        apart = [world.imagine(state, actions[i : i + 1], rng) for i, state in enumerate(apart)]
+    assert together == State.stack(apart)
+
+
+def test_a_state_goes_on_in_another_instance(tmp_path):
+    first, second = GymnasiumWorld("MountainCar-v0", rgb=False), GymnasiumWorld("MountainCar-v0", rgb=False)
+    action = torch.tensor([2])
+    state = first.imagine(first.start(1, make_rng(0)), action, make_rng(1))
+    state.save(tmp_path / "state")
+    assert second.imagine(State.load(tmp_path / "state"), action, make_rng(2)) == first.imagine(
+        state, action, make_rng(2)
+    )
+
+
+def test_dice_fall_from_the_rng_and_not_from_the_state():
+    """A slippery lake: a planner may not foresee its dice, but the same rng throws them alike."""
+    world = GymnasiumWorld("FrozenLake-v1", rgb=False)
+    states = world.start(1, make_rng(0)).fork(200)
+    actions = torch.full((200,), 2)
+    once, again = world.imagine(states, actions, make_rng(1)), world.imagine(states, actions, make_rng(1))
+    assert once == again
+    places = torch.bincount(once["observation"], minlength=16)
+    assert places[0] > 30 and places[1] > 30 and places[4] > 30  # up (stays), right, down: a third each
+    assert world.imagine(states, actions, make_rng(2)) != once
+
+
+def test_after_done_the_world_stands_still_without_reward():
+    world, rng = GymnasiumWorld("CartPole-v1", rgb=False), make_rng(0)
+    state = world.start(2, rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Gymnasium warns whoever steps a finished environment
+        while not state["done"].any():
+            state = world.imagine(state, torch.tensor([1, 1]), rng)
+        for _ in range(30):
+            after = world.imagine(state, torch.tensor([0, 0]), rng)
+            for entry in torch.nonzero(state["done"])[:, 0].tolist():
+                was, still = state.at(entry), after.at(entry)
+                assert still == was.replace(reward=torch.zeros(1))
+            state = after
+    assert not world.start(1, rng)["done"]
+
+
+def test_the_time_limit_is_left_to_the_training():
+    world, rng = GymnasiumWorld("MountainCar-v0", rgb=False), make_rng(0)
+    state = world.start(1, rng)
+    for _ in range(220):
+        state = world.imagine(state, torch.tensor([1]), rng)
+    assert not state["done"]
+    limited = GymnasiumWorld("MountainCar-v0", rgb=False, max_episode_steps=3)
+    assert limited.spec.forkable
+    state = limited.start(1, rng)
+    dones = [bool((state := limited.imagine(state, torch.tensor([1]), rng))["done"]) for _ in range(4)]
+    assert dones == [False, False, True, True]
+
+
+def test_pictures_are_of_the_state_and_not_of_the_latest_step():
+    pytest.importorskip("pygame", reason="drawing needs pygame: pip install 'gymnasium[classic-control]'")
+    world, rng = GymnasiumWorld("CartPole-v1"), make_rng(0)
+    start = world.start(1, rng)
+    before = world.render(start, ("rgb",))["rgb"]
+    moved = start
+    for _ in range(8):
+        moved = world.imagine(moved, torch.tensor([1]), rng)
+    after = world.render(State.stack([moved, start]), ("rgb",))["rgb"]
+    assert before.shape == (1, 400, 600, 3) and before.dtype == torch.uint8
+    assert torch.equal(before[0], after[1]) and not torch.equal(after[0], after[1])
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    env.reset(seed=0)
+    env.unwrapped.state = moved["observation"][0].double().numpy()
+    assert (torch.from_numpy(env.render()).int() - after[0].int()).abs().float().mean() < 0.5
+
+
+class Box2DLike(gymnasium.Env):
+    """Keeps its state in an object, as environments with a physics engine do."""
+
+    action_space, observation_space = spaces.Discrete(2), spaces.Box(-100, 100, (1,), np.float32)
+
+    def __init__(self):
+        self.engine = iter(())
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.engine = iter(self.np_random.normal(size=50).tolist())
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.array([next(self.engine) * (2 * action - 1)], np.float32), 1.0, False, False, {}
+
+
+class Secretive(Box2DLike):
+    """Looks like plain numbers, but remembers in a closure, which no snapshot sees."""
+
+    def __init__(self):
+        steps = [0]
+        self.seen = 0.0
+        self.count = lambda: steps.__setitem__(0, steps[0] + 1) or steps[0]
+
+    def reset(self, *, seed=None, options=None):
+        gymnasium.Env.reset(self, seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.seen += self.count() % 7
+        return np.array([self.seen % 50], np.float32), 1.0, False, False, {}
+
+
+class Entangled(Box2DLike):
+    """Two attributes share memory: a copy of each is not a copy of both."""
+
+    def __init__(self):
+        self.engine_state = np.zeros(2)
+        self.speed = self.engine_state[1:]
+
+    def reset(self, *, seed=None, options=None):
+        gymnasium.Env.reset(self, seed=seed)
+        self.engine_state[:] = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.speed += 0.1 * (2 * action - 1)
+        self.engine_state[0] += self.engine_state[1]
+        return self.engine_state[:1].astype(np.float32), 1.0, False, False, {}
+
+
+class Collecting(Box2DLike):
+    """Its state is a list that grows."""
+
+    def __init__(self):
+        self.cards = []
+
+    def reset(self, *, seed=None, options=None):
+        gymnasium.Env.reset(self, seed=seed)
+        self.cards = [1]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.cards = [*self.cards, int(action)]
+        return np.array([len(self.cards)], np.float32), 1.0, len(self.cards) > 20, False, {}
+
+
+@pytest.mark.parametrize("make", [Box2DLike, Secretive, Entangled, Collecting])
+def test_what_cannot_be_copied_exactly_gives_tickets(make):
+    world = GymnasiumWorld(make)
+    assert not world.spec.forkable and world.spec.max_batch == 1
+    rng = make_rng(0)
+    first = world.start(1, rng)
+    second = world.imagine(first, torch.tensor([1]), rng)
+    world.render(second, ("observation",))
+    for verb in (lambda: world.imagine(first, torch.tensor([1]), rng), lambda: world.render(first, ("reward",))):
+        with pytest.raises(StaleStateError, match="cannot go back"):
+            verb()
+    with pytest.raises(TerrellaError, match="cannot be copied"):
+        GymnasiumWorld(make, forkable=True)
+
+
+def test_what_the_trial_did_not_see_is_still_never_copied_by_halves():
+    class LateBloomer(Box2DLike):
+        """A number, until its hundredth step makes an object of it."""
+
+        def __init__(self):
+            self.steps = 0
+
+        def reset(self, *, seed=None, options=None):
+            gymnasium.Env.reset(self, seed=seed)
+            self.steps = 0
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            self.steps = self.steps + 1 if self.steps < 99 else iter(())
+            return np.zeros(1, np.float32), 1.0, False, False, {}
+
+    world, rng = GymnasiumWorld(LateBloomer), make_rng(0)
+    state = world.start(1, rng)
+    with pytest.raises(TerrellaError, match="`steps` became .*forkable=False"):
+        for _ in range(100):
+            state = world.imagine(state, torch.tensor([0]), rng)
+
+
+def test_a_wrapped_environment_from_a_function_is_copied_with_its_wrappers():
+    def make():
+        return gymnasium.wrappers.TimeAwareObservation(gymnasium.make("CartPole-v1", max_episode_steps=20))
+
+    world, rng = GymnasiumWorld(make), make_rng(0)
+    assert world.spec.forkable and world.spec.name == "gym:CartPole-v1"
+    state = world.start(1, rng)
+    for _ in range(3):
+        state = world.imagine(state, torch.tensor([0]), rng)
+    twice = world.imagine(state, torch.tensor([1]), rng), world.imagine(state, torch.tensor([1]), rng)
+    assert twice[0] == twice[1]
+    assert float(twice[0]["observation"][0, -1]) == float(state["observation"][0, -1]) + 1
+
+
+@pytest.mark.parametrize("action", [spaces.MultiBinary(3), spaces.MultiDiscrete([2, 4]), spaces.Box(-1, 1, (2, 2))])
+def test_every_kind_of_action_arrives_as_its_space_says(action):
+    class Echo(gymnasium.Env):
+        action_space, observation_space = action, spaces.Box(-10, 10, action.shape, np.float64)
+
+        def __init__(self):
+            self.last = np.zeros(action.shape)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.last = np.zeros(action.shape)
+            return self.last.copy(), {}
+
+        def step(self, given):
+            assert given in self.action_space
+            self.last = given.astype(np.float64)
+            return self.last.copy(), 0.0, False, False, {}
+
+    world, rng = GymnasiumWorld(Echo), make_rng(0)
+    assert world.spec.forkable
+    sampled = world.spec.sample_action(4, rng)
+    seen = world.render(world.imagine(world.start(4, rng), sampled, rng), ("observation",))["observation"]
+    assert torch.equal(seen, sampled.double())
+
+
+def test_what_it_says_of_itself():
+    spec = GymnasiumWorld("CartPole-v1", rgb=False).spec
+    assert (spec.dt_s, spec.name, spec.forkable, spec.max_batch) == (0.02, "gym:CartPole-v1", True, None)
+    assert spec.keys == {"ArrowLeft": [0.0], "ArrowRight": [1.0]} and "rgb" not in spec.channels
+    assert GymnasiumWorld("Pendulum-v1", rgb=False).spec.dt_s == 0.05
+    assert GymnasiumWorld("Pendulum-v1", rgb=False, dt_s=0.1).spec.dt_s == 0.1
+
+
+def test_bad_requests_are_answered_in_one_sentence():
+    for name in ("NoSuchWorld-v0", "no such name", "CartPole-v99"):
+        with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
+            GymnasiumWorld(name)
+    with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
+        GymnasiumWorld("CartPole-v1", no_such_option=1)
+    with pytest.raises(TerrellaError, match="FlattenObservation"):
+        GymnasiumWorld("Blackjack-v1", rgb=False)
+    world, rng = GymnasiumWorld("CartPole-v1", rgb=False), make_rng(0)
+    state = world.start(1, rng)
+    with pytest.raises(ActionError):
+        world.imagine(state, torch.tensor([2]), rng)
+    with pytest.raises(ObservationError):
+        world.observe({"observation": torch.zeros(1, 4)}, None, rng)
+    with pytest.raises(TerrellaError, match="not a state of gym:CartPole-v1"):
+        world.imagine(State({"frame": torch.zeros(1)}), torch.tensor([1]), rng)
