@@ -37,6 +37,14 @@ class ClipCache:
     [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; episodes: list of (start, stop) row ranges.
     """
 
+    rgb: np.ndarray | None
+    depth: np.ndarray | None
+    pose: np.ndarray | None
+    action: np.ndarray
+    action_valid: np.ndarray
+    reward: np.ndarray
+    done: np.ndarray
+
     def __init__(self, path: Path):
         self.path = path
         try:

@@ -40,9 +40,9 @@ def train_motion(
         optimiser.step()
         schedule.step()
         if step % 100 == 0:
-            report(step, steps, f"motion: {100 * float(move_loss) / 10:.2f} cm off a step")
+            report(step, steps, f"motion: {10 * move_loss.item():.2f} cm off a step")
     if not len(rare):
-        torch.nn.init.constant_(motion.ending[-1].bias, -20.0)
+        motion.ending[-1].bias.data.fill_(-20.0)
     with torch.no_grad():
         every = torch.arange(len(rows))
         _, moved = motion(inputs["heading"], inputs["moved"], inputs["actions"], inputs["free"])

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
+from ..data import ClipCache
 from ..space.camera import Intrinsics, unproject, yaw
 from ..space.keyframes import Keyframes, look, retrieve
 from ..worlds.video import VideoConfig, carry
@@ -18,7 +20,7 @@ Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres on the map
 class Recording:
     """Rows of a clip cache as tensors on demand; `start[row]` is the first row of its episode."""
 
-    cache: object
+    cache: ClipCache
     start: np.ndarray
     usable: np.ndarray  # rows that training may see
 
@@ -27,7 +29,9 @@ class Recording:
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
 
     def depth(self, rows) -> torch.Tensor:
-        return torch.from_numpy(np.asarray(self.cache.depth[rows], np.float32)).clamp(0.1, 60.0)
+        """float32 [n, H, W] metres at the size of the frames, whatever size was recorded."""
+        depth = torch.from_numpy(np.asarray(self.cache.depth[rows], np.float32)).clamp(0.1, 60.0)
+        return F.interpolate(depth[:, None], self.cache.rgb.shape[1:3], mode="nearest-exact")[:, 0]
 
     def pose(self, rows) -> torch.Tensor:
         return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
@@ -36,7 +40,7 @@ class Recording:
         return Keyframes.of(self.rgb(rows), self.depth(rows), self.pose(rows), camera)
 
 
-def usable_rows(cache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
+def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
     """Rows of `episodes` in which the eye neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
     usable = np.zeros(cache.length, bool)
     for episode in episodes:
@@ -118,4 +122,4 @@ def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: Vid
 def carried(rgb, depth, from_rows, to_rows, glimpse, recording: Recording, config: VideoConfig) -> torch.Tensor:
     """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
     poses = recording.pose(from_rows), recording.pose(to_rows)
-    return carry(rgb, depth, poses[0], glimpse.depth, poses[1], config.camera)
+    return carry(rgb, depth, poses[0], glimpse, poses[1], config.camera)

@@ -18,7 +18,7 @@ from torch import nn
 from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
-from ..space.keyframes import Glimpse, Keyframes
+from ..space.keyframes import Keyframes
 from ..worlds.folder import save_video_world, video_spec
 from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, decode_depth, encode_depth, generate, merge
 from .motion import train_motion
@@ -28,14 +28,31 @@ from .samples import Box, Recording, carried, choose_keyframes, draw, glimpse_of
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """steps, hours: whichever ends first; batch: frames a step (more on a GPU); keep_out: a box x0 y0 x1 y1 of the map,
-    in metres, that training never sees (to score new places); keyframes: of the recording that become the memory."""
+    """Settings of a training run.
+
+    Args:
+        name: What the world will be called.
+        size: Height and width of its frames in pixels.
+        steps: Training steps; training ends here or after `hours`.
+        hours: Hours of training, those of earlier runs counted in.
+        batch: Frames a step; by itself 8 on a CPU and 64 on a GPU.
+        learning_rate: Of the generator at its height.
+        motion_steps: Training steps of the motion model, which is learned first.
+        keyframes: Of the recording, that become the world's memory.
+        keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees, to score new places.
+        critic_from: The step from which a critic judges sharpness.
+        critic_weight: Its share of the loss.
+        save_every_s: Seconds between saves.
+        strip_every_s: Seconds between pictures of truth against dream.
+        seed: Of everything random.
+        device: cpu, cuda or auto.
+    """
 
     name: str = "world"
     size: tuple[int, int] = (96, 128)
     steps: int = 8000
     hours: float = 24.0
-    batch: int = 8
+    batch: int | None = None
     learning_rate: float = 8e-4
     motion_steps: int = 6000
     keyframes: int = 480
@@ -103,7 +120,8 @@ class _Run:
         rgb = torch.from_numpy(dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
         depth, pose = self.recording.depth(rows), self.recording.pose(rows)
         self.memory = Keyframes.of(rgb, depth, pose, self.video.camera)
-        self.generator, self.motion, self.critic = Generator(self.video), Motion(self.video), Critic()
+        self.generator, self.critic = Generator(self.video).to(self.device), Critic().to(self.device)
+        self.motion = Motion(self.video)
         self.smooth = copy.deepcopy(self.generator).eval().requires_grad_(False)
         self.modules = {
             "generator": self.generator,
@@ -155,21 +173,23 @@ class _Run:
         """One step; all its randomness comes from (seed, step), so a resumed run sees what an unbroken one would."""
         config, video = self.config, self.video
         rng = np.random.default_rng([config.seed, step])
+        batch = config.batch or (64 if self.device.type == "cuda" else 8)
         noise_rng = make_rng(int(rng.integers(2**62)))
         for group in self.optimisers["optimiser"].param_groups:
             group["lr"] = config.learning_rate * min(1, (step + 1) / 200) * (0.05 + 0.95 * _cosine(step / config.steps))
         with torch.no_grad():
-            shown = draw(self.recording, self.memory, video, config.batch, rng)
+            shown = draw(self.recording, self.memory, video, batch, rng)
             last_rgb, last_depth = self._frames_before(shown, rng, noise_rng)
             glimpse = glimpse_of(shown, shown.target, self.recording, video)
             last = carried(last_rgb, last_depth, shown.before, shown.target, glimpse, self.recording, video)
-            forget = torch.from_numpy(rng.random(config.batch) < 0.1)
+            forget = torch.from_numpy(rng.random(batch) < 0.1)
             last[forget] = 0
             rgb = self.recording.rgb(shown.target).float() / 127.5 - 1
             truth = torch.cat([rgb, encode_depth(self.recording.depth(shown.target))[:, None]], 1)
-            time_ = torch.from_numpy(np.where(rng.random(config.batch) < 0.5, 0, rng.random(config.batch))).float()
+            time_ = torch.from_numpy(np.where(rng.random(batch) < 0.5, 0, rng.random(batch))).float()
             noise = torch.randn(truth.shape, generator=noise_rng)
-            glimpse, last, truth, time_, noise = _to(self.device, glimpse, last, truth, time_, noise)
+            glimpse, last, noise = glimpse.to(self.device), last.to(self.device), noise.to(self.device)
+            truth, time_ = truth.to(self.device), time_.to(self.device)
             noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
         with _half(self.device):
             clean = self.generator(noisy, time_, glimpse, last).float()
@@ -214,7 +234,7 @@ class _Run:
         )
         last[torch.from_numpy(rng.random(len(last)) < 0.5)] = 0
         noise = torch.randn(len(last), 4, *self.video.size, generator=noise_rng)
-        glimpse, last, noise = _to(self.device, glimpse, last, noise)
+        glimpse, last, noise = glimpse.to(self.device), last.to(self.device), noise.to(self.device)
         with _half(self.device):
             clean = generate(self.generator, noise, glimpse, last, 1).float().cpu()
         return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8), decode_depth(clean[:, 3])
@@ -309,15 +329,3 @@ def _half(device: torch.device):
 
 def _cpu_has_bf16() -> bool:
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
-
-
-def _to(device: torch.device, *values):
-    """Tensors and Glimpses moved to the device."""
-    if device.type == "cpu":
-        return values
-    return tuple(
-        value.to(device)
-        if isinstance(value, torch.Tensor)
-        else Glimpse(*(part.to(device) for part in vars(value).values()))
-        for value in values
-    )

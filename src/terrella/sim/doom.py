@@ -147,17 +147,14 @@ class Doom:
             return torch.tensor(self._done)
         if name == "rgb":
             return torch.from_numpy(_area_mean(self._present.screen_buffer, self._shrink))
-        x, y, z, yaw_deg, pitch_deg = self._present.game_variables
+        x, y, z, yaw_deg = (float(value) for value in np.asarray(self._present.game_variables))
         if name == "pose":
             half = np.deg2rad(yaw_deg) / 2
             here = np.array([x, y, z]) / UNITS_PER_M
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
         exact = self._walls.depth(x, y, z, np.deg2rad(yaw_deg), self.config.depth_size)
-        return (
-            torch.from_numpy(_with_sprites(exact, self._present.depth_buffer) / UNITS_PER_M)
-            .float()
-            .clamp(0, MAX_DEPTH_M)
-        )
+        depth_m = _with_sprites(exact, np.asarray(self._present.depth_buffer)) / UNITS_PER_M
+        return torch.from_numpy(depth_m).float().clamp(0, MAX_DEPTH_M)
 
 
 def _open_game(config: DoomConfig) -> vizdoom.DoomGame:
@@ -179,7 +176,7 @@ def _open_game(config: DoomConfig) -> vizdoom.DoomGame:
     variable = vizdoom.GameVariable
     game.set_available_buttons([getattr(vizdoom.Button, name) for name in BUTTONS])
     game.set_available_game_variables(
-        [variable.POSITION_X, variable.POSITION_Y, variable.CAMERA_POSITION_Z, variable.ANGLE, variable.PITCH]
+        [variable.POSITION_X, variable.POSITION_Y, variable.CAMERA_POSITION_Z, variable.ANGLE]
     )
     game.add_game_args("+movebob 0")  # the head does not bob: its phase would be a hidden state
     game.set_episode_timeout(config.timeout_tics)

@@ -28,7 +28,7 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, s
 def clearance(segments: torch.Tensor, places: torch.Tensor, directions: int = 32, reach_m: float = 2.0) -> torch.Tensor:
     """Distance in metres from each of `places` [N, 2] to the nearest of `segments` [S, 4] along evenly spaced world
     directions (the first along x, counter-clockwise): [N, directions], at most `reach_m`. Runs on the CPU."""
-    from .floorplan_numba import feel
+    from .kernels_numba import feel
 
     angle = np.arange(directions) * (2 * math.pi / directions)
     heading = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)

@@ -54,6 +54,9 @@ class Glimpse:
     depth: torch.Tensor
     known: torch.Tensor
 
+    def to(self, device) -> Glimpse:
+        return Glimpse(*(getattr(self, field.name).to(device) for field in fields(self)))
+
 
 def retrieve(
     memories: list[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int
@@ -69,7 +72,7 @@ def retrieve(
     there = depth[some, some].flatten()
     beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
     points = (there[:, None] * beams) @ rotation(pose).T + pose[:3]
-    votes = torch.cat([_votes(m, points, there, camera) for m in memories])
+    votes = torch.cat([vote(m, points, there, camera) for m in memories])
     votes = torch.cat([votes, 0.02 * votes.amax(1, keepdim=True)], 1)  # more than nothing, where all is covered
     best, picks = torch.zeros(votes.shape[1], device=pose.device), []
     for _ in range(min(count, len(votes))):
@@ -85,8 +88,22 @@ def retrieve(
     return [[p - low for p in picks if low <= p < high] for low, high in zip(bounds, bounds[1:])]
 
 
-def _votes(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """[K, P]: what each keyframe has to say of each surface point."""
+def vote(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
+    """[K, P]: what each keyframe has to say of surface points [P, 3] that lie `distance` [P] deep in the new view."""
+    if points.device.type != "cpu":
+        return vote_slowly(memory, points, distance, camera)
+    from .kernels_numba import vote as kernel
+
+    votes = torch.empty(len(memory), len(points))
+    turn = rotation(memory.pose).contiguous().numpy()
+    eye = memory.pose[:, :3].contiguous().numpy()
+    depth = memory.depth.contiguous().numpy()
+    kernel(points.contiguous().numpy(), distance.contiguous().numpy(), depth, turn, eye, camera, votes.numpy())
+    return votes
+
+
+def vote_slowly(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
+    """The same as `vote`, in plain tensor algebra; the way on a GPU."""
     height, width = memory.depth.shape[-2:]
     where, depth = project(points.expand(len(memory), -1, -1), memory.pose, camera)
     inside = (depth > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)

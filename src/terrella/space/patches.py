@@ -2,7 +2,7 @@
 
 Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
 the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
-`cast` runs a compiled kernel on a CPU (space/patches_numba.py); `cast_slowly` is its obvious twin, and the way on a GPU.
+`cast` runs a compiled kernel on a CPU (space/kernels_numba.py); `cast_slowly` is its obvious twin, and the way on a GPU.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tupl
     """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9]; FAR_M where it sees none."""
     if patch.device.type != "cpu":
         return cast_slowly(patch, pose, camera, size)
-    from .patches_numba import cast_one
+    from .kernels_numba import cast_one
 
     depth = torch.empty(len(pose), *size)
     turn = rotation(pose).contiguous().numpy()

@@ -10,6 +10,7 @@ import json
 import zlib
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import simplejpeg
@@ -61,7 +62,8 @@ def load_video_world(path: str | Path, memory: bool = True, device: str = "cpu")
     try:
         weights = load_file(path / "weights.safetensors", device)
         packed = load_file(path / "memory.safetensors")
-        config = VideoConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in about["config"].items()})
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in about["config"].items()}
+        config = VideoConfig(**settings)
         generator, motion = Generator(config), Motion(config)
         generator.load_state_dict({k[10:]: v for k, v in weights.items() if k.startswith("generator.")})
         motion.load_state_dict({k[7:]: v for k, v in weights.items() if k.startswith("motion.")})

@@ -283,7 +283,7 @@ class VideoWorld:
             parts = [_resized(keys.at(pick), self.memory) for keys, pick in zip(memories, picks)]
             chosen.append(_joined(parts))
         glimpse = look(chosen, pose, config.camera, config.size, config.sources, config.slots)
-        last = carry(before["rgb"], before["depth"], before["pose"], glimpse.depth, pose, config.camera)
+        last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
         noise = torch.randn(state.batch, 4, *config.size, generator=rng)
         clean = generate(self.generator, noise, glimpse, last, config.steps)
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
@@ -328,12 +328,21 @@ def generate(
     return x
 
 
-def carry(rgb, depth, pose, target_depth, target_pose, camera) -> torch.Tensor:
-    """The last frame (rgb uint8 [B, 3, H, W]) warped into the new view, and its trust: [B, 4, H, W]."""
+def carry(
+    rgb: torch.Tensor,
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    glimpse: Glimpse,
+    target_pose: torch.Tensor,
+    camera: Intrinsics,
+) -> torch.Tensor:
+    """The last frame (rgb uint8 [B, 3, H, W]) warped into the new view where no keyframe knows it, and its trust:
+    [B, 4, H, W], 0 elsewhere. A frame that is warped again at every step blurs; a keyframe is warped once."""
     colour, agreement, _ = warp(
-        rgb.float().div(255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera
+        rgb.float().div(255)[:, None], depth[:, None], pose[:, None], glimpse.depth, target_pose, camera
     )
-    return torch.cat([colour[:, 0], agreement], 1)
+    trust = agreement * (1 - glimpse.known[:, None])
+    return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
 
 
 def _resized(keys: Keyframes, like: Keyframes) -> Keyframes:

@@ -1,4 +1,4 @@
-"""The compiled kernel of space/patches.py: one view's depth of many patches."""
+"""The compiled kernels of this room; each has a slow, obvious twin beside its caller that tests compare it with."""
 
 from __future__ import annotations
 
@@ -65,3 +65,47 @@ def cast_one(patch, turn, eye, camera, depth):
                 oa, od = o0 * a0 + o1 * a1 + o2 * a2, o0 * d0 + o1 * d1 + o2 * d2
                 if abs(oa * dd - od * ad) <= determinant and abs(od * aa - oa * ad) <= determinant:
                     depth[v, u] = along
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def feel(segments, places, heading, free):
+    """segments [S, 4], places [N, 2], heading [D, 2]; lowers `free` [N, D], which starts at the reach, in place."""
+    for n in range(len(places)):
+        x, y = places[n, 0], places[n, 1]
+        reach = free[n, 0]
+        for s in range(len(segments)):
+            ax, ay, bx, by = segments[s, 0] - x, segments[s, 1] - y, segments[s, 2] - x, segments[s, 3] - y
+            if min(ax, bx) > reach or max(ax, bx) < -reach or min(ay, by) > reach or max(ay, by) < -reach:
+                continue
+            ex, ey = bx - ax, by - ay
+            for d in range(len(heading)):
+                hx, hy = heading[d, 0], heading[d, 1]
+                across = hx * ey - hy * ex
+                if abs(across) < 1e-9:
+                    continue
+                along = (ax * ey - ay * ex) / across
+                share = (ax * hy - ay * hx) / across
+                if 0 <= along < free[n, d] and -0.02 <= share <= 1.02:
+                    free[n, d] = along
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def vote(points, distance, depth, turn, eye, camera, votes):
+    """The kernel of keyframes.vote_slowly: points [P, 3] and distance [P]; keyframes' depth [K, h, w], turn [K, 3, 3]
+    and eye [K, 3] of T_world_cam; fills votes [K, P]."""
+    keys, height, width = depth.shape
+    fx, fy, cx, cy = camera
+    for k in range(keys):
+        for p in range(len(points)):
+            votes[k, p] = 0.0
+            x, y, z = points[p, 0] - eye[k, 0], points[p, 1] - eye[k, 1], points[p, 2] - eye[k, 2]
+            ahead = turn[k, 0, 0] * x + turn[k, 1, 0] * y + turn[k, 2, 0] * z
+            if ahead <= NEAR_M or distance[p] >= 100.0:
+                continue
+            u = cx - fx * (turn[k, 0, 1] * x + turn[k, 1, 1] * y + turn[k, 2, 1] * z) / ahead
+            v = cy - fy * (turn[k, 0, 2] * x + turn[k, 1, 2] * y + turn[k, 2, 2] * z) / ahead
+            if u <= 0 or u >= 1 or v <= 0 or v >= 1:
+                continue
+            if abs(depth[k, int(v * height), int(u * width)] - ahead) < 0.06 * ahead:
+                ratio = distance[p] / ahead
+                votes[k, p] = min(ratio, 1 / max(ratio, 1e-3))

@@ -1,0 +1,150 @@
+"""Training on a small made-up place: exact resume, honest failures, a world that loads and plays."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from tests.data.corridor import Corridor
+
+from terrella.core import check_world, make_rng
+from terrella.core.errors import CheckpointError, DatasetError, TrainingError
+from terrella.data import ClipCache, Dataset, Explorer, Layout, Recorder, record
+from terrella.learn.samples import choose_keyframes, usable_rows
+from terrella.learn.train_video import TrainConfig, train_video
+from terrella.worlds.folder import load_video_world
+
+CONFIG = TrainConfig(size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9)
+
+
+def quiet(done, total, words=""):
+    pass
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learn") / "set"
+    world = Corridor()
+    record(world, Explorer(world.spec), folder, 360, make_rng(0), max_episode_steps=120)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    return out, train_video(recording, out, CONFIG, quiet)
+
+
+def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
+    out, facts = trained
+    assert facts["step"] == 4
+    for memory in (True, False):
+        world = load_video_world(out / "world", memory=memory)
+        assert (len(world.memory) > 0) == memory
+        assert "observes" in check_world(world)
+    assert list(out.glob("strip-*.png"))
+
+
+def test_a_stopped_run_goes_on_exactly(recording, trained, tmp_path):
+    class Stop(Exception):
+        pass
+
+    steps = 0
+
+    def stop_after_two(monkeypatch_step):
+        def step(self, number):
+            nonlocal steps
+            if steps == 2:
+                raise Stop
+            steps += 1
+            return monkeypatch_step(self, number)
+
+        return step
+
+    from terrella.learn import train_video as module
+
+    original = module._Run._step
+    module._Run._step = stop_after_two(original)
+    try:
+        with pytest.raises(Stop):
+            train_video(recording, tmp_path, CONFIG, quiet)
+    finally:
+        module._Run._step = original
+    train_video(recording, tmp_path, CONFIG, quiet)
+    whole, resumed = (load_file(folder / "resume.safetensors") for folder in (trained[0], tmp_path))
+    assert whole.keys() == resumed.keys()
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_a_run_with_other_settings_is_refused(recording, trained):
+    with pytest.raises(TrainingError, match="other settings"):
+        train_video(recording, trained[0], replace(CONFIG, learning_rate=1e-3), quiet)
+
+
+def test_a_foreign_resume_file_is_refused(recording, tmp_path):
+    (tmp_path / "resume.safetensors").write_bytes(b"not a run at all")
+    with pytest.raises(TrainingError, match="resume.safetensors"):
+        train_video(recording, tmp_path, CONFIG, quiet)
+
+
+def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp_path, monkeypatch):
+    from terrella.learn import train_video as module
+
+    monkeypatch.setattr(module, "_l1", lambda a, b: (a - b).abs().mean() * float("nan"))
+    with pytest.raises(TrainingError, match="not a number at step 0"):
+        train_video(recording, tmp_path, CONFIG, quiet)
+    saved = load_file(tmp_path / "resume.safetensors")
+    assert all(torch.isfinite(value.float()).all() for value in saved.values())
+
+
+def test_a_recording_without_depth_says_what_is_missing(tmp_path):
+    with Recorder(tmp_path / "set", Layout(10.0, ("left",), rgb=(24, 32))) as recorder:
+        for _ in range(9):
+            recorder.add({"rgb": np.zeros((24, 32, 3), np.uint8)}, np.array([0]), 0.0, False)
+        recorder.end_episode()
+    with pytest.raises(DatasetError, match="depth, pose or the camera"):
+        train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+
+
+def test_rows_in_the_box_are_kept_out(recording):
+    cache = ClipCache.open(Dataset(recording), (24, 32))
+    every = list(range(len(cache.episodes)))
+    free = usable_rows(cache, every, None, (0.5, 0.8, 0.5, 0.5))
+    assert free.all()
+    x = np.median(cache.pose[:, 0])
+    kept = usable_rows(cache, every, (x, -99, 99, 99), (0.5, 0.8, 0.5, 0.5))
+    assert kept.sum() < free.sum()
+    assert (cache.pose[kept][:, 0] <= x).all()
+
+
+def test_keyframes_cover_the_recording_evenly():
+    corners = np.array([[0, 0], [9, 0], [0, 9], [9, 9]], np.float32)
+    place = np.concatenate([np.repeat(corners[:1], 50, 0), corners])
+    pose = np.concatenate([place, np.zeros((54, 1)), np.tile([1, 0, 0, 0], (54, 1))], 1).astype(np.float32)
+    picks = choose_keyframes(pose, np.arange(54), 4)
+    assert {tuple(p) for p in place[picks]} == {tuple(c) for c in corners}
+
+
+def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
+    with pytest.raises(CheckpointError, match="world.json"):
+        load_video_world(tmp_path)
+    source = trained[0] / "world"
+    for change, words in (({"kind": "latent"}, "kind"), ({"version": 99}, "version")):
+        folder = tmp_path / words
+        folder.mkdir()
+        about = json.loads((source / "world.json").read_text()) | change
+        (folder / "world.json").write_text(json.dumps(about))
+        with pytest.raises(CheckpointError, match=words):
+            load_video_world(folder)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    for file in source.iterdir():
+        (broken / file.name).write_bytes(file.read_bytes())
+    weights = (source / "weights.safetensors").read_bytes()
+    (broken / "weights.safetensors").write_bytes(weights[: len(weights) // 2])
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_video_world(broken)

@@ -1,0 +1,146 @@
+"""Laws of the geometry: frames, patches against their slow twins, and memory that finds the keyframe that saw a place."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from terrella.space.camera import planar_pose, project, rays, rotation, unproject, yaw
+from terrella.space.floorplan import clearance, wall_segments
+from terrella.space.keyframes import Keyframes, look, retrieve, vote, vote_slowly
+from terrella.space.patches import FAR_M, cast, cast_slowly, patches
+from terrella.space.reproject import fill_holes, warp
+
+CAMERA = (0.5, 0.8, 0.5, 0.5)
+SIZE = (48, 64)
+
+
+def pose_at(x: float, y: float, heading: float) -> torch.Tensor:
+    return planar_pose(*(torch.tensor([value]) for value in (x, y, 1.3, heading)))
+
+
+def room_depth(pose: torch.Tensor, size=SIZE, half: float = 4.0, ceiling: float = 4.0) -> torch.Tensor:
+    """Exact depth [1, H, W] inside a box room centred on the origin: the twin that the geometry is held against."""
+    beam = torch.einsum("ij,hwj->hwi", rotation(pose)[0], rays(CAMERA, *size))
+    eye = pose[0, :3]
+    low, high = torch.tensor([-half, -half, 0.0]), torch.tensor([half, half, ceiling])
+    to_wall = torch.where(beam > 0, (high - eye) / beam.clamp_min(1e-9), (low - eye) / beam.clamp_max(-1e-9))
+    return to_wall.amin(-1)[None]
+
+
+def painted(pose: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    """Smooth colours of the surfaces seen, uint8 [1, 3, H, W]."""
+    points = unproject(depth, pose, CAMERA)
+    return (127 + 120 * torch.sin(1.3 * points)).round().to(torch.uint8).permute(0, 3, 1, 2)
+
+
+def keyframe(x: float, y: float, heading: float) -> Keyframes:
+    pose = pose_at(x, y, heading)
+    depth = room_depth(pose)
+    return Keyframes.of(painted(pose, depth), depth, pose, CAMERA)
+
+
+def joined(*parts: Keyframes) -> Keyframes:
+    return Keyframes(*(torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])))
+
+
+def test_the_camera_looks_along_its_heading_with_left_on_the_left():
+    pose = pose_at(0, 0, math.pi / 2)
+    assert yaw(pose).item() == pytest.approx(math.pi / 2)
+    where, depth = project(torch.tensor([[[-1.0, 5.0, 2.3]]]), pose, CAMERA)  # ahead, a metre to the left, a metre up
+    assert depth.item() == pytest.approx(5.0, abs=1e-5)
+    assert where[0, 0, 0] < 0.5 and where[0, 0, 1] < 0.5
+
+
+def test_project_undoes_unproject():
+    pose = pose_at(0.5, -1, 0.7)
+    depth = room_depth(pose)
+    where, again = project(unproject(depth, pose, CAMERA).flatten(1, 2), pose, CAMERA)
+    u = (torch.arange(SIZE[1]) + 0.5) / SIZE[1]
+    assert torch.allclose(again.view(depth.shape), depth, atol=1e-4)
+    assert torch.allclose(where.view(*SIZE, 2)[..., 0], u.expand(SIZE), atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [2, 8])
+def test_the_compiled_cast_equals_its_slow_twin(stride):
+    seen = pose_at(-1, 0, 0.2)
+    patch = patches(room_depth(seen), seen, CAMERA, stride)
+    views = torch.cat([pose_at(0, 0.5, 0.6), pose_at(-2, 1, -0.4)])
+    fast = cast(patch.expand(2, -1, -1), views, CAMERA, (24, 32))
+    slow = cast_slowly(patch.expand(2, -1, -1), views, CAMERA, (24, 32))
+    assert (fast < FAR_M).float().mean() > 0.2
+    different = (fast - slow).abs() > 1e-3  # a ray through a patch's very rim may fall on either side of it
+    assert different.float().mean() < 0.005
+
+
+def test_a_view_from_the_keyframe_itself_is_exact():
+    seen = pose_at(1, 1, 2.0)
+    depth = room_depth(seen)
+    again = cast(patches(depth, seen, CAMERA, 2), seen, CAMERA, SIZE)
+    hit = again < FAR_M
+    assert hit.float().mean() > 0.93
+    assert ((again - depth).abs() / depth)[hit].median() < 1e-3
+
+
+def test_a_wall_shows_nothing_from_behind():
+    seen = pose_at(0, 0, 0.0)
+    patch = patches(room_depth(seen), seen, CAMERA, 2)
+    assert (cast(patch, pose_at(9, 0, math.pi), CAMERA, SIZE) == FAR_M).float().mean() > 0.9
+
+
+def test_holes_are_filled_and_known_depth_is_kept():
+    depth = torch.full((1, 32, 32), 3.0)
+    depth[:, 8:12, 8:20] = FAR_M
+    filled = fill_holes(depth)
+    assert torch.allclose(filled, torch.full_like(filled, 3.0), atol=1e-3)
+
+
+def test_warp_carries_colour_to_where_it_belongs_and_distrusts_other_surfaces():
+    seen, view = pose_at(0, 0, 0.0), pose_at(0.5, 0.3, 0.2)
+    depth, target = room_depth(seen), room_depth(view)
+    rgb = painted(seen, depth).float() / 255
+    colour, agreement, _ = warp(rgb[:, None], depth[:, None], seen[:, None], target, view, CAMERA)
+    truth = painted(view, target).float() / 255
+    trusted = agreement[0, 0] > 0.9
+    assert trusted.float().mean() > 0.5
+    assert (colour[0, 0] - truth[0]).abs().mean(0)[trusted].mean() < 0.02
+    _, wrong, _ = warp(rgb[:, None], depth[:, None], seen[:, None], target * 0.5, view, CAMERA)
+    assert wrong.mean() < 0.1
+
+
+def test_the_compiled_vote_equals_its_slow_twin():
+    memory = joined(keyframe(0, 0, 0.0), keyframe(1, -1, 2.0), keyframe(-2, 0, 0.5))
+    view = pose_at(0.2, 0.1, 0.1)
+    depth = room_depth(view)[0, ::4, ::4].flatten()
+    points = unproject(room_depth(view), view, CAMERA)[0, ::4, ::4].reshape(-1, 3)
+    fast, slow = vote(memory, points, depth, CAMERA), vote_slowly(memory, points, depth, CAMERA)
+    assert fast.max() > 0.5
+    assert ((fast - slow).abs() > 1e-3).float().mean() < 0.01
+
+
+def test_memory_finds_the_keyframe_that_saw_the_place():
+    memory = joined(keyframe(0, 0, math.pi), keyframe(0, 0, 0.0), keyframe(0, 0, math.pi / 2))
+    picks = retrieve([memory], pose_at(0.3, 0, 0.1)[0], CAMERA, SIZE, 2)[0]
+    assert picks[0] == 1
+
+
+def test_what_memory_knows_it_draws_and_what_it_does_not_it_says():
+    memory = keyframe(0, 0, 0.0)
+    near = pose_at(0.4, 0.2, 0.05)
+    known = look([memory], near, CAMERA, SIZE, 3, 2)
+    truth = painted(near, room_depth(near)).float() / 255
+    mask = known.known[0] > 0
+    assert mask.float().mean() > 0.8
+    assert (known.rgb[0, 0] - truth[0]).abs().mean(0)[mask].mean() < 0.03
+    assert look([memory], pose_at(0, 0, math.pi), CAMERA, SIZE, 3, 2).known.mean() < 0.05
+
+
+def test_clearance_is_the_distance_to_the_walls():
+    pose = torch.cat([pose_at(0, 0, turn * math.pi / 2) for turn in range(4)])
+    depth = torch.cat([room_depth(one[None], half=1.5) for one in pose])
+    walls = wall_segments(depth, pose, CAMERA).flatten(0, 1)
+    free = clearance(walls, torch.tensor([[0.0, 0.0], [1.0, 0.0]]), directions=4, reach_m=2.0)
+    assert torch.allclose(free[0], torch.full((4,), 1.5), atol=0.05)
+    assert free[1, 0] == pytest.approx(0.5, abs=0.05) and free[1, 2] == pytest.approx(2.0)
