@@ -42,7 +42,7 @@ def train_motion(
         if step % 100 == 0:
             report(step, steps, f"motion: {10 * move_loss.item():.2f} cm off a step")
     if not len(rare):
-        motion.ending[-1].bias.data.fill_(-20.0)
+        list(motion.ending.parameters())[-1].data.fill_(-20.0)  # nothing was seen to end
     with torch.no_grad():
         every = torch.arange(len(rows))
         _, moved = motion(inputs["heading"], inputs["moved"], inputs["actions"], inputs["free"])

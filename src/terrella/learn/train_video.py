@@ -116,7 +116,7 @@ class _Run:
                 f"{dataset.root} leaves {usable.sum()} frames to train on; record more, or a smaller keep_out."
             )
         self.recording = Recording(cache, start, usable)
-        rows = choose_keyframes(cache.pose, np.flatnonzero(usable), config.keyframes)
+        rows = choose_keyframes(np.asarray(cache.pose), np.flatnonzero(usable), config.keyframes)
         rgb = torch.from_numpy(dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
         depth, pose = self.recording.depth(rows), self.recording.pose(rows)
         self.memory = Keyframes.of(rgb, depth, pose, self.video.camera)
@@ -182,8 +182,7 @@ class _Run:
             last_rgb, last_depth = self._frames_before(shown, rng, noise_rng)
             glimpse = glimpse_of(shown, shown.target, self.recording, video)
             last = carried(last_rgb, last_depth, shown.before, shown.target, glimpse, self.recording, video)
-            forget = torch.from_numpy(rng.random(batch) < 0.1)
-            last[forget] = 0
+            last = last * torch.from_numpy(rng.random(batch) > 0.1)[:, None, None, None]
             rgb = self.recording.rgb(shown.target).float() / 127.5 - 1
             truth = torch.cat([rgb, encode_depth(self.recording.depth(shown.target))[:, None]], 1)
             time_ = torch.from_numpy(np.where(rng.random(batch) < 0.5, 0, rng.random(batch))).float()
@@ -232,7 +231,7 @@ class _Run:
             self.recording,
             self.video,
         )
-        last[torch.from_numpy(rng.random(len(last)) < 0.5)] = 0
+        last = last * torch.from_numpy(rng.random(len(last)) > 0.5)[:, None, None, None]
         noise = torch.randn(len(last), 4, *self.video.size, generator=noise_rng)
         glimpse, last, noise = glimpse.to(self.device), last.to(self.device), noise.to(self.device)
         with _half(self.device):

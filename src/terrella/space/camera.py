@@ -25,20 +25,19 @@ def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tens
 def rotation(pose: torch.Tensor) -> torch.Tensor:
     """Rotation matrices of T_world_cam: [..., 7] -> [..., 3, 3]."""
     w, x, y, z = torch.nn.functional.normalize(pose[..., 3:], dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, -2)
+    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    entries = [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy)]
+    entries += [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx)]
+    entries += [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy)]
+    return torch.stack(entries, -1).unflatten(-1, (3, 3))
 
 
 def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
     """Depth [..., H, W] seen from `pose` [..., 7] -> world points [..., H, W, 3]."""
     directions = rays(camera, *depth.shape[-2:], device=depth.device)
     points = depth[..., None] * directions
-    turned = torch.einsum("...ij,...hwj->...hwi", rotation(pose), points)
-    return turned + pose[..., None, None, :3]
+    turned = points.flatten(-3, -2) @ rotation(pose).mT
+    return (turned + pose[..., None, :3]).view(points.shape)
 
 
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,7 +46,7 @@ def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tup
     Points behind the camera come back with depth <= 0 and meaningless coordinates.
     """
     fx, fy, cx, cy = camera
-    local = torch.einsum("...ji,...nj->...ni", rotation(pose), points - pose[..., None, :3])
+    local = (points - pose[..., None, :3]) @ rotation(pose)
     depth = local[..., 0]
     safe = depth.clamp_min(1e-4)
     return torch.stack([cx - fx * local[..., 1] / safe, cy - fy * local[..., 2] / safe], -1), depth

@@ -21,18 +21,21 @@ _GRID = 4  # a keyframe votes on every 4th pixel of a half-size view
 
 @dataclass(frozen=True)
 class Keyframes:
-    """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], patches [K, n, 9]."""
+    """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], its rotation `turn` [K, 3, 3],
+    and patches [K, n, 9]."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
     pose: torch.Tensor
+    turn: torch.Tensor
     coarse: torch.Tensor
     fine: torch.Tensor
 
     @staticmethod
     def of(rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> Keyframes:
         depth = depth.float()
-        return Keyframes(rgb, depth, pose, patches(depth, pose, camera, COARSE), patches(depth, pose, camera, FINE))
+        coarse, fine = patches(depth, pose, camera, COARSE), patches(depth, pose, camera, FINE)
+        return Keyframes(rgb, depth, pose, rotation(pose), coarse, fine)
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -95,8 +98,7 @@ def vote(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera
     from .kernels_numba import vote as kernel
 
     votes = torch.empty(len(memory), len(points))
-    turn = rotation(memory.pose).contiguous().numpy()
-    eye = memory.pose[:, :3].contiguous().numpy()
+    turn, eye = memory.turn.contiguous().numpy(), memory.pose[:, :3].contiguous().numpy()
     depth = memory.depth.contiguous().numpy()
     kernel(points.contiguous().numpy(), distance.contiguous().numpy(), depth, turn, eye, camera, votes.numpy())
     return votes

@@ -75,7 +75,7 @@ def cast_slowly(patch, pose, camera, size, chunk: int = 512) -> torch.Tensor:
     normal = torch.cross(down, across, dim=-1)
     facing = (normal * centre).sum(-1) < 0
     valid = facing & (centre[..., 0] > NEAR_M)
-    beam = rays(camera, *size, patch.device).flatten(0, 1)
+    beam = rays(camera, size[0], size[1], patch.device).flatten(0, 1)
     nearest = torch.full((len(pose), len(beam)), FAR_M, device=patch.device)
     aa, ad, dd = ((p * q).sum(-1)[:, None] for p, q in ((across, across), (across, down), (down, down)))
     determinant = (aa * dd - ad * ad).clamp_min(1e-20)

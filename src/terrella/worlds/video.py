@@ -8,7 +8,7 @@ recordings travel with the world as its long-term memory. `imagine` predicts the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -180,7 +180,8 @@ class VideoWorld:
         memory: Keyframes, starts: Keyframes, rewards: tuple[float, float],
     ):  # fmt: skip
         self.spec, self.config = spec, config
-        self.generator, self.motion = generator.eval(), motion.eval()
+        self.generator = generator.eval().to(memory_format=torch.channels_last)  # a third faster on a CPU
+        self.motion = motion.eval()
         self.memory, self.starts, self.rewards = memory, starts, rewards
         self._walls = wall_segments(memory.depth, memory.pose, config.camera).flatten(0, 1)
 
@@ -351,7 +352,7 @@ def _resized(keys: Keyframes, like: Keyframes) -> Keyframes:
     if not len(like) or keys.rgb.shape[-2:] == size or not len(keys):
         return keys
     rgb = F.interpolate(keys.rgb.float(), size, mode="bilinear").round().to(torch.uint8)
-    return Keyframes(rgb, keys.depth, keys.pose, keys.coarse, keys.fine)
+    return replace(keys, rgb=rgb)
 
 
 def _joined(parts: list[Keyframes]) -> Keyframes:
