@@ -1,10 +1,13 @@
 #!/bin/sh
-# Makes the bundled world doom-maze from nothing: record, train, put in place, score. About two hours on two cores.
+# Makes the bundled world doom-maze from nothing, in the folder of a checkout after `make test`: record, train, put in
+# place, score. Measured on two cores: recording 18 minutes (beside other work), training 32, scoring about 15.
 set -e
+PATH=.venv/bin:$PATH
 terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out recordings/doom-maze
 # The west room and its corridor (x below 11.9 m) are never seen in training: they are the "new places" of the scorecard.
-terrella train video recordings/doom-maze --out runs/doom-maze --config.name doom-maze \
-    --config.keep-out 0 -30 11.9 10 --config.steps 7500 --config.motion-steps 5000
+terrella train video recordings/doom-maze --out runs/doom-maze --name doom-maze \
+    --keep-out 0 -30 11.9 10 --steps 7500 --motion-steps 5000
 mkdir -p src/terrella/bundled
+rm -rf src/terrella/bundled/doom-maze
 cp -r runs/doom-maze/world src/terrella/bundled/doom-maze
 python recipes/doom_maze_score.py recordings/doom-maze scores/doom-maze

@@ -40,7 +40,7 @@ def exam(arm: str, name: str, data: str, count: int) -> Scorecard:
     world, rng = terrella.load(name, memory=ARMS[arm]), terrella.make_rng(0)
     clips, cache = places(world, data, count, rng)
     scoring = ScoreConfig(horizons=HORIZONS, control_horizons=(8, 32))
-    config = ExamConfig(score=scoring, closure_clips=24)
+    config = ExamConfig(score=scoring, closure_clips=12, stories=4)
 
     def tell(share: float, words: str) -> None:
         print(f"{arm}: {share:.0%} {words}", file=sys.stderr, flush=True)

@@ -48,15 +48,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code or 0
 
 
+_THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
+
+
 def _sentence(error: Exception) -> str | None:
     """What to tell a person of an error that is theirs or their disk's; None for a fault of ours: that needs its trace."""
     from .core.errors import TerrellaError
 
     if isinstance(error, TerrellaError):
         return str(error)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+    if isinstance(error, OSError) and error.errno in _THEIRS:
         where = f" ({error.filename})" if error.filename else ""
-        return f"{error.strerror}{where}; free some space or choose another folder."
+        return f"{error.strerror}{where}; choose another folder, or free some space."
     return None
 
 
@@ -243,7 +246,7 @@ def _load(name: str, device: str, memory: bool = True) -> World:
     """A world by name; only learned worlds have a device and a memory."""
     from . import library
 
-    if name.startswith(("doom", "gym:")) and not (library.BUNDLED / name).exists():
+    if name == "doom" or name.startswith(("doom:", "gym:")):
         return library.load(name)
     return library.load(name, device=_device(device), memory=memory)
 

@@ -98,9 +98,9 @@ def _read_card(folder: Path) -> Mapping[str, object]:
 def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     kind = _read(folder).get("kind")
     if kind == "video":
-        from .worlds.folder import load_video_world
+        from .worlds.folder import load_world
 
-        return load_video_world(folder, **options)
+        return load_world(folder, **options)
     raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
 
 

@@ -16,7 +16,7 @@ from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Explorer, Layout, Recorder, record
 from terrella.learn.samples import choose_keyframes, usable_rows
 from terrella.learn.train_video import TrainConfig, train_video
-from terrella.worlds.folder import load_video_world
+from terrella.worlds.folder import load_world
 
 CONFIG = TrainConfig(size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9)
 
@@ -43,7 +43,7 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
     out, facts = trained
     assert facts["step"] == 4
     for memory in (True, False):
-        world = load_video_world(out / "world", memory=memory)
+        world = load_world(out / "world", memory=memory)
         assert (len(world.memory) > 0) == memory
         assert "observes" in check_world(world)
     assert list(out.glob("strip-*.png"))
@@ -82,7 +82,7 @@ def test_a_stopped_run_goes_on_exactly(recording, trained, tmp_path):
 
 def test_a_run_with_other_settings_is_refused(recording, trained):
     with pytest.raises(TrainingError, match="other settings"):
-        train_video(recording, trained[0], replace(CONFIG, learning_rate=1e-3), quiet)
+        train_video(recording, trained[0], replace(CONFIG, keyframes=7), quiet)
 
 
 def test_a_foreign_resume_file_is_refused(recording, tmp_path):
@@ -101,13 +101,23 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp
     assert all(torch.isfinite(value.float()).all() for value in saved.values())
 
 
-def test_a_recording_without_depth_says_what_is_missing(tmp_path):
+def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path):
     with Recorder(tmp_path / "set", Layout(10.0, ("left",), rgb=(24, 32))) as recorder:
-        for _ in range(9):
-            recorder.add({"rgb": np.zeros((24, 32, 3), np.uint8)}, np.array([0]), 0.0, False)
-        recorder.end_episode()
-    with pytest.raises(DatasetError, match="depth, pose or the camera"):
-        train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+        for _ in range(3):
+            for step in range(60):
+                picture = np.full((24, 32, 3), 40 + step, np.uint8)
+                recorder.add({"rgb": picture}, np.array([step % 2]) if step < 59 else None, 0.5, False)
+            recorder.end_episode()
+    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    world = load_world(tmp_path / "run" / "world")
+    assert set(world.spec.channels) == {"rgb", "reward", "done"}
+    assert "batches" in check_world(world)
+    rng = make_rng(0)
+    state = world.start(1, rng)
+    still, left = (world.imagine(state, torch.tensor([[held]], dtype=torch.int8), make_rng(1)) for held in (0, 1))
+    assert not torch.equal(still["actions"], left["actions"])
+    with pytest.raises(DatasetError, match="no poses"):
+        train_video(tmp_path / "set", tmp_path / "other", replace(CONFIG, keep_out=(0, 0, 1, 1)), quiet)
 
 
 def test_rows_in_the_box_are_kept_out(recording):
@@ -131,7 +141,7 @@ def test_keyframes_cover_the_recording_evenly():
 
 def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
     with pytest.raises(CheckpointError, match="world.json"):
-        load_video_world(tmp_path)
+        load_world(tmp_path)
     source = trained[0] / "world"
     for change, words in (({"kind": "latent"}, "kind"), ({"version": 99}, "version")):
         folder = tmp_path / words
@@ -139,7 +149,7 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
         about = json.loads((source / "world.json").read_text()) | change
         (folder / "world.json").write_text(json.dumps(about))
         with pytest.raises(CheckpointError, match=words):
-            load_video_world(folder)
+            load_world(folder)
     broken = tmp_path / "broken"
     broken.mkdir()
     for file in source.iterdir():
@@ -147,4 +157,4 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
     weights = (source / "weights.safetensors").read_bytes()
     (broken / "weights.safetensors").write_bytes(weights[: len(weights) // 2])
     with pytest.raises(CheckpointError, match="damaged"):
-        load_video_world(broken)
+        load_world(broken)

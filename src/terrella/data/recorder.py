@@ -146,7 +146,13 @@ class Recorder:
                 )
             self.rows, self.episodes, self._tasks, self._stats = 0, 0, [], {}
         else:
-            self._reopen(json.loads(info.read_text(encoding="utf-8")))
+            try:
+                self._reopen(json.loads(info.read_text(encoding="utf-8")))
+            except (OSError, ValueError, KeyError, pa.ArrowException) as error:
+                first = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise DatasetError(
+                    f"{self.root} is damaged ({first}); see `terrella data doctor {self.root}`, or record to a new folder."
+                ) from error
         if task not in self._tasks:
             self._tasks.append(task)
         self._task = self._tasks.index(task)

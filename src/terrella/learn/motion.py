@@ -21,7 +21,8 @@ def train_motion(
     motion: Motion, recording: Recording, memory: Keyframes, config: VideoConfig, steps: int, seed: int,
     report: Callable[[int, int, str], None],
 ) -> dict[str, float]:  # fmt: skip
-    """Fits `motion` in place; returns the median and the mean error of a step's displacement in metres."""
+    """Fits `motion` in place; returns how near the body came to walls, and the median and mean
+    error of a step's displacement, all in metres."""
     torch.manual_seed(seed)
     rows, inputs, targets, ended = _steps(recording, memory, config)
     optimiser = torch.optim.Adam(motion.parameters(), lr=3e-3)
@@ -47,7 +48,8 @@ def train_motion(
         every = torch.arange(len(rows))
         _, moved = motion(inputs["heading"], inputs["moved"], inputs["actions"], inputs["free"])
         error = (moved - targets["moved"]).norm(dim=-1)[every]
-    return {"motion_error_median_m": float(error.median()), "motion_error_mean_m": float(error.mean())}
+    body = 0.95 * float(inputs["free"].amin(1).quantile(0.02))  # a corner may deceive the felt distance a little
+    return {"body_m": body, "motion_error_median_m": float(error.median()), "motion_error_mean_m": float(error.mean())}
 
 
 def _losses(motion, inputs, targets, pick):

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from ..data import ClipCache
 from ..space.camera import Intrinsics, unproject, yaw
-from ..space.keyframes import Keyframes, look, retrieve
+from ..space.keyframes import Glimpse, Keyframes, look, retrieve
 from ..worlds.video import VideoConfig, carry
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres on the map
@@ -75,6 +75,20 @@ def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_
 
 
 @dataclass(frozen=True)
+class Lesson:
+    """One batch for the generator: what it is shown, and the true frames it should find, in its own code."""
+
+    glimpse: Glimpse
+    last: torch.Tensor
+    truth: torch.Tensor
+    actions: torch.Tensor | None = None
+
+    def to(self, device) -> Lesson:
+        actions = None if self.actions is None else self.actions.to(device)
+        return Lesson(self.glimpse.to(device), self.last.to(device), self.truth.to(device), actions)
+
+
+@dataclass(frozen=True)
 class Shown:
     """What the generator is shown for B target rows, and the truth."""
 
@@ -89,7 +103,7 @@ def draw(recording: Recording, memory: Keyframes, config: VideoConfig, batch: in
     Both learn to complete: the first where memory is dense, the second where it is sparse.
     """
     rows = recording.usable & np.roll(recording.usable, 1)
-    rows &= np.arange(len(rows)) - recording.start >= 2
+    rows &= np.roll(recording.usable, 2) & (np.arange(len(rows)) - recording.start >= 2)
     target = rng.choice(np.flatnonzero(rows), batch)
     chosen = []
     for index, row in enumerate(target):
@@ -111,7 +125,9 @@ def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarra
     newest = row - int(rng.choice([2, 4, 8, 16, 32]))
     gaps = rng.integers(3, 24, size=int(rng.integers(1, 7))).cumsum() - 3
     past = np.maximum(newest - gaps, recording.start[row])
-    return np.unique(np.minimum(past, row - 1))
+    past = np.unique(np.minimum(past, row - 1))
+    seen = past[recording.usable[past]]  # what training must not see is not shown either
+    return seen if len(seen) else np.array([row - 1])
 
 
 def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: VideoConfig):

@@ -19,11 +19,13 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
 from ..space.keyframes import Keyframes
-from ..worlds.folder import save_video_world, video_spec
-from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, decode_depth, encode_depth, generate, merge
+from ..worlds.folder import save_world, video_spec
+from ..worlds.history import HistoryWorld
+from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, generate, merge
+from .lessons import history_lesson, place_lesson
 from .motion import train_motion
 from .run_folder import load_run, save_run
-from .samples import Box, Recording, carried, choose_keyframes, draw, glimpse_of, usable_rows
+from .samples import Box, Lesson, Recording, choose_keyframes, usable_rows
 
 
 @dataclass(frozen=True)
@@ -88,11 +90,15 @@ def train_video(
 ) -> dict:
     """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
     out = Path(out)
+    if any(length < 16 or length % 8 for length in config.size):
+        raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
+    if config.device.startswith("cuda") and not torch.cuda.is_available():
+        raise TrainingError("there is no GPU that PyTorch can use here: leave --device out, or say cpu.")
     out.mkdir(parents=True, exist_ok=True)
     dataset = Dataset(data)
     cache = ClipCache.open(dataset, config.size, lambda done, total: report(done, total, "building the clip cache"))
-    if cache.depth is None or cache.pose is None or not cache.world.get("camera"):
-        raise DatasetError(f"{data} lacks depth, pose or the camera; record it with them (terrella record doom does).")
+    if cache.rgb is None:
+        raise DatasetError(f"{data} holds no pictures (rgb); a world of pictures cannot be learned from it.")
     run = _Run(dataset, cache, out, config)
     run.learn(report)
     return run.finish()
@@ -105,7 +111,11 @@ class _Run:
         self.dataset, self.cache, self.out, self.config = dataset, cache, out, config
         self.device = torch.device(_device(config.device))
         torch.manual_seed(config.seed)
-        self.video = VideoConfig(tuple(cache.world["camera"]), cache.action.shape[1], config.size)
+        posed = cache.depth is not None and cache.pose is not None and bool(cache.world.get("camera"))
+        camera = tuple(cache.world["camera"]) if posed else (1.0, 1.0, 0.5, 0.5)
+        self.video = VideoConfig(camera, cache.action.shape[1], config.size, geometry=posed)
+        if config.keep_out is not None and not posed:
+            raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
         train, self.held_out = split(len(cache.episodes))
         start = np.zeros(cache.length, np.int64)
         for first, last in cache.episodes:
@@ -116,10 +126,7 @@ class _Run:
                 f"{dataset.root} leaves {usable.sum()} frames to train on; record more, or a smaller keep_out."
             )
         self.recording = Recording(cache, start, usable)
-        rows = choose_keyframes(np.asarray(cache.pose), np.flatnonzero(usable), config.keyframes)
-        rgb = torch.from_numpy(dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
-        depth, pose = self.recording.depth(rows), self.recording.pose(rows)
-        self.memory = Keyframes.of(rgb, depth, pose, self.video.camera)
+        self.memory = self._choose_memory() if posed else None
         self.generator, self.critic = Generator(self.video).to(self.device), Critic().to(self.device)
         self.motion = Motion(self.video)
         self.smooth = copy.deepcopy(self.generator).eval().requires_grad_(False)
@@ -137,13 +144,20 @@ class _Run:
         }
         self.facts = {"recipe": _recipe(config, dataset), "step": 0, "seconds": 0.0, "motion": None}
 
+    def _choose_memory(self) -> Keyframes:
+        rows = choose_keyframes(
+            np.asarray(self.cache.pose), np.flatnonzero(self.recording.usable), self.config.keyframes
+        )
+        rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
+        return Keyframes.of(rgb, self.recording.depth(rows), self.recording.pose(rows), self.video.camera)
+
     def learn(self, report) -> None:
         found = load_run(self.out, self.modules, self.optimisers)
         if found:
             if found["recipe"] != self.facts["recipe"]:
                 raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
             self.facts = found
-        if self.facts["motion"] is None:
+        if self.facts["motion"] is None and self.memory is not None:
             self.facts["motion"] = train_motion(
                 self.motion, self.recording, self.memory, self.video, self.config.motion_steps, self.config.seed, report
             )
@@ -151,10 +165,13 @@ class _Run:
         began = saved = drawn = time.monotonic()
         before = self.facts["seconds"]
         recent: list[dict] = []
+        self._whole = True
         try:
             while self.facts["step"] < self.config.steps and self.facts["seconds"] < 3600 * self.config.hours:
+                self._whole = False  # a step that Ctrl-C cuts is not saved: the last save goes on exactly
                 recent.append(self._step(self.facts["step"]))
                 self.facts["step"] += 1
+                self._whole = True
                 now = time.monotonic()
                 self.facts["seconds"] = before + now - began
                 if len(recent) == 20:
@@ -166,32 +183,28 @@ class _Run:
                 if now - drawn > self.config.strip_every_s:
                     self.draw_strip()
                     drawn = time.monotonic()
-        finally:  # also on Ctrl-C
-            self._save()
+        except KeyboardInterrupt:
+            if self._whole:
+                self._save()
+            raise
+        self._save()
 
     def _step(self, step: int) -> dict[str, float]:
         """One step; all its randomness comes from (seed, step), so a resumed run sees what an unbroken one would."""
-        config, video = self.config, self.video
+        config = self.config
         rng = np.random.default_rng([config.seed, step])
         batch = config.batch or (64 if self.device.type == "cuda" else 8)
         noise_rng = make_rng(int(rng.integers(2**62)))
         for group in self.optimisers["optimiser"].param_groups:
             group["lr"] = config.learning_rate * min(1, (step + 1) / 200) * (0.05 + 0.95 * _cosine(step / config.steps))
         with torch.no_grad():
-            shown = draw(self.recording, self.memory, video, batch, rng)
-            last_rgb, last_depth = self._frames_before(shown, rng, noise_rng)
-            glimpse = glimpse_of(shown, shown.target, self.recording, video)
-            last = carried(last_rgb, last_depth, shown.before, shown.target, glimpse, self.recording, video)
-            last = last * torch.from_numpy(rng.random(batch) > 0.1)[:, None, None, None]
-            rgb = self.recording.rgb(shown.target).float() / 127.5 - 1
-            truth = torch.cat([rgb, encode_depth(self.recording.depth(shown.target))[:, None]], 1)
-            time_ = torch.from_numpy(np.where(rng.random(batch) < 0.5, 0, rng.random(batch))).float()
-            noise = torch.randn(truth.shape, generator=noise_rng)
-            glimpse, last, noise = glimpse.to(self.device), last.to(self.device), noise.to(self.device)
-            truth, time_ = truth.to(self.device), time_.to(self.device)
+            lesson = self._lesson(batch, rng, noise_rng).to(self.device)
+            glimpse, last, truth = lesson.glimpse, lesson.last, lesson.truth
+            noise = torch.randn(truth.shape, generator=noise_rng).to(self.device)
+            time_ = torch.from_numpy(np.where(rng.random(batch) < 0.5, 0, rng.random(batch))).float().to(self.device)
             noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
         with _half(self.device):
-            clean = self.generator(noisy, time_, glimpse, last).float()
+            clean = self.generator(noisy, time_, glimpse, last, lesson.actions).float()
             losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
             losses["edges"] = sum(_l1(clean[:, :3].diff(dim=axis), truth[:, :3].diff(dim=axis)) for axis in (2, 3))
             total = losses["rgb"] + 0.5 * losses["depth"] + 0.5 * losses["edges"]
@@ -215,33 +228,26 @@ class _Run:
                 smooth.lerp_(raw, 1 - keep)
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def _frames_before(self, shown, rng, noise_rng):
-        """The frames before the targets: recorded in half of the steps, else dreamt by the model itself."""
-        rgb, depth = self.recording.rgb(shown.before), self.recording.depth(shown.before)
-        if rng.random() < 0.5:
-            return rgb, depth
-        glimpse = glimpse_of(shown, shown.before, self.recording, self.video)
-        earlier = shown.before - 1
-        last = carried(
-            self.recording.rgb(earlier),
-            self.recording.depth(earlier),
-            earlier,
-            shown.before,
-            glimpse,
-            self.recording,
-            self.video,
-        )
-        last = last * torch.from_numpy(rng.random(len(last)) > 0.5)[:, None, None, None]
-        noise = torch.randn(len(last), 4, *self.video.size, generator=noise_rng)
-        glimpse, last, noise = glimpse.to(self.device), last.to(self.device), noise.to(self.device)
-        with _half(self.device):
-            clean = generate(self.generator, noise, glimpse, last, 1).float().cpu()
-        return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8), decode_depth(clean[:, 3])
+    def _lesson(self, batch: int, rng: np.random.Generator, noise_rng: torch.Generator) -> Lesson:
+        def dream(shown: Lesson) -> torch.Tensor:
+            noise = torch.randn(batch, 4, *self.video.size, generator=noise_rng)
+            shown = shown.to(self.device)
+            with _half(self.device):
+                clean = generate(self.generator, noise.to(self.device), shown.glimpse, shown.last, 1, shown.actions)
+            return clean.float().cpu()
+
+        if self.video.geometry:
+            return place_lesson(self.recording, self.memory, self.video, batch, rng, dream)
+        return history_lesson(self.recording, self.video, batch, rng, dream)
 
     def _descend(self, name: str, module: nn.Module, loss: torch.Tensor) -> None:
         self.optimisers[name].zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        norm = nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        if not torch.isfinite(norm):
+            raise TrainingError(
+                f"a gradient of the {name} is not a number; the last save is good: lower --learning-rate."
+            )
         self.optimisers[name].step()
 
     def _log(self, recent: list[dict], report) -> None:
@@ -255,56 +261,82 @@ class _Run:
     def _save(self) -> None:
         save_run(self.out, self.modules, self.optimisers, self.facts)
 
-    def world(self) -> VideoWorld:
+    def world(self) -> VideoWorld | HistoryWorld:
+        """The world as it now is."""
         about = self.cache.world
+        modules = (self.generator, self.motion) if self.memory is not None else (self.generator,)
         card = {
-            "what": f"Learned from {self.dataset.length:,} frames of {about['name']}",
+            "what": f"Learned from {self.dataset.length:,} frames of {about.get('name', self.dataset.root.name)}",
             "data": f"{self.recording.usable.sum():,} frames, {len(self.cache.episodes) - len(self.held_out)} episodes",
             "steps": self.facts["step"],
             "hours": round(self.facts["seconds"] / 3600, 2),
             "keep_out": self.config.keep_out,
-            "keyframes": len(self.memory),
-            "parameters": sum(p.numel() for p in (*self.generator.parameters(), *self.motion.parameters())),
+            "keyframes": 0 if self.memory is None else len(self.memory),
+            "parameters": sum(p.numel() for module in modules for p in module.parameters()),
             **(self.facts["motion"] or {}),
         }
-        spec = video_spec(self.config.name, self.video, about["dt_s"], self.cache.action_names, about["keys"], card)
+        dt_s = about.get("dt_s", 1 / self.cache.fps)
+        spec = video_spec(self.config.name, self.video, dt_s, self.cache.action_names, about.get("keys", {}), card)
         reward, done = np.array(self.cache.reward), np.array(self.cache.done)
         usual = float(np.median(reward))
-        rewards = (usual, float(reward[done].mean() - usual) if done.any() else 0.0)
-        starts = self.memory.at(slice(None, None, max(1, len(self.memory) // 32)))
         generator = copy.deepcopy(self.smooth).cpu().float()
-        return VideoWorld(spec, self.video, generator, self.motion, self.memory, starts, rewards)
+        if self.memory is None:
+            rows = np.flatnonzero(self.recording.usable & (np.arange(len(reward)) - self.recording.start > 2))
+            rows = rows[:: max(1, len(rows) // 32)][:, None] - np.arange(self.video.slots)
+            frames = self.recording.rgb(rows.ravel()).view(*rows.shape, 3, *self.video.size)
+            return HistoryWorld(spec, self.video, generator, frames, usual)
+        rewards = (usual, _ending_pays(reward - usual, done & np.array(self.cache.action_valid)))
+        starts = self.memory.at(slice(None, None, max(1, len(self.memory) // 32)))
+        body = (self.facts["motion"] or {}).get("body_m", 0.0)
+        return VideoWorld(spec, replace(self.video, body_m=body), generator, self.motion, self.memory, starts, rewards)
 
     def draw_strip(self) -> None:
-        """Truth above dream (recorded motion, 64 steps from a held-out episode), with the memory and without; and the
-        world as it now is, so that it can be played while it learns."""
-        world, rng = self.world(), make_rng(1)
-        first, last = self.cache.episodes[self.held_out[0]]
-        rows = np.arange(first + 40, min(first + 105, last))
+        """Truth above dream (64 steps of a held-out episode), with the memory and without; and the world as it now is,
+        so that it can be played while it learns."""
+        world = self.world()
+        first, last = self.cache.episodes[(self.held_out or [0])[0]]
+        begin = max(first, min(first + 40, last - 65))
+        rows = np.arange(begin, min(begin + 65, last))
         lines = [self.recording.rgb(rows[::8])]
-        for memory in (world.memory, world.memory.at(slice(0, 0))):
-            dreaming = VideoWorld(
-                world.spec, world.config, world.generator, world.motion, memory, world.starts, world.rewards
-            )
-            seen = {"rgb": self.recording.rgb(rows[:1]).permute(0, 2, 3, 1), "depth": self.recording.depth(rows[:1])}
-            state = dreaming.observe({**seen, "pose": self.recording.pose(rows[:1])}, None, rng)
-            frames = [state["rgb"]]
-            for row in rows[1:]:
-                state = dreaming.observe({"pose": self.recording.pose([row])}, state, rng)
-                frames.append(state["rgb"])
-            lines.append(torch.cat(frames)[::8])
+        if isinstance(world, VideoWorld):
+            lines += [self._dream(one, rows, ("pose",)) for one in (world, world.without_memory())]
+        else:
+            lines.append(self._dream(world, rows, ()))
         picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
         Image.fromarray(picture).save(self.out / f"strip-{self.facts['step']:06d}.png")
-        save_video_world(world, self.out / "world", dict(world.spec.card))
+        save_world(world, self.out / "world", dict(world.spec.card))
+
+    def _dream(self, world: VideoWorld | HistoryWorld, rows: np.ndarray, evidence: tuple[str, ...]) -> torch.Tensor:
+        """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or the recorded actions."""
+        rng, recording = make_rng(1), self.recording
+        seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
+        if evidence:
+            seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
+        state = world.observe(seen, None, rng)
+        frames = [world.render(state, ("rgb",))["rgb"]]
+        for row in rows[1:]:
+            if evidence:
+                state = world.observe({"pose": recording.pose([row])}, state, rng)
+            else:
+                action = self.cache.action[row - 1].astype(world.spec.action.dtype)
+                state = world.imagine(state, torch.from_numpy(action)[None], rng)
+            frames.append(world.render(state, ("rgb",))["rgb"])
+        return torch.cat(frames)[::8].permute(0, 3, 1, 2)
 
     def finish(self) -> dict:
         self.draw_strip()
         return {"world": str(self.out / "world"), **{k: v for k, v in self.facts.items() if k != "recipe"}}
 
 
+def _ending_pays(extra: np.ndarray, ends: np.ndarray) -> float:
+    """Reward above the usual in the last steps before an episode's end (games may pay a step or two before it)."""
+    rows = np.flatnonzero(ends)
+    return float(np.mean([extra[max(row - 3, 0) : row + 1].sum() for row in rows])) if len(rows) else 0.0
+
+
 def _recipe(config: TrainConfig, dataset: Dataset) -> dict:
     """What must not change within a run; how long it goes on, and where, may."""
-    fixed = asdict(replace(config, hours=0.0, device="", save_every_s=0, strip_every_s=0))
+    fixed = asdict(replace(config, hours=0.0, device="", learning_rate=0.0, save_every_s=0, strip_every_s=0))
     return json.loads(json.dumps({**fixed, "frames": dataset.length}))
 
 

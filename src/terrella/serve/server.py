@@ -240,7 +240,7 @@ async def _listen(websocket: WebSocket, session: Session, config: ServeConfig) -
             )
             return await websocket.close(1008, "too many messages")
         try:
-            session.hear(protocol.parse_message(data))
+            session.hear(protocol.parse_message(data), websocket)
         except ProtocolError as error:
             faults += 1
             await websocket.send_text(protocol.encode_event("error", text=str(error)))

@@ -82,7 +82,10 @@ class Session:
             self._keys = replace(self._keys, held=())
             self.detached_at = time.monotonic()
 
-    def hear(self, message: Message) -> None:
+    def hear(self, message: Message, socket: Socket | None = None) -> None:
+        """A message of the player; one that a replaced socket still had in its buffer counts no more."""
+        if socket is not None and socket is not self._socket:
+            return
         self.heard_at = time.monotonic()
         if isinstance(message, Keys):
             if message.id >= self._keys.id:

@@ -9,11 +9,13 @@ import torch
 
 from .camera import Intrinsics, unproject
 
+JOIN = 0.06  # neighbours farther apart than this share of their depth are not one wall: a doorway, or too slanted
+
 
 def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int = 2) -> torch.Tensor:
     """Depth [K, h, w] from level poses [K, 7] -> segments [K, n, 4] = x1, y1, x2, y2 in metres, world frame.
 
-    They join the surfaces of neighbouring columns on the horizon; where depth jumps, the segment is a point.
+    They join the surfaces of neighbouring columns on the horizon; where they are far apart, the segment is a point.
     """
     row = min(int(camera[3] * depth.shape[-2]), depth.shape[-2] - 1)
     level = (camera[0], camera[1], camera[2], 0.5)  # the horizon's row alone is unprojected
@@ -21,7 +23,7 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, s
     start, end = points[..., :-1, :], points[..., 1:, :]
     near = depth[..., row, ::stride].float()
     near = torch.minimum(near[..., :-1], near[..., 1:])
-    joined = (end - start).norm(dim=-1, keepdim=True) < 0.35 * near[..., None]
+    joined = (end - start).norm(dim=-1, keepdim=True) < JOIN * near[..., None]
     return torch.cat([start, torch.where(joined, end, start)], -1)
 
 

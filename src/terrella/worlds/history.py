@@ -51,9 +51,10 @@ class HistoryWorld:
         action = self.spec.check_action(action, state.batch).float().view(state.batch, 1, -1)
         actions = torch.cat([action, state["actions"][:, :-1]], 1)
         noise = torch.randn(state.batch, 4, *self.config.size, generator=rng)
-        clean = generate(
-            self.generator, noise, past(state["frames"]), torch.zeros_like(noise), self.config.steps, actions.flatten(1)
-        )
+        there = next(self.generator.parameters()).device
+        glimpse, nothing = past(state["frames"]).to(there), torch.zeros_like(noise, device=there)
+        told = actions.flatten(1).to(there)
+        clean = generate(self.generator, noise.to(there), glimpse, nothing, self.config.steps, told).cpu()
         frame = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)[:, None]
         return State({"frames": torch.cat([frame, state["frames"][:, :-1]], 1), "actions": actions})
 

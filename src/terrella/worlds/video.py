@@ -7,6 +7,7 @@ recordings travel with the world as its long-term memory. `imagine` predicts the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,22 +38,24 @@ class VideoConfig:
     slots: int = 3  # of them, those that the generator sees at each pixel
     history: int = 8  # actions that the motion model remembers
     directions: int = 32  # in which it feels for walls
+    body_m: float = 0.0  # nearer than this to a wall the recordings never came: the motion is stopped there
     own_keyframes: int = 24  # of its dream, the oldest is forgotten first
     known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
     new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
+    geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/history.py)
     steps: int = 1  # flow-matching steps a frame
 
 
 class Block(nn.Module):
-    """Two 3x3 convolutions around a SiLU, told the flow time, with a residual path."""
+    """Two 3x3 convolutions around a SiLU, told the flow time (and the actions), with a residual path."""
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, told: int):
         super().__init__()
         self.first, self.second = (nn.Conv2d(channels, channels, 3, padding=1) for _ in range(2))
-        self.time = nn.Linear(1, channels)
+        self.time = nn.Linear(told, channels)
 
-    def forward(self, x: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        inner = F.silu(self.first(x) + self.time(time[:, None])[:, :, None, None])
+    def forward(self, x: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
+        inner = F.silu(self.first(x) + self.time(told)[:, :, None, None])
         return F.silu(x + self.second(inner))
 
 
@@ -71,8 +74,9 @@ class Generator(nn.Module):
         widths = config.channels
         self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
-        self.before = nn.ModuleList(Block(width) for width in widths)
-        self.after = nn.ModuleList(Block(width) for width in widths)
+        told = 1 if config.geometry else 1 + config.actions * config.slots
+        self.before = nn.ModuleList(Block(width, told) for width in widths)
+        self.after = nn.ModuleList(Block(width, told) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.leave = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1), 3, padding=1)
         nn.init.zeros_(self.leave.weight)
@@ -80,9 +84,18 @@ class Generator(nn.Module):
         bias[0] = 3.0  # at first, trust the merged colours
         self.leave.bias.data = bias.repeat_interleave(4)
 
-    def forward(self, noisy: torch.Tensor, time: torch.Tensor, glimpse: Glimpse, last: torch.Tensor) -> torch.Tensor:
+    def forward(
+        self,
+        noisy: torch.Tensor,
+        time: torch.Tensor,
+        glimpse: Glimpse,
+        last: torch.Tensor,
+        actions: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]; last [B, 4, H, W] = the last frame's colour
-        warped into this view and its trust. Returns the clean frame in the same code as `noisy`."""
+        warped into this view and its trust; actions [B, slots * A], the newest first, where there is no geometry to
+        say what they cause. Returns the clean frame in the same code as `noisy`."""
+        told = time[:, None] if actions is None else torch.cat([time[:, None], actions], 1)
         colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
         merged = merge(glimpse) * 2 - 1
         depth = encode_depth(glimpse.depth)[:, None]
@@ -98,14 +111,14 @@ class Generator(nn.Module):
         x = F.silu(self.enter(F.pixel_unshuffle(torch.cat(parts, 1), 2)))
         kept = []
         for level, block in enumerate(self.before):
-            x = block(x, time)
+            x = block(x, told)
             if level < len(self.down):
                 kept.append(x)
                 x = self.down[level](x)
-        x = self.after[-1](x, time)
+        x = self.after[-1](x, told)
         for level in reversed(range(len(self.down))):
             x = kept[level] + F.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
-            x = self.after[level](x, time)
+            x = self.after[level](x, told)
         out = F.pixel_shuffle(self.leave(x), 2)
         share = out[:, : self.choices + 1].softmax(1)
         own = out[:, self.choices + 1 : self.choices + 4]
@@ -163,6 +176,26 @@ def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)
 
 
+def kept_clear(moved: torch.Tensor, free: torch.Tensor, body_m: float) -> torch.Tensor:
+    """`moved` [B, 2] without what would bring the body nearer to a wall than `body_m`; it slides along instead.
+
+    Walls are where `free` [B, directions] is least among its neighbours: there the ray meets them at right angles.
+    What the motion model learned of walls is right nearly always; one miss in thousands, and a player is outside.
+    """
+    directions = free.shape[1]
+    angle = torch.arange(directions) * (2 * math.pi / directions)
+    heading = torch.stack([angle.cos(), angle.sin()], -1)
+    nearest = (free <= free.roll(1, 1)) & (free <= free.roll(-1, 1)) & (free < free.amax(1, keepdim=True))
+    order = free.argsort(1)  # the nearest wall first, in every story by itself
+    for rank in range(directions):
+        ray = order[:, rank : rank + 1]
+        ahead = heading[ray[:, 0]]
+        towards = (moved * ahead).sum(1)
+        excess = torch.minimum(towards - (free.gather(1, ray)[:, 0] - body_m), towards).clamp_min(0)
+        moved = moved - (excess * nearest.gather(1, ray)[:, 0])[:, None] * ahead
+    return moved
+
+
 def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
@@ -215,15 +248,18 @@ class VideoWorld:
             prior = self._blank(batch, pose)
         moved = pose[:, :2] - prior["pose"][:, :2]
         moved = torch.where((moved.norm(dim=-1) < 1.0)[:, None] & ~prior["fresh"][:, None], moved, 0.0)
-        state = prior.replace(pose=pose, moved=moved, fresh=torch.zeros(batch, dtype=torch.bool))
+        no, nothing = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
+        state = prior.replace(pose=pose, moved=moved, fresh=no, done=no, reward=nothing)
         if not {"rgb", "depth"} <= set(observation):
             return self._draw(state, prior, rng)
         height, width = self.config.size
         rgb, depth = torch.as_tensor(observation["rgb"]), torch.as_tensor(observation["depth"])
         if rgb.shape != (batch, height, width, 3) or depth.shape != (batch, height, width):
             raise ObservationError(f"rgb is uint8 [B, {height}, {width}, 3] and depth [B, {height}, {width}].")
+        if rgb.dtype != torch.uint8 or not (torch.isfinite(depth).all() and (depth > 0).all()):
+            raise ObservationError("rgb must be uint8, and depth finite and above 0 metres.")
         state = state.replace(rgb=rgb.permute(0, 3, 1, 2).contiguous(), depth=depth.float())
-        return self._remember(state, self._is_new_view(state))
+        return self._remember(state, torch.ones(batch, dtype=torch.bool))
 
     @torch.inference_mode()
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
@@ -232,6 +268,7 @@ class VideoWorld:
         pose, acts = state["pose"], torch.cat([state["actions"], action[:, None]], 1)
         free = torch.stack([self._clearance(state, view) for view in range(state.batch)])
         heading, moved = self.motion(yaw(pose), state["moved"], acts, free)
+        moved = kept_clear(moved, free, self.config.body_m)
         place = pose[:, :2] + moved
         pose = planar_pose(place[:, 0], place[:, 1], pose[:, 2], heading)
         done = state["done"] | (self.motion.ends(place, action) > 0)
@@ -246,6 +283,11 @@ class VideoWorld:
         self.spec.check_channels(channels)
         show = {"rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous()}
         return {name: show[name]() if name in show else state[name] for name in channels}
+
+    def without_memory(self) -> VideoWorld:
+        """The same world, with nothing of its recordings but where they began."""
+        none = self.memory.at(slice(0, 0))
+        return VideoWorld(self.spec, self.config, self.generator, self.motion, none, self.starts, self.rewards)
 
     def _blank(self, batch: int, pose: torch.Tensor) -> State:
         config = self.config
@@ -286,30 +328,33 @@ class VideoWorld:
         glimpse = look(chosen, pose, config.camera, config.size, config.sources, config.slots)
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
         noise = torch.randn(state.batch, 4, *config.size, generator=rng)
-        clean = generate(self.generator, noise, glimpse, last, config.steps)
+        there = next(self.generator.parameters()).device
+        clean = generate(self.generator, noise.to(there), glimpse.to(there), last.to(there), config.steps).cpu()
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
         drawn = state.replace(rgb=rgb, depth=decode_depth(clean[:, 3]))
         invented = glimpse.known.mean((1, 2)) < self.config.known_enough
-        return self._remember(drawn, invented & self._is_new_view(drawn))
+        return self._remember(drawn, invented & (self._nearest_own(drawn)[0] > 1))
 
-    def _is_new_view(self, state: State) -> torch.Tensor:
-        """[B] True where no keyframe of the story's own is near in place and heading."""
+    def _nearest_own(self, state: State) -> tuple[torch.Tensor, torch.Tensor]:
+        """How far [B] the eye is from the nearest keyframe of the story's own, above 1 for a new view; and its slot."""
         far, turn = self.config.new_view
         pose, kept = state["pose"][:, None], state["key_pose"]
         away = (kept[..., :3] - pose[..., :3]).norm(dim=-1) / far
         angle = yaw(kept) - yaw(pose)
         apart = away + torch.atan2(angle.sin(), angle.cos()).abs() / turn
         used = torch.arange(kept.shape[1]) < state["key_count"][:, None]
-        return torch.where(used, apart, 9.0).amin(1) > 1
+        return torch.where(used, apart, 9.0).min(1)
 
     def _remember(self, state: State, which: torch.Tensor) -> State:
         """The current frame kept as a keyframe in the stories `which` [B]; the oldest is forgotten when full."""
         if not which.any():
             return state
         new = Keyframes.of(state["rgb"], state["depth"], state["pose"], self.config.camera)
-        slot = state["key_count"] % self.config.own_keyframes
+        apart, nearest = self._nearest_own(state)
+        fresh = apart > 1  # else it takes the place of the keyframe that it is too near to: evidence beats a dream
+        slot = torch.where(fresh, state["key_count"] % self.config.own_keyframes, nearest)
         rows = which.nonzero()[:, 0]
-        changed = {"key_count": state["key_count"] + which.long()}
+        changed = {"key_count": state["key_count"] + (which & fresh).long()}
         for name, tensor in vars(new).items():
             kept = state[f"key_{name}"].clone()
             kept[rows, slot[rows]] = tensor[rows].to(kept.dtype)
@@ -318,13 +363,18 @@ class VideoWorld:
 
 
 def generate(
-    generator: Generator, noise: torch.Tensor, glimpse: Glimpse, last: torch.Tensor, steps: int
+    generator: Generator,
+    noise: torch.Tensor,
+    glimpse: Glimpse,
+    last: torch.Tensor,
+    steps: int,
+    actions: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Noise to frame in `steps` Euler steps of the straight flow."""
     x = noise
     for step in range(steps):
         now, after = step / steps, (step + 1) / steps
-        clean = generator(x, torch.full((len(x),), now), glimpse, last)
+        clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, actions)
         x = clean if after == 1 else x + (clean - x) * (after - now) / (1 - now)
     return x
 

@@ -1,0 +1,89 @@
+"""The bundled world does what it was learned to do: it obeys the keys, keeps to its walls, and remembers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import terrella
+from terrella.core.errors import ObservationError
+from terrella.space.camera import planar_pose, yaw
+
+BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
+
+
+@pytest.fixture(scope="module")
+def world():
+    return terrella.load("doom-maze")
+
+
+def hold(world, state, steps: int, *buttons: str):
+    rng = terrella.make_rng(0)
+    action = torch.tensor([[int(name in buttons) for name in BUTTONS]] * state.batch, dtype=torch.int8)
+    for _ in range(steps):
+        state = world.imagine(state, action, rng)
+    return state
+
+
+def turned_by(before, after) -> float:
+    angle = yaw(after["pose"]) - yaw(before["pose"])
+    return math.degrees(torch.atan2(angle.sin(), angle.cos()).item())
+
+
+def middle_of_a_room(world):
+    """A state in the room around (14.5, -5.5) m, looking along x."""
+    start = world.start(1, terrella.make_rng(0))
+    place = planar_pose(*(torch.tensor([value]) for value in (14.5, -5.5, float(start["pose"][0, 2]), 0.0)))
+    return world.observe({"pose": place}, start, terrella.make_rng(0))
+
+
+def test_turning_left_turns_left_and_the_picture_moves_right(world):
+    state = middle_of_a_room(world)
+    left, right = hold(world, state, 12, "TURN_LEFT"), hold(world, state, 12, "TURN_RIGHT")
+    assert 25 < turned_by(state, left) < 45 and -45 < turned_by(state, right) < -25  # the game: 33.4 degrees
+    one = hold(world, state, 2, "TURN_LEFT")
+    row = slice(40, 60)
+    before, after = (seen["rgb"][0, :, row].float().mean((0, 1)) for seen in (state, one))
+    shifts = range(-12, 13)
+    errors = [((after[16:-16] - before[16 - s : len(before) - 16 - s]) ** 2).mean() for s in shifts]
+    assert shifts[int(torch.stack(errors).argmin())] > 0
+
+
+def test_forward_walks_along_the_heading_and_a_wall_stops_it(world):
+    state = middle_of_a_room(world)
+    near = hold(world, state, 12, "MOVE_FORWARD")
+    walked = near["pose"][0, :2] - state["pose"][0, :2]
+    assert 0.5 < walked[0] < 2.5 and abs(walked[1]) < 0.1
+    away = hold(world, state, 12, "MOVE_BACKWARD")
+    assert (away["pose"][0, 0] - state["pose"][0, 0]) < -0.5
+    corner = hold(world, hold(world, state, 8, "TURN_LEFT", "MOVE_LEFT"), 120, "MOVE_FORWARD", "MOVE_LEFT")
+    still = hold(world, corner, 10, "MOVE_FORWARD", "MOVE_LEFT")
+    assert (still["pose"][0, :2] - corner["pose"][0, :2]).norm() < 0.5
+
+
+def test_a_turn_there_and_back_shows_the_same_room(world):
+    state, rng = middle_of_a_room(world), terrella.make_rng(0)
+    first = state["rgb"].float()
+    seen = []
+    for step in [*range(0, 181, 6), *range(180, -1, -6)]:
+        place = planar_pose(*state["pose"][:, :3].unbind(-1), torch.tensor([math.radians(step)]))
+        state = world.observe({"pose": place}, state, rng)
+        seen.append(state["rgb"].float())
+    psnr = [float(10 * torch.log10(255**2 / (frame - first).square().mean())) for frame in seen]
+    assert min(psnr[10:50]) < 20, "on the way other walls are seen"
+    assert psnr[-1] > 27
+
+
+def test_stories_in_a_batch_do_not_touch(world):
+    state = middle_of_a_room(world).fork(2)
+    action = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
+    both = world.imagine(state, action, terrella.make_rng(3))
+    assert turned_by(state.at(0), both.at(0)) > 1 and turned_by(state.at(1), both.at(1)) < -1
+
+
+def test_a_pose_that_is_not_a_number_is_refused(world):
+    state = world.start(1, terrella.make_rng(0))
+    with pytest.raises(ObservationError, match="finite"):
+        world.observe({"pose": torch.full((1, 7), float("nan"))}, state, terrella.make_rng(0))
