@@ -31,7 +31,7 @@ from terrella.measure import (
 )
 
 ARMS = {"memory": True, "no memory": False}
-CONTEXT, HORIZONS = 4, (1, 8, 32, 64)
+CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
 
 
 def exam(arm: str, name: str, data: str, count: int) -> Scorecard:

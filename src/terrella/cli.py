@@ -27,7 +27,7 @@ Host = Annotated[str, arg(help="Address to listen on; any other than this machin
 Token = Annotated[str | None, arg(help="Secret that the page's address must carry.")]
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
-CONTEXT = 4  # frames that a world is shown before it dreams, when it is scored
+CONTEXT = 10  # frames that a world is shown before it dreams, when it is scored: longer than a key's history counts
 MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
 
 

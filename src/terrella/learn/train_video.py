@@ -206,7 +206,8 @@ class _Run:
         with _half(self.device):
             clean = self.generator(noisy, time_, glimpse, last, lesson.actions).float()
             losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
-            losses["edges"] = sum(_l1(clean[:, :3].diff(dim=axis), truth[:, :3].diff(dim=axis)) for axis in (2, 3))
+            losses["edges"] = _l1(clean[:, :3].diff(dim=2), truth[:, :3].diff(dim=2))
+            losses["edges"] = losses["edges"] + _l1(clean[:, :3].diff(dim=3), truth[:, :3].diff(dim=3))
             total = losses["rgb"] + 0.5 * losses["depth"] + 0.5 * losses["edges"]
             if step >= config.critic_from:
                 self.critic.requires_grad_(False)
@@ -236,7 +237,7 @@ class _Run:
                 clean = generate(self.generator, noise.to(self.device), shown.glimpse, shown.last, 1, shown.actions)
             return clean.float().cpu()
 
-        if self.video.geometry:
+        if self.memory is not None:
             return place_lesson(self.recording, self.memory, self.video, batch, rng, dream)
         return history_lesson(self.recording, self.video, batch, rng, dream)
 

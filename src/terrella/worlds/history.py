@@ -14,7 +14,7 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
 from ..space.keyframes import Glimpse
-from .video import Generator, VideoConfig, generate
+from .video import Generator, VideoConfig, channels_last, generate
 
 
 class HistoryWorld:
@@ -23,7 +23,7 @@ class HistoryWorld:
 
     def __init__(self, spec: Spec, config: VideoConfig, generator: Generator, starts: torch.Tensor, reward: float):
         self.spec, self.config, self.starts, self.reward = spec, config, starts, reward
-        self.generator = generator.eval().to(memory_format=torch.channels_last)
+        self.generator = channels_last(generator.eval())
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Begins with a piece of a recording, no button held."""

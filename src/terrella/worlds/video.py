@@ -127,6 +127,14 @@ class Generator(nn.Module):
         return torch.cat([rgb, depth + out[:, -1:]], 1)
 
 
+def channels_last(generator: Generator) -> Generator:
+    """The same network with its weights laid out for faster convolutions on a CPU (a third less time)."""
+    for weight in generator.parameters():
+        if weight.ndim == 4:
+            weight.data = weight.data.contiguous(memory_format=torch.channels_last)
+    return generator
+
+
 def merge(glimpse: Glimpse) -> torch.Tensor:
     """The slots' colours averaged by their squared trust: [B, 3, H, W] in [0, 1]."""
     weight = (glimpse.trust + 1e-4) ** 2
@@ -213,7 +221,7 @@ class VideoWorld:
         memory: Keyframes, starts: Keyframes, rewards: tuple[float, float],
     ):  # fmt: skip
         self.spec, self.config = spec, config
-        self.generator = generator.eval().to(memory_format=torch.channels_last)  # a third faster on a CPU
+        self.generator = channels_last(generator.eval())
         self.motion = motion.eval()
         self.memory, self.starts, self.rewards = memory, starts, rewards
         self._walls = wall_segments(memory.depth, memory.pose, config.camera).flatten(0, 1)
