@@ -9,7 +9,9 @@ import torch
 
 from .camera import Intrinsics, unproject
 
-JOIN = 0.06  # neighbours farther apart than this share of their depth are not one wall: a doorway, or too slanted
+JOIN = (
+    1.92  # neighbours this many times farther apart than on a wall seen head-on are not one: a doorway, or too slanted
+)
 
 
 def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int = 2) -> torch.Tensor:
@@ -23,7 +25,8 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, s
     start, end = points[..., :-1, :], points[..., 1:, :]
     near = depth[..., row, ::stride].float()
     near = torch.minimum(near[..., :-1], near[..., 1:])
-    joined = (end - start).norm(dim=-1, keepdim=True) < JOIN * near[..., None]
+    spacing = stride / (camera[0] * depth.shape[-1])  # of neighbours on a wall seen head-on, at a depth of one
+    joined = (end - start).norm(dim=-1, keepdim=True) < JOIN * spacing * near[..., None]
     return torch.cat([start, torch.where(joined, end, start)], -1)
 
 
