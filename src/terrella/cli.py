@@ -102,7 +102,7 @@ def record_doom(
     """
     from . import library
 
-    depth = (min(height, 96), min(height, 96) * 4 // 3)
+    depth = (min(max(height, 1), 96), min(max(height, 1), 96) * 4 // 3)
     world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth)
     _record(world, out, frames, human, seed, port, json)
 
@@ -239,7 +239,8 @@ def _game_like(learned: World, name: str) -> World:
     from . import library
 
     shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
-    return library.load(name, **({"size": shape[:2]} if shape and name.startswith("doom") else {}))
+    like = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
+    return library.load(name, **like)
 
 
 def _load(name: str, device: str, memory: bool = True) -> World:
@@ -270,6 +271,7 @@ def score(
     name: Positional[str],
     data: Path,
     new: Path | None = None,
+    fresh: bool = False,
     out: Path = Path("scores"),
     clips: int = 50,
     horizons: tuple[int, ...] = (1, 8, 32, 64),
@@ -283,12 +285,14 @@ def score(
     Args:
         name: What `terrella list` shows, or the path of a checkpoint.
         data: The recording it was trained on; only the episodes kept out of training are used.
+        fresh: `data` is another recording, of which training saw nothing: every episode is used.
         new: A recording of places that it never saw; without one, the part of the map that training kept out.
         out: Folder for scorecard.json and scorecard.html.
         clips: Clips of each kind of place; intervals want 50 or more.
         horizons: Steps after which figures are given; a clip is as long as the largest.
         long_steps: Length of the long dream; 0 leaves it out.
     """
+    from .core.errors import TerrellaError
     from .core.world import make_rng
     from .data import split
     from .measure import (
@@ -300,17 +304,22 @@ def score(
         clips_from_cache,
         examine,
         in_box,
-        outside_box,
+        out_of_sight,
         write_report,
     )
     from .measure.bars import summary
 
-    arms = {"memory": _load(name, device), "no memory": _load(name, device, memory=False)}
-    world, rng, steps = arms["memory"], make_rng(seed), max(horizons, default=1)
+    if min(horizons, default=0) < 1 or clips < 1 or 0 < long_steps < 100:
+        raise TerrellaError("--horizons and --clips are whole numbers from 1 up, --long-steps is 0 or at least 100.")
+    world, rng, steps = _load(name, device), make_rng(seed), max(horizons)
+    arms = {"memory": world, "no memory": _load(name, device, memory=False)}
+    if "pose" not in world.spec.observes:  # it lives on history alone: there is no memory to leave out
+        arms = {"history": world}
     cache = _cache(data, world)
-    held_out, every = split(len(cache.episodes))[1], range(len(cache.episodes))
+    every = range(len(cache.episodes))
+    held_out = every if fresh else split(len(every))[1]
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
-    known = outside_box(*box) if box else None
+    known = out_of_sight(*box) if box else None
     places = {"recorded": clips_from_cache(cache, held_out, CONTEXT, steps, clips, rng, known)}
     if new is not None:
         unseen = _cache(new, world)
@@ -323,7 +332,7 @@ def score(
     album = None if cache.pose is None else Album.of_cache(cache)
     with progress.shown("scoring") as report:
         card = examine(arms, places, rng, config, album, lambda share, words: report(share, 1, words))
-    found = bars(card, "memory")
+    found = bars(card, next(iter(arms)))
     files = write_report(card, found, out, f"{world.spec.name}: the scorecard")
     lines = [
         f"{bar.status:>6}  {bar.name}, {bar.place}: {bar.figure} {bar.unit} (bar: {bar.target})"

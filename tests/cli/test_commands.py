@@ -17,7 +17,7 @@ OPTIONS = {
     "record doom": "--frames --height --human --json --out --port --scenario --seed",
     "record world": "--frames --human --json --out --port --seed",
     "play": "--compare --device --host --json --no-memory --port --record --seed --token --truth",
-    "score": "--clips --data --device --horizons --json --long-steps --new --out --seed",
+    "score": "--clips --data --device --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
     "data doctor": "--json",
 }
@@ -125,6 +125,22 @@ def test_a_foreign_dataset_is_left_alone(capsys, tmp_path):
 def test_a_folder_that_cannot_be_written_is_said(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     assert "file" in refusal(["record", "world", "gym:CartPole-v1", "--out", tmp_path / "file", "--frames", 10], capsys)
+
+
+@pytest.mark.parametrize("height", [0, -96, 100])
+def test_a_height_that_the_game_has_not_is_said(height, capsys, tmp_path):
+    pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install -e '.[sim]'")
+    assert "384x512" in refusal(["record", "doom", "--height", height, "--out", tmp_path / "set"], capsys)
+
+
+def test_a_recording_of_one_frame_is_refused(capsys, tmp_path):
+    said = refusal(["record", "world", "gym:CartPole-v1", "--out", tmp_path / "set", "--frames", 1], capsys)
+    assert "2 rows" in said and not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize("wrong", [["--horizons", 0], ["--clips", 0], ["--long-steps", 3], ["--horizons", 8, -1]])
+def test_a_score_over_no_steps_is_refused(wrong, capsys, tmp_path):
+    assert "from 1 up" in refusal(["score", "doom-maze", "--data", tmp_path, *wrong], capsys)
 
 
 def test_missing_checkpoints_to_list_are_said(capsys, tmp_path):

@@ -60,7 +60,7 @@ def test_score_writes_json_and_a_page(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
     assert main([*arguments(recording, tmp_path / "out"), "--json"]) == 0
     card = json.loads(capsys.readouterr().out)
-    assert card["worlds"] == {"memory": "still", "no memory": "still"}
+    assert card["worlds"] == {"history": "still"}, "it has no memory to leave out"
     assert {row["horizon"] for row in card["fidelity"]} == {1, 4}
     assert all(abs(row["gain"]["value"]) < 1e-6 for row in card["fidelity"]), "it copies the last frame, no better"
     assert json.loads((tmp_path / "out" / "scorecard.json").read_text())["worlds"] == card["worlds"]
@@ -71,6 +71,15 @@ def test_score_says_what_it_found(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
     assert main(arguments(recording, tmp_path / "out")) == 0
     assert "scorecard.html" in capsys.readouterr().out
+
+
+def test_a_recording_made_afterwards_is_used_whole(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(library, "load", lambda name, **options: Still())
+    count = []
+    for fresh in ([], ["--fresh"]):
+        assert main([*arguments(recording, tmp_path / "out"), "--clips", "9", *fresh, "--json"]) == 0
+        count.append(json.loads(capsys.readouterr().out)["places"][0]["clips"])
+    assert count[1] > count[0]
 
 
 def test_score_of_a_recording_without_held_out_episodes_is_refused(tmp_path, monkeypatch, capsys):

@@ -130,6 +130,7 @@ def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleName
         reward=np.zeros(total, np.float32),
         done=np.zeros(total, bool),
         episodes=ranges,
+        world={},
     )
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from panorama import Panorama, recording, some_clips
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.measure import clips_from_cache, in_box, outside_box
+from terrella.measure import clips_from_cache, in_box, out_of_sight
 from terrella.measure.clips import evidence
+from terrella.space.camera import yaw
 
 
 def rows(clip) -> range:
@@ -42,10 +44,25 @@ def test_places_can_be_kept_apart():
     middle = float(np.median(cache.pose[:, 0]))
     box = (middle, -1e9, 1e9, 1e9)
     inside = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), in_box(*box))
-    outside = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), outside_box(*box))
+    outside = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), out_of_sight(*box))
     assert inside and outside
     assert all((clip.pose[:, 0] >= middle).all() for clip in inside)
     assert all((clip.pose[:, 0] < middle).all() for clip in outside)
+
+
+def test_a_place_that_is_only_looked_into_is_not_recorded_ground():
+    cache = recording(length=400)
+    middle = float(np.median(cache.pose[:, 0]))
+    cache.world["camera"] = (0.5, 0.8, 0.5, 0.5)
+    cache.depth = np.full((len(cache.pose), 4, 8), 0.01, np.float32)
+    box = (middle, -1e9, 1e9, 1e9)
+    near = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), out_of_sight(*box))
+    cache.depth[:] = 1e3  # now everybody who faces the box sees into it
+    far = clips_from_cache(cache, range(4), 2, 10, 100, make_rng(0), out_of_sight(*box))
+    assert 0 < len(far) < len(near)
+    for clip in far:
+        heading = yaw(torch.from_numpy(clip.pose))
+        assert (heading.cos() < 0.8).all(), "nobody in it faces the box"
 
 
 def test_the_draw_repeats_from_its_seed():

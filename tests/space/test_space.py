@@ -6,10 +6,12 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from terrella.space.camera import planar_pose, project, rays, rotation, unproject, yaw
-from terrella.space.floorplan import clearance, wall_segments
-from terrella.space.keyframes import Keyframes, look, retrieve, vote, vote_slowly
+from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
+from terrella.space.keyframes import Keyframes, look, recall, recall_slowly, retrieve, vote, vote_slowly
 from terrella.space.patches import FAR_M, cast, cast_slowly, patches
 from terrella.space.reproject import fill_holes, warp
 
@@ -120,6 +122,20 @@ def test_the_compiled_vote_equals_its_slow_twin():
     assert ((fast - slow).abs() > 1e-3).float().mean() < 0.01
 
 
+def test_the_compiled_recall_equals_its_slow_twin():
+    memory = joined(keyframe(0, 0, 0.0), keyframe(1, -1, 0.4), keyframe(-2, 0, 0.5), keyframe(0, 2, -0.6))
+    view = pose_at(0.2, 0.1, 0.1)[0]
+    found = []
+    for way in (recall, recall_slowly):
+        colours, trust = torch.zeros(3, 3, *SIZE), torch.zeros(3, *SIZE)
+        way(memory, room_depth(view[None])[0], view, CAMERA, colours, trust)
+        found.append((colours, trust))
+    (fast, sure), (slow, also) = found
+    assert sure[1].max() > 0.3 and ((sure - also).abs() > 1e-3).float().mean() < 0.01
+    told = (sure[0] > 0.1) & (sure[0] - sure[1] > 1e-3)
+    assert told.float().mean() > 0.3 and ((fast - slow).abs()[0, :, told] > 0.02).float().mean() < 0.01
+
+
 def test_memory_finds_the_keyframe_that_saw_the_place():
     memory = joined(keyframe(0, 0, math.pi), keyframe(0, 0, 0.0), keyframe(0, 0, math.pi / 2))
     picks = retrieve([memory], pose_at(0.3, 0, 0.1)[0], CAMERA, SIZE, 2)[0]
@@ -137,10 +153,76 @@ def test_what_memory_knows_it_draws_and_what_it_does_not_it_says():
     assert look([memory], pose_at(0, 0, math.pi), CAMERA, SIZE, 3, 2).known.mean() < 0.05
 
 
-def test_clearance_is_the_distance_to_the_walls():
-    pose = torch.cat([pose_at(0, 0, turn * math.pi / 2) for turn in range(4)])
-    depth = torch.cat([room_depth(one[None], half=1.5) for one in pose])
-    walls = wall_segments(depth, pose, CAMERA).flatten(0, 1)
-    free = clearance(walls, torch.tensor([[0.0, 0.0], [1.0, 0.0]]), directions=4, reach_m=2.0)
-    assert torch.allclose(free[0], torch.full((4,), 1.5), atol=0.05)
-    assert free[1, 0] == pytest.approx(0.5, abs=0.05) and free[1, 2] == pytest.approx(2.0)
+def looks_around(half: float, noise_m: float = 0.0):
+    """Depth and pose of eight views from near the middle of a box room, with a little noise on where they stood."""
+    rng = torch.Generator().manual_seed(0)
+    turns = [turn * math.pi / 4 for turn in range(8)]
+    pose = torch.cat([pose_at(0.3 * math.cos(turn), 0.2 * math.sin(turn), turn) for turn in turns])
+    depth = torch.cat([room_depth(one[None], half=half) for one in pose])
+    pose[:, :2] += noise_m * torch.randn(8, 2, generator=rng)
+    return depth, pose
+
+
+def square(half: float) -> torch.Tensor:
+    """The four walls of a box room."""
+    corners = torch.tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half
+    return torch.cat([corners, corners.roll(-1, 0)], 1)
+
+
+def test_the_walls_of_a_room_are_found_where_they_are():
+    depth, pose = looks_around(2.0)
+    walls = wall_segments(depth, pose, CAMERA)
+    real = walls[walls[..., 0] < NOWHERE]
+    assert len(real) >= 8
+    on_a_wall = (real.view(-1, 2, 2).abs() - 2.0).abs().amin(-1)
+    assert on_a_wall.max() < 0.01, "both ends of every wall lie on a wall"
+    whole = [seen for seen in real if (seen[:2] - seen[2:]).norm() > 1.5]
+    assert whole, "a wall seen whole is one wall, not its columns"
+
+
+def test_noisy_walls_are_brought_into_agreement_and_meet_in_corners():
+    depth, pose = looks_around(2.0, noise_m=0.004)
+    walls = wall_segments(depth, pose, CAMERA)
+    raw = walls[walls[..., 0] < NOWHERE].view(-1, 2, 2)
+    plan = floor_plan(walls, pose).view(-1, 2, 2)
+
+    def off(ends: torch.Tensor) -> torch.Tensor:
+        return (ends.abs() - 2.0).abs().amin(-1).mean()
+
+    assert off(plan) < 0.8 * off(raw)
+    corners = plan.abs().amin(-1) > 1.9
+    assert corners.any() and (plan[corners].abs() - 2.0).abs().max() < 0.006
+    assert floor_plan(walls[:0], pose[:0]).shape == (0, 4)
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-1.4, 1.4)] * 2, *[st.floats(-0.6, 0.6)] * 2), min_size=1, max_size=16),
+    st.floats(0.2, 0.5),
+)
+def test_a_body_slides_along_the_walls_of_a_room(walks, half):
+    places, wish = torch.tensor(walks, dtype=torch.float64).split(2, 1)
+    room = 2.0 - half
+    moved, left = slide(square(2.0), places, wish, half)
+    assert torch.allclose(places + moved, (places + wish).clamp(-room, room), atol=1e-5)
+    blocked = (places + wish).abs() > room + 1e-6
+    assert left[blocked].abs().max() < 1e-9 if blocked.any() else torch.equal(left, wish)
+
+
+def test_a_slanted_wall_turns_a_body_aside_and_a_corner_stops_it():
+    slanted = torch.tensor([[-5.0, 6.0, 5.0, -4.0]])  # x + y = 1, at 45 degrees
+    moved, _ = slide(slanted, torch.zeros(1, 2), torch.tensor([[0.4, 0.0]]), 0.4)
+    end = moved[0].tolist()
+    assert end[0] == pytest.approx(0.3, abs=1e-5) and end[1] == pytest.approx(-0.1, abs=1e-5)
+    moved, left = slide(square(2.0), torch.tensor([[1.5, 1.5]]), torch.tensor([[0.3, 0.3]]), 0.5)
+    assert moved.abs().max() < 1e-6 and left.abs().max() < 1e-9
+    short, _ = slide(square(2.0), torch.tensor([[1.3, 0.0]]), torch.tensor([[0.4, 0.0]]), 0.5, short=0.25)
+    assert short[0, 0].item() == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_bridge_between_two_surfaces_is_no_surface():
+    seen = pose_at(0, 0, 0.0)
+    depth = torch.full((1, *SIZE), 8.0)
+    depth[:, :, :21], depth[:, :, 21] = 2.0, 5.0  # one column that hangs between a near and a far wall
+    beside = planar_pose(*(torch.tensor([value]) for value in (4.0, -2.0, 1.3, math.pi / 2)))
+    ahead = cast(patches(depth, seen, CAMERA, 2), beside, CAMERA, SIZE)[0, :, 16:48]
+    assert (ahead < FAR_M).float().mean() < 0.02, "from the side it would be a wall across the room"

@@ -10,7 +10,6 @@ import torch
 import terrella
 from terrella.core.errors import ObservationError
 from terrella.space.camera import planar_pose, yaw
-from terrella.worlds.video import kept_clear
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
 
@@ -88,16 +87,3 @@ def test_a_pose_that_is_not_a_number_is_refused(world):
     state = world.start(1, terrella.make_rng(0))
     with pytest.raises(ObservationError, match="finite"):
         world.observe({"pose": torch.full((1, 7), float("nan"))}, state, terrella.make_rng(0))
-
-
-def test_the_guard_stops_at_walls_story_by_story():
-    rng = terrella.make_rng(0)
-    free = torch.rand(64, 32, generator=rng) * 2
-    moved = (torch.rand(64, 2, generator=rng) - 0.5) * 0.4
-    together = kept_clear(moved, free, 0.47)
-    alone = torch.cat([kept_clear(moved[i : i + 1], free[i : i + 1], 0.47) for i in range(64)])
-    assert torch.allclose(together, alone, atol=1e-6)
-    open_but_east = torch.full((1, 32), 2.0)
-    open_but_east[0, 0] = 0.5
-    kept = kept_clear(torch.tensor([[0.2, 0.1]]), open_but_east, 0.47)
-    assert kept[0, 0].item() == pytest.approx(0.03, abs=1e-5) and kept[0, 1].item() == pytest.approx(0.1)

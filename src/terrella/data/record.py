@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..core.errors import DatasetError
 from ..core.world import Observation, World, make_rng
 from .format import Layout
 from .recorder import Recorder
@@ -34,6 +35,8 @@ def record(
     as one that was not. `progress(rows, frames)` is called after each row. Returns the closed recorder (its rows and
     episodes can be read). DatasetError as Recorder raises it; what was committed before is safe.
     """
+    if frames < 2:
+        raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
     layout = Layout.of(world.spec, fps)
     base = int(torch.randint(2**62, (1,), generator=rng).item())
     with Recorder(root, layout, task or f"explore {world.spec.name}") as recorder:

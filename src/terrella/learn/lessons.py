@@ -10,9 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..space.keyframes import Keyframes
+from ..space.keyframes import Glimpse, Keyframes
 from ..worlds.history import past
-from ..worlds.video import VideoConfig, decode_depth, encode_depth
+from ..worlds.video import MOOD, VideoConfig, decode_depth, encode_depth, mood
 from .samples import Lesson, Recording, carried, draw, glimpse_of
 
 # Dream(lesson without truth) -> clean frames [B, 4, H, W] in the generator's code
@@ -29,12 +29,27 @@ def place_lesson(
         glimpse, earlier = glimpse_of(shown, shown.before, recording, config), shown.before - 1
         known = recording.rgb(earlier), recording.depth(earlier)
         last = carried(*known, earlier, shown.before, glimpse, recording, config)
-        clean = dream(Lesson(glimpse, _now_and_then(last, 0.5, rng), last))
+        clean = dream(Lesson(glimpse, _now_and_then(last, 0.5, rng), mood(known[0]), last))
         rgb, depth = _pixels(clean), decode_depth(clean[:, 3])
     glimpse = glimpse_of(shown, shown.target, recording, config)
     last = carried(rgb, depth, shown.before, shown.target, glimpse, recording, config)
     truth = torch.cat([_coded(recording.rgb(shown.target)), encode_depth(recording.depth(shown.target))[:, None]], 1)
-    return Lesson(glimpse, _now_and_then(last, 0.9, rng), truth)
+    return varied(Lesson(glimpse, _now_and_then(last, 0.9, rng), mood(rgb), truth), rng)
+
+
+def varied(lesson: Lesson, rng: np.random.Generator) -> Lesson:
+    """The same lesson in a mirrored world (half of the time) with other colours (likewise): one map has few rooms, and
+    the look of a new one should be taken from what is seen of it, not from the rooms of the recording."""
+    glimpse, colours = lesson.glimpse, torch.arange(3)
+    if rng.random() < 0.5:
+        colours = torch.from_numpy(rng.permutation(3))
+    pixels = torch.cat([colours, torch.tensor([3])])
+    thumbnail = lesson.told.unflatten(1, (3, *MOOD))[:, colours]
+    parts = [glimpse.rgb[:, :, colours], glimpse.trust, glimpse.depth, glimpse.known]
+    parts += [lesson.last[:, pixels], thumbnail, lesson.truth[:, pixels]]
+    if rng.random() < 0.5:
+        parts = [part.flip(-1) for part in parts]
+    return Lesson(Glimpse(*parts[:4]), parts[4], parts[5].flatten(1), parts[6])
 
 
 def history_lesson(
@@ -49,11 +64,11 @@ def history_lesson(
     if rng.random() < 0.5:
         earlier = past(_frames(recording, back - 1))
         nothing = torch.zeros(batch, 4, *config.size)
-        clean = dream(Lesson(earlier, nothing, nothing, _actions(recording, back - 1)))
+        clean = dream(Lesson(earlier, nothing, _told(recording, back - 1, frames[:, 1]), nothing))
         frames = torch.cat([_pixels(clean)[:, None], frames[:, 1:]], 1)
     glimpse = past(frames)
     truth = torch.cat([_coded(recording.rgb(target)), encode_depth(glimpse.depth)[:, None]], 1)
-    return Lesson(glimpse, torch.zeros_like(truth), truth, _actions(recording, back))
+    return Lesson(glimpse, torch.zeros_like(truth), _told(recording, back, frames[:, 0]), truth)
 
 
 def _now_and_then(last: torch.Tensor, often: float, rng: np.random.Generator) -> torch.Tensor:
@@ -65,8 +80,10 @@ def _frames(recording: Recording, rows: np.ndarray) -> torch.Tensor:
     return flat.view(*rows.shape, *flat.shape[1:])
 
 
-def _actions(recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.asarray(recording.cache.action[rows.ravel()], np.float32)).view(len(rows), -1)
+def _told(recording: Recording, rows: np.ndarray, newest: torch.Tensor) -> torch.Tensor:
+    """The mood of the newest frame and the actions of `rows` [B, slots]."""
+    actions = torch.from_numpy(np.asarray(recording.cache.action[rows.ravel()], np.float32)).view(len(rows), -1)
+    return torch.cat([mood(newest), actions], 1)
 
 
 def _coded(rgb: torch.Tensor) -> torch.Tensor:

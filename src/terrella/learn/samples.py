@@ -9,11 +9,10 @@ import torch
 import torch.nn.functional as F
 
 from ..data import ClipCache
-from ..space.camera import Intrinsics, unproject, yaw
+from ..space.camera import Intrinsics, yaw
+from ..space.floorplan import Box, sees_into
 from ..space.keyframes import Glimpse, Keyframes, look, retrieve
-from ..worlds.video import VideoConfig, carry
-
-Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres on the map
+from ..worlds.video import VideoConfig, carry, doubled
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,8 @@ class Recording:
         return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
 
     def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
-        return Keyframes.of(self.rgb(rows), self.depth(rows), self.pose(rows), camera)
+        """As a dream keeps its own."""
+        return Keyframes.of(doubled(self.rgb(rows)), self.depth(rows), self.pose(rows), camera)
 
 
 def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
@@ -51,14 +51,9 @@ def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, cam
     pose = torch.from_numpy(np.array(cache.pose))
     usable &= ~((pose[:, 0] > x0) & (pose[:, 0] < x1) & (pose[:, 1] > y0) & (pose[:, 1] < y1)).numpy()
     rows = np.flatnonzero(usable)
-    height, width = cache.depth.shape[1:]
-    horizon = min(int(camera[3] * height), height - 1)
     for some in np.array_split(rows, max(1, len(rows) // 4096)):
-        depth = torch.from_numpy(np.asarray(cache.depth[some, horizon], np.float32))[:, None]
-        flat = (camera[0], camera[1], camera[2], 0.5)  # the horizon's row alone
-        x, y = unproject(depth, pose[some], flat)[:, 0, :, :2].unbind(-1)
-        inside = (x > x0 + 0.5) & (x < x1 - 0.5) & (y > y0 + 0.5) & (y < y1 - 0.5)
-        usable[some[inside.any(1).numpy()]] = False
+        depth = torch.from_numpy(np.asarray(cache.depth[some], np.float32))
+        usable[some[sees_into(keep_out, depth, pose[some], camera).numpy()]] = False
     return usable
 
 
@@ -76,16 +71,15 @@ def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_
 
 @dataclass(frozen=True)
 class Lesson:
-    """One batch for the generator: what it is shown, and the true frames it should find, in its own code."""
+    """One batch for the generator: what it is shown and told, and the true frames it should find, in its own code."""
 
     glimpse: Glimpse
     last: torch.Tensor
+    told: torch.Tensor
     truth: torch.Tensor
-    actions: torch.Tensor | None = None
 
     def to(self, device) -> Lesson:
-        actions = None if self.actions is None else self.actions.to(device)
-        return Lesson(self.glimpse.to(device), self.last.to(device), self.truth.to(device), actions)
+        return Lesson(self.glimpse.to(device), self.last.to(device), self.told.to(device), self.truth.to(device))
 
 
 @dataclass(frozen=True)
@@ -122,7 +116,7 @@ def draw(recording: Recording, memory: Keyframes, config: VideoConfig, batch: in
 
 def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarray:
     """A few rows of the same episode's past, the newest some steps ago, as a dream far from its keyframes has them."""
-    newest = row - int(rng.choice([2, 4, 8, 16, 32]))
+    newest = row - int(rng.choice([2, 4, 8, 16, 32, 64]))
     gaps = rng.integers(3, 24, size=int(rng.integers(1, 7))).cumsum() - 3
     past = np.maximum(newest - gaps, recording.start[row])
     past = np.unique(np.minimum(past, row - 1))

@@ -18,7 +18,7 @@ from torch import nn
 from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
-from ..space.keyframes import Keyframes
+from ..space.keyframes import Glimpse, Keyframes
 from ..worlds.folder import save_world, video_spec
 from ..worlds.history import HistoryWorld
 from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, generate, merge
@@ -43,7 +43,7 @@ class TrainConfig:
         keyframes: Of the recording, that become the world's memory.
         keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees, to score new places.
         critic_from: The step from which a critic judges sharpness.
-        critic_weight: Its share of the loss.
+        critic_weight: How hard it pulls, beside the loss itself.
         save_every_s: Seconds between saves.
         strip_every_s: Seconds between pictures of truth against dream.
         seed: Of everything random.
@@ -57,10 +57,10 @@ class TrainConfig:
     batch: int | None = None
     learning_rate: float = 8e-4
     motion_steps: int = 6000
-    keyframes: int = 480
+    keyframes: int = 640
     keep_out: Box | None = None
     critic_from: int = 1500
-    critic_weight: float = 0.02
+    critic_weight: float = 0.3
     save_every_s: float = 120.0
     strip_every_s: float = 300.0
     seed: int = 0
@@ -99,6 +99,10 @@ def train_video(
     cache = ClipCache.open(dataset, config.size, lambda done, total: report(done, total, "building the clip cache"))
     if cache.rgb is None:
         raise DatasetError(f"{data} holds no pictures (rgb); a world of pictures cannot be learned from it.")
+    if cache.world.get("discrete") or not np.isin(cache.action, (0, 1)).all():
+        raise DatasetError(
+            f"{data} has actions that are no buttons (0 or 1 each); a world of pictures is learned from buttons so far."
+        )
     run = _Run(dataset, cache, out, config)
     run.learn(report)
     return run.finish()
@@ -148,8 +152,12 @@ class _Run:
         rows = choose_keyframes(
             np.asarray(self.cache.pose), np.flatnonzero(self.recording.usable), self.config.keyframes
         )
-        rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).contiguous()
-        return Keyframes.of(rgb, self.recording.depth(rows), self.recording.pose(rows), self.video.camera)
+        rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).float()
+        size = [2 * length for length in self.config.size]  # as the keyframes of a dream, whatever size was recorded
+        rgb = F.interpolate(rgb, size, mode="area" if rgb.shape[-1] >= size[1] else "nearest-exact")
+        return Keyframes.of(
+            rgb.round().to(torch.uint8), self.recording.depth(rows), self.recording.pose(rows), self.video.camera
+        )
 
     def learn(self, report) -> None:
         found = load_run(self.out, self.modules, self.optimisers)
@@ -199,20 +207,18 @@ class _Run:
             group["lr"] = config.learning_rate * min(1, (step + 1) / 200) * (0.05 + 0.95 * _cosine(step / config.steps))
         with torch.no_grad():
             lesson = self._lesson(batch, rng, noise_rng).to(self.device)
-            glimpse, last, truth = lesson.glimpse, lesson.last, lesson.truth
+            glimpse, truth = lesson.glimpse, lesson.truth
             noise = torch.randn(truth.shape, generator=noise_rng).to(self.device)
-            time_ = torch.from_numpy(np.where(rng.random(batch) < 0.5, 0, rng.random(batch))).float().to(self.device)
+            time_ = torch.from_numpy(np.where(rng.random(batch) < 0.75, 0, rng.random(batch))).float().to(self.device)
             noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
         with _half(self.device):
-            clean = self.generator(noisy, time_, glimpse, last, lesson.actions).float()
+            clean = self.generator(noisy, time_, glimpse, lesson.last, lesson.told).float()
             losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
             losses["edges"] = _l1(clean[:, :3].diff(dim=2), truth[:, :3].diff(dim=2))
             losses["edges"] = losses["edges"] + _l1(clean[:, :3].diff(dim=3), truth[:, :3].diff(dim=3))
-            total = losses["rgb"] + 0.5 * losses["depth"] + 0.5 * losses["edges"]
-            if step >= config.critic_from:
-                self.critic.requires_grad_(False)
-                total = total - config.critic_weight * self.critic(clean[:, :3], glimpse).mean()
-                self.critic.requires_grad_(True)
+        total = losses["rgb"] + 0.5 * losses["depth"] + 0.5 * losses["edges"]
+        if step >= config.critic_from:
+            total = total + self._sharpened(clean, total, glimpse)
         if not torch.isfinite(total):
             raise TrainingError(
                 f"the loss is not a number at step {step}; the last save is good: lower --learning-rate."
@@ -229,12 +235,24 @@ class _Run:
                 smooth.lerp_(raw, 1 - keep)
         return {name: float(value.detach()) for name, value in losses.items()}
 
+    def _sharpened(self, clean: torch.Tensor, loss: torch.Tensor, glimpse: Glimpse) -> torch.Tensor:
+        """The critic's pull on dreamt frames, `critic_weight` times as strong as the loss's own (Esser et al. 2021), and
+        strongest where memory knows nothing: there the loss alone would draw a mean of all that could be."""
+        dreamt = clean.detach()[:, :3].requires_grad_()
+        with _half(self.device):
+            praise = self.critic(dreamt, glimpse).float()
+        invented = 1 - F.adaptive_avg_pool2d(glimpse.known[:, None], praise.shape[-2:])
+        (pull,) = torch.autograd.grad(-(praise * (0.2 + 0.8 * invented)).mean(), dreamt)
+        (own,) = torch.autograd.grad(loss, clean, retain_graph=True)
+        strength = self.config.critic_weight * own[:, :3].norm() / pull.norm().clamp_min(1e-12)
+        return (clean[:, :3] * (strength * pull)).sum()
+
     def _lesson(self, batch: int, rng: np.random.Generator, noise_rng: torch.Generator) -> Lesson:
         def dream(shown: Lesson) -> torch.Tensor:
             noise = torch.randn(batch, 4, *self.video.size, generator=noise_rng)
             shown = shown.to(self.device)
             with _half(self.device):
-                clean = generate(self.generator, noise.to(self.device), shown.glimpse, shown.last, 1, shown.actions)
+                clean = generate(self.generator, noise.to(self.device), shown.glimpse, shown.last, shown.told, 1)
             return clean.float().cpu()
 
         if self.memory is not None:
@@ -288,8 +306,8 @@ class _Run:
             return HistoryWorld(spec, self.video, generator, frames, usual)
         rewards = (usual, _ending_pays(reward - usual, done & np.array(self.cache.action_valid)))
         starts = self.memory.at(slice(None, None, max(1, len(self.memory) // 32)))
-        body = (self.facts["motion"] or {}).get("body_m", 0.0)
-        return VideoWorld(spec, replace(self.video, body_m=body), generator, self.motion, self.memory, starts, rewards)
+        body = {name: value for name, value in (self.facts["motion"] or {}).items() if name in ("body_m", "short")}
+        return VideoWorld(spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards)
 
     def draw_strip(self) -> None:
         """Truth above dream (64 steps of a held-out episode), with the memory and without; and the world as it now is,

@@ -2,7 +2,7 @@
 
 from .album import Album
 from .bars import Bar, bars
-from .clips import Clip, clips_from_cache, in_box, outside_box
+from .clips import Clip, clips_from_cache, in_box, out_of_sight
 from .closure import Closure, closure
 from .endurance import Endurance, long_rollout
 from .examine import ExamConfig, examine, write_report
@@ -30,7 +30,7 @@ __all__ = [
     "examine",
     "in_box",
     "long_rollout",
-    "outside_box",
+    "out_of_sight",
     "page",
     "score",
     "speed",

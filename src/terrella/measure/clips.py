@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ..core.errors import DatasetError, ObservationError
 from ..core.spec import Spec
+from ..space.floorplan import sees_into
 
-Where = Callable[[np.ndarray], np.ndarray]  # pose [N, 7] -> bool [N]: which rows may be in a clip
+Where = Callable[
+    [Any, int, int], np.ndarray
+]  # clip cache, first, stop -> bool [stop - first]: rows that may be in a clip
 
 
 @dataclass(frozen=True)
@@ -50,15 +55,29 @@ class Clip:
         return bool(self.walked_m()[-1] > 0.5 or turned.max() > np.deg2rad(20))
 
 
-def in_box(x0: float, y0: float, x1: float, y1: float) -> Where:
-    """Rows whose place lies inside the box on the map, metres."""
-    return lambda pose: (pose[:, 0] >= x0) & (pose[:, 0] <= x1) & (pose[:, 1] >= y0) & (pose[:, 1] <= y1)
+def in_box(*box: float) -> Where:
+    """Rows whose place lies inside the box x0, y0, x1, y1 on the map, metres."""
+    x0, y0, x1, y1 = box
+
+    def inside(cache, first: int, stop: int) -> np.ndarray:
+        x, y = np.asarray(cache.pose[first:stop, :2]).T
+        return (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
+
+    return inside
 
 
-def outside_box(x0: float, y0: float, x1: float, y1: float) -> Where:
-    """Rows whose place lies outside the box on the map, metres."""
-    inside = in_box(x0, y0, x1, y1)
-    return lambda pose: ~inside(pose)
+def out_of_sight(*box: float) -> Where:
+    """Rows whose place lies outside the box and, where depth and camera are recorded, from which it is not seen into."""
+
+    def outside(cache, first: int, stop: int) -> np.ndarray:
+        away = ~in_box(*box)(cache, first, stop)
+        camera = cache.world.get("camera")
+        if cache.depth is None or not camera:
+            return away
+        depth, pose = (torch.from_numpy(np.array(part[first:stop], np.float32)) for part in (cache.depth, cache.pose))
+        return away & ~sees_into((box[0], box[1], box[2], box[3]), depth, pose, tuple(camera)).numpy()
+
+    return outside
 
 
 def clips_from_cache(
@@ -103,6 +122,8 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
             raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
         stacked = torch.from_numpy(np.stack([np.asarray(array[row]) for array in arrays]))
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
+        if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
+            stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
         if tuple(stacked.shape[1:]) != wanted:
             raise ObservationError(
                 f"{spec.name} observes '{name}' of shape {wanted}, the clips hold {tuple(stacked.shape[1:])}; "
@@ -116,7 +137,7 @@ def _runs(cache, first: int, stop: int, where: Where | None):
     """Stretches [first, stop) of consecutive rows, each reached from the one before by a valid action."""
     if where is not None and cache.pose is None:
         raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
-    allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache.pose[first:stop]), bool)
+    allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache, first, stop), bool)
     linked = np.asarray(cache.action_valid[first : stop - 1], bool).copy()
     if cache.done is not None:
         linked &= ~np.asarray(cache.done[first : stop - 1], bool)

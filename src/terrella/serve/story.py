@@ -125,12 +125,12 @@ class Story:
     # -- verbs --------------------------------------------------------------------------------------------------
 
     def restart(self, seed: int) -> Moment:
-        """A new story from `seed`; the past is forgotten."""
-        self._end_episode()
-        self.seed = seed
-        self._rngs = tuple(make_rng(seed) for _ in self.worlds)
+        """A new story from `seed`; the past is forgotten, once the new one has begun."""
+        rngs = tuple(make_rng(seed) for _ in self.worlds)
+        states = self._starts(rngs)
+        self.seed, self._rngs = seed, rngs
         self._history.clear()
-        return self._begin(0)
+        return self._begin(0, states)
 
     @torch.no_grad()
     def step(self, held: Sequence[str]) -> Moment:
@@ -138,7 +138,7 @@ class Story:
         if self.rewound:
             self._return_to(self._history.newest)
         if self._shown.flags & DONE:
-            return self._begin(self._shown.step + 1)
+            return self._begin(self._shown.step + 1, self._starts(self._rngs))
         action = action_of_keys(self.spec, held)
         pairs = zip(self.worlds, self._states, self._rngs, strict=True)
         self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
@@ -170,7 +170,7 @@ class Story:
             raise ServeError("there is no truth beside this world to look at; play with --compare.")
         if self.rewound or self._shown.flags & DONE:
             raise ServeError("go on from this moment first, then let the dream look at the game.")
-        self._states = (self._states[0], self._dream_of(self._states[0]))
+        self._states = (self._states[0], self._dream_of(self._states[0], self._rngs[1]))
         return self._show(self._shown.step + 1, 0, None)
 
     def record(self, on: bool) -> None:
@@ -190,15 +190,18 @@ class Story:
     # -- inside -------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def _begin(self, step: int) -> Moment:
+    @torch.no_grad()
+    def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
+        truth = self.worlds[0].start(1, rngs[0])
+        return (truth,) if len(self.worlds) == 1 else (truth, self._dream_of(truth, rngs[1]))
+
+    def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
         self._end_episode()
-        truth = self.worlds[0].start(1, self._rngs[0])
-        self._states: tuple[State, ...] = (truth,) if len(self.worlds) == 1 else (truth, self._dream_of(truth))
-        self._return = 0.0
+        self._states, self._return = states, 0.0
         return self._show(step, FRESH, None)
 
-    def _dream_of(self, truth: State) -> State:
-        dream, rng = self.worlds[1], self._rngs[1]
+    def _dream_of(self, truth: State, rng: torch.Generator) -> State:
+        dream = self.worlds[1]
         missing = [name for name in dream.spec.observes if name not in self.spec.channels]
         if missing or not dream.spec.observes:
             self.notice = f"the dream starts on its own: it cannot look at {self.spec.name}."

@@ -59,7 +59,7 @@ class Doom:
     def __init__(self, config: DoomConfig | None = None):
         self.config = config = config or DoomConfig()
         height, width = config.size
-        if 384 % height or 512 % width or 384 // height != 512 // width:
+        if min(height, width) < 1 or 384 % height or 512 % width or 384 // height != 512 // width:
             raise TerrellaError(f"Doom renders at 384x512 divided by a whole number; size {height}x{width} is not.")
         self._shrink = 384 // height
         self._game = _open_game(config)

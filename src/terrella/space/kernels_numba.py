@@ -1,12 +1,15 @@
-"""The compiled kernels of this room; each has a slow, obvious twin beside its caller that tests compare it with."""
+"""The compiled kernels of this room; tests hold each against a slow, obvious twin or against plain geometry."""
 
 from __future__ import annotations
 
 import math
 
 import numba
+import numpy as np
 
 NEAR_M = 0.05
+SAME = 0.06  # depths that differ by less than this share are of one surface
+WITHIN_M = 0.005  # a box this deep in a wall is within it: walls are known about so well
 
 
 @numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
@@ -68,25 +71,139 @@ def cast_one(patch, turn, eye, camera, depth):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def feel(segments, places, heading, free):
-    """segments [S, 4], places [N, 2], heading [D, 2]; lowers `free` [N, D], which starts at the reach, in place."""
+def recall(rgb, depth, turns, eyes, seen, turn, eye, camera, colours, trust):
+    """The kernel of keyframes.recall_slowly: keyframes' rgb uint8 [K, 3, H, W], depth [K, h, w], turns [K, 3, 3] and eyes
+    [K, 3]; what the view sees [V, U] from its turn and eye; fills colours [S, 3, V, U] and trust [S, V, U]."""
+    keys, _, height, width = rgb.shape
+    slots, rows, columns = trust.shape
+    fx, fy, cx, cy = camera
+    sure, across, down = np.zeros(keys, np.float32), np.zeros(keys, np.float32), np.zeros(keys, np.float32)
+    for v in range(rows):
+        for u in range(columns):
+            side, up, far = -((u + 0.5) / columns - cx) / fx, -((v + 0.5) / rows - cy) / fy, seen[v, u]
+            x = eye[0] + far * (turn[0, 0] + side * turn[0, 1] + up * turn[0, 2])
+            y = eye[1] + far * (turn[1, 0] + side * turn[1, 1] + up * turn[1, 2])
+            z = eye[2] + far * (turn[2, 0] + side * turn[2, 1] + up * turn[2, 2])
+            for k in range(keys):
+                px, py, pz = x - eyes[k, 0], y - eyes[k, 1], z - eyes[k, 2]
+                ahead = turns[k, 0, 0] * px + turns[k, 1, 0] * py + turns[k, 2, 0] * pz
+                near = max(ahead, 1e-4)
+                a = cx - fx * (turns[k, 0, 1] * px + turns[k, 1, 1] * py + turns[k, 2, 1] * pz) / near
+                b = cy - fy * (turns[k, 0, 2] * px + turns[k, 1, 2] * py + turns[k, 2, 2] * pz) / near
+                sure[k], across[k], down[k] = 0.0, a, b
+                if ahead > NEAR_M and 0 <= a <= 1 and 0 <= b <= 1:
+                    held = depth[
+                        k,
+                        min(int(b * depth.shape[1]), depth.shape[1] - 1),
+                        min(int(a * depth.shape[2]), depth.shape[2] - 1),
+                    ]
+                    agreement = min(max(1.5 - abs(held - ahead) / ahead / SAME, 0.0), 1.0)
+                    likeness = max(min(far / ahead, ahead / far), 0.05)
+                    sure[k] = agreement * likeness * likeness
+            for slot in range(min(slots, keys)):
+                best = 0
+                for k in range(1, keys):
+                    if sure[k] > sure[best]:
+                        best = k
+                trust[slot, v, u] = sure[best]
+                sure[best] = -1.0
+                a = min(max(across[best] * width - 0.5, 0.0), width - 1.0)
+                b = min(max(down[best] * height - 0.5, 0.0), height - 1.0)
+                i, j = min(int(a), width - 2), min(int(b), height - 2)
+                a, b = a - i, b - j
+                for c in range(3):
+                    top = rgb[best, c, j, i] * (1 - a) + rgb[best, c, j, i + 1] * a
+                    bottom = rgb[best, c, j + 1, i] * (1 - a) + rgb[best, c, j + 1, i + 1] * a
+                    colours[slot, c, v, u] = (top * (1 - b) + bottom * b) / 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def straight_runs(inverse, left, fewest, straight, gap):
+    """Runs of columns on which the inverse depth [w] is a line of `left` [w], as far as neighbours are less than `gap`
+    metres apart: float64 [n, 4] = first, stop, slope, level."""
+    found = np.empty((len(inverse), 4))
+    count, first = 0, 0
+    while first < len(inverse):
+        stop = first + 1
+        while stop < len(inverse):
+            step = math.hypot(
+                1 / inverse[stop] - 1 / inverse[stop - 1],
+                left[stop] / inverse[stop] - left[stop - 1] / inverse[stop - 1],
+            )
+            if step > gap:
+                break
+            x, y = left[first : stop + 1], inverse[first : stop + 1]
+            middle, mean = x.mean(), y.mean()
+            slope = ((x - middle) * (y - mean)).sum() / ((x - middle) ** 2).sum()
+            if np.abs(slope * (x - middle) + mean - y).max() > straight * y.max():
+                break
+            stop += 1
+            if stop - first >= fewest:
+                found[count, 0], found[count, 1], found[count, 2] = first, stop, slope
+                found[count, 3] = mean - slope * middle
+        if stop - first >= fewest:
+            count += 1
+            first = stop
+        else:
+            first += 1
+    return found[:count]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def slide(walls, places, wish, half, short, moved, left):
+    """The kernel of floorplan.slide: walls [S, 4], places [N, 2], wish [N, 2]; fills moved [N, 2] and left [N, 2]."""
     for n in range(len(places)):
-        x, y = places[n, 0], places[n, 1]
-        reach = free[n, 0]
-        for s in range(len(segments)):
-            ax, ay, bx, by = segments[s, 0] - x, segments[s, 1] - y, segments[s, 2] - x, segments[s, 3] - y
-            if min(ax, bx) > reach or max(ax, bx) < -reach or min(ay, by) > reach or max(ay, by) < -reach:
+        x, y, mx, my = places[n, 0], places[n, 1], wish[n, 0], wish[n, 1]
+        reach, near = half + abs(mx) + abs(my), 0
+        close = np.empty((len(walls), 4))
+        for s in range(len(walls)):
+            ax, ay, bx, by = walls[s, 0] - x, walls[s, 1] - y, walls[s, 2] - x, walls[s, 3] - y
+            if min(ax, bx) < reach and max(ax, bx) > -reach and min(ay, by) < reach and max(ay, by) > -reach:
+                close[near] = walls[s]
+                near += 1
+        for bump in range(3):
+            share, along_x, along_y = first_touch(close[:near], x, y, mx, my, half)
+            if share > 1:
+                x, y = x + mx, y + my
+                break
+            go = max(share - short, 0.0)
+            x, y = x + go * mx, y + go * my
+            rest = (1 - max(share, 0.0)) * (mx * along_x + my * along_y) if bump < 2 else 0.0
+            mx, my = rest * along_x, rest * along_y
+        moved[n, 0], moved[n, 1], left[n, 0], left[n, 1] = x - places[n, 0], y - places[n, 1], mx, my
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def first_touch(walls, x, y, mx, my, half):
+    """At which share of the move mx, my a box around x, y first touches one of `walls` [S, 4] (2 where none), and the
+    direction along which it may go on. By separating axes; a wall that the box is already within does not hold it."""
+    best, along_x, along_y = 2.0, 0.0, 0.0
+    far = math.sqrt(mx * mx + my * my)
+    for s in range(len(walls)):
+        ax, ay, bx, by = walls[s, 0] - x, walls[s, 1] - y, walls[s, 2] - x, walls[s, 3] - y
+        length = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+        enter, leave, side_x, side_y = -1e9, 1e9, 0.0, 0.0
+        for axis in range(3):
+            ux, uy = 1.0, 0.0
+            if axis == 1:
+                ux, uy = 0.0, 1.0
+            elif axis == 2:
+                if length < 1e-9:
+                    break
+                ux, uy = (by - ay) / length, (ax - bx) / length
+            one, other, reach = ux * ax + uy * ay, ux * bx + uy * by, half * (abs(ux) + abs(uy))
+            low, high, speed = min(one, other) - reach, max(one, other) + reach, ux * mx + uy * my
+            if abs(speed) < 1e-12:
+                if low >= -1e-9 or high <= 1e-9:
+                    leave = -1e9
                 continue
-            ex, ey = bx - ax, by - ay
-            for d in range(len(heading)):
-                hx, hy = heading[d, 0], heading[d, 1]
-                across = hx * ey - hy * ex
-                if abs(across) < 1e-9:
-                    continue
-                along = (ax * ey - ay * ex) / across
-                share = (ax * hy - ay * hx) / across
-                if 0 <= along < free[n, d] and -0.02 <= share <= 1.02:
-                    free[n, d] = along
+            first, last = min(low / speed, high / speed), max(low / speed, high / speed)
+            if first > enter:
+                enter, side_x, side_y = first, -uy, ux
+            leave = min(leave, last)
+        if enter < min(leave, best) and enter <= 1 and enter * far > -WITHIN_M:
+            best, along_x, along_y = enter, side_x, side_y
+    return best, along_x, along_y
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -106,6 +223,6 @@ def vote(points, distance, depth, turn, eye, camera, votes):
             v = cy - fy * (turn[k, 0, 2] * x + turn[k, 1, 2] * y + turn[k, 2, 2] * z) / ahead
             if u <= 0 or u >= 1 or v <= 0 or v >= 1:
                 continue
-            if abs(depth[k, int(v * height), int(u * width)] - ahead) < 0.06 * ahead:
+            if abs(depth[k, int(v * height), int(u * width)] - ahead) < SAME * ahead:
                 ratio = distance[p] / ahead
                 votes[k, p] = min(ratio, 1 / max(ratio, 1e-3))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import torch
 
 from .camera import Intrinsics, project, rays, rotation
+from .floorplan import wall_segments
 from .patches import FAR_M, cast, patches
 from .reproject import fill_holes, warp
 
@@ -22,7 +23,7 @@ _GRID = 4  # a keyframe votes on every 4th pixel of a half-size view
 @dataclass(frozen=True)
 class Keyframes:
     """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], its rotation `turn` [K, 3, 3],
-    and patches [K, n, 9]."""
+    patches [K, n, 9] and the walls that it saw [K, n, 4] (floorplan.py)."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -30,12 +31,13 @@ class Keyframes:
     turn: torch.Tensor
     coarse: torch.Tensor
     fine: torch.Tensor
+    walls: torch.Tensor
 
     @staticmethod
     def of(rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> Keyframes:
         depth = depth.float()
         coarse, fine = patches(depth, pose, camera, COARSE), patches(depth, pose, camera, FINE)
-        return Keyframes(rgb, depth, pose, rotation(pose), coarse, fine)
+        return Keyframes(rgb, depth, pose, rotation(pose), coarse, fine, wall_segments(depth, pose, camera))
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -130,16 +132,41 @@ def look(
             depth[view] = cast(keys.fine.flatten(0, 1)[None], pose[view : view + 1], camera, size)[0]
     hit = depth < FAR_M
     depth = fill_holes(depth)
-    colours = torch.zeros(batch, count, 3, height, width, device=pose.device)
-    trust = torch.zeros(batch, count, height, width, device=pose.device)
+    colours = torch.zeros(batch, slots, 3, height, width, device=pose.device)
+    trust = torch.zeros(batch, slots, height, width, device=pose.device)
     for view, keys in enumerate(chosen):
         if len(keys):
-            rgb = keys.rgb.float().div(255)[None]
-            one = slice(view, view + 1)
-            colour, agreement, closeness = warp(rgb, keys.depth[None], keys.pose[None], depth[one], pose[one], camera)
-            likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
-            colours[view, : len(keys)], trust[view, : len(keys)] = colour[0], (agreement * likeness**2)[0]
-    trust, order = trust.topk(slots, dim=1)
-    colours = colours.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1))
+            recall(keys, depth[view], pose[view], camera, colours[view], trust[view])
     known = hit & (trust[:, 0] > 0)
     return Glimpse(colours, trust, depth, known.float())
+
+
+def recall(
+    keys: Keyframes,
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+    colours: torch.Tensor,
+    trust: torch.Tensor,
+) -> None:
+    """Fills colours [slots, 3, H, W] and trust [slots, H, W] with the most trusted that keyframes know of the surfaces that
+    lie `depth` [H, W] deep in the view from `pose` [7]."""
+    if pose.device.type != "cpu":
+        return recall_slowly(keys, depth, pose, camera, colours, trust)
+    from .kernels_numba import recall as kernel
+
+    rgb, held, turns, eyes, seen, turn, eye = (
+        part.contiguous().numpy()
+        for part in (keys.rgb, keys.depth, keys.turn, keys.pose[:, :3], depth, rotation(pose), pose[:3])
+    )
+    kernel(rgb, held, turns, eyes, seen, turn, eye, camera, colours.numpy(), trust.numpy())
+
+
+def recall_slowly(keys, depth, pose, camera, colours, trust) -> None:
+    """The same as `recall`, in plain tensor algebra; the way on a GPU."""
+    rgb = keys.rgb.float().div(255)[None]
+    colour, agreement, closeness = warp(rgb, keys.depth[None], keys.pose[None], depth[None], pose[None], camera)
+    likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
+    best, order = (agreement * likeness**2)[0].topk(min(len(trust), len(keys)), dim=0)
+    trust[: len(best)] = best
+    colours[: len(best)] = colour[0].gather(0, order[:, None].expand(-1, 3, -1, -1))

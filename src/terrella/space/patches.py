@@ -13,6 +13,7 @@ from .camera import Intrinsics, rays, rotation, unproject
 
 FAR_M = 100.0  # deeper than any depth: "nothing is known there"
 NEAR_M = 0.05
+SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall seen head-on is no surface
 
 
 def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
@@ -20,12 +21,16 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
 
     One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
     their neighbours' by half, and cross(down, across) points towards the eye that saw them. A patch that would reach
-    over an edge in the depth image keeps to its own pixel.
+    over an edge in the depth image keeps to its own pixel; one that is too slanted to be told from a bridge between two
+    surfaces shrinks to nothing, lest from the side it be a wall across the room.
     """
     points = unproject(depth, pose, camera)
     across, down = _shorter_difference(points, -2), _shorter_difference(points, -3)
     first = stride // 2
     reach = torch.where(_is_flat(depth, stride), 0.75 * stride, 0.5)[..., None]
+    head_on = depth[..., None] / (camera[0] * depth.shape[-1])
+    longest = torch.maximum(across.norm(dim=-1, keepdim=True), down.norm(dim=-1, keepdim=True))
+    reach = torch.where(longest > SLANT * head_on, 0.0, reach)
     whole = torch.cat([points, reach * across, reach * down], -1)
     return whole[..., first::stride, first::stride, :].flatten(-3, -2)
 

@@ -25,7 +25,7 @@ from ..space.keyframes import Keyframes
 from .history import HistoryWorld
 from .video import Generator, Motion, VideoConfig, VideoWorld
 
-KIND, VERSION = "video", 1
+KIND, VERSION = "video", 2
 
 
 def save_world(world: VideoWorld | HistoryWorld, path: str | Path, card: dict, quality: int = 92) -> None:

@@ -14,7 +14,7 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
 from ..space.keyframes import Glimpse
-from .video import Generator, VideoConfig, channels_last, generate
+from .video import Generator, VideoConfig, channels_last, generate, mood
 
 
 class HistoryWorld:
@@ -53,8 +53,8 @@ class HistoryWorld:
         noise = torch.randn(state.batch, 4, *self.config.size, generator=rng)
         there = next(self.generator.parameters()).device
         glimpse, nothing = past(state["frames"]).to(there), torch.zeros_like(noise, device=there)
-        told = actions.flatten(1).to(there)
-        clean = generate(self.generator, noise.to(there), glimpse, nothing, self.config.steps, told).cpu()
+        told = torch.cat([mood(state["frames"][:, 0]), actions.flatten(1)], 1).to(there)
+        clean = generate(self.generator, noise.to(there), glimpse, nothing, told, self.config.steps).cpu()
         frame = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)[:, None]
         return State({"frames": torch.cat([frame, state["frames"][:, :-1]], 1), "actions": actions})
 

@@ -1,15 +1,15 @@
 """VideoWorld: a first-person world learned from posed RGB-D recordings, that draws the next frame and remembers places.
 
 State is where the eye stands, how it moves, the frame it sees, and the keyframes of its own dream; the keyframes of the
-recordings travel with the world as its long-term memory. `imagine` predicts the motion that the action causes
-(`Motion`), asks memory what the new view shows (space/keyframes.py), and a generator completes it (`Generator`).
+recordings travel with the world as its long-term memory. `imagine` predicts the motion that the action causes (`Motion`,
+then the walls that the keyframes saw), asks memory what the new view shows (space/keyframes.py), and a generator
+completes it (`Generator`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -19,11 +19,12 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
 from ..space.camera import Intrinsics, planar_pose, yaw
-from ..space.floorplan import clearance, wall_segments
+from ..space.floorplan import floor_plan, slide
 from ..space.keyframes import Glimpse, Keyframes, look, retrieve
 from ..space.reproject import warp
 
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
+MOOD = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,12 @@ class VideoConfig:
     camera: Intrinsics
     actions: int
     size: tuple[int, int] = (96, 128)
-    channels: tuple[int, ...] = (32, 56, 88)  # of the generator at 1/2, 1/4 and 1/8 of the size
+    channels: tuple[int, ...] = (32, 56, 88, 128)  # of the generator at 1/2, 1/4, 1/8 and 1/16 of the size
     sources: int = 6  # keyframes that are warped into a view
     slots: int = 3  # of them, those that the generator sees at each pixel
     history: int = 8  # actions that the motion model remembers
-    directions: int = 32  # in which it feels for walls
-    body_m: float = 0.0  # nearer than this to a wall the recordings never came: the motion is stopped there
+    body_m: float = 0.0  # half the width of the body that slides along walls, as the recordings show it
+    short: float = 0.0  # the share of a step by which it stops short of a wall
     own_keyframes: int = 24  # of its dream, the oldest is forgotten first
     known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
     new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
@@ -47,7 +48,7 @@ class VideoConfig:
 
 
 class Block(nn.Module):
-    """Two 3x3 convolutions around a SiLU, told the flow time (and the actions), with a residual path."""
+    """Two 3x3 convolutions around a SiLU, told the flow time and more (see Generator), with a residual path."""
 
     def __init__(self, channels: int, told: int):
         super().__init__()
@@ -74,7 +75,7 @@ class Generator(nn.Module):
         widths = config.channels
         self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
-        told = 1 if config.geometry else 1 + config.actions * config.slots
+        told = 1 + 3 * MOOD[0] * MOOD[1] + (0 if config.geometry else config.actions * config.slots)
         self.before = nn.ModuleList(Block(width, told) for width in widths)
         self.after = nn.ModuleList(Block(width, told) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
@@ -90,12 +91,12 @@ class Generator(nn.Module):
         time: torch.Tensor,
         glimpse: Glimpse,
         last: torch.Tensor,
-        actions: torch.Tensor | None = None,
+        told: torch.Tensor,
     ) -> torch.Tensor:
         """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]; last [B, 4, H, W] = the last frame's colour
-        warped into this view and its trust; actions [B, slots * A], the newest first, where there is no geometry to
-        say what they cause. Returns the clean frame in the same code as `noisy`."""
-        told = time[:, None] if actions is None else torch.cat([time[:, None], actions], 1)
+        warped into this view and its trust; told [B, n]: the last frame's `mood`, and where there is no geometry to say
+        what they cause, the actions [slots * A], the newest first. Returns the clean frame in the code of `noisy`."""
+        told = torch.cat([time[:, None], told], 1)
         colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
         merged = merge(glimpse) * 2 - 1
         depth = encode_depth(glimpse.depth)[:, None]
@@ -117,7 +118,7 @@ class Generator(nn.Module):
                 x = self.down[level](x)
         x = self.after[-1](x, told)
         for level in reversed(range(len(self.down))):
-            x = kept[level] + F.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
+            x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
             x = self.after[level](x, told)
         out = F.pixel_shuffle(self.leave(x), 2)
         share = out[:, : self.choices + 1].softmax(1)
@@ -151,63 +152,39 @@ def decode_depth(code: torch.Tensor) -> torch.Tensor:
 
 
 class Motion(nn.Module):
-    """How the eye moves: turns by the actions, glides in its own frame, and is stopped by what is near in the world's."""
+    """How the eye moves where nothing is in its way: it turns by the actions, and glides by drag and thrust in its own
+    frame. Walls come after (space/floorplan.slide)."""
+
+    middle: torch.Tensor  # of the recorded places, and how far they reach, in metres
+    span: torch.Tensor
 
     def __init__(self, config: VideoConfig):
         super().__init__()
         acts = config.actions * (config.history + 1)
-        self.turn = _mlp(acts, 64, 1)
+        self.turn = nn.Sequential(nn.Linear(acts, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, 1))
         self.glide = nn.Linear(2 + config.actions, 2)
-        self.extra = _mlp(acts + 2, 64, 2)
-        self.walls = _mlp(4 + config.directions, 96, 2)
-        self.ending = _mlp(2 + config.actions, 64, 1)
+        self.ending = nn.Sequential(
+            nn.Linear(2 + config.actions, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
+        )
+        self.register_buffer("middle", torch.zeros(2))
+        self.register_buffer("span", torch.ones(()))
 
-    def forward(self, heading, moved, actions, free):
-        """heading [B] radians; moved [B, 2] metres in the last step, world frame; actions [B, history + 1, A], the
-        newest last; free [B, directions] metres. Returns the new heading [B] and this step's displacement [B, 2]."""
-        acts = actions.flatten(1)
-        heading = heading + 0.1 * self.turn(acts)[:, 0]
-        local = 10 * turned(moved, -heading)
-        glide = self.glide(torch.cat([local, actions[:, -1]], -1)) + 0.1 * self.extra(torch.cat([acts, local], -1))
-        wish = turned(glide, heading)
-        stopped = self.walls(torch.cat([wish, 10 * moved, free - 0.5], -1))
-        return heading, 0.1 * (wish + stopped)
+    def forward(self, heading, speed, actions):
+        """heading [B] radians; speed [B, 2] metres a step, world frame; actions [B, history + 1, A], the newest last.
+        Returns the new heading [B] and the displacement that this step wishes for [B, 2]."""
+        heading = heading + 0.1 * self.turn(actions.flatten(1))[:, 0]
+        glide = self.glide(torch.cat([10 * turned(speed, -heading), actions[:, -1]], -1))
+        return heading, 0.1 * turned(glide, heading)
 
     def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Logit that the episode ends at `place` [B, 2]: [B]."""
-        return self.ending(torch.cat([place / 8 - 2, action], -1))[:, 0]
+        return self.ending(torch.cat([2 * (place - self.middle) / self.span, action], -1))[:, 0]
 
 
 def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """[B, 2] rotated counter-clockwise by [B] radians."""
     c, s = angle.cos(), angle.sin()
     return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)
-
-
-def kept_clear(moved: torch.Tensor, free: torch.Tensor, body_m: float) -> torch.Tensor:
-    """`moved` [B, 2] without what would bring the body nearer to a wall than `body_m`; it slides along instead.
-
-    Walls are where `free` [B, directions] is least among its neighbours: there the ray meets them at right angles.
-    What the motion model learned of walls is right nearly always; one miss in thousands, and a player is outside.
-    """
-    directions = free.shape[1]
-    angle = torch.arange(directions) * (2 * math.pi / directions)
-    heading = torch.stack([angle.cos(), angle.sin()], -1)
-    nearest = (free <= free.roll(1, 1)) & (free <= free.roll(-1, 1)) & (free < free.amax(1, keepdim=True))
-    order = free.argsort(1)  # the nearest wall first, in every story by itself
-    for rank in range(directions):
-        ray = order[:, rank : rank + 1]
-        ahead = heading[ray[:, 0]]
-        towards = (moved * ahead).sum(1)
-        excess = torch.minimum(towards - (free.gather(1, ray)[:, 0] - body_m), towards).clamp_min(0)
-        moved = moved - (excess * nearest.gather(1, ray)[:, 0])[:, None] * ahead
-    return moved
-
-
-def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, outputs)
-    )
 
 
 class VideoWorld:
@@ -224,7 +201,7 @@ class VideoWorld:
         self.generator = channels_last(generator.eval())
         self.motion = motion.eval()
         self.memory, self.starts, self.rewards = memory, starts, rewards
-        self._walls = wall_segments(memory.depth, memory.pose, config.camera).flatten(0, 1)
+        self._walls = floor_plan(memory.walls, memory.pose)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Begins where one of the recordings was, standing still."""
@@ -254,10 +231,13 @@ class VideoWorld:
                     "a pose alone says nothing of what is seen there: give rgb and depth, or a prior."
                 )
             prior = self._blank(batch, pose)
-        moved = pose[:, :2] - prior["pose"][:, :2]
-        moved = torch.where((moved.norm(dim=-1) < 1.0)[:, None] & ~prior["fresh"][:, None], moved, 0.0)
+        speed = pose[:, :2] - prior["pose"][:, :2]
+        speed = speed + torch.where(
+            prior["dreamt"][:, None], prior["speed"], 0.0
+        )  # what was dreamt, and how wrong it was
+        speed = torch.where((speed.norm(dim=-1) < 1.0)[:, None], speed, 0.0)
         no, nothing = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
-        state = prior.replace(pose=pose, moved=moved, fresh=no, done=no, reward=nothing)
+        state = prior.replace(pose=pose, speed=speed, dreamt=no, done=no, reward=nothing)
         if not {"rgb", "depth"} <= set(observation):
             return self._draw(state, prior, rng)
         height, width = self.config.size
@@ -274,16 +254,16 @@ class VideoWorld:
         """One step: move, then draw what is seen from there."""
         action = self.spec.check_action(action, state.batch).float().view(state.batch, -1)
         pose, acts = state["pose"], torch.cat([state["actions"], action[:, None]], 1)
-        free = torch.stack([self._clearance(state, view) for view in range(state.batch)])
-        heading, moved = self.motion(yaw(pose), state["moved"], acts, free)
-        moved = kept_clear(moved, free, self.config.body_m)
+        heading, wish = self.motion(yaw(pose), state["speed"], acts)
+        moved, speed = self._walk(state, wish)
         place = pose[:, :2] + moved
         pose = planar_pose(place[:, 0], place[:, 1], pose[:, 2], heading)
-        done = state["done"] | (self.motion.ends(place, action) > 0)
-        still = state["done"][:, None]
+        still = state["done"]
+        done = still | (self.motion.ends(place, action) > 0)
         next_state = state.replace(
-            pose=torch.where(still, state["pose"], pose), moved=torch.where(still, 0.0, moved), actions=acts[:, 1:],
-            done=done, reward=torch.where(state["done"], 0.0, self.rewards[0] + self.rewards[1] * done.float()),
+            pose=torch.where(still[:, None], state["pose"], pose), speed=torch.where(still[:, None], 0.0, speed),
+            actions=acts[:, 1:], dreamt=torch.ones_like(done), done=done,
+            reward=torch.where(still, 0.0, self.rewards[0] + self.rewards[1] * done.float()),
         )  # fmt: skip
         return self._draw(next_state, state, rng)
 
@@ -301,12 +281,15 @@ class VideoWorld:
         config = self.config
         (height, width), own = config.size, config.own_keyframes
         nothing = Keyframes.of(
-            torch.zeros(1, 3, height, width, dtype=torch.uint8), torch.ones(1, height, width), pose[:1], config.camera
+            torch.zeros(1, 3, 2 * height, 2 * width, dtype=torch.uint8),
+            torch.ones(1, height, width),
+            pose[:1],
+            config.camera,
         )
         keys = {f"key_{name}": tensor.expand(batch, own, *tensor.shape[1:]) for name, tensor in vars(nothing).items()}
         return State(
             {
-                "pose": pose, "moved": torch.zeros(batch, 2), "fresh": torch.ones(batch, dtype=torch.bool),
+                "pose": pose, "speed": torch.zeros(batch, 2), "dreamt": torch.zeros(batch, dtype=torch.bool),
                 "actions": torch.zeros(batch, config.history, config.actions),
                 "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool),
                 "rgb": torch.zeros(batch, 3, height, width, dtype=torch.uint8), "depth": torch.ones(batch, height, width),
@@ -319,10 +302,16 @@ class VideoWorld:
         count = min(int(state["key_count"][view]), self.config.own_keyframes)
         return Keyframes(*(state[f"key_{name}"][view, :count] for name in vars(self.memory)))
 
-    def _clearance(self, state: State, view: int) -> torch.Tensor:
-        own = self._own(state, view)
-        walls = torch.cat([self._walls, wall_segments(own.depth, own.pose, self.config.camera).flatten(0, 1)])
-        return clearance(walls, state["pose"][view : view + 1, :2], self.config.directions)[0]
+    def _walk(self, state: State, wish: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The displacement [B, 2] and the speed left [B, 2] of a body that wishes to move by `wish` [B, 2] among the walls
+        that memory and the dream have seen."""
+        walks = []
+        for view in range(state.batch):
+            one, own = slice(view, view + 1), self._own(state, view)
+            walls = torch.cat([self._walls, own.walls.flatten(0, 1)])
+            walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
+        moved, speed = zip(*walks)
+        return torch.cat(moved), torch.cat(speed)
 
     def _draw(self, state: State, before: State, rng: torch.Generator) -> State:
         """The frame at `state`'s pose, from memory, `before`'s frame and the generator."""
@@ -331,13 +320,13 @@ class VideoWorld:
         for view in range(state.batch):
             memories = [keys for keys in (self.memory, self._own(state, view)) if len(keys)]
             picks = retrieve(memories, pose[view], config.camera, config.size, config.sources)
-            parts = [_resized(keys.at(pick), self.memory) for keys, pick in zip(memories, picks)]
-            chosen.append(_joined(parts))
+            chosen.append(_joined([keys.at(pick) for keys, pick in zip(memories, picks)]))
         glimpse = look(chosen, pose, config.camera, config.size, config.sources, config.slots)
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
         noise = torch.randn(state.batch, 4, *config.size, generator=rng)
         there = next(self.generator.parameters()).device
-        clean = generate(self.generator, noise.to(there), glimpse.to(there), last.to(there), config.steps).cpu()
+        told = mood(before["rgb"]).to(there)
+        clean = generate(self.generator, noise.to(there), glimpse.to(there), last.to(there), told, config.steps).cpu()
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
         drawn = state.replace(rgb=rgb, depth=decode_depth(clean[:, 3]))
         invented = glimpse.known.mean((1, 2)) < self.config.known_enough
@@ -357,7 +346,7 @@ class VideoWorld:
         """The current frame kept as a keyframe in the stories `which` [B]; the oldest is forgotten when full."""
         if not which.any():
             return state
-        new = Keyframes.of(state["rgb"], state["depth"], state["pose"], self.config.camera)
+        new = Keyframes.of(doubled(state["rgb"]), state["depth"], state["pose"], self.config.camera)
         apart, nearest = self._nearest_own(state)
         fresh = apart > 1  # else it takes the place of the keyframe that it is too near to: evidence beats a dream
         slot = torch.where(fresh, state["key_count"] % self.config.own_keyframes, nearest)
@@ -370,19 +359,20 @@ class VideoWorld:
         return state.replace(**changed)
 
 
+def mood(rgb: torch.Tensor) -> torch.Tensor:
+    """The look of frames (uint8 [B, 3, H, W]) as a tiny picture in [-1, 1]: [B, 36]. Where nothing is known of a view,
+    what was just seen says best what the place is like."""
+    return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, MOOD).flatten(1)
+
+
 def generate(
-    generator: Generator,
-    noise: torch.Tensor,
-    glimpse: Glimpse,
-    last: torch.Tensor,
-    steps: int,
-    actions: torch.Tensor | None = None,
+    generator: Generator, noise: torch.Tensor, glimpse: Glimpse, last: torch.Tensor, told: torch.Tensor, steps: int
 ) -> torch.Tensor:
     """Noise to frame in `steps` Euler steps of the straight flow."""
     x = noise
     for step in range(steps):
         now, after = step / steps, (step + 1) / steps
-        clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, actions)
+        clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, told)
         x = clean if after == 1 else x + (clean - x) * (after - now) / (1 - now)
     return x
 
@@ -404,13 +394,9 @@ def carry(
     return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
 
 
-def _resized(keys: Keyframes, like: Keyframes) -> Keyframes:
-    """Keyframes of the dream have the frame's size; beside the recordings' larger ones they are enlarged."""
-    size = like.rgb.shape[-2:]
-    if not len(like) or keys.rgb.shape[-2:] == size or not len(keys):
-        return keys
-    rgb = F.interpolate(keys.rgb.float(), size, mode="bilinear").round().to(torch.uint8)
-    return replace(keys, rgb=rgb)
+def doubled(rgb: torch.Tensor) -> torch.Tensor:
+    """uint8 [..., 3, H, W] -> [..., 3, 2H, 2W], every pixel four times: a warp then blurs it by half a pixel only."""
+    return rgb.repeat_interleave(2, -1).repeat_interleave(2, -2)
 
 
 def _joined(parts: list[Keyframes]) -> Keyframes:
