@@ -309,7 +309,7 @@ def score(
     )
     from .measure.bars import summary
 
-    if min(horizons, default=0) < 1 or clips < 1 or 0 < long_steps < 100:
+    if min(horizons, default=0) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100):
         raise TerrellaError("--horizons and --clips are whole numbers from 1 up, --long-steps is 0 or at least 100.")
     world, rng, steps = _load(name, device), make_rng(seed), max(horizons)
     arms = {"memory": world, "no memory": _load(name, device, memory=False)}

@@ -138,7 +138,9 @@ def test_a_recording_of_one_frame_is_refused(capsys, tmp_path):
     assert "2 rows" in said and not (tmp_path / "set").exists()
 
 
-@pytest.mark.parametrize("wrong", [["--horizons", 0], ["--clips", 0], ["--long-steps", 3], ["--horizons", 8, -1]])
+@pytest.mark.parametrize(
+    "wrong", [["--horizons", 0], ["--clips", 0], ["--long-steps", 3], ["--long-steps", -5], ["--horizons", 8, -1]]
+)
 def test_a_score_over_no_steps_is_refused(wrong, capsys, tmp_path):
     assert "from 1 up" in refusal(["score", "doom-maze", "--data", tmp_path, *wrong], capsys)
 

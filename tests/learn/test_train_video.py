@@ -8,15 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 from tests.data.corridor import Corridor
 
 from terrella.core import check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Explorer, Layout, Recorder, record
-from terrella.learn.samples import choose_keyframes, usable_rows
+from terrella.learn.lessons import varied
+from terrella.learn.samples import Lesson, choose_keyframes, usable_rows
 from terrella.learn.train_video import TrainConfig, train_video
-from terrella.worlds.folder import load_world
+from terrella.space.keyframes import Glimpse
+from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.video import mood
 
 CONFIG = TrainConfig(size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9)
 
@@ -71,9 +75,11 @@ def test_a_stopped_run_goes_on_exactly(recording, trained, tmp_path):
     module._Run._step = stop_after_two(original)
     try:
         with pytest.raises(Stop):
-            train_video(recording, tmp_path, CONFIG, quiet)
+            train_video(recording, tmp_path, replace(CONFIG, save_every_s=-1.0), quiet)
     finally:
         module._Run._step = original
+    with safe_open(tmp_path / "resume.safetensors", "pt") as saved:
+        assert json.loads(saved.metadata()["facts"])["step"] == 2, "it goes on from a trained state"
     train_video(recording, tmp_path, CONFIG, quiet)
     whole, resumed = (load_file(folder / "resume.safetensors") for folder in (trained[0], tmp_path))
     assert whole.keys() == resumed.keys()
@@ -158,3 +164,57 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
     (broken / "weights.safetensors").write_bytes(weights[: len(weights) // 2])
     with pytest.raises(CheckpointError, match="damaged"):
         load_world(broken)
+
+
+def test_ctrl_c_within_a_step_goes_on_exactly_too(recording, trained, tmp_path, monkeypatch):
+    from terrella.learn import train_video as module
+
+    original, steps = module._Run._step, []
+
+    def cut_in_the_third(self, number):
+        steps.append(number)
+        result = original(self, number)
+        if len(steps) == 3:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(module._Run, "_step", cut_in_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        train_video(recording, tmp_path, replace(CONFIG, save_every_s=-1.0), quiet)
+    train_video(recording, tmp_path, CONFIG, quiet)
+    assert steps == [0, 1, 2, 2, 3], "the step that was cut is done again"
+    whole, resumed = (load_file(folder / "resume.safetensors") for folder in (trained[0], tmp_path))
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+
+
+def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
+    world = load_world(trained[0] / "world")
+    save_world(world.without_memory(), tmp_path / "bare", {})
+    bare = load_world(tmp_path / "bare")
+    assert len(bare.memory) == 0 and len(bare.starts) == len(world.starts)
+    assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
+
+
+def test_actions_that_are_no_buttons_are_refused(tmp_path):
+    with Recorder(tmp_path / "set", Layout(10.0, ("steer",), rgb=(24, 32))) as recorder:
+        for step in range(80):
+            picture = np.full((24, 32, 3), 40 + step, np.uint8)
+            recorder.add({"rgb": picture}, np.array([0.37]) if step < 79 else None, 0.0, False)
+    with pytest.raises(DatasetError, match="no buttons"):
+        train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+
+
+def test_a_varied_lesson_is_the_same_lesson_in_another_world():
+    """Where memory holds the truth itself it still does, mirrored and in other colours."""
+    rng = make_rng(0)
+    truth = torch.rand(2, 4, 16, 24, generator=rng)
+    glimpse = Glimpse(truth[:, None, :3], torch.ones(2, 1, 16, 24), truth[:, 3], torch.ones(2, 16, 24))
+    pixels = (truth[:, :3] * 255).to(torch.uint8)
+    changed = set()
+    for seed in range(12):
+        lesson = varied(Lesson(glimpse, truth, mood(pixels), truth), np.random.default_rng(seed))
+        assert torch.equal(lesson.glimpse.rgb[:, 0], lesson.truth[:, :3]) and torch.equal(lesson.last, lesson.truth)
+        assert torch.equal(lesson.glimpse.depth, lesson.truth[:, 3])
+        assert torch.allclose(mood((lesson.truth[:, :3] * 255).to(torch.uint8)), lesson.told, atol=1e-5)
+        changed.add(not torch.equal(lesson.truth, truth))
+    assert changed == {True, False}

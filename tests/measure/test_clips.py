@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from panorama import Panorama, recording, some_clips
 
 from terrella.core import make_rng
@@ -93,3 +96,15 @@ def test_evidence_that_does_not_fit_is_refused():
     small = [clip.__class__(**{**clip.__dict__, "rgb": clip.rgb[:, ::2]}) for clip in clips]
     with pytest.raises(ObservationError, match="size"):
         evidence(small, Panorama().spec, 0)
+
+
+def test_depth_of_another_size_is_shown_at_the_size_of_the_world():
+    cache = recording()
+    cache.depth = np.random.default_rng(0).random((len(cache.pose), 6, 8)).astype(np.float32)
+    clips = clips_from_cache(cache, range(4), 2, 10, 3, make_rng(0))
+    spec = Panorama().spec
+    channels = {**spec.channels, "depth": spaces.Box(0, 100, (12, 16), np.float32)}
+    seen = evidence(clips, replace(spec, channels=channels, observes=("rgb", "pose", "depth")), 0)["depth"]
+    assert seen.shape == (3, 12, 16) and torch.equal(
+        seen[:, ::2, ::2], torch.from_numpy(np.stack([c.depth[0] for c in clips]))
+    )

@@ -87,3 +87,24 @@ def test_a_pose_that_is_not_a_number_is_refused(world):
     state = world.start(1, terrella.make_rng(0))
     with pytest.raises(ObservationError, match="finite"):
         world.observe({"pose": torch.full((1, 7), float("nan"))}, state, terrella.make_rng(0))
+
+
+def test_evidence_that_agrees_with_the_dream_leaves_its_speed():
+    world, rng = terrella.load("doom-maze"), terrella.make_rng(0)
+    running = hold(world, middle_of_a_room(world), 8, "MOVE_FORWARD")
+    told = world.observe({"pose": running["pose"]}, running, rng)
+    assert torch.allclose(told["speed"], running["speed"], atol=1e-6) and told["speed"].norm() > 0.1
+    beside = running["pose"].clone()
+    beside[0, 0] += 0.05  # the truth is five centimetres farther on: so much faster it was
+    faster = world.observe({"pose": beside}, running, rng)
+    assert (faster["speed"] - running["speed"])[0].tolist() == pytest.approx([0.05, 0.0], abs=1e-5)
+
+
+def test_a_story_among_known_walls_stays_in_the_map():
+    """Runs against every wall of the room for 200 steps; the room reaches from 12 to 17 and from -8.5 to -2.5 m."""
+    world = terrella.load("doom-maze")
+    state = middle_of_a_room(world)
+    for press in range(10):
+        state = hold(world, state, 20, "MOVE_FORWARD", *(("TURN_LEFT",) if press % 2 else ("MOVE_RIGHT",)))
+        away = (world.memory.pose[:, :2] - state["pose"][0, :2]).norm(dim=-1).min()
+        assert away < 1.5, "nobody has ever been so far from where it stands"

@@ -126,7 +126,7 @@ def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarra
 
 def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: VideoConfig):
     """What the chosen keyframes know of the views at `rows`."""
-    return look(shown.chosen, recording.pose(rows), config.camera, config.size, config.sources, config.slots)
+    return look(shown.chosen, recording.pose(rows), config.camera, config.size, config.slots)
 
 
 def carried(rgb, depth, from_rows, to_rows, glimpse, recording: Recording, config: VideoConfig) -> torch.Tensor:

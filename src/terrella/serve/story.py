@@ -190,11 +190,11 @@ class Story:
     # -- inside -------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    @torch.no_grad()
     def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
         truth = self.worlds[0].start(1, rngs[0])
         return (truth,) if len(self.worlds) == 1 else (truth, self._dream_of(truth, rngs[1]))
 
+    @torch.no_grad()
     def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
         self._end_episode()
         self._states, self._return = states, 0.0

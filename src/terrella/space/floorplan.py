@@ -16,6 +16,7 @@ WALLS = 16  # of a keyframe that are kept at most, those seen by most columns
 NOWHERE = 1e6  # where the unused ones are
 FEWEST = 4  # columns that make a wall; of a far one more are needed, for its ends are uncertain
 FAR_M, FEWEST_FAR = 4.0, 12
+SEEN_M = 50.0  # beyond it depth says "nothing there" as often as "a wall"
 STRAIGHT = 0.004  # 1 / depth along a wall is a straight line, up to this share
 GAP_M = 0.5  # columns farther apart do not join: no body fits through less
 
@@ -24,20 +25,22 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     """Depth [K, h, w] from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
 
     On the horizon the inverse depth of a flat wall is linear in the column; each run of columns on one line is a wall,
-    and where two runs meet they are drawn to their corner.
+    and where two runs meet they are drawn to their corner. What is farther than SEEN_M, or so far that neighbouring columns
+    lie half a metre apart (32 m for a wall seen head-on by 128 columns over 90 degrees), is left for a nearer look.
     """
     from .kernels_numba import straight_runs
 
+    there, depth, pose = depth.device, depth.cpu(), pose.cpu()
     height, width = depth.shape[-2:]
     row = min(int(camera[3] * height), height - 1)
     left = -((np.arange(width) + 0.5) / width - camera[2]) / camera[0]
     walls = np.full((len(depth), WALLS, 4), NOWHERE, np.float32)
     heading = yaw(pose).double().numpy()
     cosine, sine, eye = np.cos(heading), np.sin(heading), pose[:, :2].double().numpy()
-    for key, inverse in enumerate(1 / depth[:, row].double().numpy()):
+    for key, inverse in enumerate(1 / depth[:, row].double().clamp(0.05, 1e3).numpy()):
         runs = [
             (int(first), int(stop), *line)
-            for first, stop, *line in straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M)
+            for first, stop, *line in straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
         ]
         runs = [
             run
@@ -50,7 +53,7 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
                 ahead = 1 / (slope * side + level)
                 x, y = ahead * cosine[key] - ahead * side * sine[key], ahead * sine[key] + ahead * side * cosine[key]
                 walls[key, slot, 2 * end : 2 * end + 2] = eye[key] + (x, y)
-    return torch.from_numpy(walls)
+    return torch.from_numpy(walls).to(there)
 
 
 def _corners(runs: list[tuple], left: np.ndarray) -> list[tuple]:

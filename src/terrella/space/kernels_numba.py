@@ -9,7 +9,7 @@ import numpy as np
 
 NEAR_M = 0.05
 SAME = 0.06  # depths that differ by less than this share are of one surface
-WITHIN_M = 0.005  # a box this deep in a wall is within it: walls are known about so well
+WITHIN_M = 0.005  # as well as walls are known
 
 
 @numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
@@ -118,9 +118,9 @@ def recall(rgb, depth, turns, eyes, seen, turn, eye, camera, colours, trust):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def straight_runs(inverse, left, fewest, straight, gap):
+def straight_runs(inverse, left, fewest, straight, gap, least):
     """Runs of columns on which the inverse depth [w] is a line of `left` [w], as far as neighbours are less than `gap`
-    metres apart: float64 [n, 4] = first, stop, slope, level."""
+    metres apart and no inverse depth is below `least`: float64 [n, 4] = first, stop, slope, level."""
     found = np.empty((len(inverse), 4))
     count, first = 0, 0
     while first < len(inverse):
@@ -130,7 +130,7 @@ def straight_runs(inverse, left, fewest, straight, gap):
                 1 / inverse[stop] - 1 / inverse[stop - 1],
                 left[stop] / inverse[stop] - left[stop - 1] / inverse[stop - 1],
             )
-            if step > gap:
+            if step > gap or inverse[stop - 1] < least or inverse[stop] < least:
                 break
             x, y = left[first : stop + 1], inverse[first : stop + 1]
             middle, mean = x.mean(), y.mean()
@@ -176,33 +176,39 @@ def slide(walls, places, wish, half, short, moved, left):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def first_touch(walls, x, y, mx, my, half):
     """At which share of the move mx, my a box around x, y first touches one of `walls` [S, 4] (2 where none), and the
-    direction along which it may go on. By separating axes; a wall that the box is already within does not hold it."""
+    direction along which it may go on. By separating axes. Walls are known to WITHIN_M: one that the box is deeper in does
+    not hold it, and one that it would only graze by less does not stop it."""
     best, along_x, along_y = 2.0, 0.0, 0.0
-    far = math.sqrt(mx * mx + my * my)
+    unit = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+    low, high, speed = np.empty(3), np.empty(3), np.empty(3)
     for s in range(len(walls)):
         ax, ay, bx, by = walls[s, 0] - x, walls[s, 1] - y, walls[s, 2] - x, walls[s, 3] - y
         length = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
-        enter, leave, side_x, side_y = -1e9, 1e9, 0.0, 0.0
+        if length < 1e-9:
+            continue
+        unit[2, 0], unit[2, 1] = (by - ay) / length, (ax - bx) / length
+        enter, leave, face = -1e9, 1e9, -1
         for axis in range(3):
-            ux, uy = 1.0, 0.0
-            if axis == 1:
-                ux, uy = 0.0, 1.0
-            elif axis == 2:
-                if length < 1e-9:
-                    break
-                ux, uy = (by - ay) / length, (ax - bx) / length
+            ux, uy = unit[axis, 0], unit[axis, 1]
             one, other, reach = ux * ax + uy * ay, ux * bx + uy * by, half * (abs(ux) + abs(uy))
-            low, high, speed = min(one, other) - reach, max(one, other) + reach, ux * mx + uy * my
-            if abs(speed) < 1e-12:
-                if low >= -1e-9 or high <= 1e-9:
+            low[axis], high[axis], speed[axis] = min(one, other) - reach, max(one, other) + reach, ux * mx + uy * my
+            if abs(speed[axis]) < 1e-12:
+                if low[axis] >= -1e-9 or high[axis] <= 1e-9:
                     leave = -1e9
                 continue
-            first, last = min(low / speed, high / speed), max(low / speed, high / speed)
-            if first > enter:
-                enter, side_x, side_y = first, -uy, ux
-            leave = min(leave, last)
-        if enter < min(leave, best) and enter <= 1 and enter * far > -WITHIN_M:
-            best, along_x, along_y = enter, side_x, side_y
+            ends = low[axis] / speed[axis], high[axis] / speed[axis]
+            if min(ends) > enter:
+                enter, face = min(ends), axis
+            leave = min(leave, max(ends))
+        if enter >= min(leave, best) or enter > 1 or face < 0 or enter * abs(speed[face]) <= -WITHIN_M:
+            continue
+        grazes = False
+        for axis in range(3):  # how deep the box is in the wall, seen along the other axes, where it meets it
+            across = abs(unit[axis, 0] * unit[face, 1] - unit[axis, 1] * unit[face, 0])
+            deep = min(enter * speed[axis] - low[axis], high[axis] - enter * speed[axis])
+            grazes = grazes or (across > 0.02 and deep < WITHIN_M)
+        if not grazes:
+            best, along_x, along_y = enter, -unit[face, 1], unit[face, 0]
     return best, along_x, along_y
 
 

@@ -121,10 +121,8 @@ def vote_slowly(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor,
     return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
 
 
-def look(
-    chosen: list[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int, slots: int
-) -> Glimpse:
-    """The view from `pose` [B, 7] as the `chosen` keyframes (one set a view, at most `count` each) know it."""
+def look(chosen: list[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int) -> Glimpse:
+    """The view from `pose` [B, 7] as the `chosen` keyframes, one set a view, know it."""
     batch, (height, width) = len(pose), size
     depth = torch.full((batch, height, width), FAR_M, device=pose.device)
     for view, keys in enumerate(chosen):

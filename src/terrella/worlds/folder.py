@@ -155,13 +155,14 @@ def _pack_parts(name: str, parts: list[bytes]) -> dict[str, torch.Tensor]:
 
 def _unpack(packed: dict[str, torch.Tensor], config: VideoConfig) -> Keyframes:
     height, width = (int(n) for n in packed["depth_size"])
-    depth = [np.frombuffer(zlib.decompress(p), "<u2").reshape(height, width) for p in _parts(packed, "depth")]
-    metres = torch.from_numpy(np.stack(depth).astype(np.float32) / 1000)
+    depth = [np.frombuffer(zlib.decompress(p), "<u2").reshape(1, height, width) for p in _parts(packed, "depth")]
+    metres = torch.from_numpy(np.concatenate([np.zeros((0, height, width), "<u2"), *depth]).astype(np.float32) / 1000)
     return Keyframes.of(_unpack_frames(packed), metres, packed["pose"], config.camera)
 
 
 def _unpack_frames(packed: dict[str, torch.Tensor]) -> torch.Tensor:
-    frames = np.stack([simplejpeg.decode_jpeg(part) for part in _parts(packed, "rgb")])
+    decoded = [simplejpeg.decode_jpeg(part) for part in _parts(packed, "rgb")]
+    frames = np.stack(decoded) if decoded else np.zeros((0, 2, 2, 3), np.uint8)
     return torch.from_numpy(frames).permute(0, 3, 1, 2).contiguous()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +39,7 @@ class VideoConfig:
     sources: int = 6  # keyframes that are warped into a view
     slots: int = 3  # of them, those that the generator sees at each pixel
     history: int = 8  # actions that the motion model remembers
-    body_m: float = 0.0  # half the width of the body that slides along walls, as the recordings show it
+    body_m: float = 0.0  # half the width of the body that slides along walls, as recordings show it; 0: none stops it
     short: float = 0.0  # the share of a step by which it stops short of a wall
     own_keyframes: int = 24  # of its dream, the oldest is forgotten first
     known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
@@ -201,7 +202,10 @@ class VideoWorld:
         self.generator = channels_last(generator.eval())
         self.motion = motion.eval()
         self.memory, self.starts, self.rewards = memory, starts, rewards
-        self._walls = floor_plan(memory.walls, memory.pose)
+
+    @cached_property
+    def _walls(self) -> torch.Tensor:
+        return floor_plan(self.memory.walls, self.memory.pose)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Begins where one of the recordings was, standing still."""
@@ -321,7 +325,7 @@ class VideoWorld:
             memories = [keys for keys in (self.memory, self._own(state, view)) if len(keys)]
             picks = retrieve(memories, pose[view], config.camera, config.size, config.sources)
             chosen.append(_joined([keys.at(pick) for keys, pick in zip(memories, picks)]))
-        glimpse = look(chosen, pose, config.camera, config.size, config.sources, config.slots)
+        glimpse = look(chosen, pose, config.camera, config.size, config.slots)
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
         noise = torch.randn(state.batch, 4, *config.size, generator=rng)
         there = next(self.generator.parameters()).device
