@@ -105,6 +105,23 @@ def test_keys_light_up_and_are_let_go_with_the_focus(serve_world, open_page):
     until(page, "document.querySelectorAll('#keys .held').length === 0")
 
 
+PAD = """() => {
+  window.pad = { axes: [0, 0, 0, 0], buttons: [], connected: true, mapping: 'standard', index: 0, id: 'a pad' };
+  navigator.getGamepads = () => [window.pad];
+  window.dispatchEvent(new Event('gamepadconnected'));
+}"""
+
+
+def test_a_gamepad_walks_with_the_left_stick_and_turns_with_the_right(serve_world, open_page):
+    page = open_page(serve_world().url)
+    page.evaluate(PAD)
+    for axes, held in (([0, -1, 0, 0], ["KeyW"]), ([0, 0, 1, 0], ["ArrowRight"]), ([0, 0, -1, 0], ["ArrowLeft"])):
+        page.evaluate("axes => { window.pad.axes = axes; }", axes)
+        until(page, f"terrella.held.join() === '{','.join(held)}'")
+    page.evaluate("() => { window.pad.connected = false; }")
+    until(page, "terrella.held.length === 0")
+
+
 def test_rewind_branch_and_back_to_now(serve_world, open_page):
     page = open_page(serve_world([Panorama(dt_s=1 / 40)]).url)
     until(page, "terrella.step > 60")
