@@ -50,6 +50,8 @@ $(VENV)/.ready-play: pyproject.toml constraints.txt | $(BIN)/python
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade
 	@$(PIP) -q torch
 	@$(PIP) -q -e '.[sim]'
+	@echo "compiling the geometry, so that the first play need not"
+	@$(BIN)/python -c "import terrella as t; w = t.load('doom-maze'); r = t.make_rng(0); w.imagine(w.start(1, r), w.spec.sample_action(1, r), r)"
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready-play

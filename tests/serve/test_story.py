@@ -88,6 +88,20 @@ def test_a_seed_is_a_story():
     assert story.restart(2).images != first and story.restart(1).images == first
 
 
+def test_a_restart_that_fails_leaves_the_old_story():
+    world = Panorama()
+    story = Story([world], seed=1)
+    shown = story.step(WALK)
+
+    def broken(batch, rng):
+        raise DatasetError("the game is gone")
+
+    world.start = broken
+    with pytest.raises(DatasetError, match="gone"):
+        story.restart(2)
+    assert story.seed == 1 and story.shown is shown and story.step(WALK).step == shown.step + 1
+
+
 def test_a_running_game_does_not_rewind():
     story = Story([Panorama(forkable=False)], seed=0)
     story.step(LEFT)

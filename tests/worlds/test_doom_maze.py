@@ -101,7 +101,7 @@ def test_evidence_that_agrees_with_the_dream_leaves_its_speed():
 
 
 def test_a_story_among_known_walls_stays_in_the_map():
-    """Runs against every wall of the room for 200 steps; the room reaches from 12 to 17 and from -8.5 to -2.5 m."""
+    """Runs against the walls around it for 200 steps."""
     world = terrella.load("doom-maze")
     state = middle_of_a_room(world)
     for press in range(10):

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from ..data import ClipCache
 from ..space.camera import Intrinsics, yaw
-from ..space.floorplan import Box, sees_into
+from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Glimpse, Keyframes, look, retrieve
 from ..worlds.video import VideoConfig, carry, doubled
 
@@ -51,9 +51,10 @@ def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, cam
     pose = torch.from_numpy(np.array(cache.pose))
     usable &= ~((pose[:, 0] > x0) & (pose[:, 0] < x1) & (pose[:, 1] > y0) & (pose[:, 1] < y1)).numpy()
     rows = np.flatnonzero(usable)
+    row = horizon(camera, cache.depth.shape[1])
     for some in np.array_split(rows, max(1, len(rows) // 4096)):
-        depth = torch.from_numpy(np.asarray(cache.depth[some], np.float32))
-        usable[some[sees_into(keep_out, depth, pose[some], camera).numpy()]] = False
+        level = torch.from_numpy(np.asarray(cache.depth[some, row], np.float32))
+        usable[some[sees_into(keep_out, level, pose[some], camera).numpy()]] = False
     return usable
 
 

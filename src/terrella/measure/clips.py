@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from ..core.errors import DatasetError, ObservationError
 from ..core.spec import Spec
-from ..space.floorplan import sees_into
+from ..space.floorplan import horizon, sees_into
 
 Where = Callable[
     [Any, int, int], np.ndarray
@@ -74,8 +74,9 @@ def out_of_sight(*box: float) -> Where:
         camera = cache.world.get("camera")
         if cache.depth is None or not camera:
             return away
-        depth, pose = (torch.from_numpy(np.array(part[first:stop], np.float32)) for part in (cache.depth, cache.pose))
-        return away & ~sees_into((box[0], box[1], box[2], box[3]), depth, pose, tuple(camera)).numpy()
+        level = cache.depth[first:stop, horizon(camera, cache.depth.shape[1])]
+        seen, pose = (torch.from_numpy(np.array(part, np.float32)) for part in (level, cache.pose[first:stop]))
+        return away & ~sees_into((box[0], box[1], box[2], box[3]), seen, pose, tuple(camera)).numpy()
 
     return outside
 

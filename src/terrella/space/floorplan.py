@@ -5,6 +5,8 @@ World frame, metres; a body is an upright box with sides along x and y, as in Do
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import torch
 
@@ -15,7 +17,7 @@ Box = tuple[float, float, float, float]  # x0, y0, x1, y1 on the map
 WALLS = 16  # of a keyframe that are kept at most, those seen by most columns
 NOWHERE = 1e6  # where the unused ones are
 FEWEST = 4  # columns that make a wall; of a far one more are needed, for its ends are uncertain
-FAR_M, FEWEST_FAR = 4.0, 12
+NEARBY_M, FEWEST_FAR = 4.0, 12
 SEEN_M = 50.0  # beyond it depth says "nothing there" as often as "a wall"
 STRAIGHT = 0.004  # 1 / depth along a wall is a straight line, up to this share
 GAP_M = 0.5  # columns farther apart do not join: no body fits through less
@@ -31,24 +33,17 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     from .kernels_numba import straight_runs
 
     there, depth, pose = depth.device, depth.cpu(), pose.cpu()
-    height, width = depth.shape[-2:]
-    row = min(int(camera[3] * height), height - 1)
+    width, row = depth.shape[-1], horizon(camera, depth.shape[-2])
     left = -((np.arange(width) + 0.5) / width - camera[2]) / camera[0]
     walls = np.full((len(depth), WALLS, 4), NOWHERE, np.float32)
     heading = yaw(pose).double().numpy()
     cosine, sine, eye = np.cos(heading), np.sin(heading), pose[:, :2].double().numpy()
     for key, inverse in enumerate(1 / depth[:, row].double().clamp(0.05, 1e3).numpy()):
-        runs = [
-            (int(first), int(stop), *line)
-            for first, stop, *line in straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
-        ]
-        runs = [
-            run
-            for run in _corners(runs, left)
-            if run[1] - run[0] >= FEWEST_FAR or 1 / inverse[run[0] : run[1]].mean() < FAR_M
-        ]
-        runs = sorted(runs, key=lambda run: run[0] - run[1])[:WALLS]
-        for slot, (_, _, slope, level, *ends) in enumerate(runs):
+        found = straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
+        runs = _corners([(int(first), int(stop), *line) for first, stop, *line in found], left)
+        runs.sort(key=lambda run: run[0] - run[1])
+        known = (run for run in runs if run[1] - run[0] >= FEWEST_FAR or 1 / inverse[run[0] : run[1]].mean() < NEARBY_M)
+        for slot, (_, _, slope, level, *ends) in enumerate(islice(known, WALLS)):
             for end, side in enumerate(ends):
                 ahead = 1 / (slope * side + level)
                 x, y = ahead * cosine[key] - ahead * side * sine[key], ahead * sine[key] + ahead * side * cosine[key]
@@ -155,14 +150,18 @@ def slide(
     return torch.from_numpy(moved).to(wish), torch.from_numpy(left).to(wish)
 
 
+def horizon(camera: Intrinsics, height: int) -> int:
+    """The row of an image of `height` rows that looks level."""
+    return min(int(camera[3] * height), height - 1)
+
+
 def sees_into(
-    box: Box, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, deep_m: float = 0.5
+    box: Box, level: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, deep_m: float = 0.5
 ) -> torch.Tensor:
-    """Whether posed depth images (depth [K, h, w], pose [K, 7]) show, on the horizon, what lies in the box on the map and
-    more than `deep_m` metres from its sides: bool [K]."""
+    """Whether posed depth images, of which `level` [K, w] is the row of the horizon, show what lies in the box on the map
+    and more than `deep_m` metres from its sides: bool [K]; pose [K, 7]."""
     x0, y0, x1, y1 = box
-    row = min(int(camera[3] * depth.shape[-2]), depth.shape[-2] - 1)
-    flat = (camera[0], camera[1], camera[2], 0.5)  # the horizon's row alone
-    x, y = unproject(depth[:, row : row + 1], pose, flat)[:, 0, :, :2].unbind(-1)
+    flat = (camera[0], camera[1], camera[2], 0.5)  # of a picture of that row alone
+    x, y = unproject(level[:, None], pose, flat)[:, 0, :, :2].unbind(-1)
     inside = (x > x0 + deep_m) & (x < x1 - deep_m) & (y > y0 + deep_m) & (y < y1 - deep_m)
     return inside.any(1)
