@@ -106,11 +106,11 @@ def _fit_body(motion: Motion, recording: Recording, memory: Keyframes, config: V
             errors[half, short] = _walked_off(motion, recording, config, first, walls, half, short)
         return errors[half, short]
 
-    best = min((off(half, 0.0), half) for half in np.linspace(0.0, 1.0, 21).tolist())[1]
-    for reach in (0.04, 0.01, 0.003, 0.001):
-        near = [best + reach * side for side in (-1, -0.5, 0, 0.5, 1)]
-        best = min((off(half, 0.0), half) for half in near if half >= 0)[1]
-    error, short = min((off(best, share), share) for share in (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8))
+    best, short = min((off(half, 0.0), half) for half in np.linspace(0.0, 1.0, 21).tolist())[1], 0.0
+    for reach in (0.04, 0.01, 0.003, 0.001):  # each on what the other was found to be
+        near = [half for side in (-1, -0.5, 0, 0.5, 1) if (half := best + reach * side) >= 0]
+        best = min((off(half, short), half) for half in near)[1]
+        error, short = min((off(best, share), share) for share in (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8))
     return {"body_m": best, "short": short, "motion_error_m": error}
 
 
