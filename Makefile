@@ -7,10 +7,11 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test check format bench clean
+.PHONY: help play test test-lerobot check format bench clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
+	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
@@ -22,6 +23,10 @@ play: $(VENV)/.ready-play
 test: $(VENV)/.ready-dev
 	@sh tests/browser_setup.sh $(BIN)/python
 	$(BIN)/python -m pytest $(ARGS)
+
+test-lerobot: $(VENV)/.ready-dev
+	@python=$$(sh tests/lerobot_setup.sh .venv-lerobot); \
+	TERRELLA_LEROBOT_PYTHON=$$python $(BIN)/python -m pytest -rs tests/data/test_lerobot.py
 
 check: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
@@ -37,7 +42,7 @@ bench: $(VENV)/.ready-dev
 	$(BIN)/python benchmarks/play.py $(ARGS)
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-lerobot .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "Terrella needs Python 3.11, 3.12 or 3.13: install one, or run make PYTHON=/path/to/it." >&2; exit 1; }

@@ -15,8 +15,9 @@ SNIPPETS = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL
 
 
 @pytest.mark.parametrize("number", range(len(SNIPPETS)))
-def test_the_python_of_the_readme_runs(number):
+def test_the_python_of_the_readme_runs(number, tmp_path, monkeypatch):
     snippet = SNIPPETS[number]
+    monkeypatch.chdir(tmp_path)
     if '"doom-maze")' in snippet and not (BUNDLED / "doom-maze" / "world.json").is_file():
         pytest.skip("the bundled world doom-maze is not in this checkout, so README's Python did not run")
     exec(compile(snippet, f"README.md, snippet {number}", "exec"), {})

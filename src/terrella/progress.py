@@ -23,8 +23,8 @@ def shown(what: str) -> Iterator[Callable[..., None]]:
             task = bar.add_task(what, total=None, words="")
 
             def report(done: float, total: float, words: str = "") -> None:
-                if total != bar.tasks[task].total:  # another stage begins
-                    bar.reset(task, total=total)
+                if (total or None) != bar.tasks[task].total:  # another stage begins
+                    bar.reset(task, total=total or None)
                 bar.update(task, completed=done, words=words)
 
             yield report
@@ -41,10 +41,11 @@ def _lines(what: str) -> Callable[..., None]:
         now = time.monotonic()
         if total != of:  # a stage begins; what an earlier run had done says nothing of this one's speed
             began, first, of = now, done, total
-        if now - said < LINE_EVERY_S and done < total:
+        if now - said < LINE_EVERY_S and (done < total or not total):  # a total of 0 is not known
             return
         said = now
         left = f"{(total - done) * (now - began) / (done - first) / 60:.1f} min left" if first < done < total else ""
-        print(" ".join(filter(None, [what, f"{done / total:.0%}" if total else "", left, words])), file=sys.stderr)
+        share = f"{done / total:.0%}" if total else f"{done:g}"
+        print(" ".join(filter(None, [what, share, left, words])), file=sys.stderr)
 
     return report

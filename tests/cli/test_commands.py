@@ -14,12 +14,15 @@ from terrella.cli import main
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "record doom": "--frames --height --human --json --out --port --scenario --seed",
-    "record world": "--frames --human --json --out --port --seed",
+    "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed",
+    "record world": "--frames --human --json --live-mcap --out --port --seed",
     "play": "--compare --device --host --json --no-memory --port --record --seed --token --truth",
     "score": "--clips --data --device --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
-    "data doctor": "--json",
+    "data doctor": "--json --out --repair",
+    "data convert": "--episodes --fps --json --pictures --policy --seed --to",
+    "data merge": "--dry --fps --json --mapping --out",
+    "data view": "--host --json --out --port --rerun --token",
 }
 
 

@@ -40,7 +40,7 @@ class Still:
 @pytest.fixture
 def recording(tmp_path):
     """Three episodes of a bar that moves across the picture."""
-    with Recorder(tmp_path / "set", Layout(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
+    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
         for episode in range(3):
             for step in range(40):
                 picture = np.full((48, 64, 3), 40, np.uint8)
@@ -84,7 +84,7 @@ def test_a_recording_made_afterwards_is_used_whole(recording, tmp_path, monkeypa
 
 def test_score_of_a_recording_without_held_out_episodes_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
-    with Recorder(tmp_path / "set", Layout(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
+    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
         for step in range(10):
             recorder.add({"rgb": np.zeros((48, 64, 3), np.uint8)}, np.zeros(2) if step < 9 else None)
     assert main(arguments(tmp_path / "set", tmp_path / "out")) == 2

@@ -11,14 +11,16 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from corridor import Corridor, keys
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Dataset, Layout, Recorder, doctor, durable, record
+from terrella.data import ClipCache, Dataset, Layout, Recorder, doctor, record
+from terrella.data.storage import durable
 
-LAYOUT = Layout(10, ("go",), rgb=(16, 16), pose=True)
+LAYOUT = Layout.of_channels(10, ("go",), rgb=(16, 16), pose=True)
 
 
 def _episode(recorder: Recorder, rows: int, value: float = 0.0) -> None:
@@ -83,7 +85,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("name", ["sync_file", "move_into_place", "sync_folder"])
 @pytest.mark.parametrize("nth", range(1, 9))
-def test_a_cut_at_any_point_of_a_commit_leaves_what_was_there(tmp_path, monkeypatch, name, nth):
+def test_a_cut_at_any_point_of_a_commit_loses_nothing(tmp_path, monkeypatch, name, nth):
     recorder = Recorder(tmp_path, LAYOUT)
     _episode(recorder, 4, 1.0)
     with monkeypatch.context() as patch:
@@ -92,14 +94,13 @@ def test_a_cut_at_any_point_of_a_commit_leaves_what_was_there(tmp_path, monkeypa
             _episode(recorder, 6, 2.0)
         except Killed:
             pass
-    recorder._lock.close()  # as the system does with a dead process
-    lengths = [episode.length for episode in Dataset(tmp_path).episodes]
-    assert lengths in ([4], [4, 6])
+    recorder._writer.close()  # as the system does with a dead process
+    assert [episode.length for episode in Dataset(tmp_path).episodes] in ([4], [4, 6])
     assert Dataset(tmp_path).episode(0)["pose"][0, 0] == 1.0
-    with Recorder(tmp_path, LAYOUT) as again:
+    with Recorder(tmp_path, LAYOUT) as again:  # which keeps the episode that was being committed
         _episode(again, 5, 3.0)
-    assert [episode.length for episode in Dataset(tmp_path).episodes] == [*lengths, 5]
-    assert Dataset(tmp_path).episode(len(lengths))["pose"][0, 0] == 3.0
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [4, 6, 5]
+    assert [Dataset(tmp_path).episode(i)["pose"][0, 0] for i in range(3)] == [1.0, 2.0, 3.0]
     assert doctor(tmp_path) == []
 
 
@@ -112,13 +113,74 @@ def test_a_full_disk_is_said_clearly_and_loses_nothing(tmp_path, monkeypatch, na
             _stop_at(patch, name, nth, OSError(errno.ENOSPC, "No space left on device"))
             try:
                 _episode(recorder, 6)
-                assert name == "write_json" and nth == 3  # only two of them in a commit
+                assert (name, nth) == ("write_json", 3)  # only two of them in a commit
             except DatasetError as error:
                 assert "the disk is full" in str(error) and "1 episodes (4 frames) are safe" in str(error)
                 assert [episode.length for episode in Dataset(tmp_path).episodes] == [4]
-        _episode(recorder, 5)  # space was freed: the same recorder goes on
-    assert [episode.length for episode in Dataset(tmp_path).episodes][-1] == 5
+        _episode(recorder, 5)  # space was freed: the same recorder goes on, and what was in flight is an episode
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [4, 6, 5]
     assert doctor(tmp_path) == []
+
+
+def test_what_a_full_disk_left_in_flight_is_kept_by_the_next_recorder(tmp_path, monkeypatch):
+    full = OSError(errno.ENOSPC, "No space left on device")
+    recorder = Recorder(tmp_path, LAYOUT)
+    with monkeypatch.context() as patch:
+        _stop_at(patch, "move_into_place", 1, full)
+        with pytest.raises(DatasetError, match="the 6 rows in flight are kept"):
+            _episode(recorder, 6)
+    recorder.close()
+    with monkeypatch.context() as patch:  # still full
+        _stop_at(patch, "sync_file", 1, full)
+        with pytest.raises(DatasetError, match="the disk is full"):
+            Recorder(tmp_path, LAYOUT)
+    with Recorder(tmp_path, LAYOUT) as again:
+        assert again.recovered == 6
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [6] and doctor(tmp_path) == []
+
+
+def test_an_interrupt_after_a_commit_does_not_commit_twice(tmp_path, monkeypatch):
+    recorder = Recorder(tmp_path, LAYOUT)
+    _episode(recorder, 4)
+    monkeypatch.setattr(recorder._writer, "tidy", lambda: (_ for _ in ()).throw(KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        _episode(recorder, 5)
+    monkeypatch.undo()
+    recorder.close()
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == [4, 5]
+
+
+def test_an_interrupt_within_a_row_does_not_shift_the_frames(tmp_path, monkeypatch):
+    recorder = Recorder(tmp_path, LAYOUT)
+    for i in range(4):
+        recorder.add({"rgb": np.full((16, 16, 3), 50 * i, np.uint8), "pose": np.full(7, i)}, [0.0])
+    with monkeypatch.context() as patch:
+        patch.setattr("terrella.data.recorder.Mp4Writer.add", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            recorder.add({"rgb": np.zeros((16, 16, 3), np.uint8), "pose": np.full(7, 9)}, [0.0])
+    with pytest.raises(DatasetError, match="keeps the 4 rows"):
+        recorder.add({"rgb": np.zeros((16, 16, 3), np.uint8), "pose": np.full(7, 9)}, [0.0])
+    recorder.close()
+    found = Dataset(tmp_path).episode(0)
+    assert found["pose"][:, 0].tolist() == [0, 1, 2, 3]
+    assert np.abs(found["rgb"].mean((1, 2, 3)) - [0, 50, 100, 150]).max() < 4
+    with pytest.raises(DatasetError, match="closed"):
+        recorder.add({"rgb": np.zeros((16, 16, 3), np.uint8), "pose": np.full(7, 9)}, [0.0])
+
+
+def test_many_episodes_share_a_table_and_a_killed_merge_is_finished(tmp_path, monkeypatch):
+    monkeypatch.setattr("terrella.data.writer.EPISODES_PER_TABLE", 3)
+    tables = tmp_path / "meta/episodes/chunk-000"
+    with Recorder(tmp_path, LAYOUT) as recorder:
+        for value in range(7):
+            _episode(recorder, 2 + value, value)
+    assert sorted(file.name for file in tables.iterdir()) == [f"file-00{i}.parquet" for i in (0, 3, 6)]
+    last = pq.read_table(tables / "file-000.parquet").slice(2)  # as if it was killed while it removed the three
+    pq.write_table(last, tables / "file-002.parquet")
+    assert [episode.length for episode in Dataset(tmp_path).episodes] == list(range(2, 9))
+    assert [Dataset(tmp_path).episode(i)["pose"][0, 0] for i in range(7)] == list(range(7))
+    Recorder(tmp_path, LAYOUT).close()
+    assert not (tables / "file-002.parquet").exists() and doctor(tmp_path) == []
 
 
 def test_a_file_that_the_system_refuses_to_grow_ends_the_encoder_clearly(tmp_path):
@@ -128,7 +190,7 @@ import resource, signal, sys
 import numpy as np
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
-layout = Layout(10, ("go",), rgb=(64, 64))
+layout = Layout.of_channels(10, ("go",), rgb=(64, 64))
 recorder = Recorder({str(tmp_path / "set")!r}, layout)
 rng = np.random.default_rng(0)
 def episode(rows):

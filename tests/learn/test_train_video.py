@@ -108,7 +108,7 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp
 
 
 def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path):
-    with Recorder(tmp_path / "set", Layout(10.0, ("left",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(3):
             for step in range(60):
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)
@@ -196,7 +196,7 @@ def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
 
 
 def test_actions_that_are_no_buttons_are_refused(tmp_path):
-    with Recorder(tmp_path / "set", Layout(10.0, ("steer",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("steer",), rgb=(24, 32))) as recorder:
         for step in range(80):
             picture = np.full((24, 32, 3), 40 + step, np.uint8)
             recorder.add({"rgb": picture}, np.array([0.37]) if step < 79 else None, 0.0, False)

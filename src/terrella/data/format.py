@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -12,17 +16,21 @@ from gymnasium import spaces
 
 from ..core.errors import DatasetError
 from ..core.spec import Spec, shape_of
+from .source import Sensor, is_action
 
 VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+STREAM_PATH = "streams/{name}/chunk-{chunk_index:03d}/file-{file_index:03d}.{suffix}"
 INFO, STATS, TASKS, WORLD = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/terrella.json"
 
 RGB, DEPTH, STATE = "observation.images.rgb", "observation.depth", "observation.state"
 ACTION, ACTION_VALID, REWARD, DONE = "action", "action_valid", "next.reward", "next.done"
-POSE_NAMES = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+TIME = "time_s"  # float64: seconds since the episode began, by the recorder's clock; `timestamp` is frame_index / fps
+AUTOMATIC = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 POSE_CONVENTION = "T_world_cam: metres and quaternion w,x,y,z; world z up; camera x forward, y left, z up"
 DEPTH_UNIT_M = 0.001  # one step of the stored uint16
 DEPTH_BEYOND = 65535  # stored where nothing lies within range; reads back as 65.535 m
@@ -33,22 +41,45 @@ KNOWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 class Layout:
     """What a recording holds.
 
-    fps:     rows a second.
-    action:  one name per number of an action (they are stored as float32).
-    rgb:     (H, W) in pixels, both even (H.264 yuv420p); None without pictures.
-    depth:   (h, w); None without depth.
-    pose:    whether the camera's pose is recorded (float32 [7], T_world_cam).
-    vectors: other channels, name -> length, stored as float32 `observation.NAME`.
-    world:   free facts about the recorded world, kept in meta/terrella.json.
+    fps:      rows a second.
+    sensors:  what each row has: images, depth, vectors of any shape; "action", "next.reward" and "next.done" are among them.
+    streams:  what has a clock of its own and is kept beside the rows with true times, under streams/.
+    clock:    whether each row keeps its true time too (TIME), beside LeRobot's frame_index / fps.
+    pictures: "video" (H.264, lossy) or "png" (exact; for small worlds).
+    robot:    LeRobot's robot_type.
+    world:    free facts about the recorded world, kept in meta/terrella.json.
+    facts:    whatever else is kept there, by name.
     """
 
     fps: float
-    action: tuple[str, ...]
-    rgb: tuple[int, int] | None = None
-    depth: tuple[int, int] | None = None
-    pose: bool = False
-    vectors: Mapping[str, int] = field(default_factory=dict)
+    sensors: Mapping[str, Sensor]
+    streams: Mapping[str, Sensor] = field(default_factory=dict)
+    clock: bool = False
+    pictures: Literal["video", "png"] = "video"
+    robot: str = "terrella"
     world: Mapping[str, object] = field(default_factory=dict)
+    facts: Mapping[str, object] = field(default_factory=dict)
+
+    @staticmethod
+    def of_channels(
+        fps: float,
+        action: tuple[str, ...],
+        rgb: tuple[int, int] | None = None,
+        depth: tuple[int, int] | None = None,
+        pose: bool = False,
+        vectors: Mapping[str, int] | None = None,
+        world: Mapping[str, object] | None = None,
+    ) -> Layout:
+        """Of a World's channels: rgb (H, W), depth (h, w), the camera's pose, vectors by length, a name per number of an action."""
+        made = [Sensor(RGB, "image", (*rgb, 3), "uint8")] if rgb else []
+        made += [Sensor(DEPTH, "depth", depth)] if depth else []
+        made += [Sensor(STATE, "vector", (7,), names=POSE_NAMES)] if pose else []
+        for name, length in (vectors or {}).items():
+            names = tuple(f"{name}_{i}" for i in range(length))
+            made.append(Sensor(f"observation.{name}", "vector", (length,), names=names))
+        made.append(Sensor(ACTION, "vector", (len(action),), names=tuple(action)))
+        made += [Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")]
+        return Layout(fps, {sensor.name: sensor for sensor in made}, world=dict(world or {}))
 
     @staticmethod
     def of(spec: Spec, fps: float | None = None) -> Layout:
@@ -62,7 +93,6 @@ class Layout:
         }
         width = int(np.prod(shape_of(spec.action)))
         names = spec.action_names if len(spec.action_names) == width else tuple(f"action_{i}" for i in range(width))
-        exact = fps if fps is not None else 1 / spec.dt_s
         world = {
             "name": spec.name,
             "dt_s": spec.dt_s,
@@ -73,45 +103,121 @@ class Layout:
             "units": dict(spec.units),
             "discrete": isinstance(spec.action, spaces.Discrete),
         }
-        return Layout(_tidy(exact), names, size.get("rgb"), size.get("depth"), "pose" in channels, vectors, world)
+        rate = tidy(fps if fps is not None else 1 / spec.dt_s)
+        return Layout.of_channels(rate, names, size.get("rgb"), size.get("depth"), "pose" in channels, vectors, world)
+
+    @property
+    def rows(self) -> dict[str, Sensor]:
+        """The sensors of a row, with those that the recorder adds: which actions count, and the true time."""
+        found = dict(self.sensors)
+        if any(map(is_action, found)):
+            found[ACTION_VALID] = Sensor(ACTION_VALID, "vector", (1,), "bool")
+        if self.clock:
+            found[TIME] = Sensor(TIME, "vector", (1,), "float64", units={TIME: "s"})
+        return found
 
     def features(self) -> dict[str, dict]:
         """The `features` of meta/info.json."""
-        if self.rgb and (self.rgb[0] % 2 or self.rgb[1] % 2):
-            raise DatasetError(
-                f"H.264 video needs an even height and width; {self.rgb[0]}x{self.rgb[1]} is not: resize rgb."
-            )
-        found: dict[str, dict] = {}
-        if self.rgb:
-            found[RGB] = {
-                "dtype": "video",
-                "shape": [*self.rgb, 3],
-                "names": ["height", "width", "channels"],
-                "info": {
-                    "video.height": self.rgb[0],
-                    "video.width": self.rgb[1],
-                    "video.codec": "h264",
-                    "video.pix_fmt": "yuv420p",
-                    "video.is_depth_map": False,
-                    "video.fps": self.fps,
-                    "video.channels": 3,
-                    "has_audio": False,
-                },
-            }
-        if self.depth:
-            found[DEPTH] = _feature("uint16", list(self.depth), ["height", "width"])
-        if self.pose:
-            found[STATE] = _feature("float32", [7], POSE_NAMES)
-        for name, length in self.vectors.items():
-            found[f"observation.{name}"] = _feature("float32", [length], [f"{name}_{i}" for i in range(length)])
-        found[ACTION] = _feature("float32", [len(self.action)], list(self.action))
-        found[ACTION_VALID] = _feature("bool", [1])
-        found[REWARD] = _feature("float32", [1])
-        found[DONE] = _feature("bool", [1])
-        found["timestamp"] = _feature("float32", [1])
-        for name in ("frame_index", "episode_index", "index", "task_index"):
-            found[name] = _feature("int64", [1])
+        found = {name: self._feature(sensor) for name, sensor in self.rows.items()}
+        found["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        for name in AUTOMATIC[1:]:
+            found[name] = {"dtype": "int64", "shape": [1], "names": None}
         return found
+
+    def _feature(self, sensor: Sensor) -> dict:
+        shape, names = list(sensor.shape), list(sensor.names) or None
+        if not shape or min(shape) < 1:
+            raise DatasetError(f"{sensor.name} has shape {tuple(shape)}; a row needs numbers of a fixed shape.")
+        if sensor.kind == "points":
+            raise DatasetError(f"{sensor.name} has any number of points, which no row can hold: keep it as a stream.")
+        if sensor.kind == "depth":
+            return {"dtype": "uint16", "shape": shape, "names": ["height", "width"]}
+        if sensor.kind == "vector":
+            return {"dtype": sensor.dtype, "shape": shape, "names": names}
+        if self.pictures == "png":
+            return {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+        height, width = even(sensor)
+        info = {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p",
+            "video.is_depth_map": False,
+            "video.fps": self.fps,
+            "video.channels": 3,
+            "has_audio": False,
+        }
+        return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
+
+
+def even(sensor: Sensor) -> tuple[int, int]:
+    """(height, width) of an image sensor that H.264 can hold; DatasetError where it cannot."""
+    height, width = sensor.shape[:2]
+    if height % 2 or width % 2:
+        raise DatasetError(
+            f"H.264 video needs an even height and width; {sensor.name}, {height}x{width}, is not: resize it, or record PNG."
+        )
+    return height, width
+
+
+def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dict[str, Sensor]:
+    """The sensors of a stranger's `features`; what `known` (meta/terrella.json) says of one is added."""
+    found = {}
+    for name, feature in features.items():
+        if name in AUTOMATIC or name in (ACTION_VALID, TIME):
+            continue
+        shape, dtype = tuple(feature["shape"]), feature["dtype"]
+        if dtype in ("video", "image"):
+            sensor = Sensor(name, "image", shape, "uint8")
+        elif dtype == "uint16" and len(shape) == 2 and name.startswith(DEPTH):
+            sensor = Sensor(name, "depth", shape)
+        else:
+            sensor = Sensor(name, "vector", shape, dtype, names_of(feature))
+        if name in known:
+            more = known[name]
+            sensor = replace(sensor, units=more.units, frame=more.frame, rate_hz=more.rate_hz, facts=more.facts)
+        found[name] = sensor
+    return found
+
+
+def names_of(feature: Mapping) -> tuple[str, ...]:
+    """One name per number of a feature, () where it does not say."""
+    names = feature.get("names")
+    if isinstance(names, dict):  # older writers group them
+        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
+    return tuple(str(name) for name in names) if names else ()
+
+
+def sensor_json(sensor: Sensor) -> dict:
+    """A Sensor as meta/terrella.json keeps it."""
+    return {
+        "kind": sensor.kind,
+        "shape": list(sensor.shape),
+        "dtype": sensor.dtype,
+        "names": list(sensor.names),
+        "units": dict(sensor.units),
+        "frame": sensor.frame,
+        "rate_hz": sensor.rate_hz,
+        "facts": dict(sensor.facts),
+    }
+
+
+def sensor_from_json(name: str, told: Mapping) -> Sensor:
+    """The inverse of `sensor_json`; KeyError, TypeError or ValueError where it is not one."""
+    if told["kind"] not in ("image", "depth", "points", "vector"):
+        raise ValueError(f"{name} is of kind {told['kind']!r}")
+    rate = told.get("rate_hz")
+    return Sensor(
+        name,
+        told["kind"],
+        tuple(int(n) for n in told["shape"]),
+        str(np.dtype(told["dtype"])) if told["dtype"] != "string" else "string",
+        tuple(str(n) for n in told.get("names", ())),
+        {str(key): str(unit) for key, unit in dict(told.get("units", {})).items()},
+        str(told.get("frame", "")),
+        None if rate is None else float(rate),
+        dict(told.get("facts", {})),
+    )
 
 
 def _height_width(space: spaces.Space) -> tuple[int, int]:
@@ -119,17 +225,56 @@ def _height_width(space: spaces.Space) -> tuple[int, int]:
     return height, width
 
 
-def _tidy(fps: float) -> float:
+def tidy(fps: float) -> float:
+    """A rate that is whole but for rounding, as an int."""
     return int(round(fps)) if abs(fps - round(fps)) < 1e-6 else float(fps)
-
-
-def _feature(dtype: str, shape: list[int], names: list[str] | None = None) -> dict:
-    return {"dtype": dtype, "shape": shape, "names": names}
 
 
 def where(episode: int) -> dict[str, int]:
     """Chunk and file number of an episode's own files."""
     return {"chunk_index": episode // FILES_PER_CHUNK, "file_index": episode % FILES_PER_CHUNK}
+
+
+_FIELD = re.compile(r"\{(\w+)(?::0?[0-9])?d?\}")
+
+
+def fill(template: str, **values: object) -> str:
+    """A path template of info.json, filled in; DatasetError where it has other fields, or leads out of the dataset."""
+    bare = _FIELD.sub("", template)
+    unknown = set(_FIELD.findall(template)) - set(values)
+    if "{" in bare or "}" in bare or unknown:
+        raise DatasetError(f"the path template {template[:200]!r} of info.json is not one of LeRobot v3.")
+    try:
+        path = template.format(**values)
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"the path template {template[:200]!r} of info.json is not one of LeRobot v3.") from error
+    return inside(path)
+
+
+def inside(path: str) -> str:
+    """A relative path that stays in its folder; else DatasetError."""
+    parts = path.replace("\\", "/").split("/")
+    if not path or path.startswith(("/", "~")) or ".." in parts or "\0" in path or ":" in parts[0] or len(path) > 1000:
+        raise DatasetError(
+            f"the path {path[:200]!r} leads out of the dataset; a recording names only files of its own."
+        )
+    return path
+
+
+def contained(root: Path, name: str) -> Path:
+    """Where a file of a dataset lies, there or not; DatasetError where its name or a symbolic link leads out of `root`.
+
+    Of a Hugging Face cache (snapshots/REVISION/… -> ../../blobs/…) a link may lead to that cache's own blobs.
+    """
+    path, home = root / inside(name), os.path.realpath(root)
+    real = os.path.realpath(path)
+    parts = Path(home).parts
+    blobs = [Path(*parts[:at], "blobs") for at, part in enumerate(parts) if part == "snapshots"]
+    if not any(real.startswith(f"{folder}{os.sep}".replace("//", "/")) for folder in (home, *blobs)) and real != home:
+        raise DatasetError(
+            f"{path} is a link that leads out of the dataset, to {real}; put the file itself there to read it."
+        )
+    return path
 
 
 def schema(features: Mapping[str, dict]) -> pa.Schema:
@@ -138,32 +283,46 @@ def schema(features: Mapping[str, dict]) -> pa.Schema:
     for key, feature in features.items():
         if feature["dtype"] == "video":
             continue
-        value = {"dtype": feature["dtype"], "_type": "Value"}
-        arrow, shape = _arrow(feature["dtype"]), feature["shape"]
-        if len(shape) == 2:
-            value = {"shape": shape, "dtype": feature["dtype"], "_type": "Array2D"}
-            arrow = pa.list_(pa.list_(arrow))
-        elif shape[0] != 1:
-            value = {"feature": value, "length": shape[0], "_type": "Sequence"}
-            arrow = pa.list_(arrow, shape[0])
+        arrow, value = _types(feature["dtype"], tuple(feature["shape"]))
         fields.append(pa.field(key, arrow))
         described[key] = value
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": described}})})
 
 
-def _arrow(dtype: str) -> pa.DataType:
-    return pa.bool_() if dtype == "bool" else pa.from_numpy_dtype(np.dtype(dtype))
+PICTURE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])  # as `datasets` keeps images
+
+
+def _types(dtype: str, shape: tuple[int, ...]) -> tuple[pa.DataType, dict]:
+    """The Arrow type of a feature, and what `datasets` calls it."""
+    if dtype == "image":
+        return PICTURE, {"_type": "Image"}
+    try:
+        arrow = pa.bool_() if dtype == "bool" else pa.string() if dtype == "string" else pa.from_numpy_dtype(dtype)
+    except (TypeError, pa.ArrowException) as error:
+        raise DatasetError(f"a feature of type {str(dtype)[:80]!r} is none that a recording can hold.") from error
+    value: dict = {"dtype": dtype, "_type": "Value"}
+    if len(shape) >= 2:
+        for _ in shape:
+            arrow = pa.list_(arrow)
+        return arrow, {"shape": list(shape), "dtype": dtype, "_type": f"Array{len(shape)}D"}
+    width = int(np.prod(shape))
+    if width != 1:
+        return pa.list_(arrow, width), {"feature": value, "length": width, "_type": "Sequence"}
+    return arrow, value
 
 
 def to_arrow(array: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """A numpy array [T], [T, n] or [T, h, w] as an Arrow array of a type from `schema`."""
-    flat = pa.array(np.ascontiguousarray(array).reshape(-1))
+    """A numpy array [T], [T, n] or [T, h, w, …] as an Arrow array of a type from `schema`; pictures as PNG bytes [T]."""
+    if kind == PICTURE:
+        return pa.array([{"bytes": picture, "path": None} for picture in array], PICTURE)
+    flat = pa.array(np.ascontiguousarray(array).reshape(-1), None if array.dtype != object else pa.string())
     if pa.types.is_fixed_size_list(kind):
         return pa.FixedSizeListArray.from_arrays(flat, kind.list_size)
     if pa.types.is_list(kind):
-        rows, height, width = array.shape
-        lines = pa.ListArray.from_arrays(np.arange(0, rows * height * width + 1, width, dtype=np.int32), flat)
-        return pa.ListArray.from_arrays(np.arange(0, rows * height + 1, height, dtype=np.int32), lines)
+        for axis in range(array.ndim - 1, 0, -1):
+            lines = int(np.prod(array.shape[:axis]))
+            offsets = np.arange(lines + 1, dtype=np.int32) * array.shape[axis]
+            flat = pa.ListArray.from_arrays(offsets, flat)
     return flat
 
 
@@ -171,6 +330,8 @@ def to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
     """The inverse of `to_arrow`: [T, *shape], or ValueError where a row has another size or is null."""
     rows, flat = len(column), column.combine_chunks()
     while pa.types.is_list(flat.type) or pa.types.is_large_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
+        if not pa.types.is_fixed_size_list(flat.type) and len(flat.value_lengths().unique()) > 1:
+            raise ValueError(f"its rows are not all of shape {shape}")
         flat = flat.flatten()
     if flat.null_count or len(flat) != rows * int(np.prod(shape)):
         raise ValueError(f"its rows are not all of shape {shape}")

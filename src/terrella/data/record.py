@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +13,9 @@ from ..core.errors import DatasetError
 from ..core.world import Observation, World, make_rng
 from .format import Layout
 from .recorder import Recorder
+
+if TYPE_CHECKING:
+    from .live import Live
 
 # policy(observation, info, rng) -> action [1, *space.shape]; info = {"step": steps since the episode began}
 Policy = Callable[[Observation, Mapping[str, int], torch.Generator], torch.Tensor]
@@ -27,19 +31,24 @@ def record(
     fps: float | None = None,
     max_episode_steps: int = 1050,
     task: str | None = None,
+    live: Live | None = None,
 ) -> Recorder:
     """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
 
     An episode ends at `done` or after `max_episode_steps`. Each episode has a generator of its own, drawn from `rng`'s
     seed and the episode's number, so that a run that was killed and started again with the same seed records the same
-    as one that was not. `progress(rows, frames)` is called after each row. Returns the closed recorder (its rows and
+    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to.
+    Returns the closed recorder (its rows and
     episodes can be read). DatasetError as Recorder raises it; what was committed before is safe.
     """
     if frames < 2:
         raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
+    if max_episode_steps < 1:
+        raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
     layout = Layout.of(world.spec, fps)
     base = int(torch.randint(2**62, (1,), generator=rng).item())
-    with Recorder(root, layout, task or f"explore {world.spec.name}") as recorder:
+    task = task or f"explore {world.spec.name}"
+    with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again
         while recorder.rows < frames - 1:  # an episode has 2 rows or more
             seed = int(np.random.SeedSequence([base, recorder.episodes]).generate_state(1, np.uint64)[0] >> 2)
             _episode(world, policy, recorder, frames, make_rng(seed), progress, max_episode_steps)

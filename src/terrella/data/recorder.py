@@ -1,79 +1,119 @@
-"""Recorder: appends episodes to a LeRobotDataset v3.0 folder so that a crash loses at most the episode in flight."""
+"""Recorder: what happens, row by row, into a LeRobotDataset v3.0 folder, so that a crash costs next to nothing."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
-import json
-import os
 import shutil
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import av
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ..core.errors import DatasetError
-from . import durable, stats
+from . import stats
 from .format import (
     ACTION,
     ACTION_VALID,
-    DATA_PATH,
     DEPTH,
     DEPTH_BEYOND,
     DEPTH_UNIT_M,
     DONE,
-    EPISODES_PATH,
-    FILES_PER_CHUNK,
-    INFO,
-    POSE_CONVENTION,
     REWARD,
     RGB,
     STATE,
-    STATS,
-    TASKS,
-    VERSION,
-    VIDEO_PATH,
-    WORLD,
+    TIME,
     Layout,
-    schema,
-    to_arrow,
-    where,
+    even,
 )
-from .mp4 import Mp4Writer
+from .source import Sensor, follows, is_action
+from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Staged, about, growing, growing_stream, pack_row
+from .storage.journal import Journal
+from .storage.mp4 import Mp4Writer
+from .writer import Writer, fresh
 
-_ROWS_PER_GROUP = 256
-_SAMPLE_EVERY = 16  # rows; pictures looked at for the statistics
+if TYPE_CHECKING:
+    from .live import Live
+
+_CHANNELS = {"rgb": RGB, "depth": DEPTH, "pose": STATE}
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
+
+
+@dataclass(frozen=True)
+class Pressure:
+    """How far behind the encoders were. waited_s: time that `add` stood still; most_waiting: frames that queued at worst."""
+
+    waited_s: float = 0.0
+    most_waiting: int = 0
 
 
 class Recorder:
     """Appends to `root`, which is created or, where it was written by a Recorder of the same layout, gone on with.
 
     Each row is an observation, the action taken there and the reward and done that followed; the last row of an
-    episode is its terminal observation and has action_valid = False. `end_episode` stages the episode's own mp4 and
-    parquet files in a hidden folder, moves them into place and replaces meta/info.json last.
-    DatasetError where root is foreign, locked by another recorder, or the disk is full; what was committed stays.
+    episode is its terminal observation and has action_valid = False. Rows are handed to the system one by one and frames
+    as soon as they are encoded, in a hidden folder; `end_episode` makes an episode of them and replaces meta/info.json
+    last. What a killed recorder, or one whose disk was full, left there is made an episode when the folder is opened
+    again, up to the last row whose frames are whole (interrupted="keep"), or thrown away where it is about the same task
+    ("discard": for recordings that will be made again). No frame is ever dropped: where an encoder is behind, `add`
+    waits (64 frames a camera may queue), and `pressure` tells.
+    DatasetError where root is foreign, locked by another recorder, or the disk is full; nothing that was recorded goes.
+
+    task:      what the episodes from now on are about.
+    live:      where each row and reading is logged too, for somebody to watch; it never holds the recording up.
+    recovered: rows of interrupted episodes that were kept.
     """
 
-    def __init__(self, root: str | Path, layout: Layout, task: str = "explore"):
-        self.root, self.layout = Path(root), layout
-        self._features = layout.features()
-        self._schema = schema(self._features)
-        self._staging = self.root / ".staging"
-        self._video: Mp4Writer | None = None
-        self._table: pq.ParquetWriter | None = None
+    def __init__(
+        self,
+        root: str | Path,
+        layout: Layout,
+        task: str = "explore",
+        interrupted: Literal["keep", "discard"] = "keep",
+        live: Live | None = None,
+    ):
+        self.task, self.layout, self.recovered, self.live = task, layout, 0, live
+        self._writer = Writer(root, layout)
+        self.root, self._staging = self._writer.root, self._writer.staging
+        self._names = list(layout.rows)
+        self._packed = [sensor for sensor in layout.rows.values() if not self._is_video(sensor)]
+        self._numbers = {name: 1 + i for i, name in enumerate(layout.streams)}
+        self._videos: dict[str, Mp4Writer] = {}
+        self._films: dict[str, Mp4Writer] = {}
+        self._journal: Journal | None = None
+        self._pressure = Pressure()
+        self._closed = False
+        self._forget()
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            self._lock = _lock(self.root)
-        except OSError as error:
-            raise DatasetError(f"cannot record to {self.root}: {error.strerror}; choose another folder.") from error
-        try:
-            self._open(task)
+            self._recover(interrupted)
         except BaseException:
-            self._lock.close()
+            self._writer.close()
             raise
+
+    @property
+    def rows(self) -> int:
+        """Rows that are safe."""
+        return self._writer.rows
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that are safe."""
+        return self._writer.episodes
+
+    @property
+    def pressure(self) -> Pressure:
+        """Of all episodes so far."""
+        now = [*self._videos.values(), *self._films.values()]
+        return Pressure(
+            self._pressure.waited_s + sum(video.waited_s for video in now),
+            max([self._pressure.most_waiting, *(video.most_waiting for video in now)]),
+        )
 
     def add(
         self,
@@ -81,46 +121,107 @@ class Recorder:
         action: np.ndarray | None = None,
         reward: float = 0.0,
         done: bool | None = None,
+        time_s: float | None = None,
     ) -> None:
         """One row: observation without batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...).
 
-        `action` is None for the terminal observation; `done` None repeats the row before.
+        `action` is None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`.
         """
-        row = self._row(observation, action, reward, done)
-        with self._nothing_lost():
-            if not self._pending and not self._flushed:
-                self._begin()
-            if self._pending >= _ROWS_PER_GROUP:
-                self._flush()
-            if self._video:
-                picture = row.pop(RGB)
-                if self.in_flight % _SAMPLE_EVERY == 0:
-                    self._pictures.append(picture[::4, ::4])
-                self._video.add(picture)
-            for key, value in row.items():
-                self._rows[key].append(value)
-            self._pending += 1
+        row = {_CHANNELS.get(name, f"observation.{name}"): value for name, value in observation.items()}
+        if action is not None:
+            row[ACTION] = np.asarray(action, np.float32).reshape(-1)
+            row[REWARD] = np.array([reward], np.float32)
+        if done is not None:
+            row[DONE] = np.array([bool(done)])
+        self.add_row(row, time_s)
 
-    def end_episode(self) -> int | None:
-        """Commits the episode in flight and returns its number; None (and nothing kept) for fewer than 2 rows."""
-        length = self._flushed + self._pending
-        if length < 2:
+    def add_row(self, row: Mapping[str, np.ndarray | None], time_s: float | None = None) -> None:
+        """One row by the names of the layout's sensors.
+
+        Actions and what follows them ("action", "next.…") may be absent: nothing was done, nothing followed. Any other
+        that is not there is given as None; it is stored as zeros and counts as not seen where the whole episode lacks
+        it. `time_s` is the row's true time in seconds since the episode began, kept where the layout has a clock;
+        without it, now.
+        """
+        self._check_open()
+        at = self._elapsed() if time_s is None else float(time_s)
+        values = self._checked(row, at)
+        given = [name in (ACTION_VALID, TIME) or row.get(name) is not None for name in self._names]
+        with self._nothing_lost():
+            journal = self._begin()
+            self._torn = True  # until row and frames are both under way
+            journal.add(ROW, at, *pack_row(values, given, self._packed))
+            for name, video in self._videos.items():
+                video.add(values[name])
+            for name, seen in self._pictures.items():
+                if self.in_flight % SAMPLE_EVERY == 0:
+                    seen.append(stats.summarise_pictures(values[name][None, ::4, ::4]))
+            self._before = {name: values[name] for name in values if follows(name) and values[name].dtype == bool}
+            self.in_flight, self._time_s, self._torn = self.in_flight + 1, at, False
+        self._show({name: value for name in self.layout.sensors if (value := row.get(name)) is not None})
+
+    def log(self, stream: str, value: np.ndarray, time_s: float | None = None) -> None:
+        """One reading of a stream of the layout, at `time_s` seconds since the episode began (without it, now)."""
+        self._check_open()
+        if stream not in self._numbers:
+            raise DatasetError(f"this recording has no stream '{stream}'; it has {', '.join(self._numbers) or 'none'}.")
+        sensor = self.layout.streams[stream]
+        array = _as_stored(sensor, value, f"stream '{stream}'")
+        at, newest = self._elapsed() if time_s is None else float(time_s), self._newest.get(stream, -np.inf)
+        if not np.isfinite(at) or at < newest:
+            raise DatasetError(f"stream '{stream}' has a reading at {at} s after one at {newest} s.")
+        with self._nothing_lost():
+            journal = self._begin()
+            if sensor.kind == "image":
+                self._films[stream].add(array)
+            journal.add(self._numbers[stream], at, *([] if sensor.kind == "image" else [array]))
+            self._newest[stream] = at
+        self._show({stream: value})
+
+    def say(self, task: str) -> None:
+        """What the next rows of this episode are about, until it is said otherwise."""
+        self._check_open()
+        with self._nothing_lost():
+            self._begin().add(WORDS, 0.0, task.encode())
+
+    def end_episode(self, start_ns: int | None = None) -> int | None:
+        """Commits the episode in flight and returns its number; None (and nothing kept) for fewer than 2 rows.
+
+        `start_ns` is the wall-clock time of its time 0 (nanoseconds since 1970); without it, where the layout has a
+        clock, when it began.
+        """
+        if self._left:
+            self._recover("keep")
+        if self.in_flight < 2 or self._number != self.episodes:  # an interrupt may come just after it was committed
             self._discard()
             return None
         with self._nothing_lost():
-            self._rows[ACTION_VALID][-1] = np.zeros(1, bool)
-            self._flush()
-            self._commit(length)
+            self._stop()
+            staged = Staged(self._staging)
+            pictures = {
+                name: stats.merge([{name: part} for part in seen])[name] for name, seen in self._pictures.items()
+            }
+            began = self._start_ns if self.layout.clock else None
+            number = self._writer.put(staged.draft(self.in_flight, began if start_ns is None else start_ns, pictures))
         self._discard()
-        return self.episodes - 1
+        self._writer.tidy()
+        return number
+
+    def drop_episode(self) -> None:
+        """Throws the episode in flight away."""
+        self._discard()
 
     def close(self) -> None:
         """Commits the episode in flight and lets go of the folder."""
+        if self._closed:
+            return
         try:
-            self.end_episode()
+            if not self._left:
+                self.end_episode()
         finally:
-            self._discard()
-            self._lock.close()
+            self._closed = True
+            self._stop(quietly=True)
+            self._writer.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -128,269 +229,171 @@ class Recorder:
     def __exit__(self, *exception) -> None:
         self.close()
 
-    @property
-    def in_flight(self) -> int:
-        """Rows added since the last commit."""
-        return self._flushed + self._pending
-
-    # -- opening ------------------------------------------------------------------------------------------------
-
-    def _open(self, task: str) -> None:
-        info = self.root / INFO
-        fresh = not info.exists()
-        if fresh:
-            strangers = [entry.name for entry in self.root.iterdir() if not entry.name.startswith(".")]
-            if strangers not in ([], ["meta"]):
-                raise DatasetError(
-                    f"{self.root} holds other files ({strangers[0]}, ...); record to a new or empty folder."
-                )
-            self.rows, self.episodes, self._tasks, self._stats = 0, 0, [], {}
-        else:
-            try:
-                self._reopen(json.loads(info.read_text(encoding="utf-8")))
-            except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-                first = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise DatasetError(
-                    f"{self.root} is damaged ({first}); see `terrella data doctor {self.root}`, or record to a new folder."
-                ) from error
-        if task not in self._tasks:
-            self._tasks.append(task)
-        self._task = self._tasks.index(task)
-        shutil.rmtree(self._staging, ignore_errors=True)
-        for path in self._files(self.episodes).values():  # an episode that was moved into place but never committed
-            (self.root / path).unlink(missing_ok=True)
-        self._discard()
-        if fresh:
-            with self._nothing_lost():
-                facts = {"pose": POSE_CONVENTION, "depth_unit_m": DEPTH_UNIT_M, "depth_beyond": DEPTH_BEYOND}
-                durable.write_json(self.root / WORLD, {"version": 1, "world": dict(self.layout.world), **facts})
-                durable.write_json(self.root / INFO, self._info(0, 0))
-
-    def _reopen(self, info: dict) -> None:
-        if info.get("codebase_version") != VERSION or not (self.root / WORLD).exists():
-            raise DatasetError(f"{self.root} is a dataset that Terrella did not write; record to a new folder.")
-        old, new = info["features"], self._features
-        if old != json.loads(json.dumps(new)) or info["fps"] != self.layout.fps:
-            changed = sorted(set(old) ^ set(new)) or [
-                key for key in new if old[key] != json.loads(json.dumps(new[key]))
-            ]
-            what = ", ".join(changed) if changed else f"{info['fps']} frames/s"
-            raise DatasetError(f"{self.root} was recorded with another layout ({what}); record to a new folder.")
-        self.rows, self.episodes = info["total_frames"], info["total_episodes"]
-        self._tasks, parts = [], []
-        if self.episodes:
-            self._tasks = pq.read_table(self.root / TASKS).column("__index_level_0__").to_pylist()
-        for number in range(self.episodes):
-            row = pq.read_table(self.root / self._files(number)["episode"]).to_pylist()[0]
-            part: dict[str, stats.Summary] = {}
-            for name, value in row.items():
-                if name.startswith("stats/"):
-                    _, feature, key = name.split("/")
-                    part.setdefault(feature, {})[key] = np.array(value)
-            parts.append(part)
-        self._stats = stats.merge(parts)
-
     # -- rows ---------------------------------------------------------------------------------------------------
 
-    def _row(self, observation, action, reward, done) -> dict[str, np.ndarray]:
-        layout, row = self.layout, {}
-        if layout.rgb:
-            row[RGB] = self._array(observation, "rgb", (*layout.rgb, 3), np.uint8)
-        if layout.depth:
-            depth = self._array(observation, "depth", layout.depth, np.float32)
-            steps = np.nan_to_num(depth / DEPTH_UNIT_M + 0.5, nan=DEPTH_BEYOND, posinf=DEPTH_BEYOND)
-            row[DEPTH] = np.clip(steps, 0, DEPTH_BEYOND).astype(np.uint16)
-        if layout.pose:
-            row[STATE] = self._array(observation, "pose", (7,), np.float32)
-        for name, length in layout.vectors.items():
-            row[f"observation.{name}"] = self._array(observation, name, (length,), np.float32)
-        width = len(layout.action)
-        taken = np.zeros(width, np.float32) if action is None else np.asarray(action, np.float32).reshape(-1)
-        if taken.shape != (width,):
-            raise DatasetError(f"an action of this recording has {width} numbers; got {taken.size}.")
-        row[ACTION], row[ACTION_VALID] = taken.copy(), np.array([action is not None])
-        row[REWARD] = np.array([reward], np.float32)
-        before = self._rows[DONE][-1][0] if self._pending else False
-        row[DONE] = np.array([before if done is None else bool(done)])
-        for key, value in row.items():
-            if value.dtype == np.float32 and not np.isfinite(value).all():
-                raise DatasetError(f"row {self.in_flight} of the episode has a {key} that is not a finite number.")
-        return row
+    def _is_video(self, sensor: Sensor) -> bool:
+        return sensor.kind == "image" and self.layout.pictures == "video"
 
-    def _array(self, observation, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
-        if name not in observation:
-            raise DatasetError(f"this recording has a channel '{name}', which the observation lacks.")
-        array = np.asarray(observation[name])
-        if array.size != np.prod(shape) or (len(shape) > 1 and array.shape != shape):
-            raise DatasetError(f"channel '{name}' of this recording has shape {shape}; got {array.shape}.")
-        return np.array(array, dtype).reshape(shape)  # a copy: the encoder reads it later
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DatasetError(f"the recorder of {self.root} is closed; open another.")
+        if self._torn:
+            raise DatasetError(
+                f"a row was interrupted; end the episode, which keeps the {self.in_flight} rows before it."
+            )
 
-    def _begin(self) -> None:
-        self._staging.mkdir(exist_ok=True)
-        if self.layout.rgb:
-            self._video = Mp4Writer(self._staging / "video.mp4", self.layout.rgb, self.layout.fps)
-        self._table = pq.ParquetWriter(
-            self._staging / "data.parquet", self._schema, compression="zstd", compression_level=3, use_dictionary=False
-        )
+    def _checked(self, row: Mapping[str, np.ndarray | None], time_s: float) -> dict[str, np.ndarray]:
+        """The row's values as they are stored, each owned by us."""
+        found: dict[str, np.ndarray] = {}
+        for name, sensor in self.layout.sensors.items():
+            value = row.get(name)
+            if value is not None:
+                found[name] = _as_stored(sensor, value, f"row {self.in_flight} of the episode: {name}")
+            elif name in row or follows(name):
+                found[name] = self._before.get(name, _blank(sensor))
+            else:
+                short = name.removeprefix("observation.").removeprefix("images.")
+                raise DatasetError(f"this recording has a channel '{short}', which the observation lacks.")
+        acted = [row.get(name) is not None for name in self.layout.sensors if is_action(name)]
+        if acted:
+            found[ACTION_VALID] = np.array([any(acted)])
+        if self.layout.clock:
+            found[TIME] = np.array([time_s], np.float64)
+            if time_s < self._time_s:
+                raise DatasetError(
+                    f"row {self.in_flight} of the episode is at {time_s} s, the one before at {self._time_s} s."
+                )
+        for name, value in found.items():
+            if value.dtype.kind == "f" and not np.isfinite(value).all():
+                raise NotFinite(f"row {self.in_flight} of the episode has a {name} that is not a finite number.")
+        return found
 
-    def _flush(self) -> None:
-        """Moves the pending rows into a parquet row group."""
-        values = {key: np.stack(column) for key, column in self._rows.items()}
-        frame = np.arange(self._flushed, self._flushed + self._pending, dtype=np.int64)
-        values["timestamp"] = (frame / self.layout.fps).astype(np.float32)
-        values["frame_index"], values["index"] = frame, self.rows + frame
-        values["episode_index"] = np.full_like(frame, self.episodes)
-        values["task_index"] = np.full_like(frame, self._task)
-        columns = [to_arrow(values[field.name], field.type) for field in self._schema]
-        assert self._table
-        self._table.write_table(pa.Table.from_arrays(columns, schema=self._schema))
-        self._parts.append({key: stats.summarise(value) for key, value in values.items()})
-        self._flushed += self._pending
-        self._pending, self._rows = 0, self._no_rows()
+    def _show(self, values: Mapping[str, np.ndarray]) -> None:
+        if self.live is not None:
+            now_s = (time.time_ns() - self.live.start_ns) / 1e9
+            for name, value in values.items():
+                self.live.log(name, now_s, value)
 
-    def _no_rows(self) -> dict[str, list]:
-        automatic = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-        return {name: [] for name in self._schema.names if name not in automatic}
+    def _elapsed(self) -> float:
+        return (time.monotonic_ns() - self._began_ns) / 1e9 if self._journal else 0.0
 
-    # -- committing ---------------------------------------------------------------------------------------------
+    def _begin(self) -> Journal:
+        if self._journal is None:
+            if self._left:  # the disk was full; now it may not be
+                self._recover("keep")
+            fresh(self._staging)
+            self._number, self._start_ns, self._began_ns = self.episodes, time.time_ns(), time.monotonic_ns()
+            told = about(self.layout, self._number, self.task, self._start_ns)
+            self._journal = Journal(self._staging / LOG, told)
+            layout, folder = self.layout, self._staging
+            for name, sensor in layout.sensors.items():
+                if sensor.kind == "image":
+                    self._pictures[name] = []
+                if self._is_video(sensor):
+                    self._videos[name] = Mp4Writer(growing(folder, name), even(sensor), layout.fps)
+            for name, sensor in layout.streams.items():
+                if sensor.kind == "image":
+                    rate = sensor.rate_hz or layout.fps
+                    self._films[name] = Mp4Writer(growing_stream(folder, name), even(sensor), rate)
+        return self._journal
 
-    def _files(self, episode: int) -> dict[str, str]:
-        at = where(episode)
-        files = {"data": DATA_PATH.format(**at)}
-        if self.layout.rgb:
-            files["video"] = VIDEO_PATH.format(video_key=RGB, **at)
-        return {**files, "episode": EPISODES_PATH.format(**at)}
+    # -- what is left over --------------------------------------------------------------------------------------
 
-    def _commit(self, length: int) -> None:
-        number, staged = self.episodes, {"data": self._staging / "data.parquet"}
-        assert self._table
-        self._table.close()
-        self._table = None
-        durable.sync_file(staged["data"])
-        of_episode = stats.merge(self._parts)
-        if self._video:
-            self._video.close()
-            self._video = None
-            staged["video"] = self._staging / "video.mp4"
-            of_episode[RGB] = stats.summarise_pictures(np.stack(self._pictures), length)
-        staged["episode"] = self._staging / "episode.parquet"
-        pq.write_table(self._episode_table(number, length, of_episode), staged["episode"], compression="zstd")
-        durable.sync_file(staged["episode"])
-        for name, path in self._files(number).items():
-            durable.move_into_place(staged[name], self.root / path)
-        merged = stats.merge([self._stats, of_episode])
-        durable.write_json(self.root / STATS, stats.to_json(merged))
-        durable.write_whole(self.root / TASKS, lambda path: pq.write_table(_tasks_table(self._tasks), path))
-        durable.write_json(self.root / INFO, self._info(number + 1, self.rows + length))
-        self.episodes, self.rows, self._stats = number + 1, self.rows + length, merged
+    def _recover(self, interrupted: Literal["keep", "discard"]) -> None:
+        """Makes an episode of what lies in the staging folder, up to the last row whose frames are whole."""
+        self._left = False
+        try:
+            staged = Staged(self._staging)
+        except (OSError, ValueError, KeyError, TypeError):  # not even a beginning
+            return self._discard()
+        if staged.number != self.episodes:  # it was killed after the episode was safe
+            return self._discard()
+        if interrupted == "discard" and staged.task == self.task:
+            return self._discard()
+        if not staged.fits(self.layout):
+            raise DatasetError(
+                f"an interrupted episode of another layout lies in {self._staging}; "
+                f"`terrella data doctor {self.root} --repair` keeps it, deleting that folder does not."
+            )
+        with self._nothing_lost():
+            length = staged.whole()
+            if length >= 2:
+                self._writer.put(staged.draft(length, staged.start_ns if self.layout.clock else None))
+                self.recovered += length
+        self._discard()
+        self._writer.tidy()
 
-    def _episode_table(self, number: int, length: int, of_episode: dict[str, stats.Summary]) -> pa.Table:
-        at = where(number)
-        row: dict[str, object] = {"episode_index": number, "tasks": [self._tasks[self._task]], "length": length}
-        row |= {f"data/{key}": value for key, value in at.items()}
-        row |= {"dataset_from_index": self.rows, "dataset_to_index": self.rows + length}
-        if self.layout.rgb:
-            row |= {f"videos/{RGB}/{key}": value for key, value in at.items()}
-            row |= {f"videos/{RGB}/from_timestamp": 0.0, f"videos/{RGB}/to_timestamp": length / self.layout.fps}
-        for feature, summary in stats.to_json(of_episode).items():
-            row |= {f"stats/{feature}/{key}": value for key, value in summary.items()}
-        row |= {f"meta/episodes/{key}": value for key, value in at.items()}
-        return pa.table({name: [value] for name, value in row.items()})
+    @contextmanager
+    def _nothing_lost(self) -> Iterator[None]:
+        """Turns a failure to write into a DatasetError that says what is safe; what is in flight stays where it is."""
+        try:
+            yield
+        except _BROKEN as error:
+            rows = self.in_flight
+            self._stop(quietly=True)
+            self._forget()
+            self._left = True
+            self._writer.remove_unfinished()
+            why = "the disk is full" if getattr(error, "errno", None) in _FULL else f"writing failed ({error})"
+            safe = f"{self.episodes} episodes ({self.rows} frames) are safe there"
+            safe += f", the {rows} rows in flight are kept as far as they were written" if rows else ""
+            raise DatasetError(f"{why} at {self.root}; {safe}: free some space and record again to go on.") from error
 
-    def _info(self, episodes: int, rows: int) -> dict:
-        return {
-            "codebase_version": VERSION,
-            "robot_type": "terrella",
-            "total_episodes": episodes,
-            "total_frames": rows,
-            "total_tasks": len(self._tasks),
-            "chunks_size": FILES_PER_CHUNK,
-            "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": 200,
-            "fps": self.layout.fps,
-            "splits": {"train": f"0:{episodes}"},
-            "data_path": DATA_PATH,
-            "video_path": VIDEO_PATH if self.layout.rgb else None,
-            "features": self._features,
-        }
+    def _stop(self, quietly: bool = False) -> None:
+        """Ends the files in flight."""
+        self._pressure = self.pressure
+        videos, self._videos, self._films = [*self._videos.values(), *self._films.values()], {}, {}
+        if self._journal:
+            self._journal.close()
+            self._journal = None
+        for video in videos:
+            video.abandon() if quietly else video.close()
 
-    # -- giving up ----------------------------------------------------------------------------------------------
-
-    def _nothing_lost(self) -> _NothingLost:
-        return _NothingLost(self)
+    def _forget(self) -> None:
+        self.in_flight, self._number, self._start_ns, self._began_ns, self._time_s = 0, -1, 0, 0, -np.inf
+        self._torn = self._left = False
+        self._pictures: dict[str, list[stats.Summary]] = {}
+        self._newest: dict[str, float] = {}
+        self._before: dict[str, np.ndarray] = {}
 
     def _discard(self) -> None:
         """Forgets the episode in flight."""
-        if self._video:
-            self._video.abandon()
-        if self._table:
-            try:
-                self._table.close()
-            except (OSError, pa.ArrowException):
-                pass
-        self._video, self._table = None, None
-        self._rows, self._parts, self._pictures = self._no_rows(), [], []
-        self._pending = self._flushed = 0
+        self._stop(quietly=True)
+        self._forget()
         shutil.rmtree(self._staging, ignore_errors=True)
 
 
-class _NothingLost:
-    """Turns a failure to write into a DatasetError that says what is safe, after removing the episode in flight."""
-
-    def __init__(self, recorder: Recorder):
-        self.recorder = recorder
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind, error, trace) -> None:
-        if error is None or not isinstance(error, (OSError, av.FFmpegError, pa.ArrowException)):
-            return
-        recorder, full = self.recorder, getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        recorder._discard()
-        for path in recorder._files(recorder.episodes).values():
-            (recorder.root / path).unlink(missing_ok=True)
-        why = "the disk is full" if full else f"writing failed ({error})"
-        safe = f"{recorder.episodes} episodes ({recorder.rows} frames) are safe there"
-        raise DatasetError(f"{why} at {recorder.root}; {safe}: free some space and record again to go on.") from error
+class NotFinite(DatasetError):
+    """A row holds a number that is not finite."""
 
 
-def _lock(root: Path):
-    handle = open(root / ".lock", "a")
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        handle.close()
-        raise DatasetError(f"another recorder is writing to {root}; stop it or record to another folder.") from error
-    os.set_inheritable(handle.fileno(), False)
-    return handle
+def _blank(sensor: Sensor) -> np.ndarray:
+    if sensor.dtype == "string":
+        return np.array([""], object)
+    dtype = np.uint16 if sensor.kind == "depth" else np.dtype(sensor.dtype)
+    return np.full(sensor.shape, DEPTH_BEYOND if sensor.kind == "depth" else 0, dtype)
 
 
-def _tasks_table(tasks: list[str]) -> pa.Table:
-    """tasks.parquet as pandas reads it: indexed by the task's sentence."""
-    columns = [
-        {
-            "name": "task_index",
-            "field_name": "task_index",
-            "pandas_type": "int64",
-            "numpy_type": "int64",
-            "metadata": None,
-        },
-        {
-            "name": None,
-            "field_name": "__index_level_0__",
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": None,
-        },
-    ]
-    pandas = {
-        "index_columns": ["__index_level_0__"],
-        "column_indexes": [],
-        "columns": columns,
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table(
-        {"task_index": pa.array(range(len(tasks)), pa.int64()), "__index_level_0__": pa.array(tasks, pa.string())}
-    )
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+def _as_stored(sensor: Sensor, value, what: str) -> np.ndarray:
+    """A copy of the value as rows and streams hold it: depth in millimetres."""
+    array = np.asarray(value)
+    if sensor.dtype == "string":
+        return np.array([str(array.reshape(-1)[0])], object)
+    if sensor.kind == "points":
+        if array.ndim != 2 or array.shape[1] != sensor.shape[1]:
+            raise DatasetError(f"{what} should be points of shape [n, {sensor.shape[1]}]; got {array.shape}.")
+        return np.array(array, sensor.dtype)
+    if array.size != int(np.prod(sensor.shape)) or (len(sensor.shape) > 1 and array.shape != sensor.shape):
+        raise DatasetError(f"{what} should have shape {sensor.shape}; got {array.shape}.")
+    if sensor.kind == "depth":
+        with np.errstate(over="ignore"):
+            steps = np.nan_to_num(array.astype(np.float64) / DEPTH_UNIT_M + 0.5, nan=DEPTH_BEYOND, posinf=DEPTH_BEYOND)
+        return np.clip(steps, 0, DEPTH_BEYOND).astype(np.uint16)
+    dtype = np.dtype(sensor.dtype)
+    if dtype.kind in "iub" and array.dtype != dtype:
+        with np.errstate(invalid="ignore"):
+            stored = array.astype(dtype)
+        if not np.array_equal(stored, array):
+            raise DatasetError(f"{what} should be {dtype}, and what it is ({array.dtype}) does not fit that.")
+        return stored.reshape(sensor.shape)
+    return np.array(array, dtype).reshape(sensor.shape)

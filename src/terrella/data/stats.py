@@ -9,20 +9,26 @@ import numpy as np
 Summary = dict[str, np.ndarray]  # min, max, mean, std: float64 [n] (or [3, 1, 1] for pictures); count: int64 [1]
 
 
-def summarise(values: np.ndarray) -> Summary:
-    """Of rows [T] or [T, n], per column; of maps [T, h, w], over a sample of everything as shape [1, 1]."""
-    if values.ndim == 3:
-        return _summary(values[::4, ::4, ::4].astype(np.float64).reshape(-1, 1), len(values), (1, 1))
-    rows = values.astype(np.float64).reshape(len(values), -1)
-    return _summary(rows, len(rows), (rows.shape[1],))
+def summarise(values: np.ndarray, sampled: bool = False) -> Summary:
+    """Of rows [T] or [T, ...], of each number; `sampled`: of maps [T, h, w], over a sample of everything, as shape [1, 1]."""
+    if sampled:
+        some = values[::4, ::4, ::4].astype(np.float64).reshape(-1, 1)
+        return _summary(some, len(values), (1,) * (values.ndim - 1))
+    shape = values.shape[1:] or (1,)
+    return _summary(values.astype(np.float64).reshape(len(values), -1), len(values), shape)
 
 
-def summarise_pictures(pictures: np.ndarray, count: int) -> Summary:
-    """Of sampled uint8 [n, H, W, 3] pictures, per colour in 0..1 as shape [3, 1, 1], standing for `count` rows."""
-    return _summary(pictures.reshape(-1, 3) / 255.0, count, (3, 1, 1))
+def summarise_pictures(pictures: np.ndarray) -> Summary:
+    """Of uint8 [n, H, W, 3] pictures, per colour in 0..1 as shape [3, 1, 1]."""
+    return _summary(pictures.reshape(-1, 3) / 255.0, len(pictures), (3, 1, 1))
 
 
 def _summary(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers near the largest the deviation is none
+        return _of(rows, count, shape)
+
+
+def _of(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
     found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
     return {**{name: value.reshape(shape) for name, value in found.items()}, "count": np.array([count])}
 
@@ -50,5 +56,13 @@ def _merge_two(a: Summary, b: Summary) -> Summary:
 
 
 def to_json(stats: Mapping[str, Summary]) -> dict:
-    """Plain lists, as meta/stats.json and the stats columns of meta/episodes hold them."""
-    return {name: {key: value.tolist() for key, value in summary.items()} for name, summary in stats.items()}
+    """Plain lists, as meta/stats.json and the stats columns of meta/episodes hold them; JSON knows no infinity."""
+    return {
+        name: {key: np.nan_to_num(value).tolist() for key, value in summary.items()} for name, summary in stats.items()
+    }
+
+
+def from_json(found: Mapping) -> dict[str, Summary]:
+    """The inverse of `to_json`; KeyError, TypeError or ValueError where it is not one."""
+    keys = ("min", "max", "mean", "std", "count")
+    return {name: {key: np.asarray(summary[key], float) for key in keys} for name, summary in found.items()}

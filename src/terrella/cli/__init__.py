@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import json as json_text
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,17 +14,18 @@ import tyro
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from . import progress
+from .. import progress
+from . import data as data_room
+from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
-    from .core.world import World
+    from ..core.world import World
 
-Json = Annotated[bool, arg(name="json", help="Print one JSON document on stdout instead of text.")]
-Seed = Annotated[int, arg(help="The same seed gives the same result.")]
+Watch = Annotated[
+    str | None,
+    arg(name="live-mcap", help="Log while recording: to a file NAME.mcap, or to Foxglove at a port of this machine."),
+]
 Device = Annotated[str, arg(help="cpu, cuda, or auto: a GPU where there is one.")]
-Port = Annotated[int, arg(help="Port of the page; 0 takes a free one.")]
-Host = Annotated[str, arg(help="Address to listen on; any other than this machine's own needs a token.")]
-Token = Annotated[str | None, arg(help="Secret that the page's address must carry.")]
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
 CONTEXT = 10  # frames that a world is shown before it dreams, when it is scored: longer than a key's history counts
@@ -53,7 +54,7 @@ _THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, 
 
 def _sentence(error: Exception) -> str | None:
     """What to tell a person of an error that is theirs or their disk's; None for a fault of ours: that needs its trace."""
-    from .core.errors import TerrellaError
+    from ..core.errors import TerrellaError
 
     if isinstance(error, TerrellaError):
         return str(error)
@@ -68,7 +69,10 @@ def _app(given: Sequence[str]) -> SubcommandApp:
     recording.command(name="doom")(record_doom)
     recording.command(name="world")(record_world)
     training.command(name="video")(_train_video_command() if given[:1] == ["train"] else play)
-    data.command(doctor)
+    data.command(data_room.doctor)
+    data.command(data_room.convert)
+    data.command(data_room.merge)
+    data.command(data_room.view)
     app.command(recording, name="record", help="Record a world's episodes: scripted, or played by a person.")
     app.command(training, name="train", help="Train a world on a recording.")
     app.command(play)
@@ -87,6 +91,7 @@ def record_doom(
     frames: int = 100_000,
     height: int = 192,
     human: bool = False,
+    live_mcap: Watch = None,
     seed: Seed = 0,
     port: Port = 8765,
     json: Json = False,
@@ -100,11 +105,11 @@ def record_doom(
         height: Height of the pictures; their width is 4/3 of it.
         human: Play yourself, in the browser, instead of watching a script explore.
     """
-    from . import library
+    from .. import library
 
     depth = (min(max(height, 1), 96), min(max(height, 1), 96) * 4 // 3)
     world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth)
-    _record(world, out, frames, human, seed, port, json)
+    _record(world, out, frames, human, live_mcap, seed, port, json)
 
 
 def record_world(
@@ -112,6 +117,7 @@ def record_world(
     out: Path,
     frames: int = 10_000,
     human: bool = False,
+    live_mcap: Watch = None,
     seed: Seed = 0,
     port: Port = 8765,
     json: Json = False,
@@ -124,40 +130,61 @@ def record_world(
         frames: Rows to record in all (by the script; a person plays as long as they like).
         human: Play yourself, in the browser, instead of watching a script explore.
     """
-    from . import library
+    from .. import library
 
-    _record(library.load(name), out, frames, human, seed, port, json)
+    _record(library.load(name), out, frames, human, live_mcap, seed, port, json)
 
 
-def _record(world: World, out: Path, frames: int, human: bool, seed: int, port: int, json: bool) -> None:
-    from .core.errors import DatasetError
-    from .core.world import make_rng
-    from .data import Dataset, Layout, Recorder, record
-    from .data.explore import Explorer
+def _record(
+    world: World, out: Path, frames: int, human: bool, watch: str | None, seed: int, port: int, json: bool
+) -> None:
+    from ..core.errors import DatasetError
+    from ..core.world import make_rng
+    from ..data import Dataset, Layout, Recorder, record
+    from ..data.explore import Explorer
 
-    if human:
-        from .serve import serve
+    layout = Layout.of(world.spec)
+    facts: dict[str, object] = {"dataset": str(out)}
+    with _watched(watch, layout, world.spec.name, facts) as live:
+        if human:
+            from ..serve import serve
 
-        def ready(address: str) -> None:
-            _say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
+            def ready(address: str) -> None:
+                say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
 
-        layout = Layout.of(world.spec)
-        serve([world], port=port, sink_factory=lambda: Recorder(out, layout, "play"), on_ready=ready, seed=seed)
-        if not out.exists():
-            raise DatasetError("nothing was recorded: press the record button on the page before you play.")
-    else:
-        with progress.shown("recording") as report:
-            record(world, Explorer(world.spec), out, frames, make_rng(seed), progress=report)
+            sink = lambda: Recorder(out, layout, "play", live=live)  # noqa: E731
+            serve([world], port=port, sink_factory=sink, on_ready=ready, seed=seed)
+            if not out.exists():
+                raise DatasetError("nothing was recorded: press the record button on the page before you play.")
+        else:
+            with progress.shown("recording") as report:
+                done = record(world, Explorer(world.spec), out, frames, make_rng(seed), report, live=live)
+            facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out)
-    facts = {"dataset": str(out), "frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
+    facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
     if dataset.has("rgb"):
         facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
-    _result(facts, json)
+    result(facts, json)
+
+
+@contextmanager
+def _watched(target: str | None, layout, name: str, facts: dict[str, object]):
+    """A Live to log to, None without a target; says where to look, and how much of it was lost."""
+    if target is None:
+        yield None
+        return
+    from ..data.live import Live
+
+    with Live(target, {**layout.sensors, **layout.streams}, name) as live:
+        where = f"ws://127.0.0.1:{live.port} (open it in Foxglove)" if live.port else target
+        say(f"Watch at {where}.")
+        yield live
+    facts |= {"watched": where, "watch_dropped": live.dropped, "watch_notes": list(live.notes)}
 
 
 def _contact_sheet(dataset, path: Path) -> Path:
     """Twelve pictures from the whole recording, to see at a glance what it holds."""
-    from .measure import strip
+    from ..measure import strip
 
     rows = [dataset.length * (2 * place + 1) // 24 for place in range(12)]
     pictures = dataset.rgb_at(rows).reshape(3, 4, *dataset.rgb_at(rows[:1]).shape[1:])
@@ -170,7 +197,7 @@ def _contact_sheet(dataset, path: Path) -> Path:
 
 
 def _train_video_command() -> Callable[..., None]:
-    from .learn.train_video import TrainConfig, train_video
+    from ..learn.train_video import TrainConfig, train_video
 
     defaults = TrainConfig()
 
@@ -183,7 +210,7 @@ def _train_video_command() -> Callable[..., None]:
         """
         with progress.shown("training") as report:
             facts = train_video(data, out, config, report)
-        _result({"run": str(out), **(facts or {})}, json)
+        result({"run": str(out), **(facts or {})}, json)
 
     video.__annotations__["config"] = TrainConfig  # it lives in a room that is slow to import, so not in this module
     return video
@@ -214,7 +241,7 @@ def play(
         memory: --no-memory plays a learned world without its keyframes.
         record: Folder of a dataset to which the page may record.
     """
-    from .serve import serve
+    from ..serve import serve
 
     learned = _load(name, device, memory)
     worlds = [learned]
@@ -222,21 +249,21 @@ def play(
         worlds = [_game_like(learned, truth), learned]
     sink = None
     if record is not None:
-        from .data import Layout, Recorder
+        from ..data import Layout, Recorder
 
         layout, folder = Layout.of(worlds[0].spec), record
         sink = lambda: Recorder(folder, layout, "play")  # noqa: E731
     names = [world.spec.name for world in worlds]
 
     def ready(address: str) -> None:
-        _result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
+        result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
 
     serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed)
 
 
 def _game_like(learned: World, name: str) -> World:
     """The real game, with pictures of the size that the learned world shows."""
-    from . import library
+    from .. import library
 
     shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
     like = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
@@ -245,7 +272,7 @@ def _game_like(learned: World, name: str) -> World:
 
 def _load(name: str, device: str, memory: bool = True) -> World:
     """A world by name; only learned worlds have a device and a memory."""
-    from . import library
+    from .. import library
 
     if name == "doom" or name.startswith(("doom:", "gym:")):
         return library.load(name)
@@ -255,7 +282,7 @@ def _load(name: str, device: str, memory: bool = True) -> World:
 def _device(name: str) -> str:
     import torch
 
-    from .core.errors import TerrellaError
+    from ..core.errors import TerrellaError
 
     if name != "auto":
         if name.startswith("cuda") and not torch.cuda.is_available():
@@ -292,10 +319,10 @@ def score(
         horizons: Steps after which figures are given; a clip is as long as the largest.
         long_steps: Length of the long dream; 0 leaves it out.
     """
-    from .core.errors import TerrellaError
-    from .core.world import make_rng
-    from .data import split
-    from .measure import (
+    from ..core.errors import TerrellaError
+    from ..core.world import make_rng
+    from ..data import split
+    from ..measure import (
         Album,
         ExamConfig,
         ScoreConfig,
@@ -307,7 +334,7 @@ def score(
         out_of_sight,
         write_report,
     )
-    from .measure.bars import summary
+    from ..measure.bars import summary
 
     if min(horizons, default=0) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100):
         raise TerrellaError("--horizons and --clips are whole numbers from 1 up, --long-steps is 0 or at least 100.")
@@ -340,13 +367,13 @@ def score(
         if bar.figure and not bar.side
     ]
     facts = {**as_dict(card, found), "files": [str(file) for file in files]}
-    _result(facts, json, "\n".join([*lines, summary(found), f"the page: {files[1]}"]))
+    result(facts, json, "\n".join([*lines, summary(found), f"the page: {files[1]}"]))
 
 
 def _cache(data: Path, world: World) -> Any:
     """The recording's ClipCache at the size that the world shows."""
-    from .core.errors import TerrellaError
-    from .data import ClipCache
+    from ..core.errors import TerrellaError
+    from ..data import ClipCache
 
     if "rgb" not in world.spec.channels:
         raise TerrellaError(f"{world.spec.name} shows no pictures, so it cannot be scored; score a learned world.")
@@ -355,7 +382,7 @@ def _cache(data: Path, world: World) -> Any:
         return ClipCache.open(data, size=(height, width), progress=report)
 
 
-# -- list and data --------------------------------------------------------------------------------------------------
+# -- list ----------------------------------------------------------------------------------------------------------
 
 
 def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) -> None:
@@ -364,7 +391,7 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
     Args:
         folders: Folders that hold checkpoints of your own.
     """
-    from . import library
+    from .. import library
 
     entries = library.worlds(folders)
     if json:
@@ -374,34 +401,3 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
         print(f"{entry.name}  [{entry.source}]")
         for fact, value in entry.card.items():
             print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
-
-
-def doctor(folder: Positional[Path], json: Json = False) -> int:
-    """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
-
-    Args:
-        folder: Folder of the dataset.
-    """
-    from .data.doctor import doctor as examine
-
-    faults = examine(folder)
-    facts = {"dataset": str(folder), "sound": not faults, "faults": [asdict(fault) for fault in faults]}
-    lines = [
-        f"{fault.file}{'' if fault.row is None else f', row {fault.row}'}: {fault.what}.\n    mend: {fault.mend}."
-        for fault in faults
-    ]
-    _result(facts, json, "\n".join([*lines, f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}"]))
-    return 1 if faults else 0
-
-
-# -- what every command says ----------------------------------------------------------------------------------------
-
-
-def _say(words: str) -> None:
-    print(words, file=sys.stderr, flush=True)
-
-
-def _result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:
-    """One JSON document, or the same for people, on stdout."""
-    shown = json_text.dumps(facts, indent=1, default=str) if json else text
-    print(shown or "\n".join(f"{name}: {value}" for name, value in facts.items()), flush=True)

@@ -25,9 +25,12 @@ def sync_folder(path: Path) -> None:
 
 def move_into_place(staged: Path, target: Path) -> None:
     """Renames a finished file or folder over `target`, durably."""
+    new = [parent for parent in target.parents if not parent.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     os.replace(staged, target)
     sync_folder(target.parent)
+    for folder in new:
+        sync_folder(folder.parent)
 
 
 def write_whole(target: Path, write: Callable[[Path], object]) -> None:

@@ -1,0 +1,141 @@
+"""The commands that look after recordings: doctor, convert, merge, view."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from .. import progress
+from .say import Host, Json, Port, Seed, Token, result
+
+Fps = Annotated[float | None, arg(help="Rows a second; without it those that the recording has.")]
+Policy = Annotated[
+    Literal["previous", "nearest", "linear"],
+    arg(help="What a row holds of a sensor with a clock of its own: its newest reading, the nearest, or a mixture."),
+]
+
+
+def doctor(folder: Positional[Path], repair: bool = False, out: Path | None = None, json: Json = False) -> int:
+    """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
+
+    Args:
+        folder: Folder of a LeRobot v3 dataset, ours or anybody's.
+        repair: Write a mended copy that keeps every whole row; the original is not touched.
+        out: Where the mended copy goes; without it FOLDER-mended.
+    """
+    from ..data import doctor as examine
+    from ..data import repair as mend
+
+    faults = examine(folder)
+    facts: dict[str, object] = {
+        "dataset": str(folder),
+        "sound": not faults,
+        "faults": [asdict(fault) for fault in faults],
+    }
+    lines = [
+        f"{fault.file}{'' if fault.row is None else f', row {fault.row}'}: {fault.what}.\n    mend: {fault.mend}."
+        for fault in faults
+    ]
+    lines.append(f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}")
+    if repair:
+        target = out or folder.with_name(f"{folder.resolve().name}-mended")
+        with progress.shown("mending") as report:
+            done = mend(folder, target, progress=lambda pieces, of: report(pieces, of))
+        facts |= {"mended": str(target), "done": done}
+        lines += [*done, f"the mended copy: {target}"]
+    result(facts, json, "\n".join(lines))
+    return 1 if faults and not repair else 0
+
+
+def convert(
+    source: Positional[str],
+    target: Positional[Path],
+    to: Literal["auto", "lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"] = "auto",
+    fps: Fps = None,
+    policy: Policy = "previous",
+    pictures: Literal["video", "png"] = "video",
+    episodes: int = 10,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Turn a recording of one format into another: LeRobot v3, MCAP, Minari, HDF5, rollouts, videos, images.
+
+    Args:
+        source: Where it lies (which format it is, is seen from what lies there), or "gym:ID" for rollouts of an environment.
+        target: Where it shall lie; NAME.mcap and NAME.hdf5 name their formats, else it is a LeRobot v3 folder.
+        to: The format to write, where its name does not tell.
+        pictures: How LeRobot rows keep pictures: H.264 video, or PNG, which is exact and larger.
+        episodes: Rollouts to draw from "gym:ID".
+    """
+    from ..data.convert import open_source, write_source
+    from ..data.formats.lerobot import Rows
+
+    found = open_source(source, fps, episodes, seed)
+    rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, None, pictures)
+    with progress.shown(f"converting {found.name}") as report:
+        notes = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
+    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "notes": notes}
+    result(facts, json, "\n".join([*(f"note: {note}" for note in notes), f"{source} is now {target}"]))
+
+
+def merge(
+    sources: Positional[tuple[str, ...]],
+    out: Path,
+    mapping: Path | None = None,
+    fps: Fps = None,
+    dry: bool = False,
+    json: Json = False,
+) -> None:
+    """Make one training set of several robots' recordings: named dimensions, masks, statistics of each body.
+
+    Args:
+        sources: Recordings of any format.
+        out: Folder of the merged dataset (LeRobot v3).
+        mapping: File that says which number is which; without one it is guessed from the names and written to OUT.toml,
+            to be looked at, edited and given here.
+        dry: Write the guessed mapping alone.
+    """
+    from ..data.convert import open_source
+    from ..data.merging.merge import merge_into
+
+    found = {path: open_source(path) for path in sources}
+    with progress.shown("merging") as report:
+        facts, text = merge_into(found, out, mapping, fps, dry, lambda done, of: report(done, of))
+    result(facts, json, text)
+
+
+def view(
+    folder: Positional[str],
+    rerun: bool = False,
+    out: Path | None = None,
+    port: Port = 8766,
+    host: Host = "127.0.0.1",
+    token: Token = None,
+    json: Json = False,
+) -> None:
+    """Look through a recording in the browser: cameras, plots, depth, map and points in step; mark what is bad.
+
+    Args:
+        folder: Recording of any format.
+        rerun: Hand it to Rerun instead, where that is installed.
+        out: Folder to which the page exports the episodes that are not marked bad; without it FOLDER-good.
+    """
+    from ..data.browse import browse
+    from ..data.convert import open_source
+
+    if rerun:
+        from ..data.formats import rerun as viewer
+
+        viewer.show(open_source(folder))
+        return
+    from ..serve.viewer import view as serve
+
+    def ready(address: str) -> None:
+        result({"address": address, "dataset": folder}, json, f"{folder}: open {address}")
+
+    name = folder.rstrip("/").rsplit("/", 1)[-1]
+    good = out or (Path(folder).with_name(f"{name}-good") if "://" not in folder else Path(f"{name}-good"))
+    serve(browse(folder), port, host, token, ready, good)

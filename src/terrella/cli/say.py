@@ -1,0 +1,27 @@
+"""What every command says, and the options that many share."""
+
+from __future__ import annotations
+
+import json as json_text
+import sys
+from collections.abc import Mapping
+from typing import Annotated
+
+from tyro.conf import arg
+
+Json = Annotated[bool, arg(name="json", help="Print one JSON document on stdout instead of text.")]
+Seed = Annotated[int, arg(help="The same seed gives the same result.")]
+Port = Annotated[int, arg(help="Port of the page; 0 takes a free one.")]
+Host = Annotated[str, arg(help="Address to listen on; any other than this machine's own needs a token.")]
+Token = Annotated[str | None, arg(help="Secret that the page's address must carry.")]
+
+
+def say(words: str) -> None:
+    """A sentence for the person, on stderr."""
+    print(words, file=sys.stderr, flush=True)
+
+
+def result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:
+    """One JSON document, or the same for people, on stdout."""
+    shown = json_text.dumps(facts, indent=1, default=str) if json else text
+    print(shown or "\n".join(f"{name}: {value}" for name, value in facts.items()), flush=True)

@@ -1,0 +1,101 @@
+"""units: what one unit is in another ("deg" -> "rad", "mm" -> "m", "0..255" -> "0..1"), for units of one quantity."""
+
+from __future__ import annotations
+
+import math
+
+from ...core.errors import DatasetError
+
+# unit -> (quantity, how many of that quantity's first unit it is, what is added then)
+_PLAIN: dict[str, tuple[str, float, float]] = {
+    "m": ("length", 1, 0),
+    "km": ("length", 1000, 0),
+    "cm": ("length", 0.01, 0),
+    "mm": ("length", 0.001, 0),
+    "um": ("length", 1e-6, 0),
+    "in": ("length", 0.0254, 0),
+    "ft": ("length", 0.3048, 0),
+    "rad": ("angle", 1, 0),
+    "deg": ("angle", math.pi / 180, 0),
+    "turn": ("angle", 2 * math.pi, 0),
+    "s": ("time", 1, 0),
+    "ms": ("time", 0.001, 0),
+    "us": ("time", 1e-6, 0),
+    "ns": ("time", 1e-9, 0),
+    "min": ("time", 60, 0),
+    "h": ("time", 3600, 0),
+    "0..1": ("share", 1, 0),
+    "0..100": ("share", 0.01, 0),
+    "0..255": ("share", 1 / 255, 0),
+    "-1..1": ("share", 0.5, 0.5),
+    "%": ("share", 0.01, 0),
+    "kg": ("mass", 1, 0),
+    "N": ("force", 1, 0),
+    "kN": ("force", 1000, 0),
+    "N m": ("torque", 1, 0),
+    "V": ("voltage", 1, 0),
+    "mV": ("voltage", 0.001, 0),
+    "A": ("current", 1, 0),
+    "mA": ("current", 0.001, 0),
+    "K": ("temperature", 1, 0),
+    "degC": ("temperature", 1, 273.15),
+    "T": ("field", 1, 0),
+    "uT": ("field", 1e-6, 0),
+    "Pa": ("pressure", 1, 0),
+    "hPa": ("pressure", 100, 0),
+    "kPa": ("pressure", 1000, 0),
+    "rpm": ("angle/s", 2 * math.pi / 60, 0),
+    "g": ("length/s2", 9.80665, 0),  # as accelerometers count
+}
+_ALSO = {
+    "metre": "m", "meter": "m", "metres": "m", "meters": "m", "radian": "rad", "radians": "rad", "degree": "deg",
+    "degrees": "deg", "°": "deg", "µm": "um", "µs": "us", "second": "s", "seconds": "s", "rev": "turn", "Nm": "N m",
+    "N*m": "N m", "N·m": "N m", "°C": "degC", "percent": "%", "µT": "uT", "mps": "m/s", "radps": "rad/s",
+    "degps": "deg/s", "dps": "deg/s",
+}  # fmt: skip
+_FIRST = {quantity: unit for unit, (quantity, factor, shift) in reversed(_PLAIN.items()) if (factor, shift) == (1, 0)}
+
+
+def quantity(unit: str) -> str | None:
+    """What is measured in that unit ("length", "angle/s", …), None where the unit is "" or not known here."""
+    known = _known(unit)
+    return known[0] if known else None
+
+
+def basic(unit: str) -> str:
+    """The basic unit of its quantity: "m" for "mm", "rad/s" for "rpm"; an unknown unit is its own."""
+    known = _known(unit)
+    if not known:
+        return unit
+    plain, slash, per = known[0].partition("/")
+    return _FIRST[plain] + slash + per
+
+
+def convert(unit: str, to: str) -> tuple[float, float]:
+    """(scale, offset): a number x in `unit` is scale * x + offset in `to`. (1, 0) where they are the same or one is "".
+
+    DatasetError where they measure different quantities, or differ and one of them is not known.
+    """
+    if unit == to or not unit or not to:
+        return 1.0, 0.0
+    a, b = _known(unit), _known(to)
+    if not a or not b:
+        raise DatasetError(f"no conversion from '{unit or to}' to '{to}' is known; give its scale (and offset).")
+    if a[0] != b[0]:
+        raise DatasetError(f"'{unit}' measures {a[0]} and '{to}' measures {b[0]}; give its scale where that is meant.")
+    if a[1:] == b[1:]:
+        return 1.0, 0.0
+    return a[1] / b[1], (a[2] - b[2]) / b[1]
+
+
+def _known(unit: str) -> tuple[str, float, float] | None:
+    unit = _ALSO.get(unit.strip(), unit.strip())
+    if unit in _PLAIN:
+        return _PLAIN[unit]
+    plain, slash, per = unit.partition("/")
+    plain, per = _ALSO.get(plain.strip(), plain.strip()), per.strip().replace("^", "").replace("²", "2")
+    seconds = {"s": 1.0, "s2": 1.0, "h": 3600.0, "min": 60.0}.get(per)
+    if not slash or seconds is None or plain not in _PLAIN or _PLAIN[plain][2] or "/" in _PLAIN[plain][0]:
+        return None
+    measured, factor, _ = _PLAIN[plain]
+    return f"{measured}/{'s2' if per == 's2' else 's'}", factor / seconds, 0.0

@@ -1,0 +1,207 @@
+"""An episode in flight, as it lies in a recorder's staging folder: written row by row, read back whole or cut short."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..core.errors import DatasetError
+from . import stats
+from .format import Layout, sensor_from_json, sensor_json
+from .source import Sensor
+from .storage import journal, mp4
+from .storage.films import whole_frames
+from .writer import Draft, group_columns
+
+LOG = "rows.log"
+SAMPLE_EVERY = 16  # rows; pictures looked at for the statistics
+ROW, WORDS = 0, 0xFFFF  # what a record of the journal is; in between are the streams, numbered from 1
+
+
+def about(layout: Layout, number: int, task: str, start_ns: int) -> dict:
+    """What the journal of episode `number` says of itself: all that is needed to read it."""
+    return {
+        "episode": number,
+        "task": task,
+        "start_ns": start_ns,
+        "fps": layout.fps,
+        "pictures": layout.pictures,
+        "rows": {name: sensor_json(sensor) for name, sensor in layout.rows.items()},
+        "streams": {name: sensor_json(sensor) for name, sensor in layout.streams.items()},
+    }
+
+
+def pack_row(values: Mapping[str, np.ndarray], given: Sequence[bool], sensors: Sequence[Sensor]) -> list:
+    """A row as raw bytes: which of the layout's rows were given, then the values of `sensors` (no videos) in order."""
+    return [np.packbits(given), *(_packed(values[sensor.name]) for sensor in sensors)]
+
+
+def growing(folder: Path, camera: str) -> Path:
+    """The film of a camera that has a frame in each row."""
+    return folder / f"{camera}.growing.mp4"
+
+
+def growing_stream(folder: Path, camera: str) -> Path:
+    """The film of a camera with a clock of its own."""
+    return folder / f"stream-{camera}.growing.mp4"
+
+
+class Staged:
+    """The episode in a staging folder. ValueError, KeyError, TypeError or OSError where not even its beginning is whole.
+
+    number, task, start_ns: as when it began. rows, streams: its Sensors. length: rows in the journal.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        told = journal.about(folder / LOG)
+        self.number, self.task, self.start_ns = int(told["episode"]), str(told["task"]), int(told["start_ns"])
+        self.fps, self.pictures = float(told["fps"]), str(told["pictures"])
+        self.rows = {name: sensor_from_json(name, sensor) for name, sensor in told["rows"].items()}
+        self.streams = {name: sensor_from_json(name, sensor) for name, sensor in told["streams"].items()}
+        video = self.pictures == "video"
+        self.cameras = [name for name, sensor in self.rows.items() if sensor.kind == "image" and video]
+        self._packed = [sensor for name, sensor in self.rows.items() if name not in self.cameras]
+        self.length = sum(1 for _ in self._journal(ROW))
+
+    def fits(self, layout: Layout) -> bool:
+        """Whether its rows and streams are those of a layout, in whatever order."""
+        mine = about(layout, 0, "", 0)
+        same = {"rows": self.rows, "streams": self.streams}
+        return all(
+            {name: _form(sensor) for name, sensor in same[kind].items()}
+            == {name: _form(sensor_from_json(name, told)) for name, told in mine[kind].items()}
+            for kind in same
+        )
+
+    def whole(self) -> int:
+        """Rows that every camera shows: none of their frames is cut or damaged (each is decoded once)."""
+        length = self.length
+        for name in self.cameras:
+            length = min(length, _good(growing(self.folder, name), self.folder / "tried.mp4", length, self.fps))
+        return length
+
+    def draft(self, length: int, start_ns: int | None, pictures: Mapping[str, stats.Summary] | None = None) -> Draft:
+        """The first `length` rows as an episode; `pictures`: statistics of its cameras, made anew without them."""
+        videos = {name: self._finished(growing(self.folder, name), name, length) for name in self.cameras}
+        films, streams = {}, {}
+        for name, sensor in self.streams.items():
+            if sensor.kind == "image":
+                film, rate = growing_stream(self.folder, name), sensor.rate_hz or self.fps
+                times = [time_s for time_s, _ in self._readings(name)]
+                count = _good(film, self.folder / "tried.mp4", len(times), rate) if pictures is None else len(times)
+                if not count:
+                    continue  # this camera has seen nothing
+                films[name] = self._finished(film, f"stream-{name}", count)
+                streams[name] = [(time_s, None) for time_s in times[:count]]
+            else:
+                streams[name] = self._readings(name)
+        counts, tasks = self._counted(length)
+        seen = self._sampled(videos, length) if pictures is None else pictures
+        rows = group_columns(islice(self._rows(), length))
+        return Draft(length, rows, videos, seen, self.task, streams, films, start_ns, tasks, counts)
+
+    def _counted(self, length: int) -> tuple[dict[str, int], list[str]]:
+        """Rows up to the last that has a sensor, where that is not the last of all; the task of each row, [] where one."""
+        newest = np.zeros(len(self.rows), int)
+        tasks, said, task = [], False, self.task
+        for number, _, raw in journal.readings(self.folder / LOG):
+            if number == WORDS:
+                task, said = raw.decode(), True
+            elif number == ROW and len(tasks) < length:
+                tasks.append(task)
+                newest[self._given(raw)] = len(tasks)
+        counts = {name: int(count) for name, count in zip(self.rows, newest) if count != length}
+        return counts, tasks if said and len(set(tasks)) > 1 else []
+
+    def _given(self, raw: bytes) -> np.ndarray:
+        bits = np.frombuffer(raw, np.uint8, (len(self.rows) + 7) // 8)
+        return np.unpackbits(bits, count=len(self.rows)).astype(bool)
+
+    def _rows(self, encode: bool = True) -> Iterator[dict[str, np.ndarray]]:
+        skip = (len(self.rows) + 7) // 8
+        for _, raw in self._journal(ROW):
+            yield _unpacked(raw[skip:], self._packed, encode)
+
+    def _readings(self, stream: str) -> Iterator[tuple[float, np.ndarray | None]]:
+        sensor = self.streams[stream]
+        dtype = np.uint16 if sensor.kind == "depth" else np.dtype(sensor.dtype)
+        for time_s, raw in self._journal(1 + list(self.streams).index(stream)):
+            yield time_s, None if sensor.kind == "image" else np.frombuffer(raw, dtype)
+
+    def _journal(self, wanted: int) -> Iterator[tuple[float, bytes]]:
+        return ((time_s, raw) for number, time_s, raw in journal.readings(self.folder / LOG) if number == wanted)
+
+    def _finished(self, film: Path, name: str, length: int) -> Path:
+        target = self.folder / f"{name}.mp4"
+        kept = mp4.finish(film, target, length)
+        if kept != length:
+            raise DatasetError(f"the film {film} has {kept} of the {length} frames that are needed.")
+        return target
+
+    def _sampled(self, videos: Mapping[str, Path], length: int) -> dict[str, stats.Summary]:
+        """Statistics of the cameras, from every SAMPLE_EVERY-th row."""
+        parts: list[dict[str, stats.Summary]] = []
+        for name, video in videos.items():
+            for row in range(0, length, SAMPLE_EVERY):
+                parts.append({name: stats.summarise_pictures(mp4.frames_at(video, [row], self.fps)[:, ::4, ::4])})
+        images = [name for name, sensor in self.rows.items() if sensor.kind == "image" and name not in videos]
+        if images:
+            for row in islice(self._rows(encode=False), 0, length, SAMPLE_EVERY):
+                parts += [{name: stats.summarise_pictures(row[name][None, ::4, ::4])} for name in images]
+        return stats.merge(parts)
+
+
+def _form(sensor: Sensor) -> tuple:
+    return sensor.kind, sensor.shape, sensor.dtype
+
+
+def _good(film: Path, target: Path, most: int, fps: float) -> int:
+    """How many of the first frames of a growing film are whole and can be decoded."""
+    count = min(most, mp4.count_whole(film))
+    if not count:
+        return 0
+    try:
+        count = mp4.finish(film, target, count)
+        good = whole_frames(target, 0, count, fps)
+        return int(count if good.all() else good.argmin())
+    except DatasetError:
+        return 0
+    finally:
+        target.unlink(missing_ok=True)
+
+
+def _packed(value: np.ndarray) -> bytes | np.ndarray:
+    """Of fixed size as it is; text with its length in front."""
+    if value.dtype != object:
+        return value
+    text = str(value[0]).encode()
+    return len(text).to_bytes(4, "little") + text
+
+
+def _unpacked(raw: bytes, sensors: Sequence[Sensor], encode: bool) -> dict:
+    """The inverse of `_packed` for the values of a row; pictures become PNG where `encode`."""
+    found, at = {}, 0
+    for sensor in sensors:
+        if sensor.dtype == "string":
+            size = int.from_bytes(raw[at : at + 4], "little")
+            found[sensor.name] = raw[at + 4 : at + 4 + size].decode()
+            at += 4 + size
+            continue
+        dtype = np.dtype(np.uint16 if sensor.kind == "depth" else sensor.dtype)
+        array = np.frombuffer(raw, dtype, int(np.prod(sensor.shape)), at).reshape(sensor.shape)
+        at += array.nbytes
+        found[sensor.name] = png(array) if sensor.kind == "image" and encode else array
+    return found
+
+
+def png(picture: np.ndarray) -> bytes:
+    """uint8 [H, W, 3] as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()

@@ -1,0 +1,172 @@
+"""Videos as packets: which frames a file holds, where it may be cut, and cutting without encoding anew."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from ...core.errors import DatasetError
+from . import boxes, durable, mp4
+from .mp4 import Mp4Writer
+
+_BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_MOST = 50_000_000  # frames of one file; more is damage
+_FINISHED = {"movflags": "+faststart"}
+
+
+@dataclass(frozen=True)
+class Reel:
+    """The packets of a video in the order of its file.
+
+    frames:  int64 [n]: which frame (by its time and the rate) each packet is.
+    keys:    bool [n]: whether decoding may begin there.
+    digests: bytes of n: 8 of each packet, equal where packets are.
+    """
+
+    frames: np.ndarray
+    keys: np.ndarray
+    digests: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Frames from the first on without a gap."""
+        there = np.unique(self.frames[self.frames >= 0])
+        return int(np.searchsorted(there - np.arange(len(there)), 1))
+
+
+def reel(path: Path, fps: float) -> Reel:
+    """Reads the packets, decodes nothing; DatasetError where the file is none."""
+    found, keys, digests = [], [], []
+    try:
+        boxes.check(path)
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+            for packet in container.demux(stream):
+                if packet.size == 0 or packet.is_corrupt or packet.pts is None or len(found) == _MOST:
+                    break
+                found.append(round(packet.pts * a_tick))
+                keys.append(packet.is_keyframe)
+                digests.append(hashlib.blake2b(bytes(packet), digest_size=8).digest())
+    except _BROKEN as error:
+        if not found:
+            raise _broken(path, str(error)) from error
+    frames = np.array(found, np.int64) if all(abs(at) < 2**62 for at in found) else np.full(len(found), -1)
+    return Reel(frames, np.array(keys, bool), np.array(digests, "V8"))
+
+
+def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel) -> bool:
+    """Frames `first` .. `first + count - 1` of a video as one of its own.
+
+    True where its packets were copied; False where they had to be decoded and encoded again. DatasetError where a frame
+    cannot be had.
+    """
+    begin = np.flatnonzero(reel.frames == first)
+    if len(begin) == 1 and reel.keys[begin[0]]:
+        at = int(begin[0])
+        packets = reel.frames[at : at + count]
+        if len(packets) == count and np.array_equal(np.sort(packets), first + np.arange(count)):
+            if first == 0 and len(reel.frames) == count:
+                shutil.copyfile(path, target)
+            else:
+                with suppress(DatasetError):  # what this mp4 writer cannot hold may still be decoded
+                    _copy(path, at, count, target)
+            if np.array_equal(np.sort(mp4_frames(target, fps)), np.arange(count)):
+                durable.sync_file(target)
+                return True
+    _encode(path, first, count, fps, target)
+    return False
+
+
+def mp4_frames(path: Path, fps: float) -> np.ndarray:
+    """Which frames a video holds; none where it is broken."""
+    try:
+        return reel(path, fps).frames
+    except DatasetError:
+        return np.zeros(0, np.int64)
+
+
+def _copy(path: Path, at: int, count: int, target: Path) -> None:
+    """Packets number `at` .. `at + count - 1` of the file."""
+    try:
+        with av.open(str(path)) as source, av.open(str(target), "w", format="mp4", options=_FINISHED) as copy:
+            stream = source.streams.video[0]
+            out = copy.add_stream_from_template(stream, opaque=True)
+            begin = None
+            for number, packet in enumerate(source.demux(stream)):
+                if number < at:
+                    continue
+                if number == at + count or packet.pts is None:
+                    break
+                begin = packet.pts if begin is None else begin
+                packet.pts -= begin
+                packet.dts = None if packet.dts is None else packet.dts - begin
+                packet.stream = out
+                copy.mux(packet)
+    except _BROKEN as error:
+        if getattr(error, "errno", None) in _FULL:
+            raise
+        raise _broken(path, str(error)) from error
+
+
+def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:
+    growing, writer = target.with_suffix(".again.mp4"), None
+    try:
+        for frame in mp4.frames(path, first, count, fps):
+            if writer is None:
+                height, width = frame.shape[:2]
+                if height % 2 or width % 2:
+                    raise DatasetError(
+                        f"{path} must be encoded again, but H.264 cannot hold its {height}x{width} pixels."
+                    )
+                writer = Mp4Writer(growing, (height, width), fps)
+            writer.add(frame)
+        if writer:
+            writer.close()
+            mp4.finish(growing, target, count)
+    finally:
+        if writer:
+            writer.abandon()
+        growing.unlink(missing_ok=True)
+
+
+def whole_frames(path: Path, first: int, count: int, fps: float) -> np.ndarray:
+    """bool [count]: which of the frames can be decoded, all that they refer to included. Every one is tried."""
+    good = np.zeros(count, bool)
+    try:
+        boxes.check(path)
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            mp4.bound(stream)
+            a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+            if first:
+                container.seek(round(first / a_tick), stream=stream)
+            lost = False
+            for packet in container.demux(stream):
+                lost = lost and not packet.is_keyframe
+                try:
+                    for frame in packet.decode():
+                        at = round((frame.pts or 0) * a_tick) - first
+                        lost |= frame.is_corrupt
+                        if 0 <= at < count and not lost:
+                            good[at] = True
+                        elif at >= count + mp4.KEYFRAME_EVERY:
+                            return good
+                except av.FFmpegError:
+                    lost = True
+    except _BROKEN:
+        pass
+    return good
+
+
+def _broken(path: Path, why: str) -> DatasetError:
+    return DatasetError(f"the video {path} is missing, truncated or not mp4 ({why}); restore it from a copy.")

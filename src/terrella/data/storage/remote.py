@@ -1,0 +1,400 @@
+"""Files of a recording, near or far: a remote's are fetched whole when they are needed, into a bounded cache (fsspec)."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ...core.errors import DatasetError
+from ..format import contained, inside
+from . import durable
+
+BUDGET_BYTES = 8 << 30
+_LOCKS = 64
+_PACKAGES = {  # scheme -> what to install
+    "s3": "'terrella[remote]'",
+    "s3a": "'terrella[remote]'",
+    "hf": "'terrella[remote]'",
+    "gs": "gcsfs",
+    "gcs": "gcsfs",
+    "abfs": "adlfs",
+    "az": "adlfs",
+}
+_Result = TypeVar("_Result")
+
+
+def open_files(root: str | os.PathLike[str]) -> LocalFiles | Files:
+    """The files under a folder, or under an address with a scheme ("hf://datasets/user/name", "s3://bucket/set")."""
+    if isinstance(root, LocalFiles | Files):
+        return root
+    return Files(root) if isinstance(root, str) and "://" in root else LocalFiles(Path(root))
+
+
+class LocalFiles:
+    """The files of a folder, by their names relative to it; DatasetError for a name that leads out of it."""
+
+    def __init__(self, root: str | os.PathLike[str]):
+        self.root = Path(root)
+
+    def __fspath__(self) -> str:
+        return str(self.root)
+
+    __str__ = __fspath__
+
+    def local(self, name: str) -> Path:
+        """Where the file lies, whether it exists or not."""
+        return contained(self.root, name)
+
+    def exists(self, name: str) -> bool:
+        return self.local(name).is_file()
+
+    def list(self, folder: str, suffix: str = "") -> list[str]:
+        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""
+        top = self.local(folder) if folder else self.root
+        found = (path.relative_to(self.root) for path in top.rglob("*") if path.is_file())
+        return sorted(path.as_posix() for path in found if path.name.endswith(suffix) and not _hidden(path.parts))
+
+    @contextmanager
+    def holding(self, *names: str) -> Iterator[None]:
+        """Nothing is ever evicted here."""
+        yield
+
+
+class Files:
+    """The files under a remote address, by their names relative to it.
+
+    `local` fetches a file whole: into a hidden neighbour, checked by its size, then renamed. Several processes may share
+    one cache; together they keep it within `budget_bytes`, removing what was used longest ago, but never a file that
+    somebody is `holding`. A file that the remote has changed (by its size, or its tag or date where it tells one) is
+    fetched anew. DatasetError where the remote cannot be reached, refuses, or is silent for `timeout_s` seconds, each
+    after `attempts` trials; where a package is missing; where the cache is too small.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        cache_dir: str | os.PathLike[str] | None = None,
+        budget_bytes: int = BUDGET_BYTES,
+        timeout_s: float = 30.0,
+        attempts: int = 4,
+    ):
+        self.root, self.budget_bytes = root.rstrip("/"), budget_bytes
+        self._timeout_s, self._attempts = timeout_s, max(1, attempts)
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "terrella" / "remote"
+        self._cache = Path(cache_dir) if cache_dir is not None else home
+        self._listed: dict[str, dict[str, tuple[int, str]]] = {}  # folder -> name -> (bytes, tag)
+        self._system, self._base = _file_system(self.root)
+        try:
+            (self._cache / ".coming").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatasetError(
+                f"files of {root} cannot be kept in {self._cache} ({error}); name another cache_dir."
+            ) from error
+
+    def __fspath__(self) -> str:
+        return self.root
+
+    __str__ = __fspath__
+
+    def exists(self, name: str) -> bool:
+        return self._facts(name) is not None
+
+    def list(self, folder: str, suffix: str = "") -> list[str]:
+        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""
+        where, depth = f"{self._base}/{inside(folder)}" if folder else self._base, len(self._base.strip("/").split("/"))
+        try:
+            found = self._ask(f"list {folder}", lambda alive: self._system.find(where, detail=True))
+        except FileNotFoundError:
+            return []
+        names = []
+        for path, about in found.items():
+            parts = path.strip("/").split("/")[depth:]
+            if about["type"] == "file" and parts and not _hidden(parts):
+                names.append(inside("/".join(parts)))
+                self._listed.setdefault("/".join(parts[:-1]), {})[parts[-1]] = _told(self.root, about)
+        return sorted(name for name in names if name.endswith(suffix))
+
+    def local(self, name: str) -> Path:
+        """A copy of the file on this machine, fetched where there is none. Whoever keeps using it is `holding` it."""
+        facts = self._facts(name)
+        if facts is None:
+            raise DatasetError(
+                f"there is no {name} at {self.root}; the recording is not whole, or the address is wrong."
+            )
+        size, tag = facts
+        mark = hashlib.sha256(f"{self.root}\n{name}\n{size}\n{tag}".encode()).hexdigest()[:24]
+        path = self._cache / f"{mark}-{name.rsplit('/', 1)[-1]}"
+        if not _touched(path, size):
+            try:
+                with _locked(self._cache / f".lock-{int(mark[:8], 16) % _LOCKS}"):  # one process fetches, others wait
+                    if not _touched(path, size):
+                        self._fetch(name, size, path)
+            except OSError as error:
+                raise DatasetError(
+                    f"{name} of {self.root} cannot be kept in {self._cache} ({error}); free some space there."
+                ) from error
+        return path
+
+    @contextmanager
+    def holding(self, *names: str) -> Iterator[None]:
+        """While this is entered nobody removes these files from the cache, in whatever process."""
+        held: list[int] = []
+        try:
+            for name in names:
+                held.append(self._held(name))
+            yield
+        finally:
+            for file in held:
+                os.close(file)
+
+    def _held(self, name: str) -> int:
+        """An open file with a shared lock, which is what eviction respects."""
+        while True:
+            path = self.local(name)
+            try:
+                file = os.open(path, os.O_RDONLY)
+            except FileNotFoundError:  # evicted since
+                continue
+            fcntl.flock(file, fcntl.LOCK_SH)
+            if os.fstat(file).st_nlink:
+                return file
+            os.close(file)
+
+    def _facts(self, name: str) -> tuple[int, str] | None:
+        """(bytes, what changes with the content) of a remote file, None where there is no such file."""
+        folder, _, last = inside(name).rpartition("/")
+        if folder not in self._listed:
+            try:
+                found = self._ask(
+                    f"list {folder}", lambda alive: self._system.ls(f"{self._base}/{folder}", detail=True)
+                )
+            except (FileNotFoundError, NotADirectoryError):
+                found = []
+            files = (about for about in found if about["type"] == "file")
+            self._listed[folder] = {about["name"].rsplit("/", 1)[-1]: _told(self.root, about) for about in files}
+        return self._listed[folder].get(last)
+
+    def _fetch(self, name: str, size: int, path: Path) -> None:
+        def get(alive: Callable[[], None]) -> Path:
+            handle, made = tempfile.mkstemp(prefix="part-", dir=room)
+            os.close(handle)
+            self._system.get_file(f"{self._base}/{name}", made, callback=_beat(alive))
+            got = os.stat(made).st_size
+            if got != size:
+                raise OSError(f"{got} of {size} bytes came")
+            return Path(made)
+
+        with self._room(name, size) as room:
+            try:
+                part = self._ask(f"fetch {name}", get)
+            except FileNotFoundError as error:
+                raise DatasetError(f"{name} is gone from {self.root}; open the recording anew.") from error
+            durable.sync_file(part)
+            os.replace(part, path)
+
+    def _ask(self, what: str, action: Callable[[Callable[[], None]], _Result]) -> _Result:
+        """`action(alive)`, tried again where it fails; `alive()` says that it is getting on."""
+        last: Exception = TimeoutError()
+        for attempt in range(self._attempts):
+            if attempt:
+                time.sleep(min(0.1 * 3**attempt, 5.0))
+            try:
+                return _in_time(action, self._timeout_s)
+            except (FileNotFoundError, NotADirectoryError):
+                raise
+            except PermissionError as error:
+                raise DatasetError(f"{self.root} refuses to {what} ({error}); check your credentials.") from error
+            except DatasetError:
+                raise
+            except Exception as error:  # every file system has errors of its own
+                last = error
+        why = (str(last).splitlines() or [""])[0][:300] or type(last).__name__
+        raise DatasetError(
+            f"{self.root} cannot be reached (tried {self._attempts} times to {what}: {why}); check the address, the "
+            "network and your credentials."
+        ) from last
+
+    @contextmanager
+    def _room(self, name: str, size: int) -> Iterator[Path]:
+        """A folder for a file that comes, whose `size` bytes are set aside until it has come or failed."""
+        if size > self.budget_bytes:
+            raise DatasetError(
+                f"{name} of {self.root} has {size:,} bytes and {self.budget_bytes:,} may be kept here; allow more."
+            )
+        deadline = time.monotonic() + self._timeout_s
+        while (claim := self._claimed(size)) is None:
+            if time.monotonic() > deadline:
+                raise DatasetError(
+                    f"{self._cache} is full of files in use, and {name} needs {size:,} of its {self.budget_bytes:,} bytes; "
+                    "allow more, or use fewer processes."
+                )
+            time.sleep(0.02)
+        handle, folder = claim
+        try:
+            yield folder
+        except BaseException:
+            with _locked(self._cache / ".lock"):
+                self._write_used((self._read_used() or size) - size)
+            raise
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(handle)
+
+    def _claimed(self, size: int) -> tuple[int, Path] | None:
+        """A locked folder named after the bytes that are set aside; None where files in use leave too little room."""
+        with _locked(self._cache / ".lock"):
+            used = self._read_used()
+            if used is None or used + size > self.budget_bytes:
+                used = self._evicted(size)
+                if used + size > self.budget_bytes:
+                    return None
+            self._write_used(used + size)
+            folder = Path(tempfile.mkdtemp(prefix=f"{size}-", dir=self._cache / ".coming"))
+            handle = os.open(folder, os.O_RDONLY)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            return handle, folder
+
+    def _evicted(self, size: int) -> int:
+        """Bytes in use after what was used longest ago has made room for `size`, and some more so that this is rare."""
+        total, files = 0, []
+        for entry in os.scandir(self._cache):
+            if not entry.name.startswith("."):
+                about = entry.stat()
+                total += about.st_size
+                files.append((about.st_mtime_ns, about.st_size, entry.path))
+        for entry in os.scandir(self._cache / ".coming"):
+            if _let_go(Path(entry.path), shutil.rmtree):  # of a process that was killed
+                continue
+            total += int(entry.name.split("-")[0])
+        enough = max(0, self.budget_bytes - self.budget_bytes // 16 - size)
+        for _, bytes_, path in sorted(files):
+            if total <= enough:
+                break
+            if _let_go(Path(path), os.unlink):
+                total -= bytes_
+        return total
+
+    def _read_used(self) -> int | None:
+        try:
+            return int((self._cache / ".used").read_text())
+        except (OSError, ValueError):
+            return None
+
+    def _write_used(self, used: int) -> None:
+        (self._cache / ".used").write_text(str(used))
+
+
+def _file_system(root: str) -> tuple[Any, str]:
+    """fsspec's file system for an address, and the path in it."""
+    scheme = root.split("://", 1)[0]
+    try:
+        import fsspec
+    except ImportError as error:
+        raise DatasetError(f"reading {root} needs fsspec: pip install 'terrella[remote]'.") from error
+    try:
+        system, base = fsspec.core.url_to_fs(root)
+        system.invalidate_cache()
+        return system, base
+    except ImportError as error:
+        need = f"pip install {_PACKAGES[scheme]}" if scheme in _PACKAGES else "install it"
+        raise DatasetError(f"reading {scheme}:// needs a package that is missing ({error}): {need}.") from error
+    except ValueError as error:
+        raise DatasetError(
+            f"{root} is no address that can be read ({error}); it begins with hf://, s3:// or file://."
+        ) from error
+    except Exception as error:  # every file system has errors of its own
+        raise DatasetError(f"{root} cannot be opened ({error}); check the address and your credentials.") from error
+
+
+def _told(root: str, about: dict) -> tuple[int, str]:
+    """What a listing says of a file: its bytes, and a mark that changes when its content does."""
+    if not isinstance(about.get("size"), int):
+        raise DatasetError(f"{root} does not tell the size of {about.get('name')}; copy the recording to this machine.")
+    for key in ("ETag", "etag", "blob_id", "md5Hash", "LastModified", "last_modified", "mtime", "created"):
+        if about.get(key):
+            return about["size"], str(about[key])
+    return about["size"], ""
+
+
+def _in_time(action: Callable[[Callable[[], None]], _Result], silence_s: float) -> _Result:
+    """`action(alive)` in a thread of its own; TimeoutError once it has not called `alive` for `silence_s`."""
+    heard, done = [time.monotonic()], threading.Event()
+    result: list[_Result] = []
+    failed: list[BaseException] = []
+
+    def alive() -> None:
+        heard[0] = time.monotonic()
+
+    def work() -> None:
+        try:
+            result.append(action(alive))
+        except BaseException as error:  # handed to the caller's thread
+            failed.append(error)
+        finally:
+            done.set()
+
+    threading.Thread(target=work, name="remote", daemon=True).start()
+    while not done.wait(max(0.0, heard[0] + silence_s - time.monotonic())):
+        if time.monotonic() >= heard[0] + silence_s:
+            raise TimeoutError(f"it was silent for {silence_s:g} s")
+    if failed:
+        raise failed[0]
+    return result[0]
+
+
+def _beat(alive: Callable[[], None]):
+    """A callback of fsspec that says that bytes come."""
+    from fsspec.callbacks import Callback
+
+    class Beat(Callback):
+        def call(self, *args, **kwargs):
+            alive()
+
+    return Beat()
+
+
+def _touched(path: Path, size: int) -> bool:
+    """Whether the file is there and whole; if so it now counts as used last."""
+    try:
+        whole = path.stat().st_size == size
+        if whole:
+            os.utime(path)
+        return whole
+    except FileNotFoundError:
+        return False
+
+
+def _let_go(path: Path, remove: Callable[[Path], object]) -> bool:
+    """Removes what nobody has locked; whether it did."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        remove(path)
+        return True
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with open(path, "a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _hidden(parts) -> bool:
+    return any(part.startswith(".") for part in parts)

@@ -1,0 +1,314 @@
+"""ClipCache: a recording as memory-mapped arrays of one size, built once, so that training never decodes video."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ..dataset import Dataset
+from ..format import DEPTH, INFO, STATE
+from ..storage import durable
+from ..storage.remote import LocalFiles
+
+Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]  # (dtype, shape of a row) by array
+_FORMAT = 2
+_TYPES = {
+    "rgb": np.uint8,
+    "depth": np.float16,
+    "pose": np.float32,
+    "action": np.float32,
+    "action_valid": np.bool_,
+    "reward": np.float32,
+    "done": np.bool_,
+}
+_NUMBERS = {"float64": "float32"} | {
+    name: name
+    for name in ("float16", "float32", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool")
+}
+
+
+class Ranges(Sequence[tuple[int, int]]):
+    """(first row, row after the last) of each episode, read from an int64 array [E, 2] that may lie on the disk."""
+
+    def __init__(self, pairs: np.ndarray):
+        self.pairs = pairs
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> tuple[int, int]:  # type: ignore[override]
+        start, stop = self.pairs[index].tolist()
+        return start, stop
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, Sequence) and len(self) == len(other) and all(a == b for a, b in zip(self, other))
+
+
+class ClipCache:
+    """Read-only arrays over all N rows of a dataset; what the recording lacks is None.
+
+    rgb uint8 [N, H, W, 3]; depth float16 [N, h, w] metres (>= 65.5: beyond range); pose float32 [N, 7]; action float32
+    [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; episodes: (start, stop) row ranges.
+    `arrays` has those that there are by name, and the recording's other vectors ("observation.state", …) by their key.
+    All are memory-mapped: opening reads nothing of them, and takes no longer for a longer recording.
+    """
+
+    rgb: np.ndarray | None
+    depth: np.ndarray | None
+    pose: np.ndarray | None
+    action: np.ndarray
+    action_valid: np.ndarray
+    reward: np.ndarray
+    done: np.ndarray
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            about = json.loads((path / "about.json").read_text(encoding="utf-8"))
+            self.arrays = {name: np.load(path / f"{name}.npy", mmap_mode="r") for name in about["arrays"]}
+            self.episodes = Ranges(np.load(path / "episodes.npy", mmap_mode="r"))
+            self.length = self.episodes[-1][1]
+            self.fps, self.action_names, self.world = about["fps"], tuple(about["action_names"]), about["world"]
+            short = [name for name, array in self.arrays.items() if len(array) != self.length]
+            if short:
+                raise ValueError(f"{short[0]} has {len(self.arrays[short[0]])} of {self.length} rows")
+        except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+            raise DatasetError(
+                f"the cache {path} is damaged ({error}); delete that folder and it is built anew."
+            ) from error
+        for name in _TYPES:
+            setattr(self, name, self.arrays.get(name))
+
+    @staticmethod
+    def open(
+        dataset: Dataset | str | Path,
+        size: tuple[int, int] = (96, 128),
+        progress: Callable[[int, int], None] | None = None,
+        cameras: Sequence[str] = (),
+    ) -> ClipCache:
+        """The cache of `dataset` with rgb at `size` (height, width), built first where it is missing or out of date.
+
+        `cameras` are further ones by their keys, kept at the same size in `arrays`.
+
+        It lies in ROOT/.cache/terrella, or under $XDG_CACHE_HOME where the dataset's folder cannot be written.
+        `progress(done, total)` counts episodes. Killing the build leaves nothing that could be mistaken for a cache.
+        """
+        dataset = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+        if not isinstance(dataset.files, LocalFiles):
+            raise DatasetError(
+                f"{dataset.root} lies far away, and a clip cache is built of files here: read it with Clips, or copy it."
+            )
+        if not dataset.length:
+            raise DatasetError(f"{dataset.root} has no finished episode yet; record some first.")
+        shelf = _shelf(dataset)
+        more = "".join(f"+{hashlib.sha256(name.encode()).hexdigest()[:8]}" for name in sorted(set(cameras)))
+        kind = f"{size[0]}x{size[1]}{more}"
+        path = shelf / f"{kind}-{_key(dataset, size)}"
+        if path.is_dir():
+            return ClipCache(path)
+        with open(shelf / ".lock", "a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be building the same
+            if not path.is_dir():
+                for old in [*shelf.glob(f"{kind}-*"), *shelf.glob(".building*")]:
+                    shutil.rmtree(old, ignore_errors=True)
+                try:
+                    _build(dataset, size, sorted(set(cameras)), shelf, path, progress)
+                except OSError as error:
+                    raise DatasetError(f"cannot build the cache {path} ({error}); free some space there.") from error
+                finally:
+                    shutil.rmtree(shelf / ".building", ignore_errors=True)
+        return ClipCache(path)
+
+
+def split(n_episodes: int, held_out: float = 0.05, seed: int = 0) -> tuple[list[int], list[int]]:
+    """Episode numbers (train, held_out), ascending; at least one is held out where there are two or more."""
+    count = min(max(1, round(n_episodes * held_out)), n_episodes - 1) if held_out > 0 and n_episodes > 1 else 0
+    chosen = set(np.random.default_rng(seed).permutation(n_episodes)[:count].tolist())
+    return [i for i in range(n_episodes) if i not in chosen], sorted(chosen)
+
+
+def shrink(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """uint8 [T, H, W, 3] -> uint8 [T, *size, 3]: each pixel the mean of the area that it covers, rounded half up."""
+    count, height, width, _ = pictures.shape
+    if (height, width) == tuple(size):
+        return pictures
+    if height % size[0] == 0 and width % size[1] == 0:
+        down, across = height // size[0], width // size[1]
+        tall = pictures[:, ::down].astype(np.uint16 if down * across <= 256 else np.uint32)
+        for y in range(1, down):
+            tall += pictures[:, y::down]
+        found = np.empty((count, *size, 3), np.uint8)
+        for colour in range(3):  # one at a time: numpy is slow where the innermost axis has three elements
+            total = tall[:, :, ::across, colour] + tall.dtype.type(down * across // 2)
+            for x in range(1, across):
+                total += tall[:, :, x::across, colour]
+            total //= tall.dtype.type(down * across)
+            found[..., colour] = total
+        return found
+    tall = _box(height, size[0]) @ pictures.reshape(count, height, width * 3).astype(np.float32)
+    tall = tall.reshape(count, size[0], width, 3).transpose(2, 0, 1, 3).reshape(width, -1)
+    mixed = (_box(width, size[1]) @ tall).reshape(size[1], count, size[0], 3).transpose(1, 2, 0, 3)
+    return (mixed + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def _box(source: int, target: int) -> np.ndarray:
+    """float32 [target, source]: the share of each source pixel in each target pixel."""
+    edges = np.arange(target + 1) * source / target
+    pixel = np.arange(source)
+    cover = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
+    return (cover.clip(0) / (source / target)).astype(np.float32)
+
+
+def _key(dataset: Dataset, size: tuple[int, int]) -> str:
+    """Changes whenever the recording does: its info, its episodes' statistics and every file's size go in."""
+    digest = hashlib.sha256(json.dumps([_FORMAT, list(size)]).encode())
+    digest.update((dataset.root / INFO).read_bytes())
+    for path in sorted((dataset.root / "meta" / "episodes").glob("*/*.parquet")):
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    last: tuple[str, ...] = ()
+    for episode in dataset.episodes:
+        for name in sorted(set(episode.files).difference(last)):
+            path = dataset.root / name
+            digest.update(f"{name}:{path.stat().st_size if path.exists() else -1};".encode())
+        last = episode.files
+    return digest.hexdigest()[:16]
+
+
+def _shelf(dataset: Dataset) -> Path:
+    near = dataset.root / ".cache" / "terrella"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    name = hashlib.sha256(str(dataset.root.resolve()).encode()).hexdigest()[:16]
+    for shelf in (near, home / "terrella" / name):
+        try:
+            shelf.mkdir(parents=True, exist_ok=True)
+            (shelf / ".lock").touch()
+            return shelf
+        except OSError:
+            continue
+    raise DatasetError(f"no cache can be written in {near} or {home}; set XDG_CACHE_HOME to a folder that can.")
+
+
+def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], shelf: Path, path: Path, progress) -> None:
+    staged = shelf / ".building"
+    staged.mkdir()
+    kinds = kinds_of(dataset, size, cameras)
+    need = bytes_a_row(kinds) * dataset.length
+    free = shutil.disk_usage(shelf).free
+    if need > free:
+        raise DatasetError(
+            f"the cache of {dataset.root} needs {need / 1e9:.1f} GB and {free / 1e9:.1f} GB are free at {shelf}."
+        )
+    arrays = new_arrays(staged, kinds, dataset.length)
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # decoding and resizing release the interpreter lock
+        jobs = [pool.submit(fill_episode, dataset, number, size, arrays) for number in range(len(dataset.episodes))]
+        try:
+            for done, job in enumerate(as_completed(jobs), 1):
+                job.result()
+                if progress:
+                    progress(done, len(jobs))
+        except BaseException:
+            for job in jobs:
+                job.cancel()
+            raise
+    ranges = np.stack([dataset.episodes.starts, dataset.episodes.stops], 1)
+    finish(staged, path, arrays, ranges, dataset.fps, dataset.action_names, dataset.world)
+
+
+def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:
+    """(dtype, shape of a row) of every array that the cache of a dataset has, with pictures at `size` (height, width)."""
+    if min(size) < 1:
+        raise DatasetError(f"pictures of {size[0]}x{size[1]} pixels cannot be; ask for a (height, width).")
+    shapes = {
+        "rgb": (*size, 3),
+        "depth": tuple(dataset.features.get(DEPTH, {}).get("shape", ())),
+        "pose": (7,),
+        "action": (len(dataset.action_names),),
+    }
+    found = {name: (np.dtype(_TYPES[name]), shapes.get(name, ())) for name in _TYPES if dataset.has(name)}
+    for name, sensor in dataset.sensors.items():
+        if Path(name).name != name:
+            raise DatasetError(f"a feature is named '{name[:100]}', which no file can be; rename it in meta/info.json.")
+        known = not name.startswith("observation.") or name == DEPTH or (name == STATE and "pose" in found)
+        if sensor.kind == "depth" and not known:
+            found[name] = (np.dtype(np.float16), sensor.shape)
+        elif sensor.kind == "vector" and sensor.dtype in _NUMBERS and not known:
+            found[name] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
+    for name in cameras:
+        if name not in dataset.cameras:
+            raise DatasetError(f"{dataset.root} has no camera '{name}'; it has {', '.join(dataset.cameras) or 'none'}.")
+        found[name] = (np.dtype(np.uint8), (*size, 3))
+    return {name: kind for name, kind in found.items() if np.prod(kind[1]) > 0}
+
+
+def bytes_a_row(kinds: Kinds) -> int:
+    return sum(kind.itemsize * int(np.prod(shape)) for kind, shape in kinds.values())
+
+
+def new_arrays(folder: Path, kinds: Kinds, rows: int) -> dict[str, np.ndarray]:
+    """Writable memory-mapped arrays [rows, ...], a file each; OSError where the disk is too small for them."""
+    arrays = {}
+    for name, (dtype, shape) in kinds.items():
+        path = folder / f"{name}.npy"
+        arrays[name] = np.lib.format.open_memmap(path, "w+", dtype, (rows, *shape))
+        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, not a crash when the mapping is written
+            with open(path, "rb+") as file:
+                os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+    return arrays
+
+
+def finish(
+    staged: Path,
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    ranges: np.ndarray,
+    fps: float,
+    action_names: Sequence[str] = (),
+    world: Mapping[str, object] | None = None,
+) -> None:
+    """Makes a folder of filled arrays and `ranges` int64 [E, 2] the cache at `path`, in one step."""
+    np.save(staged / "episodes.npy", ranges)
+    for name in [*arrays, "episodes"]:
+        durable.sync_file(staged / f"{name}.npy")
+    about = {"arrays": sorted(arrays), "fps": fps, "action_names": list(action_names), "world": dict(world or {})}
+    durable.write_json(staged / "about.json", about)
+    durable.move_into_place(staged, path)
+
+
+def fill_episode(
+    dataset: Dataset,
+    number: int,
+    size: tuple[int, int],
+    arrays: Mapping[str, np.ndarray],
+    at: int | None = None,
+    first: int = 0,
+    count: int | None = None,
+) -> None:
+    """Writes `count` rows of an episode (None: all that are left), from its row `first` on, into the arrays.
+
+    They begin at row `at` of the arrays, or (None) where they lie in the dataset.
+    """
+    episode = dataset.episodes[number]
+    at = episode.start + first if at is None else at
+    count = episode.length - first if count is None else count
+    pictured = [name for name in arrays if name == "rgb" or name in dataset.cameras]
+    rows = dataset.episode(number, [name for name in arrays if name not in pictured])
+    for name, values in rows.items():
+        array = arrays[name]
+        array[at : at + count] = values[first : first + count].reshape(count, *array.shape[1:])
+    for name in pictured:
+        pictures = dataset.frames(number, None if name == "rgb" else name, first, count)
+        done = at
+        while batch := list(islice(pictures, 4)):  # few, so that they stay in the processor's cache
+            arrays[name][done : done + len(batch)] = shrink(np.stack(batch), size)
+            done += len(batch)

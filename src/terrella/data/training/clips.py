@@ -1,0 +1,274 @@
+"""Clips: seeded, exactly resumable batches of clips for training, from the clip cache or, window by window, from afar."""
+
+from __future__ import annotations
+
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ..dataset import Dataset
+from ..storage.remote import Files
+from .cache import ClipCache
+from .order import Plan, Starts, chosen
+from .windows import Windows
+
+Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]
+Fill = Callable[[int, int, Mapping[str, np.ndarray]], None]
+_PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64), ())}  # any recording has these
+
+
+class Clips:
+    """Batches of clips of `length` rows, `stride` rows apart, in an order that (seed, epoch) alone decides.
+
+        clips = Clips("recordings/doom", length=16, channels=("rgb", "action"), batch=32)
+        for batch in clips:                      # the rest of this epoch; the next loop is the next epoch
+            batch["rgb"]                         # uint8 [32, 16, 96, 128, 3]
+            saved = clips.state()                # JSON; Clips(...).resume(saved) goes on with the batch after this one
+
+    A clip never crosses an episode, and each row at which one may begin is visited once an epoch. Channels are those of
+    the ClipCache (rgb, depth, pose, action, action_valid, reward, done, or a vector by its key), and "episode" and "row"
+    (int64) for where a frame is from. A batch is yours for as long as you hold on to it or to a view of it; only then
+    is its memory used for another.
+
+    source:    a Dataset, a ClipCache, a folder, or a URL (hf://…, s3://…, file://…). What is far is read in windows.
+    batch:     clips in a batch. With `drop_last` clips that fill no batch are left out of the epoch.
+    size:      (height, width) of rgb; a ClipCache has its own.
+    episodes:  numbers of the episodes to read; None: all of them.
+    workers:   threads that copy batches ahead, sharing one memory-mapped cache; they never change the order.
+    rank:      of `world_size` processes, each of which gets its share of every epoch.
+    torch:     batches of torch tensors over the same memory.
+    budget_bytes: for a URL, how much may be kept on this machine: half for files on the disk, a quarter for each of two
+               windows in memory (one is read while the next is fetched). Windows follow one another in shuffled order,
+               and clips are shuffled within their window.
+    cache_dir: for a URL, where its files are kept (default: under $XDG_CACHE_HOME/terrella).
+    progress:  `progress(done, total)` counts episodes while the cache is built.
+    """
+
+    def __init__(
+        self,
+        source: Dataset | ClipCache | str | Path,
+        length: int,
+        channels: Sequence[str] = ("rgb", "action"),
+        batch: int = 16,
+        size: tuple[int, int] = (96, 128),
+        *,
+        seed: int = 0,
+        stride: int = 1,
+        episodes: Sequence[int] | None = None,
+        shuffle: bool = True,
+        drop_last: bool = True,
+        workers: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+        torch: bool = False,
+        budget_bytes: int = 8 << 30,
+        cache_dir: str | Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ):
+        if isinstance(channels, str) or not channels:
+            raise DatasetError(f"channels={channels!r} must be names in a sequence, ('rgb', 'action') for example.")
+        if workers < 0:
+            raise DatasetError(f"workers={workers} is negative; 0 copies each batch when it is asked for.")
+        plan = Plan(length, stride, batch, seed, shuffle, drop_last, rank, world_size)
+        self._plan, self._workers, self._torch, self._memory = plan, workers, torch, _Memory()
+        if isinstance(source, str | Path):
+            source = Dataset(_files(source, cache_dir, budget_bytes))
+        if isinstance(source, Dataset) and isinstance(source.files, Files):
+            self._shelf: Shelf = Windows.of(source, plan, channels, size, episodes, budget_bytes // 4)
+        else:
+            if isinstance(source, Dataset):
+                source = ClipCache.open(source, size, progress, [name for name in channels if name in source.cameras])
+            self._shelf = _Whole(source, plan, episodes)
+        kinds = {**_PLACES, **self._shelf.kinds}
+        missing = [name for name in channels if name not in kinds]
+        if missing:
+            raise DatasetError(f"the recording has no '{missing[0]}'; it has {', '.join(sorted(kinds))}.")
+        self._kinds = {name: kinds[name] for name in channels}
+        self._epoch, self._next = 0, 0
+        self._batches(0)
+
+    def __len__(self) -> int:
+        """Batches of the whole of this epoch."""
+        return self._batches(self._epoch)
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the batch that comes next, from 0."""
+        return self._epoch
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """The batches that are left of this epoch."""
+        return self._run(range(self._epoch, self._epoch + 1))
+
+    def forever(self) -> Iterator[dict[str, Any]]:
+        """The batches of this and all epochs to come, without a pause between epochs."""
+        return self._run(range(self._epoch, 1 << 62))
+
+    def state(self) -> dict:
+        """Where reading stands, as JSON values: after the batch that was given last."""
+        return {"epoch": self._epoch, "batch": self._next, "of": self._shelf.facts()}
+
+    def resume(self, state: Mapping) -> Clips:
+        """Goes on after `state`, whatever the number of workers; DatasetError where it belongs to other clips."""
+        try:
+            epoch, batch, told = int(state["epoch"]), int(state["batch"]), dict(state["of"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(f"this is no state of Clips ({error!r}); pass what `state()` gave.") from error
+        for name, mine in self._shelf.facts().items():
+            if told.get(name) != mine:
+                raise DatasetError(
+                    f"the state was saved with {name}={told.get(name)} and these clips have {name}={mine}; "
+                    "make them from the same recording with the same arguments."
+                )
+        if epoch < 0 or not 0 <= batch < self._batches(epoch):
+            raise DatasetError(f"the state names batch {batch} of epoch {epoch}, which does not exist.")
+        self._epoch, self._next = epoch, batch
+        return self
+
+    def _batches(self, epoch: int) -> int:
+        found = self._shelf.batches(epoch)
+        if not found:
+            raise DatasetError(
+                f"{self._shelf.facts()['clips']} clips of {self._plan.length} rows make no batch of {self._plan.batch} "
+                f"for each of {self._plan.world_size} ranks; ask for fewer or shorter clips, or for drop_last=False (and where "
+                "it is read in windows, which are dealt to the ranks, for a smaller budget_bytes)."
+            )
+        return found
+
+    def _run(self, epochs: range) -> Iterator[dict[str, Any]]:
+        first = self._next
+        places = (
+            (epoch, number)
+            for epoch in epochs
+            for number in range(first if epoch == epochs.start else 0, self._batches(epoch))
+        )
+        with self._shelf.reading(epochs, first) as fill:
+            for (epoch, number), arrays in self._made(fill, places):
+                last = number + 1 == self._batches(epoch)
+                self._epoch, self._next = (epoch + 1, 0) if last else (epoch, number + 1)
+                yield _as_torch(arrays) if self._torch else arrays
+
+    def _made(self, fill: Fill, places: Iterator[tuple[int, int]]) -> Iterator[tuple[tuple[int, int], dict]]:
+        """Each place with its batch, in order; workers are at most two batches each ahead."""
+        if not self._workers:
+            yield from ((place, self._make(fill, *place)) for place in places)
+            return
+        pool = ThreadPoolExecutor(self._workers, "clips")
+        try:
+            ahead = deque((place, pool.submit(self._make, fill, *place)) for place in islice(places, 2 * self._workers))
+            while ahead:
+                place, job = ahead.popleft()
+                arrays = job.result()
+                ahead.extend((more, pool.submit(self._make, fill, *more)) for more in islice(places, 1))
+                yield place, arrays
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _make(self, fill: Fill, epoch: int, number: int) -> dict[str, np.ndarray]:
+        clips = min(self._plan.batch, self._shelf.clips(epoch) - number * self._plan.batch)
+        arrays = {
+            name: self._memory.empty((clips, self._plan.length, *shape), dtype)
+            for name, (dtype, shape) in self._kinds.items()
+        }
+        fill(epoch, number, arrays)
+        return arrays
+
+
+def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) -> Any:
+    return Files(source, cache_dir, budget_bytes // 2) if isinstance(source, str) and "://" in source else source
+
+
+class Shelf(Protocol):
+    """Where clips come from: one clip cache, or windows of a recording far away."""
+
+    kinds: Kinds  # (dtype, shape of a row) by channel
+
+    def facts(self) -> dict:
+        """JSON values that, with the epoch, decide the order."""
+        ...
+
+    def clips(self, epoch: int) -> int:
+        """How many clips of an epoch are this rank's."""
+        ...
+
+    def batches(self, epoch: int) -> int:
+        """How many batches of an epoch each rank gets; without `drop_last`, this rank."""
+        ...
+
+    def reading(self, epochs: range, first: int) -> AbstractContextManager[Fill]:
+        """While it is entered, `fill(epoch, batch, arrays)` works from batch `first` of the first of `epochs` on."""
+        ...
+
+
+class _Whole:
+    """All clips of one clip cache, which any number of processes map at once."""
+
+    def __init__(self, cache: ClipCache, plan: Plan, episodes: Sequence[int] | None):
+        self._plan = plan
+        self._arrays = {name: np.asarray(array) for name, array in cache.arrays.items()}
+        self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
+        self._episodes = chosen(episodes, len(cache.episodes))
+        first, stop = cache.episodes.pairs[slice(None) if self._episodes is None else self._episodes].T
+        self._counts = np.maximum(stop - first - plan.span + 1, 0)
+        self._starts = Starts.of(first, self._counts)
+
+    def facts(self) -> dict:
+        return self._plan.facts(self._counts)
+
+    def clips(self, epoch: int) -> int:
+        return -(-(self._starts.count - self._plan.rank) // self._plan.world_size)
+
+    def batches(self, epoch: int) -> int:
+        if self._plan.drop_last:
+            return self._starts.count // self._plan.world_size // self._plan.batch
+        return -(-self.clips(epoch) // self._plan.batch)
+
+    def reading(self, epochs: range, first: int) -> AbstractContextManager[Fill]:
+        return nullcontext(self._fill)
+
+    def _fill(self, epoch: int, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+        clips = len(next(iter(arrays.values())))
+        places = (number * self._plan.batch + np.arange(clips)) * self._plan.world_size + self._plan.rank
+        stretch, first = self._starts.at(self._plan.order(places, self._starts.count, epoch))
+        rows = self._plan.rows(first)
+        for name, out in arrays.items():
+            if name == "row":
+                out[:] = rows
+            elif name == "episode":
+                out[:] = (stretch if self._episodes is None else self._episodes[stretch])[:, None]
+            else:
+                np.take(self._arrays[name], rows, axis=0, out=out, mode="clip")  # "raise" would copy twice
+
+
+class _Memory:
+    """Gives arrays whose memory comes back by itself when nobody refers to them or their views any more."""
+
+    def __init__(self):
+        self._spare: dict[int, deque[bytearray]] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        size = int(np.prod(shape)) * dtype.itemsize
+        spare = self._spare.setdefault(size, deque())
+        try:
+            memory = spare.pop()
+        except IndexError:
+            memory = bytearray(size)
+        array = np.ndarray(
+            shape, dtype, memory
+        )  # every view of it holds on to it, for it owns no memory that numpy knows
+        weakref.finalize(array, spare.append, memory).atexit = False
+        return array
+
+
+def _as_torch(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    from torch import from_numpy
+
+    return {name: from_numpy(array) for name, array in arrays.items()}

@@ -1,0 +1,438 @@
+"""Writer: puts whole episodes into a LeRobotDataset v3.0 folder, each in one step that a crash cannot halve."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ..core.errors import DatasetError
+from . import stats
+from .format import (
+    ACTION_VALID,
+    DATA_PATH,
+    DEPTH_BEYOND,
+    DEPTH_UNIT_M,
+    EPISODES_PATH,
+    FILES_PER_CHUNK,
+    INFO,
+    POSE_CONVENTION,
+    STATS,
+    STREAM_PATH,
+    TASKS,
+    VERSION,
+    VIDEO_PATH,
+    WORLD,
+    Layout,
+    even,
+    schema,
+    sensor_json,
+    to_arrow,
+    where,
+)
+from .source import Sensor
+from .storage import durable
+
+ROWS_PER_GROUP = 256
+BYTES_PER_GROUP = 1 << 25
+NAME = re.compile(r"\w[\w.-]{0,200}")
+_CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error, not another number
+EPISODES_PER_TABLE = (
+    128  # so many one-row tables of meta/episodes are made one, so that opening a long dataset stays quick
+)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """One whole episode that waits to be put in place.
+
+    length:   its rows.
+    rows:     columns of at most ROWS_PER_GROUP rows each, all but LeRobot's automatic ones and the videos; last of all
+              the last row's action counts for nothing (no outcome was recorded).
+    videos:   camera -> finished mp4 of `length` frames, in the writer's staging folder.
+    pictures: camera -> its statistics.
+    streams:  stream -> its readings in order, (time_s, value); the value of a camera's is None.
+    films:    camera stream -> finished mp4 of as many frames.
+    start_ns: wall-clock time of its time 0, None where unknown.
+    tasks:    of each row, where they differ; () where all rows are about `task`.
+    counts:   sensor -> rows up to the last that has it, where that is not the episode's last.
+    """
+
+    length: int
+    rows: Iterable[Mapping[str, np.ndarray]]
+    videos: Mapping[str, Path]
+    pictures: Mapping[str, stats.Summary]
+    task: str
+    streams: Mapping[str, Iterable[tuple[float, np.ndarray | None]]] = field(default_factory=dict)
+    films: Mapping[str, Path] = field(default_factory=dict)
+    start_ns: int | None = None
+    tasks: Sequence[str] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+class Writer:
+    """The folder `root`, created or, where it was written with the same layout, gone on with; locked until `close`.
+
+    rows, episodes: what is safe there. DatasetError where root is foreign, damaged, or locked by another writer.
+    """
+
+    def __init__(self, root: str | Path, layout: Layout):
+        self.root, self.layout = Path(root), layout
+        self.features = layout.features()
+        self.schema = schema(self.features)
+        self.staging = self.root / ".staging"
+        for sensor in [*layout.sensors.values(), *layout.streams.values()]:
+            if not NAME.fullmatch(sensor.name):
+                raise DatasetError(
+                    f"'{sensor.name[:100]}' is no name of a feature; use letters, digits, '.', '_' and '-'."
+                )
+        for sensor in layout.streams.values():
+            if sensor.kind == "image":
+                even(sensor)
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            self._lock = lock(self.root)
+        except OSError as error:
+            raise DatasetError(f"cannot record to {self.root}: {error.strerror}; choose another folder.") from error
+        try:
+            self._open()
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def close(self) -> None:
+        """Lets go of the folder."""
+        self._lock.close()
+
+    def put(self, draft: Draft) -> int:
+        """Commits an episode: its files move into place, meta/info.json is replaced last; returns its number."""
+        number = self.episodes
+        tasks = list(dict.fromkeys([*self._tasks, *(draft.tasks or [draft.task])]))
+        rows, of_episode = self._stage_rows(draft, tasks)
+        staged = {self._data(number): rows}
+        of_episode |= {name: {**seen, "count": np.array([draft.length])} for name, seen in draft.pictures.items()}
+        for name, file in draft.videos.items():
+            staged[VIDEO_PATH.format(video_key=name, **where(number))] = file
+        for name, readings in draft.streams.items():
+            staged[_stream(name, number, "parquet")] = self._stage_stream(self.layout.streams[name], readings)
+            if name in draft.films:
+                staged[_stream(name, number, "mp4")] = draft.films[name]
+        table = self._episode_table(number, draft, of_episode)
+        staged[EPISODES_PATH.format(**where(number))] = self._write(table, "episode.parquet")
+        for path, file in staged.items():
+            durable.move_into_place(file, self.root / path)
+        merged = stats.merge([self._stats, of_episode])
+        durable.write_json(self.root / STATS, stats.to_json(merged))
+        durable.write_whole(self.root / TASKS, lambda path: pq.write_table(tasks_table(tasks), path, **_CHECKED))
+        durable.write_json(self.root / INFO, self._info(number + 1, self.rows + draft.length, len(tasks)))
+        self.episodes, self.rows, self._stats, self._tasks = number + 1, self.rows + draft.length, merged, tasks
+        return number
+
+    def tidy(self, first: int | None = None) -> None:
+        """Makes one table of the one-row tables of meta/episodes, where there are enough; what fails is left as it is.
+
+        Looks at the newest episodes, or at all from number `first` on.
+        """
+        newest = max(0, self.episodes // EPISODES_PER_TABLE - 1) * EPISODES_PER_TABLE
+        try:
+            self._merge_finished(newest if first is None else first)
+        except (OSError, pa.ArrowException, ValueError, KeyError):
+            pass  # reading many small tables is slower, and as right
+
+    def remove_unfinished(self) -> None:
+        """Files of an episode that were moved into place but never committed."""
+        number = self.episodes
+        for path in [self._data(number), EPISODES_PATH.format(**where(number))]:
+            (self.root / path).unlink(missing_ok=True)
+        for name, feature in self.features.items():
+            if feature["dtype"] == "video":
+                (self.root / VIDEO_PATH.format(video_key=name, **where(number))).unlink(missing_ok=True)
+        for name in self.layout.streams:
+            for suffix in ("parquet", "mp4"):
+                (self.root / _stream(name, number, suffix)).unlink(missing_ok=True)
+
+    # -- opening ------------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self.rows, self.episodes, self._tasks, self._stats = 0, 0, [], {}
+        info = self.root / INFO
+        if info.exists():
+            try:
+                self._reopen(json.loads(info.read_text(encoding="utf-8")))
+            except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+                first = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise DatasetError(
+                    f"{self.root} is damaged ({first}); see `terrella data doctor {self.root}`, or record to a new folder."
+                ) from error
+        else:
+            strangers = [entry.name for entry in self.root.iterdir() if not entry.name.startswith(".")]
+            if strangers not in ([], ["meta"]):
+                raise DatasetError(
+                    f"{self.root} holds other files ({strangers[0]}, ...); record to a new or empty folder."
+                )
+        self.remove_unfinished()
+        self.tidy(first=0)
+        if not info.exists():
+            facts = {"pose": POSE_CONVENTION, "depth_unit_m": DEPTH_UNIT_M, "depth_beyond": DEPTH_BEYOND}
+            layout = self.layout
+            told = {"world": dict(layout.world), "sensors": _json(layout.sensors), "streams": _json(layout.streams)}
+            try:
+                durable.write_json(self.root / WORLD, {**layout.facts, "version": 2, **told, **facts})
+            except (TypeError, ValueError) as error:
+                raise DatasetError(f"the facts of {self.root} are no JSON values ({error}); leave them out.") from error
+            durable.write_json(self.root / INFO, self._info(0, 0, 0))
+
+    def _reopen(self, info: dict) -> None:
+        if info.get("codebase_version") != VERSION or not (self.root / WORLD).exists():
+            raise DatasetError(f"{self.root} is a dataset that Terrella did not write; record to a new folder.")
+        old, new = info["features"], json.loads(json.dumps(self.features))
+        world = json.loads((self.root / WORLD).read_text(encoding="utf-8"))
+        changed = sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
+        for kind, sensors in (("streams", self.layout.streams), ("sensors", self.layout.sensors)):
+            now = json.loads(json.dumps(_json(sensors)))
+            was = world.get(kind, {} if kind == "streams" else now)  # recordings of version 1 do not tell
+            changed += sorted(name for name in {*was, *now} if was.get(name) != now.get(name) and name not in changed)
+        if changed or info["fps"] != self.layout.fps:
+            what = ", ".join(changed) if changed else f"{info['fps']} frames/s"
+            raise DatasetError(f"{self.root} was recorded with another layout ({what}); record to a new folder.")
+        self.rows, self.episodes = info["total_frames"], info["total_episodes"]
+        if self.episodes:
+            self._tasks = pq.read_table(self.root / TASKS).column("__index_level_0__").to_pylist()
+            found = json.loads((self.root / STATS).read_text(encoding="utf-8"))
+            self._stats = stats.from_json(found)
+            if any(int(summary["count"][0]) != self.rows for summary in self._stats.values()):
+                self._stats = self._stats_of_episodes()  # it was killed before info.json was replaced
+
+    def _stats_of_episodes(self) -> dict[str, stats.Summary]:
+        parts: dict[int, dict[str, stats.Summary]] = {}
+        for file in sorted((self.root / "meta" / "episodes").glob("chunk-*/file-*.parquet")):
+            for row in pq.read_table(file).to_pylist():
+                part = parts.setdefault(row["episode_index"], {})
+                for name, value in row.items():
+                    if name.startswith("stats/"):
+                        _, feature, key = name.split("/")
+                        part.setdefault(feature, {})[key] = np.array(value)
+        return stats.merge(parts[number] for number in range(self.episodes))
+
+    # -- files of an episode ------------------------------------------------------------------------------------
+
+    def _data(self, number: int) -> str:
+        return DATA_PATH.format(**where(number))
+
+    def _stage_rows(self, draft: Draft, tasks: list[str]) -> tuple[Path, dict[str, stats.Summary]]:
+        file, done, parts = self.staging / "data.parquet", 0, []
+        index = {task: number for number, task in enumerate(tasks)}
+        task = np.array([index[each] for each in draft.tasks or [draft.task] * draft.length], np.int64)
+        options = {**_CHECKED, "compression_level": 3, "use_dictionary": False}
+        with pq.ParquetWriter(file, self.schema, **options) as table:
+            for group in draft.rows:
+                columns = dict(group)
+                count = len(
+                    next(iter(columns.values()), range(min(ROWS_PER_GROUP, draft.length - done)))
+                )  # videos alone
+                frame = np.arange(done, done + count, dtype=np.int64)
+                done += count
+                if done == draft.length and ACTION_VALID in columns:
+                    columns[ACTION_VALID] = columns[ACTION_VALID].copy()
+                    columns[ACTION_VALID][-1] = False
+                columns["timestamp"] = (frame / self.layout.fps).astype(np.float32)
+                columns["frame_index"], columns["index"] = frame, self.rows + frame
+                columns["episode_index"] = np.full_like(frame, self.episodes)
+                columns["task_index"] = task[frame.clip(max=len(task) - 1)]
+                arrays = [to_arrow(columns[field.name], field.type) for field in self.schema]
+                table.write_table(pa.Table.from_arrays(arrays, schema=self.schema))
+                maps = {name for name, sensor in self.layout.rows.items() if sensor.kind == "depth"}
+                numbers = {name: value for name, value in columns.items() if value.dtype != object}
+                parts.append({name: stats.summarise(value, name in maps) for name, value in numbers.items()})
+        if done != draft.length or done != len(task):
+            raise DatasetError(f"an episode of {draft.length} rows came with {done}.")
+        durable.sync_file(file)
+        return file, stats.merge(parts)
+
+    def _stage_stream(self, sensor: Sensor, readings: Iterable[tuple[float, np.ndarray | None]]) -> Path:
+        file = self.staging / f"stream-{sensor.name}.parquet"
+        form = stream_schema(sensor)
+        with pq.ParquetWriter(file, form, **_CHECKED) as table:
+            readings = iter(readings)
+            while group := list(_some(readings)):
+                columns: list[pa.Array] = [pa.array([time_s for time_s, _ in group], pa.float64())]
+                if sensor.kind != "image":
+                    values = [value.reshape(-1) for _, value in group if value is not None]
+                    offsets = np.cumsum([0, *map(len, values)])
+                    columns.append(pa.LargeListArray.from_arrays(offsets, pa.array(np.concatenate(values))))
+                table.write_table(pa.Table.from_arrays(columns, schema=form))
+        durable.sync_file(file)
+        return file
+
+    def _write(self, table: pa.Table, name: str) -> Path:
+        file = self.staging / name
+        pq.write_table(table, file, **_CHECKED)
+        durable.sync_file(file)
+        return file
+
+    def _episode_table(self, number: int, draft: Draft, of_episode: dict[str, stats.Summary]) -> pa.Table:
+        at, length, tasks = where(number), draft.length, list(dict.fromkeys(draft.tasks or [draft.task]))
+        row: dict[str, object] = {"episode_index": number, "tasks": tasks, "length": length}
+        row |= {f"data/{key}": value for key, value in at.items()}
+        row |= {"dataset_from_index": self.rows, "dataset_to_index": self.rows + length}
+        for name in draft.videos:
+            row |= {f"videos/{name}/{key}": value for key, value in at.items()}
+            row |= {f"videos/{name}/from_timestamp": 0.0, f"videos/{name}/to_timestamp": length / self.layout.fps}
+        for feature, summary in stats.to_json(of_episode).items():
+            row |= {f"stats/{feature}/{key}": value for key, value in summary.items()}
+        row |= {f"meta/episodes/{key}": value for key, value in at.items()}
+        row |= {"counts": json.dumps(dict(draft.counts))}
+        table = pa.table({name: [value] for name, value in row.items()})
+        return table.append_column("start_ns", pa.array([draft.start_ns], pa.int64()))
+
+    # -- tables of episodes -------------------------------------------------------------------------------------
+
+    def _merge_tables(self, first: int) -> None:
+        """Makes one table of the one-row tables of EPISODES_PER_TABLE episodes; the first file's name is kept."""
+        files = [self.root / EPISODES_PATH.format(**where(first + i)) for i in range(EPISODES_PER_TABLE)]
+        table = pa.concat_tables([pq.ParquetFile(file).read() for file in files], promote_options="default")
+        for key, value in where(first).items():
+            at = table.schema.get_field_index(f"meta/episodes/{key}")
+            column = pa.array(np.full(len(table), value, np.int64))
+            table = table.set_column(at, f"meta/episodes/{key}", column)
+        durable.write_whole(files[0], lambda path: pq.write_table(table, path, **_CHECKED))
+        for file in files[1:]:
+            file.unlink()
+
+    def _merge_finished(self, start: int) -> None:
+        """Merges each full block of one-row tables; of a merge that was killed, the one-row tables are removed."""
+        for first in range(start, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE):
+            last = self.root / EPISODES_PATH.format(**where(first + EPISODES_PER_TABLE - 1))
+            if not last.exists():
+                continue
+            if pq.read_metadata(self.root / EPISODES_PATH.format(**where(first))).num_rows == 1:
+                self._merge_tables(first)
+            else:
+                for number in range(first + 1, first + EPISODES_PER_TABLE):
+                    (self.root / EPISODES_PATH.format(**where(number))).unlink(missing_ok=True)
+
+    def _info(self, episodes: int, rows: int, tasks: int) -> dict:
+        return {
+            "codebase_version": VERSION,
+            "robot_type": self.layout.robot,
+            "total_episodes": episodes,
+            "total_frames": rows,
+            "total_tasks": tasks,
+            "chunks_size": FILES_PER_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self.layout.fps,
+            "splits": {"train": f"0:{episodes}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH if any(f["dtype"] == "video" for f in self.features.values()) else None,
+            "features": self.features,
+        }
+
+
+def stream_schema(sensor: Sensor) -> pa.Schema:
+    """Of a stream's table: its true times, and (but for cameras, whose mp4 lies beside it) its numbers, flattened.
+
+    The Sensor is kept in the table's metadata too, for the day on which meta/terrella.json is lost.
+    """
+    fields = [pa.field("time_s", pa.float64())]
+    if sensor.kind != "image":
+        dtype = "uint16" if sensor.kind == "depth" else sensor.dtype
+        fields.append(pa.field("value", pa.large_list(pa.from_numpy_dtype(np.dtype(dtype)))))
+    return pa.schema(fields, metadata={"sensor": json.dumps(sensor_json(sensor))})
+
+
+def lock(root: Path):
+    """The folder's lock, held until it is closed; DatasetError where another writer holds it."""
+    handle = open(root / ".lock", "a")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        handle.close()
+        raise DatasetError(f"another recorder is writing to {root}; stop it or record to another folder.") from error
+    os.set_inheritable(handle.fileno(), False)
+    return handle
+
+
+def fresh(folder: Path) -> Path:
+    """The folder, empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def group_columns(rows: Iterable[Mapping[str, np.ndarray]]) -> Iterator[dict[str, np.ndarray]]:
+    """Single rows as columns of at most ROWS_PER_GROUP, and of about BYTES_PER_GROUP."""
+    rows = iter(rows)
+    while group := list(_some(rows)):
+        yield _columns(group)
+
+
+def _some(items: Iterator) -> Iterator:
+    """The next items that make one group of rows."""
+    room = BYTES_PER_GROUP
+    for _ in range(ROWS_PER_GROUP):
+        if room <= 0 or (item := next(items, None)) is None:
+            return
+        values = item.values() if isinstance(item, Mapping) else item
+        room -= sum(value.nbytes if isinstance(value, np.ndarray) else 8 for value in values)
+        yield item
+
+
+def _columns(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    found = {}
+    for name, value in rows[0].items():
+        values = [row[name] for row in rows]
+        if isinstance(value, np.ndarray) and value.dtype != object:
+            found[name] = np.stack(values)
+        else:
+            column = np.empty(len(values), object)
+            column[:] = values
+            found[name] = column
+    return found
+
+
+def _stream(name: str, number: int, suffix: str) -> str:
+    return STREAM_PATH.format(name=name, suffix=suffix, **where(number))
+
+
+def _json(sensors: Mapping[str, Sensor]) -> dict:
+    return {name: sensor_json(sensor) for name, sensor in sensors.items()}
+
+
+def tasks_table(tasks: list[str]) -> pa.Table:
+    """tasks.parquet as pandas reads it: indexed by the task's sentence."""
+    columns = [
+        {
+            "name": "task_index",
+            "field_name": "task_index",
+            "pandas_type": "int64",
+            "numpy_type": "int64",
+            "metadata": None,
+        },
+        {
+            "name": None,
+            "field_name": "__index_level_0__",
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": None,
+        },
+    ]
+    pandas = {
+        "index_columns": ["__index_level_0__"],
+        "column_indexes": [],
+        "columns": columns,
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table(
+        {"task_index": pa.array(range(len(tasks)), pa.int64()), "__index_level_0__": pa.array(tasks, pa.string())}
+    )
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})

@@ -1,0 +1,351 @@
+"""The page of a recording: its files, its readings as the page asks for them, marks and the export of the good ones."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import secrets
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from ..core.errors import ServeError, TerrellaError
+from . import readings
+from .guard import SafeHeaders, is_loopback, refusal
+from .server import open_port, page_address
+
+_SCRIPTS = ("app", "library", "tiles", "depth", "points", "map", "tracks", "colours")
+_FILES = {
+    "/": ("view/index.html", "text/html"),
+    "/style.css": ("style.css", "text/css"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/view/view.css": ("view/view.css", "text/css"),
+    **{f"/view/{name}.js": (f"view/{name}.js", "text/javascript") for name in _SCRIPTS},
+}
+_LONGEST_MESSAGE = 4096  # bytes that the page may post at once
+_BUCKETS = 4096  # of one series, at most
+
+
+class Viewable(Protocol):
+    """A recording that can be looked at. Methods are called by one thread at a time; only `export` runs beside others.
+
+    Each may raise a TerrellaError, whose sentence the page shows. Sensors are known by their names, of kind "image",
+    "depth", "points" or "vector"; episodes by their number from 0.
+    """
+
+    def about(self) -> dict:
+        """JSON: name, robot, fps (or None), notes (sentences), can_export, and sensors, a list of: name, label, kind,
+        shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), and pose:
+        None, or the columns of x and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
+        ...
+
+    def listing(self) -> list[dict]:
+        """JSON of every episode: rows, seconds, task."""
+        ...
+
+    def episode(self, number: int) -> dict:
+        """JSON: number, seconds, task, start_ns (text or None), language ([[time_s, text], ...]), and sensors: name ->
+        count and fault (a sentence, "" where it can be shown); sensors that the episode lacks are left out."""
+        ...
+
+    def times(self, number: int, sensor: str) -> np.ndarray:
+        """float64 [n] ascending: when each reading was taken, in seconds since the episode began."""
+        ...
+
+    def reading(self, number: int, sensor: str, index: int) -> np.ndarray:
+        """image uint8 [H, W, 3]; depth [h, w] metres, inf where nothing was hit; points [n, k], x, y, z first."""
+        ...
+
+    def series(self, number: int, sensor: str) -> np.ndarray:
+        """All readings of a vector, float64 [n, k]."""
+        ...
+
+    def marks(self) -> list[int]:
+        """Numbers of the episodes marked bad."""
+        ...
+
+    def mark(self, number: int, bad: bool) -> None:
+        """Marks an episode bad or good, for good."""
+        ...
+
+    def export(self, path: Path, keep: Sequence[int], report: Callable[[int, int], None]) -> None:
+        """Writes the episodes `keep` as a new recording into the folder `path`, which does not exist; calls
+        `report(done, of)` now and then, lets what that raises pass, and leaves nothing half-written behind."""
+        ...
+
+
+class Exporting:
+    """One export at a time, in a thread of its own, into a folder that the server chose."""
+
+    def __init__(self, viewable: Viewable, path: Path | None):
+        self._viewable, self.path = viewable, path
+        self._thread: threading.Thread | None = None
+        self._stopped = False
+        self.status: dict = {"state": "idle", "text": "", "done": 0, "of": 0}
+
+    def start(self, keep: Sequence[int]) -> None:
+        """ServeError where there is nowhere to write to, nothing to write, or one is under way."""
+        if self.path is None:
+            raise ServeError("this page was opened for looking only; start it with a folder to export to.")
+        if self._thread is not None and self._thread.is_alive():
+            raise ServeError("an export is under way; wait until it is finished.")
+        if self.path.exists():
+            raise ServeError(f"{self.path} exists already; move it away, or export to another folder.")
+        if not keep:
+            raise ServeError("every episode is marked bad: there is nothing to export.")
+        self.status = {"state": "running", "text": "", "done": 0, "of": len(keep)}
+        self._thread = threading.Thread(target=self._run, args=(self.path, keep), name="export")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends what is under way at its next report, and waits for it."""
+        self._stopped = True
+        if self._thread is not None:
+            self._thread.join()
+
+    def _report(self, done: int, of: int) -> None:
+        if self._stopped:
+            raise ServeError("the export was stopped with the server.")
+        self.status = {**self.status, "done": int(done), "of": int(of)}
+
+    def _run(self, path: Path, keep: Sequence[int]) -> None:
+        try:
+            self._viewable.export(path, keep, self._report)
+            words = f"{len(keep)} episode{'s' * (len(keep) != 1)} written to {path}"
+            self.status = {**self.status, "state": "done", "text": words, "done": len(keep), "of": len(keep)}
+        except (TerrellaError, OSError) as error:
+            self.status = {**self.status, "state": "failed", "text": str(error)}
+        except Exception as error:  # told to the page; the trace goes to the terminal
+            self.status = {**self.status, "state": "failed", "text": f"{type(error).__name__}: {error}"}
+            raise
+
+
+class _Desk:
+    """Answers the page: one method a route, run by the one thread that touches the recording."""
+
+    def __init__(self, viewable: Viewable, exporting: Exporting):
+        self._viewable, self._exporting = viewable, exporting
+        self._spans: dict[tuple[int, str], tuple[float, float]] = {}
+        about = viewable.about()
+        self._kinds = {sensor["name"]: sensor["kind"] for sensor in about["sensors"]}
+        self._names = list(self._kinds)
+
+    def about(self, request: Request) -> Response:
+        path = self._exporting.path
+        about = {**self._viewable.about(), "export_to": str(path) if path else ""}
+        return _json({**about, "episodes": self._viewable.listing(), "bad": self._viewable.marks()})
+
+    def episode(self, request: Request) -> Response:
+        return _json(self._viewable.episode(request.path_params["number"]))
+
+    def times(self, request: Request) -> Response:
+        return _bytes(readings.times(self._viewable.times(request.path_params["number"], self._sensor(request))))
+
+    def series(self, request: Request) -> Response:
+        number, sensor = request.path_params["number"], self._sensor(request)
+        start, stop = (_number(request, name, default) for name, default in (("from", -math.inf), ("to", math.inf)))
+        buckets = min(max(int(_number(request, "buckets", 1024)), 1), _BUCKETS)
+        time_s, values = self._viewable.times(number, sensor), self._viewable.series(number, sensor)
+        return _bytes(readings.series(time_s, values, start, stop, buckets, "pick" in request.query_params))
+
+    def reading(self, request: Request) -> Response:
+        number, sensor = request.path_params["number"], self._sensor(request)
+        value = self._viewable.reading(number, sensor, request.path_params["index"])
+        kind = self._kinds[sensor]
+        if kind == "image":
+            across = int(min(max(_number(request, "across", 8192), 16), 8192))
+            return Response(readings.picture(value, across), media_type="image/jpeg")
+        if kind == "depth":
+            return _bytes(readings.depth(value, self._span(number, sensor)))
+        if kind == "points":
+            return _bytes(readings.points(value))
+        raise ServeError(f"{sensor} is a vector: ask for its series.")
+
+    def mark(self, number: int, bad: bool) -> Response:
+        self._viewable.mark(number, bad)
+        return _json({"bad": self._viewable.marks()})
+
+    def export(self) -> Response:
+        bad = set(self._viewable.marks())
+        self._exporting.start([number for number in range(len(self._viewable.listing())) if number not in bad])
+        return _json(self._exporting.status)
+
+    def _sensor(self, request: Request) -> str:
+        place = request.path_params["sensor"]
+        if place >= len(self._names):
+            raise ServeError(f"this recording has {len(self._names)} sensors, no sensor {place}; reload the page.")
+        return self._names[place]
+
+    def _span(self, number: int, sensor: str) -> tuple[float, float]:
+        """The colours' near and far, from a few readings of the episode."""
+        if (number, sensor) not in self._spans:
+            count = len(self._viewable.times(number, sensor))
+            looks = sorted({(2 * part + 1) * count // 10 for part in range(5)})
+            samples = []
+            for at in looks:
+                with contextlib.suppress(TerrellaError):  # a broken one is told where it is shown
+                    samples.append(self._viewable.reading(number, sensor, at)[::4, ::4])
+            if len(self._spans) > 256:
+                self._spans.clear()
+            self._spans[number, sensor] = readings.depth_span(samples)
+        return self._spans[number, sensor]
+
+
+def _json(value: object) -> Response:
+    return JSONResponse(value)
+
+
+def _bytes(content: bytes) -> Response:
+    return Response(content, media_type="application/octet-stream")
+
+
+def _number(request: Request, name: str, default: float) -> float:
+    try:
+        value = float(request.query_params.get(name, default))
+    except ValueError:
+        value = math.nan
+    if math.isnan(value):
+        raise ServeError(f"{name} must be a number; reload the page.")
+    return value
+
+
+def build_viewer(
+    viewable: Viewable,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    export_to: str | Path | None = None,
+    on_ready: Callable[[], None] | None = None,
+) -> Starlette:
+    """The ASGI application of `view`."""
+    exporting = Exporting(viewable, Path(export_to) if export_to is not None else None)
+    desk = _Desk(viewable, exporting)
+    worker = ThreadPoolExecutor(1, thread_name_prefix="recording")
+    web = resources.files("terrella.serve") / "web"
+    files = {path: ((web / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        if on_ready:
+            on_ready()
+        try:
+            yield
+        finally:
+            await asyncio.get_running_loop().run_in_executor(None, exporting.stop)
+            worker.shutdown(cancel_futures=True)
+
+    def show(request: Request) -> Response:
+        content, kind = files[request.url.path]
+        return Response(content, media_type=kind)
+
+    async def answered(request: Request, method: Callable[..., Response], *arguments: object) -> Response:
+        try:
+            return await asyncio.get_running_loop().run_in_executor(worker, method, *arguments)
+        except TerrellaError as error:
+            return PlainTextResponse(str(error), 422)
+
+    def asks(method: Callable[[Request], Response]) -> Callable:
+        async def route(request: Request) -> Response:
+            why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
+            return PlainTextResponse(why, 403) if why else await answered(request, method, request)
+
+        return route
+
+    async def mark(request: Request) -> Response:
+        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
+        if why:
+            return PlainTextResponse(why, 403)
+        try:
+            body = await _message(request)
+            number, bad = body["episode"], body["bad"]
+            if type(number) is not int or type(bad) is not bool:
+                raise ValueError
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return PlainTextResponse("a mark is {episode: a whole number, bad: true or false}; reload the page.", 422)
+        return await answered(request, desk.mark, number, bad)
+
+    async def export(request: Request) -> Response:
+        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
+        if why:
+            return PlainTextResponse(why, 403)
+        return _json(exporting.status) if request.method == "GET" else await answered(request, desk.export)
+
+    routes = [Route(path, show) for path in files]
+    routes += [
+        Route("/about", asks(desk.about)),
+        Route("/episode/{number:int}", asks(desk.episode)),
+        Route("/times/{number:int}/{sensor:int}", asks(desk.times)),
+        Route("/series/{number:int}/{sensor:int}", asks(desk.series)),
+        Route("/reading/{number:int}/{sensor:int}/{index:int}", asks(desk.reading)),
+        Route("/mark", mark, methods=["POST"]),
+        Route("/export", export, methods=["GET", "POST"]),
+    ]
+    app = Starlette(routes=routes, lifespan=lifespan, middleware=[Middleware(SafeHeaders, host=host)])
+    app.state.exporting = exporting
+    return app
+
+
+async def _message(request: Request) -> dict:
+    """The posted JSON object; ValueError where it is none, or too long."""
+    content = b""
+    async for part in request.stream():
+        content += part
+        if len(content) > _LONGEST_MESSAGE:
+            raise ValueError
+    found = json.loads(content)
+    if not isinstance(found, dict):
+        raise ValueError
+    return found
+
+
+def make_viewer(
+    viewable: Viewable,
+    listener: socket.socket,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    export_to: str | Path | None = None,
+    on_ready: Callable[[str], None] | None = None,
+) -> uvicorn.Server:
+    """The server behind `view`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
+    url = page_address(host, listener.getsockname()[1], token)
+    app = build_viewer(viewable, host, token, export_to, (lambda: on_ready(url)) if on_ready else None)
+    settings = uvicorn.Config(
+        app, log_level="warning", access_log=False, ws="none", timeout_graceful_shutdown=2, server_header=False,
+        proxy_headers=False,
+    )  # fmt: skip
+    return uvicorn.Server(settings)
+
+
+def view(
+    viewable: Viewable,
+    port: int = 8766,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    on_ready: Callable[[str], None] | None = None,
+    export_to: str | Path | None = None,
+) -> None:
+    """Serves the page of a recording until interrupted.
+
+    `on_ready` gets the address to open. `export_to` is the one folder into which the page may export; it must not exist
+    yet. On any address but this machine's own a token is mandatory: where none is given one is made, and the address
+    carries it. ServeError where the port is taken.
+    """
+    if token is None and not is_loopback(host):
+        token = secrets.token_urlsafe(16)
+    with contextlib.closing(open_port(host, port)) as listener:
+        server = make_viewer(viewable, listener, host, token, export_to, on_ready)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listener])
