@@ -98,7 +98,7 @@ def main() -> None:
         lists = {
             field.name: getattr(card, field.name) + getattr(other, field.name)
             for field in dataclasses.fields(card)
-            if isinstance(getattr(card, field.name), list) and field.name != "places"
+            if isinstance(getattr(card, field.name), list) and field.name not in ("places", "looks")
         }
         card = dataclasses.replace(card, worlds=card.worlds | other.worlds, **lists)
     rng, speeds = terrella.make_rng(0), []

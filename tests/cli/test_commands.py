@@ -22,6 +22,7 @@ OPTIONS = {
     "data doctor": "--json --out --repair",
     "data convert": "--episodes --fps --json --pictures --policy --seed --to",
     "data merge": "--dry --fps --json --mapping --out",
+    "data label": "--frames --json --labelled --out --seed",
     "data view": "--host --json --out --port --rerun --token",
 }
 

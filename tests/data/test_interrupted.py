@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -12,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrella.data import Dataset, Layout, Recorder
+from terrella.core.errors import DatasetError
+from terrella.data import Dataset, Layout, Recorder, repair
 from terrella.data.format import RGB, STATE
 from terrella.data.source import Sensor
 
@@ -140,6 +142,39 @@ def test_a_damaged_frame_ends_the_episode_before_it(tmp_path):
     check(tmp_path, 0, 8)
 
 
+def test_repair_keeps_an_interrupted_first_episode(tmp_path):
+    _left_in_flight(tmp_path / "set", 12)
+    repair(tmp_path / "set", tmp_path / "mended")
+    assert check(tmp_path / "mended", 0, 12) == 12
+
+
+def test_a_closed_recorder_leaves_the_next_one_alone(tmp_path):
+    first = Recorder(tmp_path, LAYOUT, "patrol")
+    first.close()
+    with Recorder(tmp_path, LAYOUT, "patrol") as second:
+        drive(second, 8)
+        first.end_episode()
+        first.drop_episode()
+        first.close()
+    assert check(tmp_path, 0, 8) == 8
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.EIO, "Input/output error")])
+def test_what_cannot_be_kept_now_is_kept_later(tmp_path, monkeypatch, error):
+    _left_in_flight(tmp_path, 9)
+
+    def failing(*_):
+        raise error
+
+    for place in ("terrella.data.recorder.Staged", "terrella.data.writer.Writer.put"):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, failing)
+            with pytest.raises((DatasetError, KeyboardInterrupt)):
+                Recorder(tmp_path, LAYOUT)
+    with Recorder(tmp_path, LAYOUT) as again:
+        assert again.recovered == 9
+
+
 def test_what_was_interrupted_fits_by_name_not_by_order(tmp_path):
     one = Layout(10, {name: Sensor(f"observation.{name}", "vector", (1,)) for name in "ab"})
     one = Layout(10, {sensor.name: sensor for sensor in one.sensors.values()})
@@ -183,8 +218,6 @@ def test_streams_keep_their_true_times_and_come_to_the_rows_by_a_stated_policy(t
 
 
 def test_a_stream_that_goes_back_in_time_is_refused(tmp_path):
-    from terrella.core.errors import DatasetError
-
     with Recorder(tmp_path, LAYOUT) as recorder:
         recorder.log(LIDAR, np.zeros((2, 3)), time_s=1.0)
         with pytest.raises(DatasetError, match=r"0.5 s after one at 1.0 s"):

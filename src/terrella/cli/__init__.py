@@ -69,6 +69,8 @@ def _app(given: Sequence[str]) -> SubcommandApp:
     recording.command(name="doom")(record_doom)
     recording.command(name="world")(record_world)
     training.command(name="video")(_train_video_command() if given[:1] == ["train"] else play)
+    training.command(name="latent-actions")(_train_latent_command() if given[:1] == ["train"] else play)
+    data.command(data_room.label)
     data.command(data_room.doctor)
     data.command(data_room.convert)
     data.command(data_room.merge)
@@ -214,6 +216,26 @@ def _train_video_command() -> Callable[..., None]:
 
     video.__annotations__["config"] = TrainConfig  # it lives in a room that is slow to import, so not in this module
     return video
+
+
+def _train_latent_command() -> Callable[..., None]:
+    from ..learn.latent_actions import LatentConfig, train_latent_actions
+
+    defaults = LatentConfig()
+
+    def latent_actions(data: Positional[Path], out: Path, config: LatentConfig = defaults, json: Json = False) -> None:
+        """Learn a few actions from pictures alone; `terrella data label` then writes them into a recording.
+
+        Args:
+            data: Folder of the dataset; its own actions, if it has any, are not looked at.
+            out: Folder of the run: checkpoint, log, and pictures of truth, inferred and random actions.
+        """
+        with progress.shown("training") as report:
+            facts = train_latent_actions(data, out, config, report)
+        result({"run": str(out), **(facts or {})}, json)
+
+    latent_actions.__annotations__["config"] = LatentConfig
+    return latent_actions
 
 
 # -- play -----------------------------------------------------------------------------------------------------------

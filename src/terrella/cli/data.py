@@ -41,7 +41,7 @@ def doctor(folder: Positional[Path], repair: bool = False, out: Path | None = No
     ]
     lines.append(f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}")
     if repair:
-        target = out or folder.with_name(f"{folder.resolve().name}-mended")
+        target = out or folder.resolve().with_name(f"{folder.resolve().name}-mended")
         with progress.shown("mending") as report:
             done = mend(folder, target, progress=lambda pieces, of: report(pieces, of))
         facts |= {"mended": str(target), "done": done}
@@ -103,7 +103,7 @@ def merge(
 
     found = {path: open_source(path) for path in sources}
     with progress.shown("merging") as report:
-        facts, text = merge_into(found, out, mapping, fps, dry, lambda done, of: report(done, of))
+        facts, text = merge_into(found, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
     result(facts, json, text)
 
 
@@ -136,6 +136,35 @@ def view(
     def ready(address: str) -> None:
         result({"address": address, "dataset": folder}, json, f"{folder}: open {address}")
 
-    name = folder.rstrip("/").rsplit("/", 1)[-1]
-    good = out or (Path(folder).with_name(f"{name}-good") if "://" not in folder else Path(f"{name}-good"))
+    here = Path(folder).resolve() if "://" not in folder else Path.cwd() / folder.rstrip("/").rsplit("/", 1)[-1]
+    good = out or here.with_name(f"{here.name}-good")
     serve(browse(folder), port, host, token, ready, good)
+
+
+def label(
+    run: Positional[Path],
+    folder: Positional[Path],
+    out: Path,
+    labelled: Path | None = None,
+    frames: int = 200,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Write a copy of a recording whose actions are the codes that `terrella train latent-actions` learned.
+
+    Args:
+        run: Folder of that run.
+        folder: Recording to label; pictures alone will do.
+        out: Folder of the labelled copy, which `terrella train video` makes a world of.
+        labelled: Recording with real actions, by which keys are mapped to codes.
+        frames: How many of its frames are looked at.
+    """
+    from ..learn.latent_codes import label as write
+    from ..learn.latent_codes import map_keys
+
+    with progress.shown("labelling") as report:
+        keys = map_keys(run, labelled, report, frames, seed=seed) if labelled else None
+        facts = write(run, folder, out, report, keys)
+    if keys:
+        facts |= {"key_accuracy": keys.accuracy, "commonest_action": keys.commonest, "labelled_frames": keys.used}
+    result({"dataset": str(out), **facts}, json)

@@ -322,6 +322,8 @@ def pose_columns(sensor: Sensor) -> dict | None:
 
     The world's z is up, and a body looks along its own x. Quaternions and yaw turn the body's axes into the world's.
     """
+    if not sensor.dtype.startswith("float"):
+        return None
     plain = [re.sub(r"[^a-z]", "", re.sub(r"_(m|rad|deg)$", "", name.lower())) for name in sensor.names]
 
     def place(pattern: str) -> int | None:
@@ -382,8 +384,8 @@ def browse(path: str | Path) -> Browse:
     if not (where / INFO).exists():
 
         def write(out: Path, keep: Sequence[int], report: Report) -> None:
-            takes = list(source.takes())
-            chosen = replace(source, takes=lambda: [takes[number] for number in keep])
+            wanted = set(keep)
+            chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
             write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
 
         return Browse(source, marks, export=write)

@@ -190,8 +190,12 @@ class Recorder:
         `start_ns` is the wall-clock time of its time 0 (nanoseconds since 1970); without it, where the layout has a
         clock, when it began.
         """
+        if self._closed:
+            return None
         if self._left:
+            before = self.episodes
             self._recover("keep")
+            return self.episodes - 1 if self.episodes > before else None
         if self.in_flight < 2 or self._number != self.episodes:  # an interrupt may come just after it was committed
             self._discard()
             return None
@@ -209,7 +213,8 @@ class Recorder:
 
     def drop_episode(self) -> None:
         """Throws the episode in flight away."""
-        self._discard()
+        if not self._closed:
+            self._discard()
 
     def close(self) -> None:
         """Commits the episode in flight and lets go of the folder."""
@@ -237,6 +242,8 @@ class Recorder:
     def _check_open(self) -> None:
         if self._closed:
             raise DatasetError(f"the recorder of {self.root} is closed; open another.")
+        if self._journal is None and self.in_flight:
+            raise DatasetError(f"an episode of {self.in_flight} rows waits to be committed; end it first.")
         if self._torn:
             raise DatasetError(
                 f"a row was interrupted; end the episode, which keeps the {self.in_flight} rows before it."
@@ -301,10 +308,12 @@ class Recorder:
 
     def _recover(self, interrupted: Literal["keep", "discard"]) -> None:
         """Makes an episode of what lies in the staging folder, up to the last row whose frames are whole."""
-        self._left = False
+        if not (self._staging / LOG).exists():
+            return self._discard()
         try:
-            staged = Staged(self._staging)
-        except (OSError, ValueError, KeyError, TypeError):  # not even a beginning
+            with self._nothing_lost():
+                staged = Staged(self._staging)
+        except (ValueError, KeyError, TypeError):  # not even a beginning
             return self._discard()
         if staged.number != self.episodes:  # it was killed after the episode was safe
             return self._discard()

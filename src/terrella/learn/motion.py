@@ -76,7 +76,12 @@ def _steps(recording: Recording, config: VideoConfig):
         "place": place[index + 1],
     }
     targets = {"heading": heading[index + 1], "moved": place[index + 1] - place[index]}
-    return rows, inputs, targets, torch.from_numpy(np.array(cache.done)[rows])
+    return (
+        rows,
+        inputs,
+        targets,
+        torch.from_numpy(np.zeros(len(rows), bool) if cache.done is None else np.array(cache.done)[rows]),
+    )
 
 
 def _actions(recording: Recording, rows: np.ndarray, history: int) -> torch.Tensor:

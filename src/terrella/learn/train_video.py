@@ -296,7 +296,8 @@ class _Run:
         }
         dt_s = about.get("dt_s", 1 / self.cache.fps)
         spec = video_spec(self.config.name, self.video, dt_s, self.cache.action_names, about.get("keys", {}), card)
-        reward, done = np.array(self.cache.reward), np.array(self.cache.done)
+        told = (self.cache.reward, self.cache.done)  # what a recording lacks is none of either
+        reward, done = (np.zeros(self.cache.length) if part is None else np.array(part) for part in told)
         usual = float(np.median(reward))
         generator = copy.deepcopy(self.smooth).cpu().float()
         if self.memory is None:

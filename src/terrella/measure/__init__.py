@@ -4,8 +4,10 @@ from .album import Album
 from .bars import Bar, bars
 from .clips import Clip, clips_from_cache, in_box, out_of_sight
 from .closure import Closure, closure
+from .encoder import FrameEncoder, frame_features, shipped_encoder
 from .endurance import Endurance, long_rollout
 from .examine import ExamConfig, examine, write_report
+from .frechet import clip_features, frechet, frechet_interval
 from .page import page
 from .scorecard import Scorecard, ScoreConfig, as_dict, score, to_json
 from .speed import Speed, speed
@@ -20,19 +22,25 @@ __all__ = [
     "Endurance",
     "ExamConfig",
     "Figure",
+    "FrameEncoder",
     "ScoreConfig",
     "Scorecard",
     "Speed",
     "as_dict",
     "bars",
+    "clip_features",
     "clips_from_cache",
     "closure",
     "examine",
+    "frame_features",
+    "frechet",
+    "frechet_interval",
     "in_box",
     "long_rollout",
     "out_of_sight",
     "page",
     "score",
+    "shipped_encoder",
     "speed",
     "strip",
     "to_json",

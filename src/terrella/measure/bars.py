@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .roll import PREDICTED
-from .scorecard import Scorecard
+from .scorecard import Fidelity, Scorecard
 from .statistics import Figure
 
 MET, MISSED, VOID, UNMEASURED = "met", "missed", "void", "not measured"
@@ -71,7 +71,23 @@ def _fidelity_bars(card: Scorecard, arm: str, motion: str) -> list[Bar]:
         step, figure = (worst.horizon, worst.sharpness) if worst else (None, None)
         name = "sharpness against the game's, worst horizon"
         found.append(_bar(name, place, motion, step, card.dt_s, "0.7 to 1.3", "\u00d7", figure, 0.7, 1.3))
+        if card.looks:  # frames may be too small for the encoder
+            found.append(_looks_bar(card, place, motion, rows))
     return found
+
+
+def _looks_bar(card: Scorecard, place: str, motion: str, rows: Sequence[Fidelity]) -> Bar:
+    """The Frechet distance as a share of that of the game's own frames blurred by one pixel; the worst horizon."""
+    soft = {looks.horizon: looks.blurred.value for looks in card.looks if looks.place == place}
+    shares = {
+        row.horizon: _scaled(row.frechet, 1 / soft[row.horizon])
+        for row in rows
+        if row.frechet is not None and soft.get(row.horizon, 0.0) > 0
+    }
+    step = max(shares, key=lambda horizon: shares[horizon].value, default=None)
+    name, target = "Frechet distance over that of the game blurred by one pixel, worst horizon", "\u2264 1"
+    figure = None if step is None else shares[step]
+    return _bar(name, place, motion, step, card.dt_s, target, "\u00d7", figure, -math.inf, 1.0)
 
 
 def _control_bar(card: Scorecard, arm: str, place: str, step: int, target: float, side: bool) -> Bar:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 
@@ -54,6 +56,16 @@ def colour_statistics(frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
     """Mean and standard deviation over the pixels of each channel: uint8 [..., H, W, 3] -> two float64 [..., 3]."""
     pixels = frames.double().flatten(-3, -2)
     return pixels.mean(-2), pixels.std(-2, correction=0)
+
+
+def blurred(frames: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
+    """uint8 [N, H, W, 3] behind a Gaussian blur of `sigma` pixels, edges mirrored; uint8 of the same shape."""
+    reach = math.ceil(3 * sigma)
+    taps = torch.exp(-((torch.arange(-reach, reach + 1, device=frames.device) / sigma) ** 2) / 2)
+    taps = taps / taps.sum()
+    image = F.pad(frames.permute(0, 3, 1, 2).float(), (reach,) * 4, mode="reflect").flatten(0, 1)[:, None]
+    image = F.conv2d(F.conv2d(image, taps.view(1, 1, 1, -1)), taps.view(1, 1, -1, 1))
+    return image.unflatten(0, (len(frames), 3))[:, :, 0].permute(0, 2, 3, 1).round().to(torch.uint8)
 
 
 def _window(image: torch.Tensor) -> torch.Tensor:

@@ -25,7 +25,15 @@ _HERE = Path(__file__).parent
 def page(card: Scorecard, bars: Sequence[Bar], title: str) -> str:
     """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it."""
     style = (_HERE / "page.css").read_text(encoding="utf-8")
-    sections = [_bars(bars), _strips(card), _psnr(card), _sharpness(card), _control(card), _position(card)]
+    sections = [
+        _bars(bars),
+        _strips(card),
+        _psnr(card),
+        _sharpness(card),
+        _looks(card),
+        _control(card),
+        _position(card),
+    ]
     sections += [_closures(card), _endurance(card), _speeds(card), _method(card)]
     places = " &middot; ".join(
         f"{place.clips} clips of {escape(place.name)} places ({place.moving_share:.0%} moving)" for place in card.places
@@ -94,7 +102,8 @@ def _psnr(card: Scorecard) -> str:
 
 
 def _fidelity_table(card: Scorecard, place: str) -> str:
-    kinds = (("PSNR", "psnr"), ("gain over copy last", "gain"), ("SSIM", "ssim"), ("sharpness", "sharpness"))
+    kinds = [("PSNR", "psnr"), ("gain over copy last", "gain"), ("SSIM", "ssim"), ("sharpness", "sharpness")]
+    kinds += [("Frechet distance", "frechet")] if card.looks else []
     found = sorted((row for row in card.fidelity if row.place == place), key=lambda row: row.horizon)
     if not found:
         return ""
@@ -114,6 +123,46 @@ def _sharpness(card: Scorecard) -> str:
     charts = _charts(card, "sharpness", "gradient energy, dream / game", (0.7, 1.0, 1.3))
     lead = "Gradient energy of the dreams over the game's: below 1 is blurred, above 1 too rough. Dotted: 0.7, 1, 1.3."
     return _section("Sharpness over time", lead, charts)
+
+
+def _looks(card: Scorecard) -> str:
+    """Frechet distances against horizon, each place by itself, with what real and blurred frames would get."""
+    if not card.looks:
+        return ""
+    boxes, every = [], []
+    for place in card.places:
+        found = [row for row in card.fidelity if row.place == place.name and row.frechet is not None]
+        looks = list({row.horizon: row for row in card.looks if row.place == place.name}.values())  # cards are merged
+        if not looks:
+            continue
+        lines = []
+        for arm, motion in dict.fromkeys((row.arm, row.motion) for row in found):
+            mine = [row for row in found if (row.arm, row.motion) == (arm, motion)]
+            dash = "" if motion == PREDICTED else "5 4"
+            points = [(row.horizon, row.frechet) for row in mine if row.frechet is not None]
+            lines.append(_points_line(f"{arm}, {motion} motion", points, _colour(card, arm), dash))
+        lines.append(_points_line("real frames (copy last)", [(r.horizon, r.copy_last) for r in looks], _QUIET, "2 3"))
+        lines.append(
+            _points_line("the game blurred by 1 pixel", [(r.horizon, r.blurred) for r in looks], _QUIET, "7 3")
+        )
+        every += [value for line in lines for value in (*line.y, *line.low, *line.high)]
+        boxes.append((place.name, lines))
+    steps = [(step, str(step)) for step in sorted({row.horizon for row in card.looks})]
+    span, charts = y_span(every), ""
+    for name, lines in boxes:
+        svg = line_chart(lines, steps, "steps", "Frechet distance of looks", True, span)
+        charts += _figure_box(f"{name} places", svg, lines)
+    lead = (
+        "How far the dreams, all together, look from the game, in the features of a fixed encoder: 0 is alike, and blur "
+        "does not help. It asks only whether a picture could be the game's, not whether it is the right one."
+    )
+    return _section("Looks over time", lead, f"<div class=charts>{charts}</div>")
+
+
+def _points_line(label: str, points: Sequence[tuple[int, Figure]], colour: str, dash: str) -> Line:
+    x, figures = [step for step, _ in points], [figure for _, figure in points]
+    y, low, high = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
+    return Line(label, x, y, low, high, colour, dash)
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> str:

@@ -15,8 +15,10 @@ from ..core.errors import DatasetError
 from ..core.world import World, make_rng
 from .clips import Clip
 from .closure import Closure
+from .encoder import MIN_SIDE, frame_features
 from .endurance import Endurance
-from .fidelity import gradient_energy, psnr
+from .fidelity import blurred, gradient_energy, psnr
+from .frechet import frechet_interval
 from .roll import PREDICTED, TRUE, Dream, dream, frames_at, poses_at, true_motion_works
 from .speed import Speed
 from .statistics import Band, Figure, mean_band, mean_interval, median_interval, ratio_band, ratio_interval
@@ -29,7 +31,8 @@ Progress = Callable[[float, str], None]  # share done in 0..1, what is being don
 class ScoreConfig:
     """horizons: steps at which figures are given; control_horizons: where true actions are set against another
     player's; batch: clips rolled together; strips: clips of each place whose pictures are kept; walked_m: clips that
-    walked less have no position error; drop: PSNR at the first horizon less that at the second."""
+    walked less have no position error; drop: PSNR at the first horizon less that at the second; frechet: compare looks
+    through the fixed encoder, where frames are at least MIN_SIDE a side."""
 
     horizons: tuple[int, ...] = (1, 8, 32, 64, 128)
     control_horizons: tuple[int, ...] = (8, 32, 128)
@@ -38,6 +41,7 @@ class ScoreConfig:
     batch: int = 8
     strips: int = 3
     walked_m: float = 0.5
+    frechet: bool = True
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ class Place:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """One arm at one horizon. gain: psnr - copy_last, paired; sharpness: gradient energy of dreams over the game's."""
+    """One arm at one horizon. gain: psnr - copy_last, paired; sharpness: gradient energy of dreams over the game's;
+    frechet: distance of the dreams' looks from the game's (frechet.py), None where it was not asked for or frames are
+    too small."""
 
     place: str
     arm: str
@@ -65,6 +71,19 @@ class Fidelity:
     copy_last: Figure
     gain: Figure
     sharpness: Figure
+    frechet: Figure | None = None
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What a Frechet distance is worth at one horizon: copy_last: that of real frames of other moments (the last shown
+    of each clip); blurred: that of the game's own frames behind a Gaussian blur of one pixel."""
+
+    place: str
+    horizon: int
+    seconds: float
+    copy_last: Figure
+    blurred: Figure
 
 
 @dataclass(frozen=True)
@@ -135,6 +154,7 @@ class Scorecard:
     fidelity: list[Fidelity] = field(default_factory=list)
     control: list[Control] = field(default_factory=list)
     position: list[Position] = field(default_factory=list)
+    looks: list[Looks] = field(default_factory=list)
     drops: list[Drop] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     closures: list[Closure] = field(default_factory=list)
@@ -165,8 +185,9 @@ def score(
         seed, order = _seed(rng), torch.randperm(len(clips), generator=rng).tolist()
         others = [clips[order[(order.index(number) + 1) % len(clips)]] for number in range(len(clips))]
         card.places.append(_describe(place, clips))
-        truth = _truth(clips, max(config.horizons))
+        truth = _truth(clips, config)
         _add_copy_last(card, place, truth, rng)
+        _add_looks(card, place, clips, truth, config)
         rows: list[dict[str, np.ndarray]] = [{"truth": _kept(clip, config.horizons)} for clip in clips[: config.strips]]
         for arm, world in arms.items():
             tell(done / total, f"{place} places, {arm}")
@@ -177,8 +198,8 @@ def score(
                 _add_fidelity(card, place, arm, motion, dreamt, truth, config, rng)
                 for picture, clip, frames in zip(rows, clips, dreamt.frames):
                     picture[f"{arm}, {motion} motion"] = _with_context(clip, frames)
-            if len(clips) > 1:
-                steps = [step for step in config.control_horizons if step <= max(config.horizons)]
+            steps = [step for step in config.control_horizons if step <= max(config.horizons)]
+            if len(clips) > 1 and steps:
                 wrong = _dream_all(world, clips, PREDICTED, steps, config.batch, seed, others)
                 _add_control(card, place, arm, dreams[PREDICTED], wrong, steps, rng)
             _add_position(card, place, arm, dreams[PREDICTED], clips, config, rng)
@@ -219,10 +240,12 @@ def _plain(value):
 
 @dataclass(frozen=True)
 class _Truth:
-    """Of the recording, [n, T]: PSNR of the last context frame against each later one, and gradient energy."""
+    """Of the recording, [n, T]: PSNR of the last context frame against each later one, and gradient energy; features
+    of the frames at the horizons [n, K, D], or None where looks are not compared."""
 
     copy_last: torch.Tensor
     energy: torch.Tensor
+    features: torch.Tensor | None
 
 
 def _seed(rng: torch.Generator) -> int:
@@ -246,15 +269,18 @@ def _describe(place: str, clips: Sequence[Clip]) -> Place:
     return Place(place, len(clips), moving, clips[0].context, clips[0].horizon)
 
 
-def _truth(clips: Sequence[Clip], steps: int) -> _Truth:
-    context = clips[0].context
+def _truth(clips: Sequence[Clip], config: ScoreConfig) -> _Truth:
+    context, steps = clips[0].context, max(config.horizons)
     copied, energy = [], []
     last = frames_at(clips, context - 1)
     for step in range(steps):
         frames = frames_at(clips, context + step)
         copied.append(psnr(last, frames))
         energy.append(gradient_energy(frames))
-    return _Truth(torch.stack(copied, 1), torch.stack(energy, 1))
+    features = None
+    if config.frechet and min(clips[0].rgb.shape[1:3]) >= MIN_SIDE:
+        features = torch.stack([frame_features(frames_at(clips, context - 1 + step)) for step in config.horizons], 1)
+    return _Truth(torch.stack(copied, 1), torch.stack(energy, 1), features)
 
 
 def _dream_all(world: World, clips, motion: str, horizons, batch: int, seed: int, others=None) -> Dream:
@@ -278,7 +304,19 @@ def _add_copy_last(card: Scorecard, place: str, truth: _Truth, rng: torch.Genera
     card.curves.append(Curve("psnr", place, COPY_LAST, "", mean_band(truth.copy_last, rng)))
 
 
+def _add_looks(card: Scorecard, place: str, clips: Sequence[Clip], truth: _Truth, config: ScoreConfig) -> None:
+    if truth.features is None:
+        return
+    context = clips[0].context
+    last = frame_features(frames_at(clips, context - 1))
+    for number, step in enumerate(config.horizons):
+        soft = frame_features(blurred(frames_at(clips, context - 1 + step)))
+        figures = [frechet_interval(truth.features[:, number], seen) for seen in (last, soft)]
+        card.looks.append(Looks(place, step, step * card.dt_s, *figures))
+
+
 def _add_fidelity(card, place, arm, motion, dreamt: Dream, truth: _Truth, config: ScoreConfig, rng) -> None:
+    seen = None if truth.features is None else frame_features(dreamt.frames)
     for number, step in enumerate(config.horizons):
         at = step - 1
         card.fidelity.append(
@@ -293,6 +331,7 @@ def _add_fidelity(card, place, arm, motion, dreamt: Dream, truth: _Truth, config
                 copy_last=mean_interval(truth.copy_last[:, at], rng),
                 gain=mean_interval(dreamt.psnr[:, at] - truth.copy_last[:, at], rng),
                 sharpness=ratio_interval(dreamt.energy[:, at], truth.energy[:, at], rng),
+                frechet=None if seen is None else frechet_interval(truth.features[:, number], seen[:, number]),
             )
         )
     first, last = config.drop

@@ -89,6 +89,8 @@ def _swapped(found: Survey, features: dict[str, dict], forms: list[pa.Schema], s
     """Takes away what no table and no video has; where something is missed, what they have beside it is taken in."""
     columns = {name for form in forms for name in form.names}
     cameras = {camera for file in found.films if (camera := camera_of(file, found.video_path))}
+    if not forms and not cameras:
+        return  # there is no episode yet: what is promised may still come
     lost = [name for name, feature in features.items() if feature["dtype"] == "video" and name not in cameras]
     if forms:
         lost += [name for name, feature in features.items() if feature["dtype"] != "video" and name not in columns]

@@ -16,7 +16,7 @@ from .. import stats
 from ..dataset import decoded
 from ..episodes import Film
 from ..format import ACTION_VALID, AUTOMATIC, INFO, STREAM_PATH, TIME, Layout, fill, schema, sensors_of, tidy, where
-from ..source import Sensor, follows
+from ..source import Sensor, follows, is_action
 from ..staged import LOG, Staged
 from ..storage import durable, mp4
 from ..storage.films import Reel, cut, reel, whole_frames
@@ -103,6 +103,10 @@ class _Mender:
             self._summarise(pieces)
             self._recover()
             self.writer.tidy(0)
+            if not self.writer.episodes:
+                raise DatasetError(
+                    f"nothing of {found.root} could be kept: {'; '.join(self.said) or 'it has no rows'}."
+                )
         finally:
             self.writer.close()
             for folder in (self.writer.staging, self.out / _REBUILT, self.out / _INTERRUPTED):
@@ -312,6 +316,11 @@ class _Mender:
             for name, count in known.items()
             if name in self.features
         }
+        if told is not None and piece.frame + piece.count < told.length and ACTION_VALID in self.features:
+            reader = RowReader({ACTION_VALID: self.features[ACTION_VALID]})  # what comes after its last row is gone
+            acted = np.flatnonzero(np.concatenate([part[ACTION_VALID].reshape(-1) for part in reader.columns(piece)]))
+            last = int(acted[-1]) + 1 if len(acted) else 0
+            kept |= {name: min(kept.get(name, last), last) for name in self.features if is_action(name)}
         return {name: count for name, count in kept.items() if count != piece.count}
 
     def _rows(self, piece: Piece, shift: float) -> Iterator[dict[str, np.ndarray]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +52,7 @@ def write(
     Sensors whose clocks are not the rows' are kept twice: resampled in the rows, where every LeRobot reader finds them,
     and with their true times as streams; points are streams alone. `progress(takes, 0)` is called after each take.
     """
-    root = Path(root)
+    root = Path(os.path.abspath(root))
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise DatasetError(f"{root} is not empty; convert into a new folder.")
     first = next(iter(source.takes()), None)
@@ -58,8 +60,12 @@ def write(
         raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
     lead = _lead(source, first, rows)
     layout, notes = _layout(source, first, lead, rows)
-    staged = root.with_name(f".{root.name}.new")
-    shutil.rmtree(staged, ignore_errors=True)
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        staged = Path(tempfile.mkdtemp(prefix=f".{root.name}.", dir=root.parent))
+        staged.chmod(0o755)
+    except OSError as error:
+        raise DatasetError(f"{root} cannot be written ({error}); choose another place.") from error
     try:
         notes += _write(source, layout, staged, lead, rows, progress)
         if root.exists():

@@ -1,0 +1,112 @@
+"""The Frechet distance between two sets of frames, in the features of the fixed encoder: blur cannot win here.
+
+Two Gaussians are fitted to the features of real and of dreamt frames, and their 2-Wasserstein distance, squared, is
+    |m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2))          (Dowson and Landau 1982; "FID" where the features are Inception's).
+
+What it means: 0 where the dreams look like the game as a set; it rises with blur, noise, wrong colours, blocks, ghosts,
+missing and made-up things, and does not care which dream belongs to which frame. What it does not: it is not the FID of
+papers (another encoder), figures at other frame sizes do not compare, it sees only means and covariances, it cannot tell a
+right frame from a wrong one that looks as real (PSNR does), and a set that lacks variety shows only through its spread.
+
+Finite samples: the plain figure is too large by about C / n. Both sets here have equally many frames, in groups (clips)
+that are left out one at a time, from both sets at once: the jackknife (Quenouille 1956, Tukey 1958) takes the 1/n term
+away and gives the interval. A corrected figure may fall a little below 0 where the sets are alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from .statistics import Figure
+
+_LEAST_GROUPS = 8  # with fewer the jackknife's interval means little
+
+
+def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
+    """Squared Frechet distance of features [..., n, D] and [..., m, D]: float64 [...], as it stands, never below 0.
+
+    Unbiased covariances; no matrix is inverted, so sets smaller than D are allowed (but see the bias above).
+    """
+    _check(real, dreamt)
+    real, dreamt = real.double(), dreamt.double()
+    return frechet_of_moments(*_moments(real), *_moments(dreamt))
+
+
+def frechet_of_moments(
+    mean_a: torch.Tensor, cov_a: torch.Tensor, mean_b: torch.Tensor, cov_b: torch.Tensor
+) -> torch.Tensor:
+    """The same of means [..., D] and covariances [..., D, D].
+
+    tr (S1 S2)^(1/2) is the sum of the singular values of S1^(1/2) S2^(1/2): symmetric roots by eigenvalues, those that
+    rounding made negative set to 0. Squaring first and rooting after, as is usual, would lose half of the digits.
+    """
+    cross = torch.linalg.svdvals(_root(cov_a) @ _root(cov_b)).sum(-1)
+    traces = torch.diagonal(cov_a + cov_b, dim1=-2, dim2=-1).sum(-1)
+    return ((mean_a - mean_b).square().sum(-1) + traces - 2 * cross).clamp_min(0)
+
+
+def frechet_interval(
+    real: torch.Tensor, dreamt: torch.Tensor, groups: torch.Tensor | None = None, seed: int = 0
+) -> Figure:
+    """The distance with its 1/n bias taken off, and a 95% interval, of features [n, D] of as many real as dreamt frames.
+
+    groups: long [n], the clip of each row (in both sets), so that frames of one clip leave together; each row by itself
+    where None. At most 50 are left out one after another: more are joined at random by `seed`. Figure.count is the
+    number of frames. NaN where there are fewer than two groups; without an interval below eight.
+    """
+    _check(real, dreamt)
+    if len(real) != len(dreamt):
+        raise ValueError(f"only equally many frames compare fairly; got {len(real)} real and {len(dreamt)} dreamt.")
+    mine = _joined(torch.arange(len(real)) if groups is None else groups, seed)
+    count = int(mine.max()) + 1 if len(mine) else 0
+    if count < 2 or len(real) - int(mine.bincount().max()) < 2:
+        return Figure(math.nan, math.nan, math.nan, len(real))
+    whole = frechet(real, dreamt)
+    left = torch.stack([frechet(real[mine != group], dreamt[mine != group]) for group in range(count)])
+    value = float(count * whole - (count - 1) * left.mean())
+    if count < _LEAST_GROUPS:
+        return Figure(value, math.nan, math.nan, len(real))
+    deviation = float(((count - 1) / count * (left - left.mean()).square().sum()).sqrt())
+    return Figure(value, value - 1.96 * deviation, value + 1.96 * deviation, len(real))
+
+
+def clip_features(features: torch.Tensor) -> torch.Tensor:
+    """Features of short clips from those of their frames: [N, T, D] -> [N, 2 D], T at least 2.
+
+    The mean over the clip, and the root mean square of the steps from frame to frame: flicker makes those too large, a
+    film that stands still too small, and neither can be seen in single frames.
+    """
+    if features.ndim != 3 or features.shape[1] < 2:
+        raise ValueError(f"clips are features [N, T, D] with T at least 2; got {tuple(features.shape)}.")
+    return torch.cat([features.mean(1), features.diff(dim=1).square().mean(1).sqrt()], 1)
+
+
+def _moments(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    mean = features.mean(-2)
+    away = features - mean[..., None, :]
+    return mean, away.mT @ away / (features.shape[-2] - 1)
+
+
+def _root(matrix: torch.Tensor) -> torch.Tensor:
+    values, vectors = torch.linalg.eigh(matrix)
+    return (vectors * values.clamp_min(0).sqrt()[..., None, :]) @ vectors.mT
+
+
+def _joined(groups: torch.Tensor, seed: int, most: int = 50) -> torch.Tensor:
+    """Groups numbered from 0 without gaps, at most `most` of them."""
+    _, number = torch.unique(groups, return_inverse=True)
+    count = int(number.max()) + 1 if len(number) else 0
+    if count <= most:
+        return number
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    return order[number] % most
+
+
+def _check(real: torch.Tensor, dreamt: torch.Tensor) -> None:
+    if real.shape[-1] != dreamt.shape[-1] or min(real.shape[-2], dreamt.shape[-2]) < 2:
+        shapes = f"{tuple(real.shape)} and {tuple(dreamt.shape)}"
+        raise ValueError(f"a distance needs features [n, D] of at least two frames on either side; got {shapes}.")
+    if not (real.isfinite().all() and dreamt.isfinite().all()):
+        raise ValueError("features hold numbers that are not finite; the frames' encoder is broken.")

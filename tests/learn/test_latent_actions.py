@@ -1,0 +1,183 @@
+"""Latent actions in a place whose four moves are known: found without labels, mapped to keys, written as actions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from terrella.core.errors import DatasetError, TrainingError
+from terrella.data import ClipCache, Dataset, Layout, Recorder, open_source
+from terrella.learn import latent_actions as module
+from terrella.learn.latent_actions import LatentConfig, load_latent, posterior, train_latent_actions
+from terrella.learn.latent_codes import agreement, examine_latent, label, map_keys, shown_shift
+from terrella.learn.latent_model import Forward, warped
+
+CONFIG = LatentConfig(codes=4, stride=1, size=(32, 32), steps=100, batch=8, strip_every_s=1e9)
+MOVES = {"up": (-2, 0), "down": (2, 0), "left": (0, -2), "right": (0, 2)}
+
+
+def quiet(done, total, words=""):
+    pass
+
+
+def scrolling(folder, acted=True, episodes=4, length=120):
+    """A smooth random picture that one of four keys scrolls by two pixels."""
+    rng = np.random.default_rng(0)
+    coarse = torch.from_numpy(rng.random((1, 3, 16, 16), np.float32))
+    wide = torch.nn.functional.interpolate(coarse.repeat(1, 1, 3, 3), (192, 192), mode="bicubic")[0, :, 64:128, 64:128]
+    picture = (wide.clamp(0, 1) * 255).to(torch.uint8).permute(1, 2, 0).numpy()
+    sensors = Layout.of_channels(10.0, tuple(MOVES), rgb=(32, 32)).sensors
+    kept = {name: sensor for name, sensor in sensors.items() if acted or name != "action"}
+    layout = Layout(10.0, kept, pictures="png", world={"name": "scroll"})
+    with Recorder(folder, layout) as recorder:
+        for _ in range(episodes):
+            at = rng.integers(0, 64, 2)
+            moves = rng.integers(4, size=length).repeat(4)
+            for row, move in enumerate(moves[:length].tolist()):
+                seen = np.roll(picture, (-at[0], -at[1]), (0, 1))[:32, :32]
+                recorder.add({"rgb": seen}, np.eye(4)[move] if acted and row < length - 1 else None, 0.0, False)
+                at = at + list(MOVES.values())[move]
+            recorder.end_episode()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return scrolling(tmp_path_factory.mktemp("latent") / "set")
+
+
+@pytest.fixture(scope="module")
+def run(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    train_latent_actions(recording, out, CONFIG, quiet)
+    return out
+
+
+def test_four_moves_are_found_without_labels(recording, run):
+    found = examine_latent(run, recording, quiet)
+    assert found["actions"]["purity"] > 0.9 and found["actions"]["information"] > 0.8, found
+    assert found["actions"]["commonest"] < 0.5, "else purity would say little"
+    assert found["psnr_db"]["difference"] > 2 and found["psnr_db"]["interval"][0] > 2
+    for name in ("drawn_px", "seen_px"):
+        flows = sorted((np.round(np.array(code[name]) / 2).astype(int) + 0).tolist() for code in found["codes"])
+        assert flows == [[-1, 0], [0, -1], [0, 1], [1, 0]], "the picture moves by two pixels in each direction"
+    assert all(code["agreement"] > 0.9 for code in found["codes"])
+    assert list(run.glob(f"strip-{CONFIG.steps:06d}.png"))
+
+
+def test_keys_are_mapped_by_a_few_labelled_frames(recording, run):
+    keys = map_keys(run, recording, quiet, frames=60)
+    assert keys.accuracy > 0.9 and keys.commonest < 0.5 and keys.used == 60
+    assert set(keys.pairs) == {tuple(np.eye(4)[i]) for i in range(4)}
+    for action, code in keys.pairs.items():
+        assert tuple(keys.actions[code]) == action
+    assert keys.code_of(np.array([1, 1, 1, 1])) is None
+    only = map_keys(run, recording, quiet, frames=60, names=("left", "right"))
+    assert only.accuracy > 0.9 and only.actions.shape == (4, 2)
+
+
+def test_a_labelled_copy_has_codes_for_actions(recording, run, tmp_path):
+    told = label(run, recording, tmp_path / "copy", quiet)
+    copy, original = Dataset(tmp_path / "copy"), Dataset(recording)
+    assert told["frames"] == copy.length == original.length
+    codes = [code for code in range(4) if code + 1 != told["still"]]
+    assert copy.action_names == tuple(f"code_{code + 1}" for code in codes), (
+        "while no key is held, the stillest happens"
+    )
+    assert copy.world["keys"] == {f"Digit{code + 1}": np.eye(3)[at].tolist() for at, code in enumerate(codes)}
+    for number in range(len(original.episodes)):
+        new, old = copy.episode(number), original.episode(number)
+        assert np.array_equal(new["rgb"], old["rgb"])
+        assert set(new["action"].sum(1)) <= {0, 1} and np.array_equal(new["action_valid"], old["action_valid"])
+        assert agreement(old["action"][:-1], (new["action"][:-1] @ [1, 2, 3]).astype(int))["purity"] > 0.9
+    assert set(open_source(tmp_path / "copy").sensors) == set(open_source(recording).sensors)
+
+
+def test_pictures_alone_are_enough(run, tmp_path):
+    silent = scrolling(tmp_path / "set", False, episodes=2, length=40)
+    assert ClipCache.open(silent, (32, 32)).action is None
+    assert "actions" not in examine_latent(run, silent, quiet)
+    assert Dataset(label(run, silent, tmp_path / "copy", quiet)["dataset"]).episode(0)["action"].shape == (40, 3)
+    with pytest.raises(DatasetError, match="no recorded actions"):
+        map_keys(run, silent, quiet)
+
+
+def test_a_stopped_run_goes_on_exactly(recording, tmp_path, monkeypatch):
+    config = replace(CONFIG, steps=4, batch=4)
+    train_latent_actions(recording, tmp_path / "whole", config, quiet)
+
+    class Stop(Exception):
+        pass
+
+    original = module._Run._step
+
+    def stopping(self, step):
+        if step == 2:
+            raise Stop
+        return original(self, step)
+
+    monkeypatch.setattr(module._Run, "_step", stopping)
+    with pytest.raises(Stop):
+        train_latent_actions(recording, tmp_path / "cut", replace(config, save_every_s=-1.0), quiet)
+    monkeypatch.setattr(module._Run, "_step", original)
+    train_latent_actions(recording, tmp_path / "cut", config, quiet)
+    whole, cut = (load_file(tmp_path / name / "resume.safetensors") for name in ("whole", "cut"))
+    assert whole.keys() == cut.keys() and all(torch.equal(whole[name], cut[name]) for name in whole)
+    with pytest.raises(TrainingError, match="other settings"):
+        train_latent_actions(recording, tmp_path / "cut", replace(config, codes=5), quiet)
+
+
+def test_bad_input_is_refused_in_one_sentence(recording, run, tmp_path):
+    for wrong in ({"size": (30, 32)}, {"codes": 1}, {"stride": 0}):
+        with pytest.raises(TrainingError):
+            train_latent_actions(recording, tmp_path / "run", replace(CONFIG, **wrong), quiet)
+    with pytest.raises(DatasetError, match="smaller --stride"):
+        train_latent_actions(recording, tmp_path / "run", replace(CONFIG, stride=119), quiet)
+    with pytest.raises(TrainingError, match="no run"):
+        load_latent(tmp_path)
+    with pytest.raises(DatasetError, match="ask for fewer"):
+        map_keys(run, recording, quiet, frames=100_000)
+    with pytest.raises(DatasetError, match="no action 'fire'"):
+        map_keys(run, recording, quiet, names=("fire",))
+    with pytest.raises(DatasetError, match="not empty"):
+        label(run, recording, recording, quiet)
+    with Recorder(tmp_path / "blind", Layout.of_channels(10.0, ("a",), pose=True)) as recorder:
+        for _ in range(3):
+            recorder.add({"pose": np.eye(7, dtype=np.float32)[3]}, np.zeros(1))
+    with pytest.raises(DatasetError, match="no pictures"):
+        train_latent_actions(tmp_path / "blind", tmp_path / "run", CONFIG, quiet)
+
+
+def test_warping_reads_where_the_flow_points():
+    frame = torch.rand(1, 3, 8, 8)
+    flow = torch.zeros(1, 2, 8, 8)
+    assert torch.allclose(warped(frame, flow), frame, atol=1e-6)
+    flow[:, 0], flow[:, 1] = 2, -1
+    assert torch.allclose(warped(frame, flow)[..., 1:, :6], frame[..., :-1, 2:], atol=1e-5)
+
+
+def test_a_shift_of_the_picture_is_seen():
+    picture = torch.rand(1, 3, 48, 80)
+    views = [picture[..., 4 + y : 36 + y, 8 + x : 72 + x] for x, y in ((0, 0), (3, -2), (-8, 0))]
+    assert shown_shift(torch.cat(views[:1] * 3), torch.cat(views)).tolist() == [[0, 0], [-3, 2], [8, 0]]
+
+
+def test_half_size_errors_agree_with_whole_outcomes():
+    torch.manual_seed(0)
+    model, before = Forward(4), torch.rand(2, 3, 32, 32)
+    for code in range(4):
+        after = model(before, torch.eye(4)[[code, code]])
+        errors = model.errors(model.features(before), before, after)
+        assert (errors.argmin(1) == code).all()
+
+
+def test_the_posterior_is_even_at_first_and_sharp_at_last():
+    errors = torch.rand(64, 4) * 0.01 + torch.tensor([0.1, 0.2, 0.2, 0.2])
+    early, late = posterior(errors, 0.0), posterior(errors, 1.0)
+    assert early.sum(0).max() / early.sum(0).min() < 5
+    assert (late.argmax(1) == 0).all() and (late.max(1).values > 0.99).all()
+    assert torch.allclose(early.sum(1), torch.ones(64), atol=1e-5)
