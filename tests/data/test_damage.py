@@ -150,14 +150,10 @@ def test_flipped_bits_never_crash_and_a_repair_keeps_the_other_episodes(folder):
 @pytest.mark.skipif(
     not WHOLE, reason="an hour: set TERRELLA_DAMAGE=all to cut every file at every offset and flip thousands of bits"
 )
-def test_the_whole_sweep(folder):
-    flips = _flips(folder, 3000, 1, 3)
-    cuts = _cuts(folder, 1, 16, 32)
-    results = _run(folder, flips)
-    print("\nflipped bits: " + _report(flips, results), flush=True)
-    for case, result in zip(flips, results):
-        _judge(case, result)
-    results = _run(folder, cuts)
-    print("cuts: " + _report(cuts, results), flush=True)
-    for case, result in zip(cuts, results):
+@pytest.mark.parametrize("kind", ["flips", "cuts"])
+def test_the_whole_sweep(folder, kind):
+    cases = _flips(folder, 3000, 1, 3) if kind == "flips" else _cuts(folder, 1, 16, 32)
+    results = _run(folder, cases)
+    print(f"\n{kind}: {_report(cases, results)}", flush=True)
+    for case, result in zip(cases, results):
         _judge(case, result)

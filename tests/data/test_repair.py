@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -343,6 +344,23 @@ def test_a_cut_stream_costs_the_stream_alone(interrupted, tmp_path):
     assert len(mended.readings(1, LIDAR).time_s) == 0 and len(mended.readings(0, LIDAR).time_s) == 25
     assert 0 < len(mended.readings(0, SIDE).time_s) < 7
     assert any(LIDAR in sentence for sentence in said)
+
+
+def test_a_spoilt_picture_of_a_stream_cuts_its_film_there(interrupted, tmp_path):
+    shutil.rmtree(interrupted / ".staging")
+    film = interrupted / f"streams/{SIDE}/chunk-000/file-000.mp4"
+    with av.open(str(film)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    raw = bytearray(film.read_bytes())
+    at, size = packets[3]
+    raw[at : at + size] = b"\xff" * size
+    film.write_bytes(raw)
+    repair(interrupted, tmp_path / "out")
+    mended = Dataset(tmp_path / "out")
+    assert [episode.length for episode in mended.episodes] == [25, 20] and doctor(tmp_path / "out") == []
+    kept = mended.readings(0, SIDE)
+    assert len(kept.time_s) == 3 and len(list(kept.values)) == 3
+    assert len(mended.readings(1, SIDE).time_s) == 5
 
 
 def test_streams_are_declared_anew_from_their_tables(interrupted, tmp_path):

@@ -394,16 +394,17 @@ class _Mender:
         return streams, films
 
     def _stream_film(self, name: str, sensor: Sensor, film: str, wanted: np.ndarray) -> np.ndarray:
-        """Cuts the wanted frames out of a stream's film; returns those of them that could be had."""
+        """Cuts the wanted frames out of a stream's film, up to the first that is damaged; returns which they are."""
         rate, path = sensor.rate_hz or self.found.fps, self.found.path(film)
         opened = reel(path, rate)
-        there = wanted[wanted < opened.count]
-        if not len(there):
-            return there
-        cut(
-            path, int(there[0]), int(there[-1] - there[0]) + 1, rate, self.writer.staging / f"stream-{name}.mp4", opened
-        )
-        return np.arange(there[0], there[-1] + 1)
+        good = np.append(whole_frames(path, 0, opened.count, rate), False)
+        follows_on = np.diff(wanted, prepend=wanted[:1] - 1) == 1
+        bad = np.flatnonzero(~(good[wanted.clip(max=opened.count)] & follows_on))
+        there = wanted[: bad[0]] if len(bad) else wanted
+        if len(there):
+            target = self.writer.staging / f"stream-{name}.mp4"
+            cut(path, int(there[0]), len(there), rate, target, opened)
+        return there
 
     # -- what is left -------------------------------------------------------------------------------------------
 
