@@ -140,6 +140,8 @@ def test_what_does_not_fit_is_refused_and_leaves_the_recording_whole(tmp_path):
     recorder.add({"pose": np.ones(7)})
     recorder.close()
     assert Dataset(tmp_path).episode(0)["pose"].tolist() == [[0.0] * 7, [1.0] * 7]
+    with pytest.raises(DatasetError, match="rows a second"):
+        Recorder(tmp_path / "slow", Layout.of_channels(3e-5, ("go",), pose=True))
     with pytest.raises(DatasetError, match="even"):
         Recorder(tmp_path / "odd", Layout.of_channels(10, ("go",), rgb=(15, 16)))
 

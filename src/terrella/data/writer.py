@@ -87,6 +87,8 @@ class Writer:
 
     def __init__(self, root: str | Path, layout: Layout):
         self.root, self.layout = Path(root), layout
+        if not 0.001 <= layout.fps <= 100_000:
+            raise DatasetError(f"{layout.fps} rows a second are none that a video can have; give 0.001 to 100,000.")
         self.features = layout.features()
         self.schema = schema(self.features)
         self.staging = self.root / ".staging"
