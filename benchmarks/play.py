@@ -1,6 +1,7 @@
 """Plays a world through the real server and a real browser, and prints what a player gets; beside DIAMOND if asked.
 
     python benchmarks/play.py doom-maze --minutes 10 --diamond ~/diamond
+    python benchmarks/play.py doom-maze --minutes 60 --fast
 
 DIAMOND (https://github.com/eloialonso/diamond) is imported from the user's own checkout: its Atari denoiser with its
 published configuration (64x64, 3 denoising steps), random weights, which cost the same as trained ones.
@@ -29,7 +30,8 @@ FLAGS += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else [
 SERVER = """
 import sys, terrella
 from terrella.serve import serve
-serve([terrella.load(sys.argv[1])], port=0, on_ready=lambda address: print(address, flush=True))
+options = {"fast": True} if sys.argv[2:] == ["fast"] else {}
+serve([terrella.load(sys.argv[1], **options)], port=0, on_ready=lambda address: print(address, flush=True))
 """
 
 OURS = """
@@ -78,6 +80,7 @@ def main(
     world: Annotated[str, tyro.conf.Positional] = "doom-maze",
     minutes: float = 1.0,
     diamond: Path | None = None,
+    fast: bool = False,
     json: bool = False,
 ) -> None:
     """Measure play: delivered frames, key-to-frame latency, drift of the frame time, memory, time to the first frame.
@@ -86,15 +89,16 @@ def main(
         world: What `terrella list` shows, or the path of a checkpoint.
         minutes: How long to play.
         diamond: A checkout of DIAMOND, to time its denoiser in the same run.
+        fast: Play as `terrella play --fast` does (DIAMOND is set against eager torch all the same).
         json: Print one JSON document instead of lines.
     """
-    result = play(world, minutes)
+    result = play(world, minutes, fast)
     if diamond is not None:
         result["beside_diamond"] = beside_diamond(world, diamond)
     print(jsonlib.dumps(result, indent=1) if json else report(result))
 
 
-def play(world: str, minutes: float) -> dict:
+def play(world: str, minutes: float, fast: bool = False) -> dict:
     """Drives headless Chromium with keys for `minutes`; figures of what was painted on its canvas."""
     from playwright.sync_api import sync_playwright
 
@@ -103,7 +107,7 @@ def play(world: str, minutes: float) -> dict:
         browser = playwright.chromium.launch(executable_path=found, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         begun = time.monotonic()
-        with serving(world) as (process, address):
+        with serving(world, fast) as (process, address):
             page.goto(address)
             while not page.evaluate("!!window.terrella && terrella.painted > 0"):
                 if time.monotonic() - begun > 120 or page.evaluate("window.terrella?.state === 'refused'"):
@@ -118,8 +122,9 @@ def play(world: str, minutes: float) -> dict:
 
 
 @contextlib.contextmanager
-def serving(world: str):
-    process = subprocess.Popen([sys.executable, "-c", SERVER, world], stdout=subprocess.PIPE, text=True)
+def serving(world: str, fast: bool):
+    given = [sys.executable, "-c", SERVER, world, *(["fast"] if fast else [])]
+    process = subprocess.Popen(given, stdout=subprocess.PIPE, text=True)
     try:
         address = process.stdout.readline().strip() if process.stdout else ""
         if not address:

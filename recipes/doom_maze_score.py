@@ -36,6 +36,7 @@ from terrella.worlds.video import VideoWorld, encode_depth, merge
 
 ARMS = ("memory", "no memory", "no network")
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
+DRIFT, DRIFT_CLIPS = 256, 24
 
 
 def exam(arm: str, name: str, data: str, count: int) -> Scorecard:
@@ -43,13 +44,15 @@ def exam(arm: str, name: str, data: str, count: int) -> Scorecard:
     torch.set_num_threads(1)
     world, rng = load(arm, name), terrella.make_rng(0)
     clips, cache = places(world, data, count, rng)
+    long, _ = places(world, data, DRIFT_CLIPS, terrella.make_rng(1), DRIFT)
     scoring = ScoreConfig(horizons=HORIZONS, control_horizons=(8, 32))
-    config = ExamConfig(score=scoring, closure_clips=24, closure_deg=(180.0,), closure_step_deg=6.0)
+    config = ExamConfig(score=scoring, closure_clips=24, closure_step_deg=6.0)
+    closing = {"last frame only": world.with_memory_of(0)} if arm == "no memory" else None
 
     def tell(share: float, words: str) -> None:
         print(f"{arm}: {share:.0%} {words}", file=sys.stderr, flush=True)
 
-    return examine({arm: world}, clips, rng, config, Album.of_cache(cache), tell)
+    return examine({arm: world}, clips, rng, config, Album.of_cache(cache), tell, long, closing)
 
 
 class Average(torch.nn.Module):
@@ -71,11 +74,11 @@ def load(arm: str, name: str):
     return VideoWorld(world.spec, world.config, Average(), world.motion, world.memory, world.starts, world.rewards)
 
 
-def places(world, data: str, count: int, rng):
-    """Clips of the places that training saw, and of those that it never did."""
+def places(world, data: str, count: int, rng, steps: int = max(HORIZONS)):
+    """Clips of `steps` steps of the places that training saw, and of those that it never did."""
     cache = ClipCache.open(data, world.spec.channels["rgb"].shape[:2])
     box, every = world.spec.card["keep_out"], range(len(cache.episodes))
-    asked = (cache, every, CONTEXT, max(HORIZONS), count, rng)
+    asked = (cache, every, CONTEXT, steps, count, rng)
     return {
         "recorded": clips_from_cache(*asked, out_of_sight(*box)),
         "new": clips_from_cache(*asked, in_box(*box)),

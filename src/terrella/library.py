@@ -11,6 +11,7 @@ from typing import Any
 
 from .core.errors import CheckpointError, TerrellaError
 from .core.world import World
+from .space.eye import Eye
 
 BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
@@ -28,27 +29,44 @@ class Entry:
         return asdict(self)
 
 
-def load(name: str | Path, **options: Any) -> World:
+def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = None, **options: Any) -> World:
     """Opens a world.
 
     name:    a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment
              ("gym:CartPole-v1"), or the path of a checkpoint folder or of a training run.
-    options: for a learned world what its `load` takes (memory=False, device="cuda"), for the game the fields of
+    options: for a learned world what its `load` takes (memory=False, device="cuda") and fast=True (ONNX Runtime or a
+             compiled graph where that is faster here: worlds/fast.py), for the game the fields of
              DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
+    remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
+             `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
+    if remember:
+        from .space import remembering
+
+        return remembering.remember(load(name, **options), eye=None if eye is None else open_eye(eye))
+    if eye is not None:
+        raise TerrellaError("an eye is for remembering: ask for that too, or leave the eye out.")
     text = str(name)
     if text == "doom" or text.startswith("doom:"):
         return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
+    if text.startswith("gym:ALE/"):
+        return _open_atari(text.partition(":")[2], options)
     if text.startswith("gym:"):
         from .sim.gymnasium import GymnasiumWorld
 
         return GymnasiumWorld(text.partition(":")[2], **options)
+    return _open_checkpoint(folder_of(name), options)
+
+
+def folder_of(name: str | Path) -> Path:
+    """The folder of a learned world: a bundled one by its name, a checkpoint, or that in the folder of a training run."""
+    text = str(name)
     if (BUNDLED / text / "world.json").is_file():
-        return _open_checkpoint(BUNDLED / text, options)
+        return BUNDLED / text
     if Path(text).exists():
         run = Path(text) / "world"  # where `terrella train` leaves the world of a run
-        return _open_checkpoint(run if (run / "world.json").is_file() else Path(text), options)
+        return run if (run / "world.json").is_file() else Path(text)
     bundled = ", ".join(sorted(_bundled())) or "none"
     raise TerrellaError(
         f"There is no world '{text}': bundled are {bundled}; the real game is {GAME}, an environment gym:CartPole-v1; "
@@ -100,8 +118,33 @@ def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     if kind == "video":
         from .worlds.folder import load_world
 
-        return load_world(folder, **options)
+        world = load_world(folder, **{name: value for name, value in options.items() if name != "fast"})
+        if options.get("fast"):
+            from .worlds.fast import quicken
+
+            quicken(world)
+        return world
     raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
+
+
+def open_eye(source: str | Path) -> Eye:
+    """The eye in a file that `terrella train eye` wrote, or of a world that has one."""
+    from .space.eye import Eye, load_eye
+
+    if Path(source).is_file():
+        return load_eye(source)
+    eye = getattr(load(source), "eye", None)
+    if not isinstance(eye, Eye):
+        raise TerrellaError(f"{source} has no eye; give a file that `terrella train eye` wrote.")
+    return eye
+
+
+def _open_atari(game: str, options: Mapping[str, Any]) -> World:
+    if not find_spec("ale_py"):
+        raise TerrellaError("Atari games need ale-py, which is not installed: pip install 'terrella[atari]'.")
+    from .sim.atari import AtariWorld
+
+    return AtariWorld(game, **options)
 
 
 def _open_doom(scenario: str, options: Mapping[str, Any]) -> World:

@@ -14,10 +14,10 @@ from terrella.cli import main
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed",
-    "record world": "--frames --human --json --live-mcap --out --port --seed",
-    "play": "--compare --device --host --json --no-memory --port --record --seed --token --truth",
-    "score": "--clips --data --device --fresh --horizons --json --long-steps --new --out --seed",
+    "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
+    "record world": "--frames --human --json --live-mcap --out --pictures --port --seed --size",
+    "play": "--compare --device --eye --fast --host --image --json --no-memory --port --record --remember --seed --token --truth",
+    "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
     "data doctor": "--json --out --repair",
     "data convert": "--episodes --fps --json --pictures --policy --seed --to",

@@ -73,6 +73,19 @@ def test_score_says_what_it_found(recording, tmp_path, monkeypatch, capsys):
     assert "scorecard.html" in capsys.readouterr().out
 
 
+def test_drift_is_measured_as_far_as_it_is_asked_for(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(library, "load", lambda name, **options: Still())
+    assert main([*arguments(recording, tmp_path / "out"), "--json"]) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["drifts"] == [] and "no clip of 256 steps fits" in shown.err
+    assert main([*arguments(recording, tmp_path / "out"), "--drift", "20", "--json"]) == 0
+    drifts = json.loads(capsys.readouterr().out)["drifts"]
+    assert [(row["arm"], row["steps"]) for row in drifts] == [("copy last", 20), ("history", 20)]
+    assert drifts[0]["psnr"]["value"] == drifts[1]["psnr"]["value"], "it stands still as well"
+    assert main([*arguments(recording, tmp_path / "out"), "--drift", "60"]) == 2
+    assert "no window of 70 rows" in capsys.readouterr().err
+
+
 def test_a_recording_made_afterwards_is_used_whole(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
     count = []

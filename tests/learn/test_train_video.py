@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from safetensors import safe_open
 from safetensors.torch import load_file
 from tests.data.corridor import Corridor
@@ -22,7 +23,10 @@ from terrella.space.keyframes import Glimpse
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.video import mood
 
-CONFIG = TrainConfig(size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9)
+CONFIG = TrainConfig(
+    size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, eye_steps=0,
+    doubt_frames=0,
+)  # fmt: skip
 
 
 def quiet(done, total, words=""):
@@ -40,7 +44,7 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    return out, train_video(recording, out, CONFIG, quiet)
+    return out, train_video(recording, out, replace(CONFIG, eye_steps=4, doubt_frames=60), quiet)
 
 
 def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
@@ -48,7 +52,7 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
     assert facts["step"] == 4
     for memory in (True, False):
         world = load_world(out / "world", memory=memory)
-        assert (len(world.memory) > 0) == memory
+        assert (len(world.memory) > 0) == memory and world.eye is not None and "uncertainty" in world.spec.channels
         assert "observes" in check_world(world)
     assert list(out.glob("strip-*.png"))
 
@@ -195,13 +199,21 @@ def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
     assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
 
 
-def test_actions_that_are_no_buttons_are_refused(tmp_path):
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("steer",), rgb=(24, 32))) as recorder:
-        for step in range(80):
-            picture = np.full((24, 32, 3), 40 + step, np.uint8)
-            recorder.add({"rgb": picture}, np.array([0.37]) if step < 79 else None, 0.0, False)
+def test_axes_are_learned_from_pictures_and_refused_beside_poses(tmp_path):
+    for name, posed in (("flat", False), ("posed", True)):
+        layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
+        layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
+        with Recorder(tmp_path / name, layout) as recorder:
+            for step in range(80):
+                seen = {"rgb": np.full((24, 32, 3), 40 + step, np.uint8)}
+                if posed:
+                    seen |= {"depth": np.ones((24, 32)), "pose": np.array([0, 0, 0, 1, 0, 0, 0])}
+                recorder.add(seen, np.array([0.37 - step / 50]) if step < 79 else None, 0.0, False)
+    train_video(tmp_path / "flat", tmp_path / "run", CONFIG, quiet)
+    space = load_world(tmp_path / "run" / "world").spec.action
+    assert isinstance(space, spaces.Box) and space.low[0] < -1 and space.high[0] == np.float32(0.37)
     with pytest.raises(DatasetError, match="no buttons"):
-        train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+        train_video(tmp_path / "posed", tmp_path / "other", CONFIG, quiet)
 
 
 def test_a_varied_lesson_is_the_same_lesson_in_another_world():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,21 @@ import torch
 from panorama import Panorama, recording, some_clips
 
 from terrella.core import check_world, make_rng
-from terrella.core.errors import DatasetError
-from terrella.measure import Album, ScoreConfig, closure, long_rollout, score, speed, to_json
+from terrella.core.errors import DatasetError, ObservationError
+from terrella.measure import (
+    Album,
+    ScoreConfig,
+    closure,
+    key_way,
+    long_rollout,
+    score,
+    speed,
+    to_json,
+    walk_way,
+    yaw_way,
+)
 from terrella.measure.album import look
+from terrella.measure.closure import walkers
 from terrella.measure.fidelity import PSNR_CAP_DB
 
 CONFIG = ScoreConfig((1, 8, 32), (8, 32), (8, 32), drop=(8, 32), batch=5, strips=2)
@@ -119,20 +132,51 @@ def test_one_clip_has_figures_without_intervals_and_no_control(clips):
 
 
 def test_closure_of_a_perfect_world_closes(clips):
-    done = closure(Panorama(), clips, make_rng(0), far_deg=180)
+    done = closure(Panorama(), clips, make_rng(0), yaw_way(180))
     assert not done.void and done.closed.value > 45 and done.far.value < 20
-    assert done.steps == 120 and done.picture.shape == (5, 24, 32, 3)
+    assert done.steps == 120 and done.picture.shape == (6, 24, 32, 3) and done.again.value > 45
     assert np.array_equal(done.picture[1], done.picture[3]) and not np.array_equal(done.picture[0], done.picture[2])
 
 
 def test_closure_of_a_static_world_is_void(clips):
-    done = closure(Panorama("static"), clips, make_rng(0))
+    done = closure(Panorama("static"), clips, make_rng(0), yaw_way(180))
     assert done.void and done.closed.value == PSNR_CAP_DB
 
 
 def test_closure_of_a_forgetful_world_does_not_close(clips):
-    done = closure(Panorama("forgetful"), clips, make_rng(0))
+    done = closure(Panorama("forgetful"), clips, make_rng(0), yaw_way(180))
     assert not done.void and done.closed.high < 20
+
+
+def test_a_walk_there_and_back_closes_where_the_place_is_remembered():
+    clips = walkers(some_clips(8, 64), 100)
+    assert clips and all(clip.walked_m()[49] >= 1 for clip in clips)
+    done = {flaw: closure(Panorama(flaw), clips, make_rng(0), walk_way(100)) for flaw in ("", "static", "forgetful")}
+    assert done[""].closed.value > 45 and done[""].steps == 100 and done[""].far_m > 0.5
+    assert done["static"].void and not done["forgetful"].void and done["forgetful"].closed.high < 20
+    assert done[""].again.value > 45 > 20 > done["forgetful"].again.high
+    assert done["static"].void_again and not done[""].void_again
+
+
+def test_a_world_without_poses_is_turned_by_its_keys(clips):
+    class Keyed(Panorama):
+        """Takes pictures alone, and shows no pose."""
+
+        @property
+        def spec(self):
+            whole = super().spec
+            return replace(whole, observes=("rgb",), channels={"rgb": whole.channels["rgb"]})
+
+        def observe(self, observation, prior, rng):
+            return super().observe({"pose": prior["pose"] if prior else start["pose"], **observation}, None, rng)
+
+    left, right = torch.tensor([0, 1, 0]), torch.tensor([0, 0, 1])
+    start = Panorama()._state(torch.from_numpy(np.stack([clips[0].pose[0]] * 4)))
+    way = key_way(left, right, "left and right", 60)
+    done = closure(Keyed(), clips[:4], make_rng(0), way, batch=4)
+    assert done.steps == 60 and done.closed.value > 20 > done.far.value
+    with pytest.raises(ObservationError, match="does not observe 'pose'"):
+        closure(Keyed(), clips[:4], make_rng(0), yaw_way(90))
 
 
 def test_long_dreams_of_the_perfect_world_stay_and_fading_ones_do_not(clips):

@@ -120,3 +120,10 @@ def test_a_card_becomes_plain_json():
 
     card = {"a": 1, "b": float("nan"), "c": {"d": (1, 2.5, Odd())}, 3: None}
     assert json.loads(json.dumps(protocol.plain(card))) == {"a": 1, "b": "nan", "c": {"d": [1, 2.5, "odd"]}, "3": None}
+
+
+def test_vitals_ride_at_the_end_of_a_frame():
+    frame = protocol.Frame(1, 2, 0, 2, (b"jpeg", b"other"), vitals=(42.0, 3.0))
+    assert protocol.decode_frame(protocol.encode_frame(frame)) == frame
+    with pytest.raises(ProtocolError):
+        protocol.decode_frame(protocol.encode_frame(frame)[:-1])

@@ -296,3 +296,47 @@ def test_bad_requests_are_answered_in_one_sentence():
         world.observe({"observation": torch.zeros(1, 4)}, None, rng)
     with pytest.raises(TerrellaError, match="not a state of gym:CartPole-v1"):
         world.imagine(State({"frame": torch.zeros(1)}), torch.tensor([1]), rng)
+
+
+class Painter(gymnasium.Env):
+    """What it observes is a picture; it steers, brakes, and counts its laps in `info`."""
+
+    action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.ones(3, np.float32))
+    observation_space = spaces.Box(0, 255, (8, 12, 3), np.uint8)
+
+    def __init__(self):
+        self.laps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.laps = 0
+        return self._seen(), {"laps": 0}
+
+    def step(self, action):
+        self.laps += int(action[1] > 0.5)
+        return self._seen(), 0.0, False, False, {"laps": self.laps}
+
+    def _seen(self):
+        picture = np.zeros((8, 12, 3), np.uint8)
+        picture[::2, ::2] = min(255, 20 * self.laps)
+        return picture
+
+
+def test_a_pictured_observation_is_the_picture_made_small_and_info_can_be_told():
+    world, rng = GymnasiumWorld(Painter, size=(4, 6), told=("laps",)), make_rng(0)
+    assert set(world.spec.channels) == {"rgb", "reward", "done", "laps"} and world.spec.forkable
+    state = world.start(2, rng)
+    gas, nothing = [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
+    for _ in range(4):
+        state = world.imagine(state, torch.tensor([gas, nothing]), rng)
+    seen = world.render(state, ("rgb", "laps"))
+    assert seen["laps"].tolist() == [4.0, 0.0]
+    assert (seen["rgb"][0] == 20).all(), "the mean of four pixels, one of them 80"
+    assert (seen["rgb"][1] == 0).all() and seen["rgb"].shape == (2, 4, 6, 3)
+    assert "rgb" not in GymnasiumWorld(Painter, rgb=False).spec.channels
+
+
+def test_arrow_keys_steer_give_gas_and_brake():
+    keys = GymnasiumWorld(Painter).spec.keys
+    assert keys["ArrowLeft"] == [-1, 0, 0] and keys["ArrowRight"] == [1, 0, 0]
+    assert keys["ArrowUp"] == [0, 1, 0] and keys["ArrowDown"] == [0, 0, 1]

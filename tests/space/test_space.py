@@ -9,43 +9,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrella.space.camera import planar_pose, project, rays, rotation, unproject, yaw
+from terrella.space.camera import planar_pose, project, unproject, yaw
 from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
 from terrella.space.keyframes import Keyframes, look, recall, recall_slowly, retrieve, vote, vote_slowly
-from terrella.space.patches import FAR_M, cast, cast_slowly, patches
+from terrella.space.patches import FAR_M, cast, cast_slowly, patches, patches_slowly
 from terrella.space.reproject import fill_holes, warp
 
-CAMERA = (0.5, 0.8, 0.5, 0.5)
-SIZE = (48, 64)
-
-
-def pose_at(x: float, y: float, heading: float) -> torch.Tensor:
-    return planar_pose(*(torch.tensor([value]) for value in (x, y, 1.3, heading)))
-
-
-def room_depth(pose: torch.Tensor, size=SIZE, half: float = 4.0, ceiling: float = 4.0) -> torch.Tensor:
-    """Exact depth [1, H, W] inside a box room centred on the origin: the twin that the geometry is held against."""
-    beam = torch.einsum("ij,hwj->hwi", rotation(pose)[0], rays(CAMERA, *size))
-    eye = pose[0, :3]
-    low, high = torch.tensor([-half, -half, 0.0]), torch.tensor([half, half, ceiling])
-    to_wall = torch.where(beam > 0, (high - eye) / beam.clamp_min(1e-9), (low - eye) / beam.clamp_max(-1e-9))
-    return to_wall.amin(-1)[None]
-
-
-def painted(pose: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """Smooth colours of the surfaces seen, uint8 [1, 3, H, W]."""
-    points = unproject(depth, pose, CAMERA)
-    return (127 + 120 * torch.sin(1.3 * points)).round().to(torch.uint8).permute(0, 3, 1, 2)
+from .rooms import CAMERA, SIZE, painted, pose_at, room_depth
 
 
 def keyframe(x: float, y: float, heading: float) -> Keyframes:
     pose = pose_at(x, y, heading)
     depth = room_depth(pose)
     return Keyframes.of(painted(pose, depth), depth, pose, CAMERA)
-
-
-def joined(*parts: Keyframes) -> Keyframes:
-    return Keyframes(*(torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])))
 
 
 def test_the_camera_looks_along_its_heading_with_left_on_the_left():
@@ -63,6 +39,17 @@ def test_project_undoes_unproject():
     u = (torch.arange(SIZE[1]) + 0.5) / SIZE[1]
     assert torch.allclose(again.view(depth.shape), depth, atol=1e-4)
     assert torch.allclose(where.view(*SIZE, 2)[..., 0], u.expand(SIZE), atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 8])
+def test_the_compiled_patches_equal_their_slow_twin(stride):
+    pose = torch.cat([pose_at(-1, 0, 0.2), pose_at(0.5, 2, 2.9)])
+    depth = torch.cat([room_depth(one[None]) for one in pose])
+    depth[:, 10:30, 20:36] = 1.5  # a pillar, with edges all around
+    depth[:, 10:30, 36], depth[:, 10:30, 51] = 0.5, 0.5  # and columns on their own
+    fast, slow = patches(depth, pose, CAMERA, stride), patches_slowly(depth, pose, CAMERA, stride)
+    assert fast.shape == slow.shape and 0 < (slow[..., 3:] == 0).all(-1).float().mean() < 0.1
+    assert ((fast - slow).abs().amax(-1) > 1e-3).float().mean() < 0.005
 
 
 @pytest.mark.parametrize("stride", [2, 8])
@@ -113,7 +100,7 @@ def test_warp_carries_colour_to_where_it_belongs_and_distrusts_other_surfaces():
 
 
 def test_the_compiled_vote_equals_its_slow_twin():
-    memory = joined(keyframe(0, 0, 0.0), keyframe(1, -1, 2.0), keyframe(-2, 0, 0.5))
+    memory = Keyframes.joined([keyframe(0, 0, 0.0), keyframe(1, -1, 2.0), keyframe(-2, 0, 0.5)])
     view = pose_at(0.2, 0.1, 0.1)
     depth = room_depth(view)[0, ::4, ::4].flatten()
     points = unproject(room_depth(view), view, CAMERA)[0, ::4, ::4].reshape(-1, 3)
@@ -123,7 +110,7 @@ def test_the_compiled_vote_equals_its_slow_twin():
 
 
 def test_the_compiled_recall_equals_its_slow_twin():
-    memory = joined(keyframe(0, 0, 0.0), keyframe(1, -1, 0.4), keyframe(-2, 0, 0.5), keyframe(0, 2, -0.6))
+    memory = Keyframes.joined([keyframe(0, 0, 0.0), keyframe(1, -1, 0.4), keyframe(-2, 0, 0.5), keyframe(0, 2, -0.6)])
     view = pose_at(0.2, 0.1, 0.1)[0]
     found = []
     for way in (recall, recall_slowly):
@@ -137,7 +124,7 @@ def test_the_compiled_recall_equals_its_slow_twin():
 
 
 def test_memory_finds_the_keyframe_that_saw_the_place():
-    memory = joined(keyframe(0, 0, math.pi), keyframe(0, 0, 0.0), keyframe(0, 0, math.pi / 2))
+    memory = Keyframes.joined([keyframe(0, 0, math.pi), keyframe(0, 0, 0.0), keyframe(0, 0, math.pi / 2)])
     picks = retrieve([memory], pose_at(0.3, 0, 0.1)[0], CAMERA, SIZE, 2)[0]
     assert picks[0] == 1
 

@@ -76,6 +76,40 @@ def test_a_turn_there_and_back_shows_the_same_room(world):
     assert psnr[-1] > 27
 
 
+def test_without_its_recordings_it_remembers_what_it_was_shown_and_dreamt(world):
+    """Out and back along a curve; with the last frame alone it does not find back."""
+    shown = middle_of_a_room(world)
+    seen = {name: shown[name] for name in ("depth", "pose")} | {"rgb": shown["rgb"].permute(0, 2, 3, 1)}
+    start, likeness = seen["pose"][:, :3], {}
+    for name, budget_mb in (("own", 16.0), ("last frame", 0.0)):
+        alone, rng = world.without_memory().with_memory_of(budget_mb), terrella.make_rng(0)
+        state = alone.observe(seen, None, rng)
+        far = None
+        for step in [*range(1, 13), *range(11, -1, -1)]:
+            x, y, z = (start + torch.tensor([[0.08 * step, 0.02 * step, 0.0]])).unbind(-1)
+            state = alone.observe({"pose": planar_pose(x, y, z, torch.tensor([math.radians(7.5 * step)]))}, state, rng)
+            far = state["rgb"] if step == 12 else far
+        likeness[name] = [
+            float(10 * torch.log10(255**2 / (frame.float() - shown["rgb"].float()).square().mean()))
+            for frame in (state["rgb"], far)
+        ]
+    assert likeness["own"][0] > 27 and likeness["own"][1] < 20
+    assert likeness["last frame"][0] < likeness["own"][0] - 6
+
+
+def test_evidence_of_a_place_is_known_and_a_dream_elsewhere_is_not(world):
+    state, rng = middle_of_a_room(world.without_memory()), terrella.make_rng(0)
+    shown = world.render(state, ("rgb", "depth", "pose"))
+    alone = world.without_memory()
+    state = alone.observe(shown, None, rng)
+    assert alone.render(state, ("known",))["known"].min() == 1
+    turned = planar_pose(*shown["pose"][:, :3].unbind(-1), torch.tensor([math.pi]))
+    away = alone.observe({"pose": turned}, state, rng)
+    assert alone.render(away, ("known",))["known"].mean() < 0.1
+    kinds = alone.render(away, ("keyframes",))["keyframes"][0, :, 3]
+    assert kinds[kinds > 0].tolist() == [2, 3], "one observed, one dreamt"
+
+
 def test_stories_in_a_batch_do_not_touch(world):
     state = middle_of_a_room(world).fork(2)
     action = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)

@@ -7,8 +7,9 @@ import json as json_text
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -26,6 +27,7 @@ Watch = Annotated[
     arg(name="live-mcap", help="Log while recording: to a file NAME.mcap, or to Foxglove at a port of this machine."),
 ]
 Device = Annotated[str, arg(help="cpu, cuda, or auto: a GPU where there is one.")]
+Fast = Annotated[bool, arg(help="Draw through ONNX Runtime, or a compiled graph on a GPU, if that is faster here.")]
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
 CONTEXT = 10  # frames that a world is shown before it dreams, when it is scored: longer than a key's history counts
@@ -69,7 +71,11 @@ def _app(given: Sequence[str]) -> SubcommandApp:
     recording.command(name="doom")(record_doom)
     recording.command(name="world")(record_world)
     training.command(name="video")(_train_video_command() if given[:1] == ["train"] else play)
+    training.command(name="eye")(_train_eye_command() if given[:1] == ["train"] else play)
+    training.command(name="senses")(_train_senses_command() if given[:1] == ["train"] else play)
     training.command(name="latent-actions")(_train_latent_command() if given[:1] == ["train"] else play)
+    training.command(name="distil")(_train_distil_command() if given[:1] == ["train"] else play)
+    training.command(name="dreams")(_train_dreams_command() if given[:1] == ["train"] else play)
     data.command(data_room.label)
     data.command(data_room.doctor)
     data.command(data_room.convert)
@@ -90,6 +96,7 @@ def _app(given: Sequence[str]) -> SubcommandApp:
 def record_doom(
     out: Path,
     scenario: str = "my_way_home",
+    skill: int | None = None,
     frames: int = 100_000,
     height: int = 192,
     human: bool = False,
@@ -102,7 +109,8 @@ def record_doom(
 
     Args:
         out: Folder of the dataset (LeRobot v3); an unfinished recording there goes on.
-        scenario: Name of a ViZDoom scenario.
+        scenario: Name of a ViZDoom scenario, or maps of a game: freedoom2/MAP01,MAP02; each episode takes one of them.
+        skill: 1 to 5, how hard it is; without it the scenario's own.
         frames: Rows to record in all (by the script; a person plays as long as they like).
         height: Height of the pictures; their width is 4/3 of it.
         human: Play yourself, in the browser, instead of watching a script explore.
@@ -110,7 +118,7 @@ def record_doom(
     from .. import library
 
     depth = (min(max(height, 1), 96), min(max(height, 1), 96) * 4 // 3)
-    world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth)
+    world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth, skill=skill)
     _record(world, out, frames, human, live_mcap, seed, port, json)
 
 
@@ -118,34 +126,54 @@ def record_world(
     name: Positional[str],
     out: Path,
     frames: int = 10_000,
+    size: tuple[int, int] | None = None,
+    pictures: Literal["auto", "png", "video"] = "auto",
     human: bool = False,
     live_mcap: Watch = None,
     seed: Seed = 0,
     port: Port = 8765,
     json: Json = False,
 ) -> None:
-    """Record any world: a Gymnasium environment ("gym:CartPole-v1"), a learned world, a checkpoint folder.
+    """Record any world: a Gymnasium environment ("gym:CartPole-v1", "gym:ALE/Breakout-v5"), a learned world, a checkpoint.
 
     Args:
         name: What `terrella list` shows, or a path.
         out: Folder of the dataset (LeRobot v3); an unfinished recording there goes on.
         frames: Rows to record in all (by the script; a person plays as long as they like).
+        size: Height and width of the pictures of a Gymnasium environment; by itself as it draws them, Atari 64 64.
+        pictures: How they are kept: "png" exactly, "video" as H.264; "auto" exactly where they are at most 96 pixels a side.
         human: Play yourself, in the browser, instead of watching a script explore.
     """
     from .. import library
+    from ..core.errors import TerrellaError
 
-    _record(library.load(name), out, frames, human, live_mcap, seed, port, json)
+    if size is not None and not name.startswith("gym:"):
+        raise TerrellaError("--size is for Gymnasium environments; other worlds show the size that they show.")
+    options: dict[str, Any] = {"size": size} if size else {}
+    world = library.load(name, **options)
+    if pictures == "auto":
+        drawn = world.spec.channels.get("rgb")
+        pictures = "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
+    _record(world, out, frames, human, live_mcap, seed, port, json, pictures)
 
 
 def _record(
-    world: World, out: Path, frames: int, human: bool, watch: str | None, seed: int, port: int, json: bool
+    world: World,
+    out: Path,
+    frames: int,
+    human: bool,
+    watch: str | None,
+    seed: int,
+    port: int,
+    json: bool,
+    pictures: Literal["video", "png"] = "video",
 ) -> None:
     from ..core.errors import DatasetError
     from ..core.world import make_rng
     from ..data import Dataset, Layout, Recorder, record
     from ..data.explore import Explorer
 
-    layout = Layout.of(world.spec)
+    layout = replace(Layout.of(world.spec), pictures=pictures)
     facts: dict[str, object] = {"dataset": str(out)}
     with _watched(watch, layout, world.spec.name, facts) as live:
         if human:
@@ -160,7 +188,8 @@ def _record(
                 raise DatasetError("nothing was recorded: press the record button on the page before you play.")
         else:
             with progress.shown("recording") as report:
-                done = record(world, Explorer(world.spec), out, frames, make_rng(seed), report, live=live)
+                player, rng = Explorer(world.spec), make_rng(seed)
+                done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out)
     facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
@@ -218,6 +247,50 @@ def _train_video_command() -> Callable[..., None]:
     return video
 
 
+def _train_eye_command() -> Callable[..., None]:
+    from ..learn.eye import EyeTraining, train_eye
+
+    defaults = EyeTraining()
+
+    def eye(data: Positional[Path], out: Path, config: EyeTraining = defaults, json: Json = False) -> None:
+        """Train an eye that sees depth in one picture, and motion between two, on any recording with depth and poses.
+
+        Args:
+            data: Folder of the dataset.
+            out: Folder for eye.safetensors and eye.json, its errors on the episodes kept out.
+        """
+        with progress.shown("training") as report:
+            facts = train_eye(data, out, config, report)
+        result(facts, json)
+
+    eye.__annotations__["config"] = EyeTraining
+    return eye
+
+
+def _train_senses_command() -> Callable[..., None]:
+    from .. import library
+    from ..learn.senses import SensesConfig, train_senses
+
+    defaults = SensesConfig()
+
+    def senses(
+        name: Positional[str], data: Path, out: Path, config: SensesConfig = defaults, json: Json = False
+    ) -> None:
+        """Give a trained world an eye for lone pictures and a doubt that says when it invents (train video ends with them).
+
+        Args:
+            name: What `terrella list` shows, or the path of a checkpoint.
+            data: The recording that it was trained on.
+            out: Folder for the world with its senses.
+        """
+        with progress.shown("training") as report:
+            facts = train_senses(library.folder_of(name), data, out, config, report)
+        result(facts, json)
+
+    senses.__annotations__["config"] = SensesConfig
+    return senses
+
+
 def _train_latent_command() -> Callable[..., None]:
     from ..learn.latent_actions import LatentConfig, train_latent_actions
 
@@ -238,19 +311,82 @@ def _train_latent_command() -> Callable[..., None]:
     return latent_actions
 
 
+def _train_distil_command() -> Callable[..., None]:
+    from ..learn.distil import DistilConfig, distil
+
+    defaults = DistilConfig()
+
+    def few_steps(
+        name: Positional[str],
+        data: Path,
+        out: Path,
+        config: DistilConfig = defaults,
+        device: Device = "auto",
+        json: Json = False,
+    ) -> None:
+        """Teach a world that draws a frame in many steps (`train video --flow-steps 8`) to draw it in one or two.
+
+        Args:
+            name: The world that teaches: what `terrella list` shows, or a path.
+            data: Folder of a recording of the same game.
+            out: Folder of the run: checkpoint, log, and pictures of truth against dream.
+        """
+        with progress.shown("training") as report:
+            facts = distil(_load(name, device), data, out, config, report)
+        result({"run": str(out), **facts}, json)
+
+    few_steps.__annotations__["config"] = DistilConfig
+    return few_steps
+
+
+def _train_dreams_command() -> Callable[..., None]:
+    from ..learn.self_forcing import DreamsConfig, train_dreams
+
+    defaults = DreamsConfig()
+
+    def dreams(
+        name: Positional[str],
+        data: Path,
+        out: Path,
+        config: DreamsConfig = defaults,
+        teacher: str | None = None,
+        device: Device = "auto",
+        json: Json = False,
+    ) -> None:
+        """Go on training a world inside its own dreams, so that long play drifts less.
+
+        Args:
+            name: The world: what `terrella list` shows, or a path.
+            data: Folder of a recording of the same game.
+            out: Folder of the run: checkpoint, log, and pictures of truth, the old dream and the new.
+            teacher: A world that draws a frame in many steps, of which the dreams should be as sharp: see `train distil`.
+        """
+        master = None if teacher is None else _load(teacher, device)
+        with progress.shown("training") as report:
+            facts = train_dreams(_load(name, device), data, out, config, report, master)
+        result({"run": str(out), **facts}, json)
+
+    dreams.__annotations__["config"] = DreamsConfig
+    return dreams
+
+
 # -- play -----------------------------------------------------------------------------------------------------------
 
 
 def play(
     name: Positional[str],
+    image: Path | None = None,
     compare: bool = False,
     truth: str = "doom:my_way_home",
     memory: bool = True,
+    remember: bool = False,
+    eye: str | None = None,
     record: Path | None = None,
     port: Port = 8765,
     host: Host = "127.0.0.1",
     token: Token = None,
     device: Device = "auto",
+    fast: Fast = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -258,15 +394,28 @@ def play(
 
     Args:
         name: What `terrella list` shows, or the path of a checkpoint.
+        image: Begin with this picture (any image file); one can be dropped on the page, too.
         compare: Show the truth beside the dream, driven by the same keys.
         truth: The real game that --compare shows.
         memory: --no-memory plays a learned world without its keyframes.
+        remember: Give a world without a spatial memory one: what it showed, it shows again.
+        eye: What tells depth and motion to a memory, where the world does not: a file of `terrella train eye`, or a world
+            that has an eye.
         record: Folder of a dataset to which the page may record.
     """
+    from ..core.errors import TerrellaError
     from ..serve import serve
 
-    learned = _load(name, device, memory)
+    learned = _load(name, device, memory, fast)
+    if remember or eye is not None:
+        from ..library import open_eye
+        from ..space import remembering
+
+        learned = remembering.remember(learned, eye=None if eye is None else open_eye(eye))
     worlds = [learned]
+    picture = _first_picture(image, learned) if image is not None else None
+    if compare and picture is not None:
+        raise TerrellaError("--image cannot be compared with a game, which cannot go on from it; leave --compare out.")
     if compare:
         worlds = [_game_like(learned, truth), learned]
     sink = None
@@ -280,7 +429,21 @@ def play(
     def ready(address: str) -> None:
         result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
 
-    serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed)
+    serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed, picture=picture)
+
+
+def _first_picture(path: Path, world: World) -> Any:
+    """The picture of an image file as the world would see it, after it was seen once: what is refused is refused now."""
+    from ..core.errors import ServeError
+    from ..core.world import make_rng
+    from ..serve import read_picture
+
+    if "rgb" not in world.spec.observes:
+        raise ServeError(f"{world.spec.name} takes no pictures, so it cannot begin with one; leave --image out.")
+    height, width = world.spec.channels["rgb"].shape[:2]
+    picture = read_picture(path, (height, width))
+    world.observe({"rgb": picture[None]}, None, make_rng(0))
+    return picture
 
 
 def _game_like(learned: World, name: str) -> World:
@@ -288,17 +451,24 @@ def _game_like(learned: World, name: str) -> World:
     from .. import library
 
     shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
-    like = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
+    like: dict[str, Any] = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
     return library.load(name, **like)
 
 
-def _load(name: str, device: str, memory: bool = True) -> World:
-    """A world by name; only learned worlds have a device and a memory."""
+def _load(name: str, device: str, memory: bool = True, fast: bool = False) -> World:
+    """A world by name; only learned worlds have a device, a memory and a faster way of drawing."""
     from .. import library
+    from ..core.errors import TerrellaError
 
     if name == "doom" or name.startswith(("doom:", "gym:")):
+        if fast:
+            raise TerrellaError(f"--fast is for learned worlds; {name} runs its own engine: leave it out.")
         return library.load(name)
-    return library.load(name, device=_device(device), memory=memory)
+    options: dict[str, Any] = {"fast": True} if fast else {}
+    world = library.load(name, device=_device(device), memory=memory, **options)
+    if fast:
+        say(f"{name}: {world.spec.card.get('fast')}")
+    return world
 
 
 def _device(name: str) -> str:
@@ -325,7 +495,9 @@ def score(
     clips: int = 50,
     horizons: tuple[int, ...] = (1, 8, 32, 64),
     long_steps: int = 1000,
+    drift: int | None = None,
     device: Device = "auto",
+    fast: Fast = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -340,8 +512,11 @@ def score(
         clips: Clips of each kind of place; intervals want 50 or more.
         horizons: Steps after which figures are given; a clip is as long as the largest.
         long_steps: Length of the long dream; 0 leaves it out.
+        drift: Steps of the drift curves, on clips of their own (at most 24); 0 leaves them out. Unless said, 256 where the
+            recordings have clips that long.
     """
-    from ..core.errors import TerrellaError
+    from .. import library
+    from ..core.errors import DatasetError, TerrellaError
     from ..core.world import make_rng
     from ..data import split
     from ..measure import (
@@ -358,10 +533,12 @@ def score(
     )
     from ..measure.bars import summary
 
-    if min(horizons, default=0) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100):
-        raise TerrellaError("--horizons and --clips are whole numbers from 1 up, --long-steps is 0 or at least 100.")
-    world, rng, steps = _load(name, device), make_rng(seed), max(horizons)
-    arms = {"memory": world, "no memory": _load(name, device, memory=False)}
+    if min(horizons, default=0) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100) or (drift or 0) < 0:
+        raise TerrellaError(
+            "--horizons and --clips are whole numbers from 1 up, --drift from 0 up, --long-steps is 0 or at least 100."
+        )
+    world, rng, steps = _load(name, device, fast=fast), make_rng(seed), max(horizons)
+    arms = {"memory": world, "no memory": _load(name, device, memory=False, fast=fast)}
     if "pose" not in world.spec.observes:  # it lives on history alone: there is no memory to leave out
         arms = {"history": world}
     cache = _cache(data, world)
@@ -369,18 +546,39 @@ def score(
     held_out = every if fresh else split(len(every))[1]
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
     known = out_of_sight(*box) if box else None
-    places = {"recorded": clips_from_cache(cache, held_out, CONTEXT, steps, clips, rng, known)}
+    sources: dict[str, tuple] = {"recorded": (cache, held_out, known)}
     if new is not None:
         unseen = _cache(new, world)
-        places["new"] = clips_from_cache(unseen, range(len(unseen.episodes)), CONTEXT, steps, clips, rng)
+        sources["new"] = (unseen, range(len(unseen.episodes)), None)
     elif box:
-        places["new"] = clips_from_cache(cache, every, CONTEXT, steps, clips, rng, in_box(*box))
+        sources["new"] = (cache, every, in_box(*box))
+
+    def draw(place: str, horizon: int, count: int, chance) -> Any:
+        source, episodes, where = sources[place]
+        return clips_from_cache(source, episodes, CONTEXT, horizon, count, chance, where)
+
+    places = {place: draw(place, steps, clips, rng) for place in sources}
+    long_clips, chance = {}, make_rng(seed + 1)  # the other figures do not depend on whether drift is measured
+    for place in sources if drift != 0 else ():
+        try:
+            long_clips[place] = draw(place, drift or 256, min(clips, 24), chance)
+        except DatasetError:
+            if drift:
+                raise
+            say(
+                f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
+            )
     obeying = tuple(step for step in ScoreConfig().control_horizons if step <= steps) or (steps,)
     scoring = ScoreConfig(horizons=tuple(sorted(horizons)), control_horizons=obeying)
     config = ExamConfig(score=scoring, long_steps=long_steps)
     album = None if cache.pose is None else Album.of_cache(cache)
+    closing = {}  # what is seen again by a world that keeps nothing but its last frame
+    if len(arms) > 1:
+        closing = {"last frame only": library.load(name, device=_device(device), memory=False, memory_mb=0)}
     with progress.shown("scoring") as report:
-        card = examine(arms, places, rng, config, album, lambda share, words: report(share, 1, words))
+        tell = lambda share, words: report(share, 1, words)  # noqa: E731
+        card = examine(arms, places, rng, config, album, tell, long_clips, closing)
+    card = replace(card, fates=_fates(arms, sources, scoring.horizons, clips, make_rng(seed + 2)))
     found = bars(card, next(iter(arms)))
     files = write_report(card, found, out, f"{world.spec.name}: the scorecard")
     lines = [
@@ -388,8 +586,23 @@ def score(
         for bar in found
         if bar.figure and not bar.side
     ]
+    for row in card.drifts:
+        within = f"within twice its first error for {row.usable} of {row.steps} steps"
+        lines.append(f" drift  {row.arm}{row.motion and f', {row.motion} motion'}, {row.place}: {within}")
     facts = {**as_dict(card, found), "files": [str(file) for file in files]}
     result(facts, json, "\n".join([*lines, summary(found), f"the page: {files[1]}"]))
+
+
+def _fates(arms: dict[str, World], sources: dict[str, tuple], horizons: tuple[int, ...], clips: int, rng) -> list:
+    """What the arms' dreams tell of rewards, vitals and ends, where world and recordings have vitals."""
+    from ..measure.outcomes import fates, passages, vitals_of
+
+    spec, found = next(iter(arms.values())).spec, []
+    for place, (cache, episodes, _) in sources.items():
+        if set(vitals_of(cache)) & set(spec.channels):
+            shown = passages(cache, episodes, CONTEXT, max(horizons), clips, rng)
+            found += fates(arms, place, shown, horizons, rng)
+    return found
 
 
 def _cache(data: Path, world: World) -> Any:

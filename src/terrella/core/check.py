@@ -22,6 +22,8 @@ _WELL_KNOWN = {
     "pose": (np.float32, 1),
     "reward": (np.float32, 0),
     "done": (np.bool_, 0),
+    "known": (np.float32, 2),
+    "keyframes": (np.float32, 2),
 }
 
 

@@ -26,6 +26,7 @@ class _View:
     yaw: float  # radians, counter-clockwise
     bearing: torch.Tensor  # [C] radians from straight ahead, left positive
     free_m: torch.Tensor  # [C] level distance to the first obstacle
+    thing_m: torch.Tensor  # [C] distance to the nearest thing that may move or be picked up, inf where there is none
 
     def walkable_m(self) -> torch.Tensor:
         """[C] metres that a body with width can go in each direction, as far as is seen."""
@@ -40,12 +41,22 @@ class _View:
         blocks = (across < _BODY_M) | (self.bearing.abs() < 0.05)
         return float((self.free_m * torch.cos(self.bearing))[blocks].min())
 
+    def thing(self, towards: float | None = None) -> tuple[float, float] | None:
+        """Bearing and distance of a thing in sight: the nearest, or that nearest to the bearing `towards`."""
+        seen = torch.isfinite(self.thing_m)
+        if not seen.any():
+            return None
+        worth = self.thing_m if towards is None else torch.where(seen, (self.bearing - towards).abs(), torch.inf)
+        pick = int(worth.argmin())
+        return float(self.bearing[pick]), float(self.thing_m[pick])
+
 
 class Explorer:
     """A policy for `record`: policy(observation, info, rng) -> action [1, ...].
 
     In worlds with depth, pose and Doom's six movement buttons it goes where it has been least in this episode, by ways
-    that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Elsewhere it
+    that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Where there is
+    a channel `things` it walks up to them, and shoots at them with ATTACK; USE it tries on what is in its way. Elsewhere it
     holds random actions for 3 to 40 steps. It knows nothing but the observations since info["step"] was 0.
     """
 
@@ -61,7 +72,7 @@ class Explorer:
             return self._random(info, rng)
         view = _look(self.spec, observation)
         if info["step"] == 0 or self._moves is None:
-            self._moves = _Walk(rng).story(view)
+            self._moves = _Walk(rng, self.spec).story(view)
             buttons = next(self._moves)
         else:
             buttons = self._moves.send(view)
@@ -78,8 +89,10 @@ class Explorer:
 class _Walk:
     """One episode of walking: endless moves, each a few steps to a few dozen long."""
 
-    def __init__(self, rng: torch.Generator):
+    def __init__(self, rng: torch.Generator, spec: Spec):
         self.rng = rng
+        self.shoots, self.uses = "ATTACK" in spec.action_names, "USE" in spec.action_names
+        self.meets = "things" in spec.channels
         self.visits: dict[tuple[int, int], int] = {}
         self.boredom = 0.0  # grows while nothing new is found, and lowers what counts as promising
 
@@ -87,6 +100,9 @@ class _Walk:
         kinds = [self.seek, self.run, self.turn, self.strafe, self.back, self.stop, self.look_around, self.mash]
         weights = torch.tensor([10.0, 2.0, 1.0, 1.5, 0.6, 0.4, 0.3, 1.0])
         while True:
+            if self.meets and view.thing() and _chance(self.rng, 0.6):
+                fights = self.shoots and _chance(self.rng, 0.8)
+                view = yield from self.fight(view) if fights else self.fetch(view)
             kind = kinds[int(torch.multinomial(weights, 1, generator=self.rng))]
             view = yield from kind(view)
 
@@ -134,8 +150,47 @@ class _Walk:
         likelihood = torch.exp(10 * (score - score.max()))
         return view.yaw + float(view.bearing[int(torch.multinomial(likelihood, 1, generator=self.rng))])
 
+    def fight(self, view: _View) -> _Moves:
+        """Turns to the thing in sight that is nearest to the middle and shoots at it, standing, strafing or walking."""
+        along = [(), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][_whole(self.rng, 0, 5)]
+        for _ in range(_whole(self.rng, 10, 50)):
+            found = view.thing(0.0)
+            if found is None:
+                break
+            off = found[0]
+            turn = () if abs(off) < 0.06 else ("TURN_LEFT",) if off > 0 else ("TURN_RIGHT",)
+            shot = ("ATTACK",) if abs(off) < 0.1 and _chance(self.rng, 0.8) else ()
+            view = yield from self.step(*along, *turn, *shot)
+        return view
+
+    def fetch(self, view: _View) -> _Moves:
+        """Walks up to the nearest thing in sight, as to a pick-up."""
+        found, stuck = view.thing(), 0
+        while found and stuck < 8:
+            off = found[0]
+            buttons = ["MOVE_FORWARD"] if abs(off) < 0.4 else []
+            if abs(off) > 0.06:
+                buttons.append("TURN_LEFT" if off > 0 else "TURN_RIGHT")
+            before = view
+            view = yield from self.step(*buttons)
+            stood = math.dist((before.x, before.y), (view.x, view.y)) < 0.02
+            stuck = stuck + 1 if stood and buttons[:1] == ["MOVE_FORWARD"] else 0
+            found = view.thing(off) if _chance(self.rng, 0.98) else None  # some are never reached
+        return view
+
+    def use(self, view: _View) -> _Moves:
+        """Presses what is in the way, waits for it to open, and goes on if it does."""
+        view = yield from self.hold(("USE",), 1, 3)
+        for _ in range(_whole(self.rng, 10, 40)):
+            view = yield from self.step(*(("MOVE_FORWARD",) if view.ahead_m() > 1.0 else ()))
+        return view
+
     def dodge(self, view: _View) -> _Moves:
         """Away from a wall: towards the more open half, now and then by a strafe or a step back."""
+        if self.uses and _chance(self.rng, 0.5):
+            view = yield from self.use(view)
+            if view.ahead_m() > 1.5:
+                return view
         left = float(view.free_m[view.bearing > 0].mean()) > float(view.free_m[view.bearing <= 0].mean())
         if _chance(self.rng, 0.15):
             left = not left
@@ -237,9 +292,13 @@ def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
     bottom = max(top + 1, int(height * (horizon + 0.05)))
     level = torch.nn.functional.adaptive_max_pool1d(-depth[top:bottom].amin(0)[None], bins)[0].neg()
     bearing = -torch.atan(((torch.arange(bins) + 0.5) / bins - centre) / focal)
+    thing = torch.full((bins,), torch.inf)
+    if "things" in observation:
+        far = torch.where(observation["things"][0].bool(), depth, torch.inf).amin(0)
+        thing = -torch.nn.functional.adaptive_max_pool1d(-far[None], bins)[0]
     x, y, _, w, qx, qy, qz = observation["pose"][0].tolist()
     yaw = math.atan2(2 * (w * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
-    return _View(x, y, yaw, bearing, level / torch.cos(bearing))
+    return _View(x, y, yaw, bearing, level / torch.cos(bearing), thing / torch.cos(bearing))
 
 
 def _wrapped(angle: float) -> float:

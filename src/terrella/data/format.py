@@ -15,7 +15,7 @@ import pyarrow as pa
 from gymnasium import spaces
 
 from ..core.errors import DatasetError
-from ..core.spec import Spec, shape_of
+from ..core.spec import Spec, dtype_of, shape_of
 from .source import Sensor, is_action
 
 VERSION = "v3.0"
@@ -69,14 +69,17 @@ class Layout:
         pose: bool = False,
         vectors: Mapping[str, int] | None = None,
         world: Mapping[str, object] | None = None,
+        masks: Mapping[str, tuple[int, int]] | None = None,
     ) -> Layout:
-        """Of a World's channels: rgb (H, W), depth (h, w), the camera's pose, vectors by length, a name per number of an action."""
+        """Of a World's channels: rgb (H, W), depth (h, w), the camera's pose, vectors by length, a name per number of an
+        action, masks (bool pictures) by (h, w)."""
         made = [Sensor(RGB, "image", (*rgb, 3), "uint8")] if rgb else []
         made += [Sensor(DEPTH, "depth", depth)] if depth else []
         made += [Sensor(STATE, "vector", (7,), names=POSE_NAMES)] if pose else []
         for name, length in (vectors or {}).items():
             names = tuple(f"{name}_{i}" for i in range(length))
             made.append(Sensor(f"observation.{name}", "vector", (length,), names=names))
+        made += [Sensor(f"observation.{name}", "vector", shape, "bool") for name, shape in (masks or {}).items()]
         made.append(Sensor(ACTION, "vector", (len(action),), names=tuple(action)))
         made += [Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")]
         return Layout(fps, {sensor.name: sensor for sensor in made}, world=dict(world or {}))
@@ -91,6 +94,11 @@ class Layout:
             for name, space in channels.items()
             if name not in KNOWN_CHANNELS and len(shape_of(space)) <= 1
         }
+        masks = {
+            name: _height_width(space)
+            for name, space in channels.items()
+            if len(shape_of(space)) == 2 and dtype_of(space) == np.bool_
+        }
         width = int(np.prod(shape_of(spec.action)))
         names = spec.action_names if len(spec.action_names) == width else tuple(f"action_{i}" for i in range(width))
         world = {
@@ -102,9 +110,11 @@ class Layout:
             "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
             "units": dict(spec.units),
             "discrete": isinstance(spec.action, spaces.Discrete),
+            **_limits(spec),
         }
         rate = tidy(fps if fps is not None else 1 / spec.dt_s)
-        return Layout.of_channels(rate, names, size.get("rgb"), size.get("depth"), "pose" in channels, vectors, world)
+        pictured = size.get("rgb"), size.get("depth"), "pose" in channels
+        return Layout.of_channels(rate, names, *pictured, vectors, world, masks)
 
     @property
     def rows(self) -> dict[str, Sensor]:
@@ -218,6 +228,12 @@ def sensor_from_json(name: str, told: Mapping) -> Sensor:
         None if rate is None else float(rate),
         dict(told.get("facts", {})),
     )
+
+
+def _limits(spec: Spec) -> dict[str, list[float]]:
+    """The least and greatest action, where both are finite."""
+    low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
+    return {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
 
 
 def _height_width(space: spaces.Space) -> tuple[int, int]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -32,12 +33,14 @@ def record(
     max_episode_steps: int = 1050,
     task: str | None = None,
     live: Live | None = None,
+    pictures: Literal["video", "png"] = "video",
 ) -> Recorder:
     """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
 
     An episode ends at `done` or after `max_episode_steps`. Each episode has a generator of its own, drawn from `rng`'s
     seed and the episode's number, so that a run that was killed and started again with the same seed records the same
-    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to.
+    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to;
+    `pictures` as in Layout.
     Returns the closed recorder (its rows and
     episodes can be read). DatasetError as Recorder raises it; what was committed before is safe.
     """
@@ -45,7 +48,7 @@ def record(
         raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
     if max_episode_steps < 1:
         raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
-    layout = Layout.of(world.spec, fps)
+    layout = replace(Layout.of(world.spec, fps), pictures=pictures)
     base = int(torch.randint(2**62, (1,), generator=rng).item())
     task = task or f"explore {world.spec.name}"
     with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again

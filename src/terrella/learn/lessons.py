@@ -15,17 +15,24 @@ from ..worlds.history import past
 from ..worlds.video import MOOD, VideoConfig, decode_depth, encode_depth, mood
 from .samples import Lesson, Recording, carried, draw, glimpse_of
 
+DREAMT, OFTEN = (0, 1, 2, 4), (0.4, 0.3, 0.2, 0.1)  # frames of a history that are dreamt, and in what share of lessons
+CHANGED = 20.0  # see `changing`
 # Dream(lesson without truth) -> clean frames [B, 4, H, W] in the generator's code
 Dream = Callable[[Lesson], torch.Tensor]
 
 
 def place_lesson(
-    recording: Recording, memory: Keyframes, config: VideoConfig, batch: int, rng: np.random.Generator, dream: Dream
+    recording: Recording,
+    memory: Keyframes,
+    config: VideoConfig,
+    batch: int,
+    rng: np.random.Generator,
+    dream: Dream | None,
 ) -> Lesson:
-    """Views of recorded places; the last frame is recorded in half of the lessons, else dreamt."""
+    """Views of recorded places; the last frame is recorded in half of the lessons, else dreamt (never without `dream`)."""
     shown = draw(recording, memory, config, batch, rng)
     rgb, depth = recording.rgb(shown.before), recording.depth(shown.before)
-    if rng.random() < 0.5:
+    if dream and rng.random() < 0.5:
         glimpse, earlier = glimpse_of(shown, shown.before, recording, config), shown.before - 1
         known = recording.rgb(earlier), recording.depth(earlier)
         last = carried(*known, earlier, shown.before, glimpse, recording, config)
@@ -53,22 +60,42 @@ def varied(lesson: Lesson, rng: np.random.Generator) -> Lesson:
 
 
 def history_lesson(
-    recording: Recording, config: VideoConfig, batch: int, rng: np.random.Generator, dream: Dream
+    recording: Recording,
+    config: VideoConfig,
+    batch: int,
+    rng: np.random.Generator,
+    dream: Dream | None,
 ) -> Lesson:
-    """Next frames; the newest frame shown is recorded in half of the lessons, else dreamt from those before it."""
-    slots = config.slots
-    rows = recording.usable & (np.arange(len(recording.usable)) - recording.start > slots)
-    target = rng.choice(np.flatnonzero(rows), batch)
-    back = target[:, None] - 1 - np.arange(slots)
-    frames = _frames(recording, back)
-    if rng.random() < 0.5:
-        earlier = past(_frames(recording, back - 1))
+    """Next frames; of those that are shown the newest 0 to 4 are dreamt, each from those before it (none without `dream`).
+
+    Before an episode's first frame it stood still, and nobody acted. Pixels that change count for more.
+    """
+    dreamt = int(rng.choice(DREAMT, p=OFTEN)) if dream else 0
+    since = np.arange(len(recording.usable)) - recording.start
+    target = rng.choice(np.flatnonzero(recording.usable & (since > dreamt)), batch)
+    frames = _frames(recording, _before(recording, target - dreamt, config.slots))
+    for row in (target - dreamt + step for step in range(dreamt)):
         nothing = torch.zeros(batch, 4, *config.size)
-        clean = dream(Lesson(earlier, nothing, _told(recording, back - 1, frames[:, 1]), nothing))
-        frames = torch.cat([_pixels(clean)[:, None], frames[:, 1:]], 1)
-    glimpse = past(frames)
-    truth = torch.cat([_coded(recording.rgb(target)), encode_depth(glimpse.depth)[:, None]], 1)
-    return Lesson(glimpse, torch.zeros_like(truth), _told(recording, back, frames[:, 0]), truth)
+        clean = dream(Lesson(past(frames), nothing, _told(recording, row, frames), nothing))  # pyright: ignore[reportOptionalCall]
+        frames = torch.cat([_pixels(clean)[:, None], frames[:, :-1]], 1)
+    glimpse, found = past(frames), recording.rgb(target)
+    truth = torch.cat([_coded(found), encode_depth(glimpse.depth)[:, None]], 1)
+    weight = changing(found, torch.stack([frames[:, 0], recording.rgb(target - 1)], 1))
+    return Lesson(glimpse, torch.zeros_like(truth), _told(recording, target, frames), truth, weight)
+
+
+def changing(found: torch.Tensor, before: torch.Tensor, often: float = CHANGED) -> torch.Tensor:
+    """How much each pixel of the frames `found` (uint8 [B, 3, H, W]) counts, 1 in the mean: [B, 1, H, W]. One that differs
+    from any of the frames `before` (uint8 [B, n, 3, H, W]) counts for 1 + `often` of the others: else a ball of two pixels
+    is cheaper to forget than to follow."""
+    moved = (found[:, None].int() - before.int()).abs().amax((1, 2)) > 20
+    weight = 1 + often * moved[:, None].float()
+    return weight / weight.mean()
+
+
+def _before(recording: Recording, rows: np.ndarray, count: int) -> np.ndarray:
+    """The `count` rows before each of `rows`, the newest first, none before its episode began: [n, count]."""
+    return np.maximum(rows[:, None] - 1 - np.arange(count), recording.start[rows][:, None])
 
 
 def _now_and_then(last: torch.Tensor, often: float, rng: np.random.Generator) -> torch.Tensor:
@@ -80,10 +107,13 @@ def _frames(recording: Recording, rows: np.ndarray) -> torch.Tensor:
     return flat.view(*rows.shape, *flat.shape[1:])
 
 
-def _told(recording: Recording, rows: np.ndarray, newest: torch.Tensor) -> torch.Tensor:
-    """The mood of the newest frame and the actions of `rows` [B, slots]."""
-    actions = torch.from_numpy(np.asarray(recording.cache.action[rows.ravel()], np.float32)).view(len(rows), -1)
-    return torch.cat([mood(newest), actions], 1)
+def _told(recording: Recording, rows: np.ndarray, frames: torch.Tensor) -> torch.Tensor:
+    """The mood of the newest of `frames` [B, slots, ...] and the actions that led to `rows` and the frames before them."""
+    wanted = rows[:, None] - 1 - np.arange(frames.shape[1])
+    began = wanted < recording.start[rows][:, None]
+    actions = recording.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
+    actions = torch.where(torch.from_numpy(began)[..., None], 0.0, actions)
+    return torch.cat([mood(frames[:, 0]), actions.flatten(1)], 1)
 
 
 def _coded(rgb: torch.Tensor) -> torch.Tensor:

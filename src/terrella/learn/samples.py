@@ -11,8 +11,12 @@ import torch.nn.functional as F
 from ..data import ClipCache
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
-from ..space.keyframes import Glimpse, Keyframes, look, retrieve
-from ..worlds.video import VideoConfig, carry, doubled
+from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
+from ..worlds.controls import AXES, CHOICE, Controls
+from ..worlds.moving import still
+from ..worlds.video import VideoConfig, carry
+
+THINGS = "observation.things"  # the channel that marks what may move or vanish
 
 
 @dataclass(frozen=True)
@@ -22,10 +26,16 @@ class Recording:
     cache: ClipCache
     start: np.ndarray
     usable: np.ndarray  # rows that training may see
+    controls: Controls | None = None  # what its actions mean; None: buttons
 
     def rgb(self, rows) -> torch.Tensor:
         """uint8 [n, 3, H, W]"""
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
+
+    def action(self, rows) -> torch.Tensor:
+        """float32 [n, A], as networks are told it."""
+        action = torch.from_numpy(np.array(self.cache.action[rows], np.float32))
+        return action if self.controls is None else self.controls.tell(action)
 
     def depth(self, rows) -> torch.Tensor:
         """float32 [n, H, W] metres at the size of the frames, whatever size was recorded."""
@@ -35,9 +45,37 @@ class Recording:
     def pose(self, rows) -> torch.Tensor:
         return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
 
+    def things(self, rows) -> torch.Tensor:
+        """float32 [n, H, W], 1 where something is that may move or vanish; 0 everywhere where that was not recorded."""
+        recorded = self.cache.arrays.get(THINGS)
+        height, width = self.cache.rgb.shape[1:3]
+        if recorded is None:
+            return torch.zeros(len(rows), height, width)
+        things = torch.from_numpy(np.asarray(recorded[rows], np.float32))
+        return F.adaptive_max_pool2d(things[:, None], (height, width))[:, 0]
+
+    def lasting(self, rows) -> torch.Tensor:
+        """The depth [n, H, W] that a keyframe may hold: 0 where things are."""
+        return still(self.depth(rows), self.things(rows))
+
     def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
         """As a dream keeps its own."""
-        return Keyframes.of(doubled(self.rgb(rows)), self.depth(rows), self.pose(rows), camera)
+        return Keyframes.of(doubled(self.rgb(rows)), self.lasting(rows), self.pose(rows), camera)
+
+
+def controls_of(cache: ClipCache) -> Controls:
+    """What the actions of a recording mean: as its world said, else as they look (buttons where all are 0 or 1)."""
+    low, high = cache.world.get("action_low"), cache.world.get("action_high")
+    whole = bool(cache.world.get("discrete"))
+    if low is None or high is None:
+        action = np.asarray(cache.action)
+        low, high = action.min(0).tolist(), action.max(0).tolist()
+        buttons = not whole and bool(np.isin(action, (0, 1)).all())
+    else:
+        buttons = str(cache.world.get("action_space")).startswith("MultiBinary")
+    if buttons:
+        return Controls.buttons(cache.action.shape[1])
+    return Controls(CHOICE if whole else AXES, tuple(map(float, low)), tuple(map(float, high)))
 
 
 def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
@@ -70,6 +108,12 @@ def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_
     return np.sort(rows[picks])
 
 
+def open_views(memory: Keyframes, count: int) -> Keyframes:
+    """`count` of the keyframes, spread over the map, among the quarter that looks farthest: a good place to begin a story."""
+    far = memory.depth.flatten(1).median(1).values.argsort(descending=True)[: max(count, len(memory) // 4)]
+    return memory.at(torch.from_numpy(choose_keyframes(memory.pose.numpy(), far.sort().values.numpy(), count)))
+
+
 @dataclass(frozen=True)
 class Lesson:
     """One batch for the generator: what it is shown and told, and the true frames it should find, in its own code."""
@@ -78,9 +122,12 @@ class Lesson:
     last: torch.Tensor
     told: torch.Tensor
     truth: torch.Tensor
+    weight: torch.Tensor | None = None  # [B, 1, H, W], how much each pixel counts; None: all alike
 
     def to(self, device) -> Lesson:
-        return Lesson(self.glimpse.to(device), self.last.to(device), self.told.to(device), self.truth.to(device))
+        weight = None if self.weight is None else self.weight.to(device)
+        glimpse, last = self.glimpse.to(device), self.last.to(device)
+        return Lesson(glimpse, last, self.told.to(device), self.truth.to(device), weight)
 
 
 @dataclass(frozen=True)
@@ -92,13 +139,17 @@ class Shown:
     target: np.ndarray
 
 
-def draw(recording: Recording, memory: Keyframes, config: VideoConfig, batch: int, rng: np.random.Generator) -> Shown:
+def draw(
+    recording: Recording, memory: Keyframes, config: VideoConfig, batch: int, rng: np.random.Generator, back: int = 2
+) -> Shown:
     """Half of the samples stand in recorded places (memory, thinned at random), half see only their own episode's past.
 
-    Both learn to complete: the first where memory is dense, the second where it is sparse.
+    Both learn to complete: the first where memory is dense, the second where it is sparse. `back` rows before each target
+    are of its episode and usable.
     """
-    rows = recording.usable & np.roll(recording.usable, 1)
-    rows &= np.roll(recording.usable, 2) & (np.arange(len(rows)) - recording.start >= 2)
+    rows = recording.usable & (np.arange(len(recording.usable)) - recording.start >= back)
+    for age in range(1, back + 1):
+        rows &= np.roll(recording.usable, age)
     target = rng.choice(np.flatnonzero(rows), batch)
     chosen = []
     for index, row in enumerate(target):

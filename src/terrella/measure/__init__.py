@@ -3,7 +3,8 @@
 from .album import Album
 from .bars import Bar, bars
 from .clips import Clip, clips_from_cache, in_box, out_of_sight
-from .closure import Closure, closure
+from .closure import Closure, closure, key_way, walk_way, yaw_way
+from .drift import Drift, drift
 from .encoder import FrameEncoder, frame_features, shipped_encoder
 from .endurance import Endurance, long_rollout
 from .examine import ExamConfig, examine, write_report
@@ -19,6 +20,7 @@ __all__ = [
     "Bar",
     "Clip",
     "Closure",
+    "Drift",
     "Endurance",
     "ExamConfig",
     "Figure",
@@ -31,11 +33,13 @@ __all__ = [
     "clip_features",
     "clips_from_cache",
     "closure",
+    "drift",
     "examine",
     "frame_features",
     "frechet",
     "frechet_interval",
     "in_box",
+    "key_way",
     "long_rollout",
     "out_of_sight",
     "page",
@@ -44,5 +48,7 @@ __all__ = [
     "speed",
     "strip",
     "to_json",
+    "walk_way",
     "write_report",
+    "yaw_way",
 ]

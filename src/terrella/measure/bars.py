@@ -43,7 +43,8 @@ def bars(card: Scorecard, arm: str) -> list[Bar]:
             found.append(_control_bar(card, arm, place, step, target, side))
         found.append(_obeys_bar(card, arm, place))
         found.append(_position_bar(card, arm, place))
-    found += [_closure_bar(card, arm, place) for place in ("recorded", "new")]
+    for place in ("recorded", "new"):
+        found += _closure_bars(card, arm, place)
     return found + _endurance_bars(card, arm)
 
 
@@ -117,16 +118,25 @@ def _position_bar(card: Scorecard, arm: str, place: str) -> Bar:
     return _bar(name, place, PREDICTED, 64, card.dt_s, "\u2264 5 %", "%", figure, -math.inf, 5.0, note=note)
 
 
-def _closure_bar(card: Scorecard, arm: str, place: str) -> Bar:
-    rows = [row for row in card.closures if (row.arm, row.place, round(row.far_deg)) == (arm, place, 180)]
-    name, target = "closure of yaw 0-180-0", "\u2265 27 dB"
-    if not rows:
-        return _bar(name, place, "true", None, card.dt_s, target, "dB", None, 27.0, math.inf)
-    note = f"far view against the first: {rows[0].far.value:.1f} dB"
-    if rows[0].void:
-        note += ", not different enough: the picture hardly turned, so closure proves nothing"
-        return Bar(name, place, "true", rows[0].steps, None, target, "dB", rows[0].closed, VOID, False, note=note)
-    return _bar(name, place, "true", rows[0].steps, None, target, "dB", rows[0].closed, 27.0, math.inf, note=note)
+def _closure_bars(card: Scorecard, arm: str, place: str) -> list[Bar]:
+    """Each way there and back that was gone; at least those along poses."""
+    rows = {row.way: row for row in card.closures if (row.arm, row.place) == (arm, place)}
+    found = []
+    for way in dict.fromkeys(("yaw 0-180-0", "yaw 0-90-0", *rows)):
+        name, least, row = f"closure of {way}", 27.0 if way == "yaw 0-180-0" else 25.0, rows.get(way)
+        target = f"\u2265 {least:g} dB"
+        if row is None:
+            found.append(_bar(name, place, "true", None, card.dt_s, target, "dB", None, least, math.inf))
+            continue
+        far = f"{row.far_m:.1f} m away, the far view" if row.far_m > 0.1 else "far view"
+        note = f"{far} against the first: {row.far.value:.1f} dB; it seen again: {row.again.value:.1f} dB"
+        if row.void:
+            note += ", not different enough: the picture hardly changed, so closure proves nothing"
+            found.append(Bar(name, place, "true", row.steps, None, target, "dB", row.closed, VOID, False, note=note))
+        else:
+            bar = _bar(name, place, "true", row.steps, None, target, "dB", row.closed, least, math.inf, note=note)
+            found.append(bar)
+    return found
 
 
 def _endurance_bars(card: Scorecard, arm: str) -> list[Bar]:

@@ -114,6 +114,19 @@ def clips_from_cache(
     return [_cut(cache, starts[pick], length, context) for pick in order]
 
 
+def check_clips(place: str, clips: Sequence[Clip], steps: int) -> None:
+    """DatasetError unless there are clips of `place`, all of one shape, with `steps` steps or more to dream."""
+    if not clips:
+        raise DatasetError(f"there are no clips of {place} places; draw some, or leave the place out.")
+    if len({(clip.context, len(clip.rgb)) for clip in clips}) != 1:
+        raise DatasetError(f"the clips of {place} places differ in length; draw them with one context and one horizon.")
+    if clips[0].horizon < steps:
+        raise DatasetError(
+            f"the clips of {place} places have {clips[0].horizon} steps to dream, the largest horizon is {steps}; "
+            "draw longer ones."
+        )
+
+
 def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Tensor]:
     """What `spec` observes of row `row` of each clip: name -> tensor [B, ...]; ObservationError where it cannot."""
     seen = {}

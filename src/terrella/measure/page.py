@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from .bars import Bar, summary
+from .closure import Closure
+from .drift import COPY_LAST, Drift
 from .plot import Line, line_chart, y_span
 from .roll import PREDICTED
-from .scorecard import COPY_LAST, Curve, Picture, Scorecard
-from .statistics import Figure
+from .scorecard import Curve, Picture, Scorecard
+from .statistics import Band, Figure
 from .strip import join_row, jpeg
 
 COLOURS = ("#6fd3c1", "#e3a857", "#8ea6ff", "#e07a9b", "#b6d36f")
@@ -30,6 +32,9 @@ def page(card: Scorecard, bars: Sequence[Bar], title: str) -> str:
         _strips(card),
         _psnr(card),
         _sharpness(card),
+        _drift(card),
+        _risk(card),
+        _fates(card),
         _looks(card),
         _control(card),
         _position(card),
@@ -123,6 +128,135 @@ def _sharpness(card: Scorecard) -> str:
     charts = _charts(card, "sharpness", "gradient energy, dream / game", (0.7, 1.0, 1.3))
     lead = "Gradient energy of the dreams over the game's: below 1 is blurred, above 1 too rough. Dotted: 0.7, 1, 1.3."
     return _section("Sharpness over time", lead, charts)
+
+
+def _drift(card: Scorecard) -> str:
+    """PSNR and sharpness at every step of the long clips, each line ending in its name, and how far each can be used."""
+    if not card.drifts:
+        return ""
+    drifts = list({(row.place, row.arm, row.motion): row for row in card.drifts}.values())  # cards are merged
+    ordered = sorted(drifts, key=lambda row: row.motion == "")  # copy-last is drawn last
+    steps = max(row.steps for row in ordered)
+    ticks = [(2**k, str(2**k)) for k in range(steps.bit_length())]
+    inside = ""
+    for what, label, guides in (
+        ("psnr", "PSNR, dB", ()),
+        ("sharpness", "gradient energy, dream / game", (0.7, 1.0, 1.3)),
+    ):
+        bands = [
+            getattr(row, what) for row in ordered if row.motion or what == "psnr"
+        ]  # still frames may be very rough
+        span = y_span([v for band in bands for v in (_values(band) if what == "psnr" else band.value)] + list(guides))
+        for place in dict.fromkeys(row.place for row in ordered):
+            lines = [_drift_line(card, row, what) for row in ordered if row.place == place]
+            svg = line_chart(lines, ticks, "steps", label, True, span, guides, named=True)
+            inside += f"<figure class=wide><h3>{escape(place)} places, {label.partition(',')[0]}</h3>"
+            inside += f"<div class=scroll>{svg}</div></figure>"
+    rows = []
+    for row in drifts:
+        name = f"{escape(_named(row.arm, row.motion))}<small>{escape(row.place)} places, {row.psnr.count} clips</small>"
+        rows.append([name, _steps_within(row.usable, row), _steps_within(row.usable_shared, row)])
+    heads = ("arm", "twice its own first error", "twice copy-last's")
+    lead = (
+        f"The same over {steps:,} steps ({drifts[0].seconds:.1f} s), on clips long enough for that. A dot marks how far a "
+        "dream can be used: the last step up to which its error stays within twice that of its own first step, which is "
+        "where the curve has fallen by 3 dB. The table adds the same from copy-last's first step, one yardstick for all."
+    )
+    return _section("Drift", lead, inside + _table(heads, rows))
+
+
+def _drift_line(card: Scorecard, row: Drift, what: str) -> Line:
+    band, mark = getattr(row, what), int(row.usable.value) if what == "psnr" else None
+    dash = "" if row.motion == PREDICTED else "5 4" if row.motion else "2 3"
+    steps, colour = list(range(1, row.steps + 1)), _colour(card, row.arm)
+    return Line(_named(row.arm, row.motion), steps, band.value, band.low, band.high, colour, dash, mark)
+
+
+def _risk(card: Scorecard) -> str:
+    """Risk-coverage curves of the arms, with the oracle's, and what the uncertainty is worth."""
+    if not card.risks:
+        return ""
+    inside, ticks = "", [(k / 4, f"{25 * k}%") for k in range(5)]
+    for place in dict.fromkeys(row.place for row in card.risks):
+        rows = [row for row in card.risks if row.place == place and row.motion == PREDICTED]
+        lines = []
+        for row in rows:
+            colour, x, chance = _colour(card, row.arm), row.coverage, [row.random.value] * len(row.coverage)
+            for name, y, dash in (
+                ("its own order", row.risk, ""),
+                ("an oracle", row.best, "2 3"),
+                ("chance", chance, "5 4"),
+            ):
+                lines.append(Line(f"{row.arm}, {name}", x, y, y, y, colour, dash))
+        if lines:
+            svg = line_chart(lines, ticks, "share of the frames kept, the surest first", "mean error of those")
+            heading = "all places together" if place == "all" else f"{place} places"
+            inside += _figure_box(heading, svg, lines)
+    rows = []
+    for row in card.risks:
+        name = f"{escape(_named(row.arm, row.motion))}<small>{escape(row.place)} places, {row.aurc.count} clips</small>"
+        found = f"{100 * row.closed.value:.0f}%<small>{100 * row.closed.low:.0f} to {100 * row.closed.high:.0f}</small>"
+        areas = [_hundredths(row.aurc), _hundredths(row.random), _hundredths(row.oracle)]
+        rows.append([name, *areas, found, _hundredths(row.expected), _hundredths(row.off)])
+    heads = ("arm", "area under the curve", "by chance", "by an oracle", "of the way to it", "error expected", "off")
+    lead = (
+        "Each frame comes with the error that the world expects of it. If the least certain frames are set aside, how large is "
+        "the mean absolute error of the rest (in % of full brightness)? Solid: by the world's own uncertainty; dotted: by an "
+        "oracle that knows the errors; dashed: by chance, which is also the mean error found, beside the error expected. "
+        "<i>Off</i> is the mean distance of both in eight equal bins."
+    )
+    return _section("Does it know when it invents?", lead, f"<div class=charts>{inside}</div>{_table(heads, rows)}")
+
+
+def _fates(card: Scorecard) -> str:
+    """A table of what dreams tell of rewards, vitals and ends."""
+    if not card.fates:
+        return ""
+    vitals = list(dict.fromkeys(name for row in card.fates for name in row.vitals))
+    heads = ["arm", "reward", "that it pays", "it ends", *vitals]
+    rows = []
+    for row in card.fates:
+        name = (
+            f"{escape(row.arm)}<small>{escape(row.place)} places, {row.horizon} step{'s'[: row.horizon == 1]}</small>"
+        )
+        cells = [f"{row.reward.value:.3g}<small>{row.reward_usual.value:.3g} by the usual</small>"]
+        for share, count in ((row.reward_auc, row.paid), (row.done_auc, row.ended)):
+            found = f"{share:.2f}" if math.isfinite(share) else "-"
+            cells.append(f"{found}<small>{count} of {row.reward.count} clips</small>")
+        for vital in vitals:
+            error, copied = row.vitals[vital], row.vitals_copied[vital]
+            cells.append(f"{error.value:.3g}<small>{copied.value:.3g} by a copy</small>")
+        rows.append([name, *cells])
+    lead = (
+        "What dreams tell of rewards, vitals and ends: the mean absolute error of the reward summed over the steps, beside "
+        "that of always paying the usual; how well the dreamt sum tells clips that paid more, and the dream's end tells clips "
+        "that ended (area under the ROC curve: 1 always, 0.5 by chance); the error of each vital, beside leaving it as it was."
+    )
+    return _section("What it pays and costs", lead, _table(heads, rows))
+
+
+def _hundredths(figure: Figure) -> str:
+    words = f"{100 * figure.value:.2f}"
+    if not math.isfinite(figure.low):
+        return words
+    return f"{words}<small>{100 * figure.low:.2f} to {100 * figure.high:.2f}</small>"
+
+
+def _steps_within(figure: Figure, row: Drift) -> str:
+    words = (
+        f"all {row.steps} steps" if figure.value >= row.steps else f"{figure.value:.0f} step{'s'[: figure.value != 1]}"
+    )
+    if not math.isfinite(figure.low):
+        return words
+    return f"{words}<small>{figure.low:.0f} to {figure.high:.0f}</small>"
+
+
+def _values(band: Band) -> list[float]:
+    return [*band.value, *band.low, *band.high]
+
+
+def _named(arm: str, motion: str) -> str:
+    return f"{arm}, {motion} motion" if motion else arm
 
 
 def _looks(card: Scorecard) -> str:
@@ -253,18 +387,47 @@ def _strips(card: Scorecard) -> str:
 
 
 def _closures(card: Scorecard) -> str:
-    parts = []
-    for done in card.closures:
-        columns = [f"{share * done.far_deg:.0f}\N{DEGREE SIGN}" for share in (0, 0.5, 1, 0.5, 0)]
-        closed = f"closes at {done.closed.value:.1f} dB ({done.closed.low:.1f} to {done.closed.high:.1f})"
-        verdict = "void, the far view is not different" if done.void else closed
-        title = f"{done.place} places, {done.arm}, {done.far_deg:.0f}\N{DEGREE SIGN} and back: {verdict}"
-        parts.append(_picture(Picture(title, columns, {f"far view {done.far.value:.1f} dB": done.picture})))
+    if not card.closures:
+        return ""
+    arms = list(dict.fromkeys(done.arm for done in card.closures))
+    rows, parts = [], []
+    for way, place in dict.fromkeys((done.way, done.place) for done in card.closures):
+        found = {done.arm: done for done in card.closures if (done.way, done.place) == (way, place)}
+        name = f"{escape(way)}<small>{escape(place)} places</small>"
+        rows.append([name, *(_closed(found[arm]) if arm in found else "" for arm in arms)])
+        first = next(iter(found.values()))
+        ends = (
+            (f"{first.far_deg:.0f}\N{DEGREE SIGN}", f"{first.far_m:.1f} m")
+            if first.far_deg
+            else (f"{first.far_m:.1f} m",)
+        )
+        columns = ["first", "on the way", f"far, {ends[0]}", "on the way back", "back", "far again"]
+        strips = {f"{arm}: {_closed_words(done)}": done.picture for arm, done in found.items()}
+        parts.append(_picture(Picture(f"{way}, {place} places", columns, strips)))
     lead = (
-        "The camera turns away and back in small steps; the last picture should be the first one again. "
-        "Where the view never changed on the way, that proves nothing and is called void."
+        "The camera goes away and back in small steps, and away once more. Back again, the picture should be the first one "
+        "(PSNR, dB); below it: the far view, which the world drew itself, seen a second time against the first time. Where the "
+        "view never changed on the way, that proves nothing and is called void."
     )
-    return _section("Does it remember?", lead, "".join(parts))
+    return _section("Does it remember?", lead, _table(("there and back", *map(escape, arms)), rows) + "".join(parts))
+
+
+def _closed(done: Closure) -> str:
+    if done.void:
+        return "void"
+    inside = f"<small>{done.closed.low:.1f} to {done.closed.high:.1f}</small>" if math.isfinite(done.closed.low) else ""
+    return f"{done.closed.value:.1f}{inside}<small>far again {_again(done)}</small>"
+
+
+def _again(done: Closure) -> str:
+    return "void" if done.void_again else f"{done.again.value:.1f}"
+
+
+def _closed_words(done: Closure) -> str:
+    if done.void:
+        return f"void, the far view is not different ({done.far.value:.1f} dB)"
+    far = f"the far view against the first: {done.far.value:.1f} dB, against itself when seen again: {_again(done)} dB"
+    return f"closes at {done.closed.value:.1f} dB; {far}"
 
 
 def _speeds(card: Scorecard) -> str:
@@ -291,7 +454,7 @@ def _charts(card: Scorecard, what: str, y_label: str, guides: Sequence[float] = 
     curves = [curve for curve in card.curves if curve.what == what]
     if not curves:
         return ""
-    span = y_span([value for c in curves for value in (*c.band.value, *c.band.low, *c.band.high)] + list(guides))
+    span = y_span([value for curve in curves for value in _values(curve.band)] + list(guides))
     steps = sorted({row.horizon for row in card.fidelity})
     boxes = []
     for place in card.places:
@@ -302,10 +465,17 @@ def _charts(card: Scorecard, what: str, y_label: str, guides: Sequence[float] = 
 
 
 def _line(card: Scorecard, curve: Curve) -> Line:
-    label = f"{curve.arm}, {curve.motion} motion" if curve.motion else curve.arm
     dash = "" if curve.motion == PREDICTED else "5 4" if curve.motion else "2 3"
     x = list(range(1, len(curve.band.value) + 1))
-    return Line(label, x, curve.band.value, curve.band.low, curve.band.high, _colour(card, curve.arm), dash)
+    return Line(
+        _named(curve.arm, curve.motion),
+        x,
+        curve.band.value,
+        curve.band.low,
+        curve.band.high,
+        _colour(card, curve.arm),
+        dash,
+    )
 
 
 def _figure_box(title: str, svg: str, lines: Sequence[Line]) -> str:

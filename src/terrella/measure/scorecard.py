@@ -11,19 +11,20 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ..core.errors import DatasetError
 from ..core.world import World, make_rng
-from .clips import Clip
+from .clips import Clip, check_clips
 from .closure import Closure
+from .drift import COPY_LAST, Drift
 from .encoder import MIN_SIDE, frame_features
 from .endurance import Endurance
-from .fidelity import blurred, gradient_energy, psnr
+from .fidelity import blurred
 from .frechet import frechet_interval
-from .roll import PREDICTED, TRUE, Dream, dream, frames_at, poses_at, true_motion_works
+from .outcomes import Fate
+from .risk import Risk, pooled, risk
+from .roll import PREDICTED, TRUE, Dream, dream_all, frames_at, poses_at, stand_still, true_motion_works
 from .speed import Speed
 from .statistics import Band, Figure, mean_band, mean_interval, median_interval, ratio_band, ratio_interval
 
-COPY_LAST = "copy last"
 Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
 
 
@@ -157,6 +158,9 @@ class Scorecard:
     looks: list[Looks] = field(default_factory=list)
     drops: list[Drop] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
+    drifts: list[Drift] = field(default_factory=list)
+    risks: list[Risk] = field(default_factory=list)
+    fates: list[Fate] = field(default_factory=list)
     closures: list[Closure] = field(default_factory=list)
     endurance: list[Endurance] = field(default_factory=list)
     speeds: list[Speed] = field(default_factory=list)
@@ -180,8 +184,9 @@ def score(
     first = next(iter(arms.values()))
     card = Scorecard({name: world.spec.name for name, world in arms.items()}, first.spec.dt_s, [])
     total, done = len(arms) * len(clips_by_place), 0
+    doubted: dict[tuple[str, str], list[tuple[torch.Tensor, torch.Tensor]]] = {}
     for place, clips in clips_by_place.items():
-        _check_clips(place, clips, config)
+        check_clips(place, clips, max(config.horizons))
         seed, order = _seed(rng), torch.randperm(len(clips), generator=rng).tolist()
         others = [clips[order[(order.index(number) + 1) % len(clips)]] for number in range(len(clips))]
         card.places.append(_describe(place, clips))
@@ -191,16 +196,20 @@ def score(
         rows: list[dict[str, np.ndarray]] = [{"truth": _kept(clip, config.horizons)} for clip in clips[: config.strips]]
         for arm, world in arms.items():
             tell(done / total, f"{place} places, {arm}")
-            dreams = {PREDICTED: _dream_all(world, clips, PREDICTED, config.horizons, config.batch, seed)}
+            dreams = {PREDICTED: dream_all(world, clips, PREDICTED, config.horizons, config.batch, seed)}
             if true_motion_works(world, clips[0], make_rng(seed)):
-                dreams[TRUE] = _dream_all(world, clips, TRUE, config.horizons, config.batch, seed)
+                dreams[TRUE] = dream_all(world, clips, TRUE, config.horizons, config.batch, seed)
             for motion, dreamt in dreams.items():
                 _add_fidelity(card, place, arm, motion, dreamt, truth, config, rng)
+                if dreamt.error is not None and dreamt.uncertainty is not None:
+                    doubted.setdefault((arm, motion), []).append((dreamt.error, dreamt.uncertainty))
+                    chance = make_rng(seed)  # of its own: the other figures are those of a world that does not doubt
+                    card.risks.append(risk(place, arm, motion, dreamt.error, dreamt.uncertainty, chance))
                 for picture, clip, frames in zip(rows, clips, dreamt.frames):
                     picture[f"{arm}, {motion} motion"] = _with_context(clip, frames)
             steps = [step for step in config.control_horizons if step <= max(config.horizons)]
             if len(clips) > 1 and steps:
-                wrong = _dream_all(world, clips, PREDICTED, steps, config.batch, seed, others)
+                wrong = dream_all(world, clips, PREDICTED, steps, config.batch, seed, others)
                 _add_control(card, place, arm, dreams[PREDICTED], wrong, steps, rng)
             _add_position(card, place, arm, dreams[PREDICTED], clips, config, rng)
             done += 1
@@ -208,6 +217,9 @@ def score(
         card.pictures.extend(
             Picture(f"{place} place, clip {number + 1}", columns, row) for number, row in enumerate(rows)
         )
+    for (arm, motion), parts in doubted.items():
+        if len(parts) > 1:
+            card.risks.append(pooled(parts, arm, motion, make_rng(len(card.risks))))
     tell(1.0, "scored")
     return card
 
@@ -252,18 +264,6 @@ def _seed(rng: torch.Generator) -> int:
     return int(torch.randint(2**31 - 1, (1,), generator=rng).item())
 
 
-def _check_clips(place: str, clips: Sequence[Clip], config: ScoreConfig) -> None:
-    if not clips:
-        raise DatasetError(f"there are no clips of {place} places; draw some, or leave the place out.")
-    if len({(clip.context, len(clip.rgb)) for clip in clips}) != 1:
-        raise DatasetError(f"the clips of {place} places differ in length; draw them with one context and one horizon.")
-    if clips[0].horizon < max(config.horizons):
-        asked = f"the largest horizon is {max(config.horizons)}"
-        raise DatasetError(
-            f"the clips of {place} places have {clips[0].horizon} steps to dream, {asked}; draw longer ones."
-        )
-
-
 def _describe(place: str, clips: Sequence[Clip]) -> Place:
     moving = sum(clip.moves() for clip in clips) / len(clips)
     return Place(place, len(clips), moving, clips[0].context, clips[0].horizon)
@@ -271,25 +271,11 @@ def _describe(place: str, clips: Sequence[Clip]) -> Place:
 
 def _truth(clips: Sequence[Clip], config: ScoreConfig) -> _Truth:
     context, steps = clips[0].context, max(config.horizons)
-    copied, energy = [], []
-    last = frames_at(clips, context - 1)
-    for step in range(steps):
-        frames = frames_at(clips, context + step)
-        copied.append(psnr(last, frames))
-        energy.append(gradient_energy(frames))
+    copied, energy = stand_still(clips, steps)
     features = None
     if config.frechet and min(clips[0].rgb.shape[1:3]) >= MIN_SIDE:
         features = torch.stack([frame_features(frames_at(clips, context - 1 + step)) for step in config.horizons], 1)
-    return _Truth(torch.stack(copied, 1), torch.stack(energy, 1), features)
-
-
-def _dream_all(world: World, clips, motion: str, horizons, batch: int, seed: int, others=None) -> Dream:
-    size = min(batch, world.spec.max_batch or batch)
-    parts = []
-    for start in range(0, len(clips), size):
-        hands = others[start : start + size] if others else None
-        parts.append(dream(world, clips[start : start + size], motion, horizons, make_rng(seed + start), hands))
-    return Dream.join(parts)
+    return _Truth(copied, energy, features)
 
 
 def _kept(clip: Clip, horizons: Sequence[int]) -> np.ndarray:

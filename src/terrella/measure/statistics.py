@@ -65,15 +65,36 @@ def median_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
     return _figure(values.quantile(0.5), values[picks].quantile(0.5, dim=1), len(values))
 
 
+def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Generator) -> Figure:
+    """The step up to which the mean of values [n, T] has stayed at or above the mean of floor [n].
+
+    Steps count from 1; 0 where already the first is below, T where none is. Clips of both are resampled together.
+    """
+    over = values.double() - floor.double()[:, None]
+
+    def last(means: torch.Tensor) -> torch.Tensor:
+        """Means [..., T] -> steps before the first that is below 0: [...]."""
+        return (means >= -1e-9).cumprod(-1).sum(-1).double()
+
+    centre = last(over.mean(0))
+    if len(over) < 2:
+        return Figure(float(centre), math.nan, math.nan, len(over))
+    return _figure(centre, last(_weights(len(over), rng) @ over / len(over)), len(over))
+
+
 def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Generator) -> Band:
     if count < 2:
         nothing = [math.nan] * len(centre)
         return Band(centre.tolist() if count else nothing, nothing, nothing, count)
+    low, high = resample(_weights(count, rng)).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    return Band(centre.tolist(), low.tolist(), high.tolist(), count)
+
+
+def _weights(count: int, rng: torch.Generator) -> torch.Tensor:
+    """How often each of `count` clips was drawn in each resample: float64 [RESAMPLES, count]."""
     picks = torch.randint(count, (RESAMPLES, count), generator=rng)
     ones = torch.ones(RESAMPLES, count, dtype=torch.float64)
-    weights = torch.zeros_like(ones).scatter_add_(1, picks, ones)
-    low, high = resample(weights).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
-    return Band(centre.tolist(), low.tolist(), high.tolist(), count)
+    return torch.zeros_like(ones).scatter_add_(1, picks, ones)
 
 
 def _figure(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figure:

@@ -20,6 +20,8 @@ class Moment:
     episode_return: float = 0.0
     states: tuple[State, ...] | None = None
     rng: torch.Tensor | None = None  # the generator's state after this step
+    uncertainty: float = -1.0  # the error to expect of the last image, -1 where its world does not say
+    vitals: tuple[float, ...] = ()  # of the first world's player
 
 
 class History:

@@ -10,8 +10,11 @@ from dataclasses import dataclass
 
 from ..core.errors import ProtocolError
 
-VERSION = 1
+VERSION = 2
 MAX_MESSAGE = 4096  # bytes of one message from a page
+MAX_PICTURE = (
+    2**16 - 256
+)  # bytes of a picture from a page: what it sends as bytes is one, what it sends as text is JSON
 MAX_HELD = 16  # keys held at once
 U32 = 2**32 - 1
 
@@ -21,8 +24,8 @@ FRESH = 2  # first frame of an episode
 REPLAY = 4  # a frame out of the history: the session stands in the past
 
 # version u8, flags u8, images u16, seq u32, step u32, oldest u32, newest u32, action id u32,
-# generation ms f32, episode return f32, client's time of that action f64, server's time f64; little endian
-_HEADER = struct.Struct("<BBHIIIIIffdd")
+# generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32; little endian
+_HEADER = struct.Struct("<BBHIIIIIffddf")
 _LENGTH = struct.Struct("<I")
 
 
@@ -31,7 +34,9 @@ class Frame:
     """One moment as the page gets it.
 
     seq counts messages (the page acknowledges it); step is the world's; oldest..newest is what can be rewound to;
-    action_id and client_ms echo the latest keys message that this step obeyed; images are JPEGs, one per world.
+    action_id and client_ms echo the latest keys message that this step obeyed; images are JPEGs, one per world;
+    uncertainty is the error to expect of the last of them, -1 where its world does not say; vitals are the numbers of the
+    player (health) that the first world tells, in the order of hello.
     """
 
     seq: int
@@ -45,26 +50,27 @@ class Frame:
     episode_return: float = 0.0
     client_ms: float = 0.0
     server_s: float = 0.0
+    uncertainty: float = -1.0
+    vitals: tuple[float, ...] = ()
 
 
 def encode_frame(frame: Frame) -> bytes:
     parts = [
         _HEADER.pack(
             VERSION, frame.flags, len(frame.images), frame.seq & U32, frame.step, frame.oldest, frame.newest,
-            frame.action_id, frame.generation_ms, frame.episode_return, frame.client_ms, frame.server_s,
+            frame.action_id, frame.generation_ms, frame.episode_return, frame.client_ms, frame.server_s, frame.uncertainty,
         )
     ]  # fmt: skip
     for image in frame.images:
         parts += [_LENGTH.pack(len(image)), image]
-    return b"".join(parts)
+    return b"".join([*parts, struct.pack(f"<{len(frame.vitals)}f", *frame.vitals)])
 
 
 def decode_frame(data: bytes) -> Frame:
     """What `encode_frame` wrote; ProtocolError where the bytes are cut short or of another version."""
     try:
-        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server = _HEADER.unpack_from(
-            data
-        )
+        fields = _HEADER.unpack_from(data)
+        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, doubt = fields
         if version != VERSION:
             raise ProtocolError(
                 f"a frame of protocol version {version} came, this side speaks {VERSION}; reload the page."
@@ -75,11 +81,12 @@ def decode_frame(data: bytes) -> Frame:
             at += _LENGTH.size
             images.append(data[at : at + length])
             at += length
+        vitals = struct.unpack(f"<{max(len(data) - at, 0) // 4}f", data[at:])
     except struct.error as error:
         raise ProtocolError(f"a frame of {len(data)} bytes is cut short; reload the page.") from error
-    if at != len(data):
+    if at > len(data):
         raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
-    return Frame(seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server)
+    return Frame(seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, doubt, vitals)
 
 
 @dataclass(frozen=True)
@@ -142,11 +149,30 @@ class Record:
     on: bool
 
 
-Message = Keys | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record
+@dataclass(frozen=True)
+class Show:
+    """What the page shows of memory from now on: `map` asks for chart events, `invented` for tinted pictures."""
+
+    map: bool
+    invented: bool
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The bytes of an image file: a new episode begins with it."""
+
+    data: bytes
+
+
+Message = Keys | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record | Show | Picture
 
 
 def parse_message(data: str | bytes) -> Message:
-    """A message from a page; ProtocolError says what is wrong with it."""
+    """A message from a page: text is JSON, bytes are a picture; ProtocolError says what is wrong with it."""
+    if isinstance(data, bytes):
+        if not 0 < len(data) <= MAX_PICTURE:
+            raise ProtocolError(f"a picture of {len(data)} bytes came; at most {MAX_PICTURE} are taken.")
+        return Picture(data)
     if len(data) > MAX_MESSAGE:
         raise ProtocolError(f"a message of {len(data)} bytes is too long; the limit is {MAX_MESSAGE}.")
     try:
@@ -186,6 +212,10 @@ def parse_message(data: str | bytes) -> Message:
             if not isinstance(body.get("on"), bool):
                 raise ProtocolError("'on' must be true or false.")
             return Record(body["on"])
+        case "show":
+            if not (isinstance(body.get("map"), bool) and isinstance(body.get("invented"), bool)):
+                raise ProtocolError("'map' and 'invented' must be true or false.")
+            return Show(body["map"], body["invented"])
     raise ProtocolError(f"no message is called {str(kind)[:40]!r}.")
 
 
@@ -204,7 +234,12 @@ def _number(body: dict, name: str) -> float:
 
 
 def encode_event(kind: str, **body) -> str:
-    """A JSON message to the page: hello, status or error."""
+    """A JSON message to the page: hello, status, error, or chart: the map of a moment.
+
+    chart: world (its number on the page), step, eye [x, y in metres, heading in radians], known (the share of its picture
+    that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind
+    (1 recorded, 2 observed, 3 dreamt) of each, in one flat list.
+    """
     return json.dumps({"type": kind, **body}, allow_nan=False)
 
 

@@ -28,10 +28,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from ..core.errors import ProtocolError, ServeError
 from ..core.world import World
 from . import protocol
+from .chart import mapped, tells_known
 from .clip import make_clip
 from .guard import RateLimit, SafeHeaders, is_loopback, refusal
+from .picture import doubtful
 from .session import Session
-from .story import SinkFactory, Story, StoryConfig, check_playable
+from .story import SinkFactory, Story, StoryConfig, check_playable, vitals
 
 _FILES = {
     "/": ("index.html", "text/html"),
@@ -41,6 +43,9 @@ _FILES = {
     "/controls.js": ("controls.js", "text/javascript"),
     "/card.js": ("card.js", "text/javascript"),
     "/keycaps.js": ("keycaps.js", "text/javascript"),
+    "/map.js": ("map.js", "text/javascript"),
+    "/doubt.js": ("doubt.js", "text/javascript"),
+    "/picture.js": ("picture.js", "text/javascript"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
 
@@ -62,8 +67,15 @@ class ServeConfig:
 class Sessions:
     """The sessions of one server, their one worker thread and their seats."""
 
-    def __init__(self, worlds: Sequence[World], seed: int, sink_factory: SinkFactory | None, config: ServeConfig):
-        self.worlds, self.seed, self.config = tuple(worlds), seed, config
+    def __init__(
+        self,
+        worlds: Sequence[World],
+        seed: int,
+        sink_factory: SinkFactory | None,
+        config: ServeConfig,
+        picture: torch.Tensor | None = None,
+    ):
+        self.worlds, self.seed, self.config, self.picture = tuple(worlds), seed, config, picture
         self._sink_factory = sink_factory
         self._seats = config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
@@ -107,7 +119,7 @@ class Sessions:
         task.add_done_callback(self._ended.discard)
 
     def _tell_story(self) -> Story:
-        return Story(self.worlds, self.seed, self._sink_factory, self.config.story)
+        return Story(self.worlds, self.seed, self._sink_factory, self.config.story, self.picture)
 
     def hello(self, session: Session, resumed: bool) -> str:
         """All that the page needs to know about the worlds."""
@@ -136,6 +148,10 @@ def _describe(world: World, label: str) -> dict:
         "action_names": list(spec.action_names),
         "action_kind": type(spec.action).__name__,
         "scored": "reward" in spec.channels,
+        "vitals": vitals(spec),
+        "doubtful": doubtful(spec),
+        "mapped": mapped(spec),
+        "tells_known": tells_known(spec),
         "card": protocol.plain(dict(spec.card)),
     }
 
@@ -148,6 +164,7 @@ def build_app(
     seed: int = 0,
     config: ServeConfig | None = None,
     on_ready: Callable[[], None] | None = None,
+    picture: torch.Tensor | None = None,
 ) -> Starlette:
     """The ASGI application; `host` is the address it is bound to, which decides what Host headers it answers to."""
     check_playable(worlds)
@@ -157,7 +174,7 @@ def build_app(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config)
+        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture)
         sweeper = asyncio.create_task(_sweep(sessions))
         if on_ready:
             on_ready()
@@ -285,8 +302,10 @@ def serve(
     on_ready: Callable[[str], None] | None = None,
     seed: int = 0,
     config: ServeConfig | None = None,
+    picture: torch.Tensor | None = None,
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
+    Stories begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
@@ -298,7 +317,7 @@ def serve(
         token = secrets.token_urlsafe(16)
     listener = open_port(host, port)
     with contextlib.closing(listener):
-        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config)
+        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture)
         with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
             server.run(sockets=[listener])
 
@@ -325,11 +344,12 @@ def make_server(
     on_ready: Callable[[str], None] | None = None,
     seed: int = 0,
     config: ServeConfig | None = None,
+    picture: torch.Tensor | None = None,
 ) -> uvicorn.Server:
     """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
     ready = (lambda: on_ready(url)) if on_ready else None
-    app = build_app(worlds, host, token, sink_factory, seed, config, ready)
+    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture)
     settings = uvicorn.Config(
         app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=2**16, ws_max_queue=64,
         ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False, proxy_headers=False,

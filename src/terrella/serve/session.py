@@ -15,11 +15,28 @@ from typing import Protocol
 
 from ..core.errors import TerrellaError
 from . import protocol
+from .chart import Chart
 from .history import Moment
-from .protocol import Ack, Branch, Frame, Keys, Message, Pause, Record, Restart, Resume, Rewind, Seek, Sync
+from .protocol import (
+    Ack,
+    Branch,
+    Frame,
+    Keys,
+    Message,
+    Pause,
+    Picture,
+    Record,
+    Restart,
+    Resume,
+    Rewind,
+    Seek,
+    Show,
+    Sync,
+)
 from .story import Story
 
 MAX_UNACKED = 2
+CHART_S = 0.1  # between two maps
 
 
 class Socket(Protocol):
@@ -53,6 +70,9 @@ class Session:
         self._paused = self._closed = False
         self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
         self._error = self._told = ""
+        self._show = Show(map=False, invented=False)
+        self._charted: Chart | None = None  # what the page has on its map
+        self._chart_due = 0.0
         self._due = 0.0
 
     # -- the socket's side: called on the event loop, never waits ------------------------------------------------
@@ -70,6 +90,7 @@ class Session:
         before, self._socket = self._socket, socket
         self.detached_at, self._acked, self._told = None, self._sent, "hello"
         self._keys = Keys(0, ())  # a new page counts its messages anew
+        self._show = Show(map=False, invented=False)
         self.heard_at = time.monotonic()
         self._unseen = self.story.shown if self.story else None
         self._wake.set()
@@ -97,6 +118,8 @@ class Session:
             return
         elif isinstance(message, Seek) and self._commands and isinstance(self._commands[-1], Seek):
             self._commands[-1] = message  # a scrubbed timeline: only the latest place matters
+        elif isinstance(message, Picture) and self._commands and isinstance(self._commands[-1], Picture):
+            self._commands[-1] = message
         elif len(self._commands) < 64:
             self._commands.append(message)
         self._wake.set()
@@ -183,8 +206,8 @@ class Session:
                     self._unseen = await self._work(story.to_newest) if story.rewound else self._unseen
                     self._paused, self._error = False, ""
                 case Restart(seed):
-                    seed = secrets.randbelow(2**31) if seed is None else seed
-                    self._unseen = await self._work(story.restart, seed)
+                    new = secrets.randbelow(2**31) if seed is None else seed
+                    self._unseen = await self._work(story.restart, new, seed is not None)
                     self._paused, self._error = False, ""
                 case Rewind(steps):
                     self._unseen = await self._work(story.stand_at, story.shown.step - steps)
@@ -193,10 +216,16 @@ class Session:
                 case Branch():
                     self._unseen = await self._work(story.branch)
                     self._paused, self._error = False, ""
+                case Picture(data):
+                    self._unseen = await self._work(story.enter, data)
+                    self._paused, self._error = False, ""
                 case Sync():
                     self._unseen = await self._work(story.sync)
                 case Record(on):
                     await self._work(story.record, on)
+                case Show():
+                    self._show, self._charted, self._chart_due = message, None, 0.0
+                    self._unseen = self._unseen or story.shown
         except TerrellaError as error:
             await self._event(protocol.encode_event("error", text=str(error)))
         except Exception as error:  # a world is a stranger's code: the server outlives it
@@ -224,10 +253,12 @@ class Session:
     async def _send(self, moment: Moment, story: Story, made_ms: float, keys: Keys) -> None:
         self._unseen = None
         flags = moment.flags | protocol.REPLAY * story.rewound
+        images = (await self._beside(story.tinted, moment) if self._show.invented else None) or moment.images
         self._sent += 1
         frame = Frame(
-            self._sent, moment.step, story.oldest_step, story.newest_step, moment.images, flags,
-            keys.id, made_ms, moment.episode_return, keys.t, time.time(),
+            self._sent, moment.step, story.oldest_step, story.newest_step, images, flags,
+            keys.id, made_ms, moment.episode_return, keys.t, time.time(), moment.uncertainty,
+            moment.vitals,
         )  # fmt: skip
         socket = self._socket
         if socket is None:
@@ -236,6 +267,25 @@ class Session:
             await socket.send_bytes(protocol.encode_frame(frame))
         except Exception:  # however a connection breaks, the story waits for the next
             self.detach(socket)
+        if self._show.map and (time.perf_counter() >= self._chart_due or story.rewound):
+            await self._chart(story)
+
+    async def _chart(self, story: Story) -> None:
+        self._chart_due = time.perf_counter() + CHART_S
+        found = await self._beside(story.chart)
+        if found is not None:
+            number, chart = found
+            before, self._charted = self._charted, chart
+            await self._event(protocol.encode_event("chart", world=number, step=story.shown.step, **chart.body(before)))
+
+    async def _beside(self, function: Callable, *arguments):
+        """What the story says of memory; None, and no more of it, where its world cannot."""
+        try:
+            return await self._work(function, *arguments)
+        except Exception:  # a world is a stranger's code: play goes on without
+            traceback.print_exc(file=sys.stderr)
+            self._show = Show(map=False, invented=False)
+            return None
 
     async def _event(self, text: str) -> None:
         socket = self._socket

@@ -16,7 +16,9 @@ from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
 from .actions import action_of_keys
+from .chart import Chart, chart, mapped, tells_known, tinted
 from .history import History, Moment
+from .picture import MAX_DROPPED_PIXELS, doubtful, picture_of
 from .protocol import DONE, FRESH
 
 JPEG_QUALITY = 90
@@ -35,6 +37,12 @@ class Sink(Protocol):
 
 
 SinkFactory = Callable[[], Sink]
+
+
+def vitals(spec: Spec) -> list[str]:
+    """The channels that are one number of the player's, such as health, which the page shows beside the score."""
+    others = ("reward", "done", "uncertainty")
+    return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
 
 
 @dataclass(frozen=True)
@@ -69,10 +77,11 @@ class Story:
         seed: int,
         sink_factory: SinkFactory | None = None,
         config: StoryConfig | None = None,
+        picture: torch.Tensor | None = None,
     ):
         check_playable(worlds)
         config = config or StoryConfig()
-        self.worlds = tuple(worlds)
+        self.worlds, self._picture = tuple(worlds), picture
         self.notice = ""  # something that a person should know, in one sentence
         self._sink_factory = sink_factory
         self._sink: Sink | None = None
@@ -122,12 +131,34 @@ class Story:
         past = self._history.pictures()
         return past[: len(past) - (self.newest_step - self._shown.step)]
 
+    def chart(self) -> tuple[int, Chart] | None:
+        """The map of the moment shown, of the last world that has one, and which that is; None where none has."""
+        number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
+        if number is None:
+            return None
+        return number, chart(self.worlds[number], (self._shown.states or self._states)[number])
+
+    def tinted(self, moment: Moment) -> tuple[bytes, ...]:
+        """The moment's JPEGs with what was invented tinted, where a world says that and the moment's states are kept."""
+        images = list(moment.images)
+        for number, world in enumerate(self.worlds):
+            if moment.states is not None and tells_known(world.spec):
+                seen = world.render(moment.states[number], ("rgb", "known"))
+                images[number] = encode_jpeg(tinted(seen["rgb"], seen["known"]))
+        return tuple(images)
+
     # -- verbs --------------------------------------------------------------------------------------------------
 
-    def restart(self, seed: int) -> Moment:
-        """A new story from `seed`; the past is forgotten, once the new one has begun."""
+    def restart(self, seed: int, same_picture: bool = True) -> Moment:
+        """A new story from `seed`, and the picture that this one began with, if any; the past is forgotten, once the new one
+        has begun."""
+        picture, self._picture = self._picture, self._picture if same_picture else None
         rngs = tuple(make_rng(seed) for _ in self.worlds)
-        states = self._starts(rngs)
+        try:
+            states = self._starts(rngs)
+        except TerrellaError:
+            self._picture = picture
+            raise
         self.seed, self._rngs = seed, rngs
         self._history.clear()
         return self._begin(0, states)
@@ -163,6 +194,20 @@ class Story:
         self._shown = self._history.newest
         return self._shown
 
+    def enter(self, data: bytes) -> Moment:
+        """A new episode that begins with a picture, the bytes of an image file; the past stays."""
+        height, width = self.spec.channels["rgb"].shape[:2]
+        before = self._picture
+        self._picture = picture_of(data, (height, width), MAX_DROPPED_PIXELS, "this picture")
+        try:
+            states = self._starts(self._rngs)
+        except TerrellaError:
+            self._picture = before
+            raise
+        if self.rewound:
+            self._return_to(self._history.newest)
+        return self._begin(self._shown.step + 1, states)
+
     @torch.no_grad()
     def sync(self) -> Moment:
         """The dream looks at the truth as it is now."""
@@ -191,6 +236,9 @@ class Story:
 
     @torch.no_grad()
     def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
+        if self._picture is not None:
+            return (self._entered(self._picture, rngs[0]),)
+        self.notice = ""
         truth = self.worlds[0].start(1, rngs[0])
         return (truth,) if len(self.worlds) == 1 else (truth, self._dream_of(truth, rngs[1]))
 
@@ -199,6 +247,24 @@ class Story:
         self._end_episode()
         self._states, self._return = states, 0.0
         return self._show(step, FRESH, None)
+
+    def _entered(self, picture: torch.Tensor, rng: torch.Generator) -> State:
+        """The played world after seeing `picture`; a notice says so where it is unlike what the world knows."""
+        world = self.worlds[0]
+        if len(self.worlds) == 2:
+            raise ServeError(
+                "a picture cannot begin a comparison: the game cannot go on from it; play without --compare."
+            )
+        if "rgb" not in world.spec.observes:
+            raise ServeError(f"{world.spec.name} takes no pictures, so it cannot begin with one.")
+        state = world.observe({"rgb": picture[None]}, None, rng)
+        levels = doubtful(world.spec)
+        self.notice = ""
+        if levels and float(world.render(state, ("uncertainty",))["uncertainty"][0]) >= levels[1]:
+            self.notice = (
+                f"this picture is unlike what {world.spec.name} learned from: most of what follows is invented."
+            )
+        return state
 
     def _dream_of(self, truth: State, rng: torch.Generator) -> State:
         dream = self.worlds[1]
@@ -215,10 +281,15 @@ class Story:
         return state
 
     def _show(self, step: int, flags: int, action: torch.Tensor | None) -> Moment:
-        wanted = ["rgb", *(name for name in ("reward", "done") if name in self.spec.channels)]
+        wanted = ["rgb", *(name for name in ("reward", "done", "uncertainty") if name in self.spec.channels)]
+        told = vitals(self.spec)
+        wanted += told
         extra = [name for name in self.spec.channels if name not in wanted] if self._sink else []
         seen = self.worlds[0].render(self._states[0], tuple(wanted + extra))
-        others = [world.render(state, ("rgb",)) for world, state in zip(self.worlds[1:], self._states[1:], strict=True)]
+        others = [
+            world.render(state, ("rgb", *(("uncertainty",) if "uncertainty" in world.spec.channels else ())))
+            for world, state in zip(self.worlds[1:], self._states[1:], strict=True)
+        ]
         images = tuple(encode_jpeg(view["rgb"]) for view in (seen, *others))
         reward = float(seen["reward"][0]) if "reward" in seen and action is not None else 0.0
         done = bool(seen["done"][0]) if "done" in seen and action is not None else False
@@ -228,7 +299,10 @@ class Story:
         if not self.no_rewind:
             rngs = torch.stack([rng.get_state() for rng in self._rngs])
         flags |= DONE * done
-        moment = Moment(step, images, flags, self._return, None if self.no_rewind else self._states, rngs)
+        last = (seen, *others)[-1]
+        doubt = float(last["uncertainty"][0]) if "uncertainty" in last else -1.0
+        fit = tuple(float(seen[name][0]) for name in told)
+        moment = Moment(step, images, flags, self._return, None if self.no_rewind else self._states, rngs, doubt, fit)
         self._history.push(moment)
         self._shown = moment
         return moment

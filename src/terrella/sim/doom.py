@@ -1,15 +1,19 @@
 """ViZDoom as a World: the real game, with named buttons, exact depth and the camera's pose.
 
 Doom's own depth buffer has 8 bits (about 7 map units a level), so depth is cast exactly from the map's sectors, and
-the buffer is used only where it shows something nearer (a sprite). One metre is 32 map units, the usual reading.
+the buffer is used only where it shows something else (a sprite). One metre is 32 map units, the usual reading.
+What may move or vanish (monsters, shots, pick-ups, doors, lifts) is marked in the channel `things`: no memory of the
+place should hold it.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,42 +23,53 @@ from gymnasium import spaces
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, REWARD, Spec
 from ..core.state import State
+from .doom_map import Sectors, map_names, skies
 
 UNITS_PER_M = 32.0
 TICS_PER_S = 35
 MAX_DEPTH_M = 60.0
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
+MORE_BUTTONS = ("ATTACK", "USE")  # where the scenario's own configuration has them
 KEYS = {
-    code: [float(name == button) for name in BUTTONS]
-    for code, button in {
-        "KeyW": "MOVE_FORWARD",
-        "KeyS": "MOVE_BACKWARD",
-        "KeyA": "MOVE_LEFT",
-        "KeyD": "MOVE_RIGHT",
-        "ArrowLeft": "TURN_LEFT",
-        "ArrowRight": "TURN_RIGHT",
-        "ArrowUp": "MOVE_FORWARD",
-        "ArrowDown": "MOVE_BACKWARD",
-    }.items()
+    "KeyW": "MOVE_FORWARD",
+    "KeyS": "MOVE_BACKWARD",
+    "KeyA": "MOVE_LEFT",
+    "KeyD": "MOVE_RIGHT",
+    "ArrowLeft": "TURN_LEFT",
+    "ArrowRight": "TURN_RIGHT",
+    "ArrowUp": "MOVE_FORWARD",
+    "ArrowDown": "MOVE_BACKWARD",
+    "Space": "ATTACK",
+    "KeyE": "USE",
 }
 # Horizontal field of view 90 degrees; Doom's pixels are 1.2 times as tall as wide, so fy/H = 0.5 * (4/3) * 1.2.
 CAMERA = (0.5, 0.8, 0.5, 0.5)
+MAP_SPACING_M = 1024.0  # from one map of a game to the next: see `map_origin`
+HEALTH = spaces.Box(0, 1000, (), np.float32)
+PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
 _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map units + offset), fitted on my_way_home
 
 
 @dataclass(frozen=True)
 class DoomConfig:
-    """scenario: a ViZDoom scenario's name; size: rgb (height, width), 4:3; depth_size: likewise;
-    timeout_tics: when an episode ends by itself, 0 for never."""
+    """scenario: a ViZDoom scenario's name, or maps of a game ("freedoom2/MAP01,MAP02"), of which each story takes one;
+    size: rgb (height, width), 4:3; depth_size: likewise; timeout_tics: when an episode ends by itself, 0 for never;
+    skill: 1 to 5, how hard it is; None for the scenario's own, 3 on the maps of a game."""
 
     scenario: str = "my_way_home"
     size: tuple[int, int] = (96, 128)
     depth_size: tuple[int, int] = (96, 128)
     timeout_tics: int = 0
+    skill: int | None = None
 
 
 class Doom:
-    """The game as a World. One process, one story: not forkable, batch 1; a state is a ticket for the present."""
+    """The game as a World. One process, one story: not forkable, batch 1; a state is a ticket for the present.
+
+    A scenario that tells the player's health has the channels `health` and `things` (bool [h, w]: what may move or
+    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. On a map of a game
+    a kill and the exit pay 1, death costs 1, and stories begin at the map's start or where a pick-up lies.
+    """
 
     def __init__(self, config: DoomConfig | None = None):
         self.config = config = config or DoomConfig()
@@ -62,25 +77,34 @@ class Doom:
         if min(height, width) < 1 or 384 % height or 512 % width or 384 // height != 512 // width:
             raise TerrellaError(f"Doom renders at 384x512 divided by a whole number; size {height}x{width} is not.")
         self._shrink = 384 // height
-        self._game = _open_game(config)
-        self._walls = _Sectors(self._game.get_state().sectors)
+        scenario, self._maps = _named(config.scenario)
+        self._game, self.buttons, alive = _open_game(config, scenario, self._maps)
+        self._wad = _wad(self._game)
+        self._places: dict[str, Sectors] = {}
         self._ticket = 0
         self._seen: dict[str, torch.Tensor] = {}
+        self._cast_at = -1
+        channels: dict[str, spaces.Space] = {
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": spaces.Box(0, MAX_DEPTH_M, config.depth_size, np.float32),
+            "pose": spaces.Box(-np.inf, np.inf, (7,), np.float32),
+        }
+        if alive:
+            channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
+            channels["health"] = HEALTH
         self.spec = Spec(
             name=f"doom:{config.scenario}",
-            action=spaces.MultiBinary(len(BUTTONS)),
-            channels={
-                "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
-                "depth": spaces.Box(0, MAX_DEPTH_M, config.depth_size, np.float32),
-                "pose": spaces.Box(-np.inf, np.inf, (7,), np.float32),
-                "reward": REWARD,
-                "done": DONE,
-            },
+            action=spaces.MultiBinary(len(self.buttons)),
+            channels={**channels, "reward": REWARD, "done": DONE},
             observes=(),
             dt_s=1 / TICS_PER_S,
             units={"depth": "m", "pose": "m, quaternion wxyz of T_world_cam"},
-            action_names=BUTTONS,
-            keys=KEYS,
+            action_names=self.buttons,
+            keys={
+                code: [float(name == button) for name in self.buttons]
+                for code, button in KEYS.items()
+                if button in self.buttons
+            },
             camera=CAMERA,
             forkable=False,
             max_batch=1,
@@ -88,11 +112,16 @@ class Doom:
         )
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        """A new episode; where the scenario has several spawn points, `rng` picks."""
+        """A new episode; where there are several maps or spawn points, `rng` picks."""
         if batch != 1:
             raise TerrellaError(f"{self.spec.name} is one game process: start(1, rng), or open several.")
         self._game.set_seed(int(torch.randint(2**31 - 1, (1,), generator=rng).item()))
+        if self._maps:
+            self._game.set_doom_map(self._maps[int(torch.randint(len(self._maps), (1,), generator=rng))])
         self._game.new_episode()
+        self._enter()
+        if self._maps:
+            self._step_in(rng)
         self._reward, self._done = 0.0, False
         return self._advance()
 
@@ -121,6 +150,23 @@ class Doom:
     def close(self) -> None:
         self._game.close()
 
+    def _enter(self) -> None:
+        """Takes up the geometry of the map that the episode is on."""
+        name, sectors = self._game.get_doom_map(), self._game.get_state().sectors
+        if name not in self._places:
+            self._places[name] = Sectors(sectors, skies(self._wad, name))
+        self._walls, self._origin = self._places[name], map_origin(self._wad.stem, name) if self._maps else (0.0, 0.0)
+        self._walls.update(sectors)
+        self._walls.began = self._walls.heights
+
+    def _step_in(self, rng: torch.Generator) -> None:
+        """A map is wide and has one start: in three stories of four the player stands where a pick-up lay."""
+        found = [thing for thing in self._game.get_state().objects if thing.category in PICK_UPS]
+        if found and float(torch.rand(1, generator=rng)) < 0.75:
+            place = found[int(torch.randint(len(found), (1,), generator=rng))]
+            self._game.send_game_command(f"warp {place.position_x:.0f} {place.position_y:.0f}")
+            self._game.make_action([0.0] * len(self.buttons), 2)
+
     def _check_present(self, state: State) -> None:
         if int(state["ticket"][0]) != self._ticket:
             raise StaleStateError(
@@ -147,23 +193,78 @@ class Doom:
             return torch.tensor(self._done)
         if name == "rgb":
             return torch.from_numpy(_area_mean(self._present.screen_buffer, self._shrink))
-        x, y, z, yaw_deg = (float(value) for value in np.asarray(self._present.game_variables))
+        x, y, z, yaw_deg, health = (float(value) for value in np.asarray(self._present.game_variables))
+        if name == "health":
+            dead = self._done and self._game.is_player_dead()  # of the dead there is no state, the last picture stays
+            return torch.tensor(0.0 if dead else max(health, 0.0), dtype=torch.float32)
         if name == "pose":
             half = np.deg2rad(yaw_deg) / 2
-            here = np.array([x, y, z]) / UNITS_PER_M
+            here = np.array([x, y, z]) / UNITS_PER_M + (*self._origin, 0.0)
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
-        exact = self._walls.depth(x, y, z, np.deg2rad(yaw_deg), self.config.depth_size)
-        depth_m = _with_sprites(exact, np.asarray(self._present.depth_buffer)) / UNITS_PER_M
+        depth, sector = self._cast(x, y, z, np.deg2rad(yaw_deg))
+        if name == "things":
+            moved = self._walls.moved()
+            return torch.from_numpy(self._sprites() | np.append(moved, False)[sector])
+        depth_m = _with_sprites(depth, np.asarray(self._present.depth_buffer)) / UNITS_PER_M
         return torch.from_numpy(depth_m).float().clamp(0, MAX_DEPTH_M)
 
+    def _cast(self, x: float, y: float, z: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+        """What is seen of the map's sectors now: depth [h, w] in map units and sector [h, w]."""
+        if self._cast_at != self._ticket:
+            self._walls.update(self._present.sectors)
+            size, farthest = self.config.depth_size, MAX_DEPTH_M * UNITS_PER_M
+            self._cast_of, self._cast_at = self._walls.depth(x, y, z, yaw, CAMERA, size, farthest), self._ticket
+        return self._cast_of
 
-def _open_game(config: DoomConfig) -> vizdoom.DoomGame:
-    scenario = os.path.join(vizdoom.scenarios_path, f"{config.scenario}.cfg")
-    if not os.path.exists(scenario):
-        known = sorted(name[:-4] for name in os.listdir(vizdoom.scenarios_path) if name.endswith(".cfg"))
-        raise TerrellaError(f"ViZDoom has no scenario '{config.scenario}'; it has {', '.join(known)}.")
+    def _sprites(self) -> np.ndarray:
+        """Where a sprite covers any of a pixel: bool [h, w]."""
+        values = np.zeros(256, bool)
+        values[[label.value for label in self._present.labels]] = True
+        return _any_of(
+            _any_of(values[self._present.labels_buffer], self.config.depth_size[0], 0), self.config.depth_size[1], 1
+        )
+
+
+def map_origin(game: str, name: str) -> tuple[float, float]:
+    """Where a game's map lies in one wide world, metres: several can be learned together, and each place is one place."""
+    number = int("".join(re.findall(r"\d", name)) or 0)
+    row = number // 6
+    return MAP_SPACING_M * (number % 6), MAP_SPACING_M * (-1 - row if game.endswith("1") else row)
+
+
+def _named(scenario: str) -> tuple[str, tuple[str, ...]]:
+    """ "freedoom2/MAP01,MAP02" -> ("freedoom2", ("MAP01", "MAP02")); a scenario of its own has no maps to choose from."""
+    name, _, maps = scenario.partition("/")
+    return name, tuple(part.strip().upper() for part in maps.split(",") if part.strip())
+
+
+def _open_game(
+    config: DoomConfig, scenario: str, maps: tuple[str, ...]
+) -> tuple[vizdoom.DoomGame, tuple[str, ...], bool]:
+    """The running game, its buttons, and whether it tells the player's health."""
+    if config.skill is not None and not 1 <= config.skill <= 5:
+        raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); {config.skill} is not one.")
+    settings = Path(vizdoom.scenarios_path) / f"{scenario}.cfg"
+    games = sorted(path.stem for path in Path(vizdoom.__file__).parent.glob("freedoom*.wad"))
+    if not scenario or Path(scenario).name != scenario or not settings.exists():
+        known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
+        raise TerrellaError(f"ViZDoom has no scenario '{scenario}'; it has {', '.join(known)}.")
+    if maps or scenario in games:
+        have = map_names(Path(vizdoom.__file__).parent / f"{scenario}.wad") if scenario in games else []
+        if not have:
+            raise TerrellaError(
+                f"'{scenario}' has no maps to choose from here; the games that have are {', '.join(games)}."
+            )
+        if not maps or set(maps) - set(have):
+            wrong = ", ".join(sorted(set(maps) - set(have))) or "none was named"
+            example = f"{scenario}/{have[0]} or {scenario}/{have[0]},{have[1]}"
+            raise TerrellaError(f"{scenario} has the maps {have[0]} to {have[-1]} ({wrong}); say {example}.")
     game = vizdoom.DoomGame()
-    game.load_config(scenario)
+    game.load_config(str(settings))
+    button, variable = vizdoom.Button, vizdoom.GameVariable
+    more = [name for name in MORE_BUTTONS if getattr(button, name) in game.get_available_buttons()]
+    alive = bool(maps) or variable.HEALTH in game.get_available_game_variables()
+    buttons = (*BUTTONS, *more)
     game.set_doom_config_path(os.path.join(tempfile.gettempdir(), f"terrella-vizdoom-{os.getpid()}.ini"))
     game.set_window_visible(False)
     game.set_mode(vizdoom.Mode.PLAYER)
@@ -171,17 +272,44 @@ def _open_game(config: DoomConfig) -> vizdoom.DoomGame:
     game.set_screen_format(vizdoom.ScreenFormat.RGB24)
     game.set_depth_buffer_enabled(True)
     game.set_sectors_info_enabled(True)
-    for switch in (game.set_render_hud, game.set_render_weapon, game.set_render_crosshair, game.set_render_messages):
+    game.set_labels_buffer_enabled(alive)
+    game.set_audio_buffer_enabled(False)
+    game.set_automap_buffer_enabled(False)
+    for switch in (
+        game.set_render_hud,
+        game.set_render_weapon,
+        game.set_render_crosshair,
+        game.set_render_messages,
+        game.set_render_screen_flashes,
+    ):
         switch(False)
-    variable = vizdoom.GameVariable
-    game.set_available_buttons([getattr(vizdoom.Button, name) for name in BUTTONS])
+    game.set_available_buttons([getattr(button, name) for name in buttons])
     game.set_available_game_variables(
-        [variable.POSITION_X, variable.POSITION_Y, variable.CAMERA_POSITION_Z, variable.ANGLE]
+        [variable.POSITION_X, variable.POSITION_Y, variable.CAMERA_POSITION_Z, variable.ANGLE, variable.HEALTH]
     )
+    if maps:
+        game.set_doom_map(maps[0])
+        game.set_doom_skill(3)
+        game.set_objects_info_enabled(True)
+        game.set_kill_reward(1.0)
+        game.set_death_penalty(1.0)
+    if config.skill is not None:
+        game.set_doom_skill(config.skill)
     game.add_game_args("+movebob 0")  # the head does not bob: its phase would be a hidden state
     game.set_episode_timeout(config.timeout_tics)
-    game.init()
-    return game
+    try:
+        game.init()
+    except vizdoom.FileDoesNotExistException as error:
+        raise TerrellaError(
+            f"{scenario} needs a file that ViZDoom does not bring ({error}); choose another."
+        ) from error
+    return game, buttons, alive
+
+
+def _wad(game: vizdoom.DoomGame) -> Path:
+    """The file that holds the map: the scenario's, or the game's."""
+    own = Path(game.get_doom_scenario_path())
+    return own if own.is_file() else Path(game.get_doom_game_path())
 
 
 def _area_mean(image: np.ndarray, shrink: int) -> np.ndarray:
@@ -195,6 +323,11 @@ def _area_mean(image: np.ndarray, shrink: int) -> np.ndarray:
     return (total // np.uint16(shrink * shrink)).astype(np.uint8)
 
 
+def _any_of(mask: np.ndarray, count: int, axis: int) -> np.ndarray:
+    """bool, `axis` made `count` long: True where any of its part is."""
+    return np.logical_or.reduceat(mask, np.arange(count) * mask.shape[axis] // count, axis)
+
+
 def _with_sprites(exact: np.ndarray, buffer: np.ndarray) -> np.ndarray:
     """Depth in map units; where the 8-bit buffer is clearly nearer than the map (a thing stands there), the buffer's."""
     rows = (np.arange(exact.shape[0]) * 2 + 1) * buffer.shape[0] // (2 * exact.shape[0])
@@ -202,46 +335,3 @@ def _with_sprites(exact: np.ndarray, buffer: np.ndarray) -> np.ndarray:
     level = buffer[np.ix_(rows, columns)].astype(np.float32)
     coarse = (level + 0.5 - _BUFFER_OFFSET) / _BUFFER_SLOPE
     return np.where((coarse < exact * 0.85 - 16) & (level > 1), coarse, exact)
-
-
-class _Sectors:
-    """The map as prisms; `depth` casts one ray a pixel through them."""
-
-    def __init__(self, sectors):
-        self.heights = [(sector.floor_height, sector.ceiling_height) for sector in sectors]
-        lines = [np.array([(w.x1, w.y1, w.x2, w.y2) for w in sector.lines], np.float64) for sector in sectors]
-        self.lines = np.concatenate(lines)
-        self.owner = np.repeat(np.arange(len(lines)), [len(group) for group in lines])
-        ends = [tuple(sorted([(x1, y1), (x2, y2)])) for x1, y1, x2, y2 in self.lines]
-        self.solid = np.array([ends.count(pair) == 1 for pair in ends])  # a line of one sector only is a wall
-
-    def depth(self, x: float, y: float, eye: float, yaw: float, size: tuple[int, int]) -> np.ndarray:
-        """Depth along the optical axis, map units, float64 [H, W]; map coordinates, yaw in radians."""
-        height, width = size
-        right_slope = ((np.arange(width) + 0.5) / width - CAMERA[2]) / CAMERA[0]
-        down_slope = ((np.arange(height) + 0.5) / height - CAMERA[3]) / CAMERA[1]
-        forward, right = np.array([np.cos(yaw), np.sin(yaw)]), np.array([np.sin(yaw), -np.cos(yaw)])
-        start, end = self.lines[:, :2] - (x, y), self.lines[:, 2:] - (x, y)
-        near_f, near_r, far_f, far_r = start @ forward, start @ right, end @ forward, end @ right
-        side_a = near_r - right_slope[:, None] * near_f  # [W, lines]; the ray crosses where the sign changes
-        side_b = far_r - right_slope[:, None] * far_f
-        share = side_a / np.where(side_a == side_b, 1.0, side_a - side_b)
-        along = near_f + share * (far_f - near_f)
-        crossing = np.where(((side_a > 0) != (side_b > 0)) & (along > 0), along, np.inf)
-        slope = np.where(np.abs(down_slope) > 1e-9, down_slope, 1e-9)[:, None]
-        wall = crossing[:, self.solid].min(1)
-        best = np.broadcast_to(np.minimum(wall, MAX_DEPTH_M * UNITS_PER_M), (height, width))
-        for sector, (floor, ceiling) in enumerate(self.heights):
-            cuts = np.sort(crossing[:, self.owner == sector], axis=1)
-            if not np.isfinite(cuts).any():
-                continue
-            inside = np.isfinite(cuts).sum(1) % 2 == 1  # an odd count: the eye is in this sector
-            cuts = np.where(inside[:, None], np.pad(cuts, ((0, 0), (1, 0)))[:, :-1], cuts)
-            cuts = np.pad(cuts, ((0, 0), (0, cuts.shape[1] % 2)), constant_values=np.inf)
-            surface = np.where(slope > 0, (eye - floor) / slope, (eye - ceiling) / slope)  # floor below, ceiling above
-            for enter, leave in zip(cuts[:, ::2].T, cuts[:, 1::2].T):
-                if not np.isfinite(leave).any():
-                    break
-                hit = np.maximum(surface, enter)
-                best = np.minimum(best, np.where(hit <= leave, hit, np.inf))
-        return best

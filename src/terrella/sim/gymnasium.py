@@ -6,11 +6,13 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from PIL import Image
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, REWARD, Spec
@@ -27,10 +29,15 @@ class GymnasiumWorld:
 
     env:      an id, which is made without its time limit (that belongs to the training: `as_env(max_steps=...)`),
               or a function that returns a new environment each time it is called.
-    rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array".
+    rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array". Where its observation is
+              a picture already (uint8 [H, W, 3]), that is `rgb`, and takes the place of `observation`.
+    size:     (height, width) to which rgb is area-averaged; None leaves it as it is drawn.
+    told:     numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
     forkable: None finds out: an environment whose Python state is plain numbers is copied between two instances on
               trial, and only if every step agrees bit for bit are its states values. False makes states tickets for
               the present.
+    snapshots: what copies the environment's state, by default sim/snapshot.py.
+    name, action_names, keys: for the spec, where the environment's own say too little.
     dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second.
     options:  handed to gymnasium.make.
 
@@ -45,22 +52,30 @@ class GymnasiumWorld:
         env: str | Callable[[], gymnasium.Env],
         *,
         rgb: bool = True,
+        size: tuple[int, int] | None = None,
+        told: Sequence[str] = (),
         forkable: bool | None = None,
+        snapshots: Callable[[gymnasium.Env], Any] | None = None,
         dt_s: float | None = None,
+        name: str = "",
+        action_names: tuple[str, ...] = (),
+        keys: Mapping[str, list[float]] | None = None,
         **options,
     ):
         self._lock = threading.Lock()  # one environment serves all stories, so only one may move at a time
-        self._env, name = _build(env, rgb, options)
+        self._env, found = _build(env, rgb, options)
+        name, self._size, self._told = name or found, check_size(size), tuple(told)
         for space in (self._env.observation_space, self._env.action_space):
             if not isinstance(space, _KNOWN_SPACES):
                 raise TerrellaError(
                     f"{name} has the space {space}; wrap it so that it is one array (FlattenObservation)."
                 )
+        self._pictured = rgb and _is_picture(self._env.observation_space)
         self._env.reset(seed=0)
         self._snapshots, self._viewer = None, self._env
         if forkable is not False:
             twin, _ = _build(env, rgb, options)
-            self._snapshots, why = _try_copying(self._env, twin)
+            self._snapshots, why = _try_copying(self._env, twin, snapshots or Snapshots)
             if self._snapshots is not None:
                 self._viewer = twin
             else:
@@ -69,7 +84,7 @@ class GymnasiumWorld:
                     raise TerrellaError(f"{name} cannot be copied ({why}); leave out forkable=True.")
         self._ticket = 0
         self._env.reset(seed=0)
-        self.spec = self._describe(name, dt_s, rgb)
+        self.spec = self._describe(name, dt_s, rgb, action_names, keys)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` resets of the environment, seeded from `rng`."""
@@ -80,8 +95,8 @@ class GymnasiumWorld:
         with self._lock:
             rows = []
             for seed in _seeds(batch, rng):
-                observation, _ = self._env.reset(seed=seed)
-                rows.append(self._row(observation, 0.0, False))
+                observation, info = self._env.reset(seed=seed)
+                rows.append(self._row(observation, 0.0, False, info))
             return self._state(rows)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
@@ -105,25 +120,27 @@ class GymnasiumWorld:
                 if self._snapshots is not None:
                     self._snapshots.put(self._env, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
                     _reseed(self._env, seed)
-                seen, reward, terminated, truncated, _ = self._env.step(actions[entry])
-                rows.append(self._row(seen, reward, terminated or truncated))
+                seen, reward, terminated, truncated, info = self._env.step(actions[entry])
+                rows.append(self._row(seen, reward, terminated or truncated, info))
             return self._state(rows)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
         self._check(state)
-        return {name: self._pictures(state) if name == "rgb" else state[name] for name in channels}
+        return {name: state[name] if name in state else self._pictures(state) for name in channels}
 
     def close(self) -> None:
         self._env.close()
         self._viewer.close()
 
-    def _row(self, observation, reward, done) -> dict[str, np.ndarray]:
+    def _row(self, observation, reward, done, info: Mapping) -> dict[str, np.ndarray]:
         space = self._env.observation_space
+        seen = np.array(observation, dtype=space.dtype).reshape(space.shape)
         row = {
-            "observation": np.array(observation, dtype=space.dtype).reshape(space.shape),
+            **({"rgb": _resized(seen, self._size)} if self._pictured else {"observation": seen}),
             "reward": np.float32(reward),
             "done": np.bool_(done),
+            **{name: np.float32(info[name]) for name in self._told},
         }
         if self._snapshots is not None:
             try:
@@ -158,18 +175,18 @@ class GymnasiumWorld:
             for entry in range(state.batch):
                 if self._snapshots is not None:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
-                frames.append(np.array(self._viewer.render(), dtype=np.uint8))
+                frames.append(_resized(np.array(self._viewer.render(), dtype=np.uint8), self._size))
         return torch.from_numpy(np.stack(frames))
 
-    def _describe(self, name: str, dt_s: float | None, rgb: bool) -> Spec:
-        channels = {
-            "observation": self._env.observation_space,
-            "reward": REWARD,
-            "done": DONE,
-        }
-        size = _picture_size(self._viewer) if rgb else None
-        if size is not None:
-            channels["rgb"] = spaces.Box(0, 255, (*size, 3), np.uint8)
+    def _describe(self, name: str, dt_s: float | None, rgb: bool, action_names, keys) -> Spec:
+        channels = {} if self._pictured else {"observation": self._env.observation_space}
+        channels |= {"reward": REWARD, "done": DONE}
+        channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._told}
+        drawn = (
+            self._env.observation_space.shape[:2] if self._pictured else _picture_size(self._viewer) if rgb else None
+        )
+        if drawn is not None:
+            channels["rgb"] = spaces.Box(0, 255, (*(self._size or drawn), 3), np.uint8)
         if self._snapshots is not None:
             self._width = (len(self._snapshots.take(self._env)[0]),)
         return Spec(
@@ -178,7 +195,8 @@ class GymnasiumWorld:
             channels=channels,
             observes=(),
             dt_s=dt_s or _step_seconds(self._env),
-            keys=_arrow_keys(self._env.action_space),
+            action_names=action_names,
+            keys=keys if keys is not None else _arrow_keys(self._env.action_space),
             forkable=self._snapshots is not None,
             max_batch=None if self._snapshots is not None else 1,
             card={"what": f"the Gymnasium environment {name.removeprefix('gym:')}", "kind": "simulator"},
@@ -213,12 +231,12 @@ def _reseed(env: gymnasium.Env, seed: int) -> None:
     bits.state = {"bit_generator": "PCG64", "state": spread, "has_uint32": 0, "uinteger": 0}  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _try_copying(env: gymnasium.Env, twin: gymnasium.Env) -> tuple[Snapshots | None, str]:
+def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> tuple[Any, str]:
     """Snapshots, if `twin`, put before every step to where `env` is, lives the same life; else None and why not."""
     actions = Spec("trial", env.action_space, {}, (), 1.0)
     rng = make_rng(0)
     try:
-        snapshots = Snapshots(env)
+        snapshots = copier(env)
         for seed in range(_TRIALS):
             env.reset(seed=seed)
             for action in actions.sample_action(_TRIAL_STEPS, rng).numpy():
@@ -237,6 +255,27 @@ def _try_copying(env: gymnasium.Env, twin: gymnasium.Env) -> tuple[Snapshots | N
     except NotCopyable as error:
         return None, str(error)
     return snapshots, ""
+
+
+def check_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
+    """The size of a picture, if it can be one; else TerrellaError."""
+    if size is None:
+        return None
+    sound = len(size) == 2 and all(int(side) == side and 1 <= side <= 4096 for side in size)
+    if not sound:
+        raise TerrellaError(f"a picture of {tuple(size)} pixels cannot be: size is (height, width), 1 to 4096 each.")
+    return int(size[0]), int(size[1])
+
+
+def _is_picture(space: gymnasium.Space) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3 and space.shape[2] == 3
+
+
+def _resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    """uint8 [H, W, 3] -> uint8 [*size, 3], each pixel the mean of the area that it covers."""
+    if size is None or picture.shape[:2] == tuple(size):
+        return picture
+    return np.asarray(Image.fromarray(picture).resize((size[1], size[0]), Image.Resampling.BOX))
 
 
 def _picture_size(env: gymnasium.Env) -> tuple[int, int] | None:
@@ -262,11 +301,21 @@ def _step_seconds(env: gymnasium.Env) -> float:
 
 
 def _arrow_keys(action: gymnasium.Space) -> dict[str, list[float]]:
-    """Left and right as the first and the last choice, or as the ends of the only axis."""
+    """Left and right as the first and the last choice, or as the ends of the first axis; of several axes, up and down are
+    the ends of the second, or, where that knows no backwards (a throttle), up is the second and down the third (a brake)."""
     if isinstance(action, spaces.Discrete):
-        first, last = int(action.start), int(action.start + action.n - 1)
-    elif isinstance(action, spaces.Box) and action.shape == (1,) and action.is_bounded():
-        first, last = float(action.low[0]), float(action.high[0])
-    else:
+        return {"ArrowLeft": [float(action.start)], "ArrowRight": [float(action.start + action.n - 1)]}
+    if not (isinstance(action, spaces.Box) and len(action.shape) == 1 and action.is_bounded()):
         return {}
-    return {"ArrowLeft": [float(first)], "ArrowRight": [float(last)]}
+
+    def only(axis: int, value: float) -> list[float]:
+        return [float(value) if place == axis else 0.0 for place in range(action.shape[0])]
+
+    keys = {"ArrowLeft": only(0, action.low[0]), "ArrowRight": only(0, action.high[0])}
+    if action.shape[0] > 1:
+        back = 1 if action.low[1] < 0 else 2
+        keys["ArrowUp"] = only(1, action.high[1])
+        if back < action.shape[0]:
+            keys["ArrowDown"] = only(back, action.low[1] if back == 1 else action.high[back])
+    rest = np.zeros(action.shape)
+    return keys if bool((action.low <= rest).all() and (rest <= action.high).all()) else {}

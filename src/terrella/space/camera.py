@@ -10,6 +10,21 @@ import torch
 
 Intrinsics = tuple[float, float, float, float]
 
+_STAY = torch.eye(3)
+_TURN = torch.tensor(  # a rotation less the identity, of the products ww, wx, wy, wz, xw, ... of a unit quaternion
+    [
+        [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, -2], [0, 2, 0]],
+         [[0, 0, 2], [0, 0, 0], [-2, 0, 0]], [[0, -2, 0], [2, 0, 0], [0, 0, 0]]],
+        [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, -2, 0], [0, 0, -2]],
+         [[0, 2, 0], [2, 0, 0], [0, 0, 0]], [[0, 0, 2], [0, 0, 0], [2, 0, 0]]],
+        [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+         [[-2, 0, 0], [0, 0, 0], [0, 0, -2]], [[0, 0, 0], [0, 0, 2], [0, 2, 0]]],
+        [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+         [[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[-2, 0, 0], [0, -2, 0], [0, 0, 0]]],
+    ],
+    dtype=torch.float32,
+).view(16, 9)  # fmt: skip
+
 
 def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tensor:
     """Directions through the pixel centres in the camera frame, scaled so that x (forward) is 1: float32 [H, W, 3]."""
@@ -24,12 +39,10 @@ def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tens
 
 def rotation(pose: torch.Tensor) -> torch.Tensor:
     """Rotation matrices of T_world_cam: [..., 7] -> [..., 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(pose[..., 3:], dim=-1).unbind(-1)
-    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
-    entries = [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy)]
-    entries += [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx)]
-    entries += [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy)]
-    return torch.stack(entries, -1).unflatten(-1, (3, 3))
+    quaternion = pose[..., 3:]
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    products = (quaternion[..., :, None] * quaternion[..., None, :]).flatten(-2)
+    return (products @ _TURN.to(pose)).unflatten(-1, (3, 3)) + _STAY.to(pose)
 
 
 def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:

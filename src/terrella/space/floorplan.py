@@ -24,7 +24,7 @@ GAP_M = 0.5  # columns farther apart do not join: no body fits through less
 
 
 def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """Depth [K, h, w] from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
+    """Depth [K, h, w] (0: nothing known) from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
 
     On the horizon the inverse depth of a flat wall is linear in the column; each run of columns on one line is a wall,
     and where two runs meet they are drawn to their corner. What is farther than SEEN_M, or so far that neighbouring columns
@@ -38,7 +38,8 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     walls = np.full((len(depth), WALLS, 4), NOWHERE, np.float32)
     heading = yaw(pose).double().numpy()
     cosine, sine, eye = np.cos(heading), np.sin(heading), pose[:, :2].double().numpy()
-    for key, inverse in enumerate(1 / depth[:, row].double().clamp(0.05, 1e3).numpy()):
+    level = torch.where(depth[:, row] > 0, depth[:, row], 1e3).double()
+    for key, inverse in enumerate(1 / level.clamp(0.05, 1e3).numpy()):
         found = straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
         runs = _corners([(int(first), int(stop), *line) for first, stop, *line in found], left)
         runs.sort(key=lambda run: run[0] - run[1])

@@ -12,13 +12,61 @@ SAME = 0.06  # depths that differ by less than this share are of one surface
 WITHIN_M = 0.005  # as well as walls are known
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def lift(depth, turn, eye, camera, stride, slant, patch):
+    """The kernel of patches.patches_slowly for one image: depth [H, W], turn [3, 3] and eye [3] of T_world_cam; fills
+    patch [N, 9]."""
+    height, width = depth.shape
+    fx, fy, cx, cy = camera
+    rim, first, n = max(1, round(0.75 * stride)), stride // 2, 0
+    ramp_u, ramp_v = 1 / (width * fx), 1 / (height * fy)
+    longest = (slant * ramp_u) ** 2
+    for v in range(first, height, stride):
+        up = -((v + 0.5) / height - cy) / fy
+        above, below = max(v - 1, 0), min(v + 1, height - 1)
+        top, bottom = max(v - rim, 0), min(v + rim, height - 1)
+        for u in range(first, width, stride):
+            side, here = -((u + 0.5) / width - cx) / fx, depth[v, u]
+            left, right = max(u - 1, 0), min(u + 1, width - 1)
+            a0, b0 = here - depth[v, left], depth[v, right] - here  # to the right: of both neighbours the nearer one
+            a1, b1 = a0 * side - depth[v, left] * ramp_u, b0 * side - depth[v, right] * ramp_u
+            a2, b2 = a0 * up, b0 * up
+            aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+            if u == right or (u != left and aa < bb):
+                b0, b1, b2, bb = a0, a1, a2, aa
+            c0, d0 = here - depth[above, u], depth[below, u] - here  # and down
+            c1, d1 = c0 * side, d0 * side
+            c2, d2 = c0 * up - depth[above, u] * ramp_v, d0 * up - depth[below, u] * ramp_v
+            cc, dd = c0 * c0 + c1 * c1 + c2 * c2, d0 * d0 + d1 * d1 + d2 * d2
+            if v == below or (v != above and cc < dd):
+                d0, d1, d2, dd = c0, c1, c2, cc
+            reach = 0.0
+            if max(bb, dd) <= longest * here * here:
+                west, east = max(u - rim, 0), min(u + rim, width - 1)
+                twice = 2 / max(here, NEAR_M)
+                bend = abs(1 / max(depth[v, west], NEAR_M) + 1 / max(depth[v, east], NEAR_M) - twice)
+                bend = max(bend, abs(1 / max(depth[top, u], NEAR_M) + 1 / max(depth[bottom, u], NEAR_M) - twice))
+                bend = max(bend, abs(1 / max(depth[top, west], NEAR_M) + 1 / max(depth[bottom, east], NEAR_M) - twice))
+                bend = max(bend, abs(1 / max(depth[top, east], NEAR_M) + 1 / max(depth[bottom, west], NEAR_M) - twice))
+                reach = 0.75 * stride if bend < 0.025 * twice else 0.5
+            b0, b1, b2, d0, d1, d2 = reach * b0, reach * b1, reach * b2, reach * d0, reach * d1, reach * d2
+            p1, p2 = here * side, here * up
+            for c in range(3):
+                x, y, z = turn[c, 0], turn[c, 1], turn[c, 2]
+                patch[n, c] = eye[c] + x * here + y * p1 + z * p2
+                patch[n, 3 + c] = x * b0 + y * b1 + z * b2
+                patch[n, 6 + c] = x * d0 + y * d1 + z * d2
+            n += 1
+
+
 @numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
 def cast_one(patch, turn, eye, camera, depth):
-    """patch [N, 9], turn [3, 3] and eye [3] of T_world_cam, camera intrinsics; fills `depth` [H, W] in place."""
+    """patch [N, 9], turn [3, 3] and eye [3] of T_world_cam, camera intrinsics; lowers `depth` [H, W] to what they show."""
     height, width = depth.shape
     fx, fy, cx, cy = camera
     fx, cx, fy, cy = fx * width, cx * width, fy * height, cy * height
-    depth[:] = 100.0
+    to_right, to_left = (cx - width) / fx if cx < width else -1e9, cx / fx if cx > 0 else 1e9  # the rim of the picture
+    to_bottom, to_top = (cy - height) / fy if cy < height else -1e9, cy / fy if cy > 0 else 1e9
     for n in range(len(patch)):
         x, y, z = patch[n, 0] - eye[0], patch[n, 1] - eye[1], patch[n, 2] - eye[2]
         c0 = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
@@ -26,6 +74,13 @@ def cast_one(patch, turn, eye, camera, depth):
             continue
         c1 = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
         c2 = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
+        reach = abs(patch[n, 3]) + abs(patch[n, 4]) + abs(patch[n, 5])  # no corner is farther from the centre
+        reach += abs(patch[n, 6]) + abs(patch[n, 7]) + abs(patch[n, 8])
+        deepest = c0 + reach
+        if c1 + reach <= deepest * to_right or c1 - reach >= deepest * to_left:
+            continue
+        if c2 + reach <= deepest * to_bottom or c2 - reach >= deepest * to_top:
+            continue
         x, y, z = patch[n, 3], patch[n, 4], patch[n, 5]
         a0 = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
         a1 = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
@@ -115,6 +170,69 @@ def recall(rgb, depth, turns, eyes, seen, turn, eye, camera, colours, trust):
                     top = rgb[best, c, j, i] * (1 - a) + rgb[best, c, j, i + 1] * a
                     bottom = rgb[best, c, j + 1, i] * (1 - a) + rgb[best, c, j + 1, i + 1] * a
                     colours[slot, c, v, u] = (top * (1 - b) + bottom * b) / 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def carry(rgb, depth, turn, eye, known, seen, target_turn, target_eye, camera, carried):
+    """The kernel of reproject.carry_unknown_slowly for one view: a frame's rgb uint8 [3, H, W] and depth [h, w] from its turn
+    [3, 3] and eye [3]; what the view knows [V, U] and sees [V, U] from its own; fills `carried` [4, V, U], which is 0."""
+    _, height, width = rgb.shape
+    rows, columns = seen.shape
+    fx, fy, cx, cy = camera
+    for v in range(rows):
+        for u in range(columns):
+            wanted = 1 - known[v, u]
+            if wanted <= 0:
+                continue
+            side, up, far = -((u + 0.5) / columns - cx) / fx, -((v + 0.5) / rows - cy) / fy, seen[v, u]
+            x = far * (target_turn[0, 0] + side * target_turn[0, 1] + up * target_turn[0, 2]) + target_eye[0] - eye[0]
+            y = far * (target_turn[1, 0] + side * target_turn[1, 1] + up * target_turn[1, 2]) + target_eye[1] - eye[1]
+            z = far * (target_turn[2, 0] + side * target_turn[2, 1] + up * target_turn[2, 2]) + target_eye[2] - eye[2]
+            ahead = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+            if ahead <= NEAR_M:
+                continue
+            a = cx - fx * (turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z) / ahead
+            b = cy - fy * (turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z) / ahead
+            if a < 0 or a > 1 or b < 0 or b > 1:
+                continue
+            i, j = min(int(a * depth.shape[1]), depth.shape[1] - 1), min(int(b * depth.shape[0]), depth.shape[0] - 1)
+            trust = wanted * min(max(1.5 - abs(depth[j, i] - ahead) / ahead / SAME, 0.0), 1.0)
+            if trust <= 0:
+                continue
+            carried[3, v, u] = trust
+            a, b = min(max(a * width - 0.5, 0.0), width - 1.0), min(max(b * height - 0.5, 0.0), height - 1.0)
+            i, j = min(int(a), width - 2), min(int(b), height - 2)
+            a, b = a - i, b - j
+            for c in range(3):
+                top = rgb[c, j, i] * (1 - a) + rgb[c, j, i + 1] * a
+                bottom = rgb[c, j + 1, i] * (1 - a) + rgb[c, j + 1, i + 1] * a
+                carried[c, v, u] = (top * (1 - b) + bottom * b) / 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def pick(votes, anyway, picks):
+    """The kernel of keyframes.pick_slowly: votes [K, P]; fills picks [n] and returns how many there are."""
+    keys, points = votes.shape
+    best, most = np.zeros(points, np.float32), 0.0  # what is covered so far; the same of the column that counts anyway
+    strongest = np.zeros(keys, np.float32)
+    for k in range(keys):
+        for p in range(points):
+            strongest[k] = max(strongest[k], votes[k, p])
+    for n in range(len(picks)):
+        chosen, gained = 0, 0.0
+        for k in range(keys):
+            gain = max(anyway * strongest[k] - most, 0.0)
+            for p in range(points):
+                gain += max(votes[k, p] - best[p], np.float32(0))
+            if gain > gained:
+                chosen, gained = k, gain
+        if gained <= 0:
+            return n
+        picks[n] = chosen
+        most = max(most, anyway * strongest[chosen])
+        for p in range(points):
+            best[p] = max(best[p], votes[chosen, p])
+    return len(picks)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -232,3 +350,87 @@ def vote(points, distance, depth, turn, eye, camera, votes):
             if abs(depth[k, int(v * height), int(u * width)] - ahead) < SAME * ahead:
                 ratio = distance[p] / ahead
                 votes[k, p] = min(ratio, 1 / max(ratio, 1e-3))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cast_prisms(lines, solid, first, heights, sky, x, y, eye, yaw, camera, farthest, depth, sector):
+    """Fills `depth` [H, W] and `sector` int32 [H, W] of the view from x, y and height `eye` along `yaw` (radians).
+
+    lines [N, 4] = x1, y1, x2, y2, sector by sector: those of sector s are rows first[s] to first[s + 1]; solid [N] where
+    nothing is behind; heights [S, 2] = floor, ceiling; sky [S] where the ceiling is the open sky. Depth is along the optical
+    axis, in the units of the map, `farthest` at most and for the sky. `sector` is that whose floor, ceiling or edge is seen,
+    -1 for a solid wall and the sky.
+    """
+    rows, columns = depth.shape
+    fx, fy, cx, cy = camera
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    ahead, right = np.empty((len(lines), 2)), np.empty((len(lines), 2))
+    for n in range(len(lines)):
+        for end in range(2):
+            px, py = lines[n, 2 * end] - x, lines[n, 2 * end + 1] - y
+            ahead[n, end], right[n, end] = px * cosine + py * sine, px * sine - py * cosine
+    near = np.zeros(len(first) - 1, np.bool_)  # sectors of which a line lies before the eye
+    for s in range(len(near)):
+        for n in range(first[s], first[s + 1]):
+            near[s] |= max(ahead[n, 0], ahead[n, 1]) > 0 and min(ahead[n, 0], ahead[n, 1]) < farthest
+    down = np.empty(rows)
+    for v in range(rows):
+        slope = ((v + 0.5) / rows - cy) / fy
+        down[v] = slope if abs(slope) > 1e-9 else 1e-9
+    cuts = np.empty(len(lines) + 2)
+    for u in range(columns):
+        side = ((u + 0.5) / columns - cx) / fx
+        wall = farthest
+        for n in range(len(lines)):
+            if solid[n]:
+                wall = min(wall, crossing(ahead, right, n, side))
+        depth[:, u], sector[:, u] = wall, -1
+        for s in range(len(near)):
+            if not near[s]:
+                continue
+            count = 0
+            for n in range(first[s], first[s + 1]):
+                cut = crossing(ahead, right, n, side)
+                if cut < np.inf:
+                    at = count
+                    while at > 0 and cuts[at - 1] > cut:
+                        cuts[at] = cuts[at - 1]
+                        at -= 1
+                    cuts[at] = cut
+                    count += 1
+            if count == 0:
+                continue
+            if count % 2 == 1:  # the eye is in this sector
+                for at in range(count, 0, -1):
+                    cuts[at] = cuts[at - 1]
+                cuts[0] = 0.0
+                count += 1
+            floor, ceiling = heights[s, 0], heights[s, 1]
+            for pair in range(0, count, 2):
+                enter, leave = cuts[pair], cuts[pair + 1]
+                if enter >= wall:
+                    break
+                for v in range(rows):
+                    high = (
+                        eye - down[v] * enter
+                    )  # where the ray enters: on the edge of a floor or ceiling, or between them
+                    if high <= floor or high >= ceiling:
+                        hit = enter
+                    else:
+                        hit = (eye - floor) / down[v] if down[v] > 0 else (eye - ceiling) / down[v]
+                    if hit <= leave and hit < depth[v, u]:
+                        open_air = sky[s] and eye - down[v] * hit > ceiling - 1e-3
+                        depth[v, u], sector[v, u] = hit, -2 if open_air else s
+        for v in range(rows):
+            if sector[v, u] == -2:
+                depth[v, u], sector[v, u] = farthest, -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def crossing(ahead, right, n, side):
+    """How far ahead the vertical plane of a column, `side` to the right for each unit ahead, meets line n; inf where not."""
+    a, b = right[n, 0] - side * ahead[n, 0], right[n, 1] - side * ahead[n, 1]
+    if (a > 0) == (b > 0):
+        return np.inf
+    along = ahead[n, 0] + a / (a - b) * (ahead[n, 1] - ahead[n, 0])
+    return along if along > 0 else np.inf

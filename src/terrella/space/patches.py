@@ -2,10 +2,13 @@
 
 Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
 the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
-`cast` runs a compiled kernel on a CPU (space/kernels_numba.py); `cast_slowly` is its obvious twin, and the way on a GPU.
+`patches` and `cast` run compiled kernels on a CPU (space/kernels_numba.py); `patches_slowly` and `cast_slowly` are their
+obvious twins, and the way on a GPU.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 
@@ -24,6 +27,27 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
     over an edge in the depth image keeps to its own pixel; one that is too slanted to be told from a bridge between two
     surfaces shrinks to nothing, lest from the side it be a wall across the room.
     """
+    if depth.device.type != "cpu":
+        return patches_slowly(depth, pose, camera, stride)
+    from .kernels_numba import lift
+
+    height, width = depth.shape[-2:]
+    images = depth.detach().float().reshape(-1, height, width).contiguous().numpy()
+    turn = rotation(pose).reshape(-1, 3, 3).contiguous().numpy()
+    eye = pose[..., :3].reshape(-1, 3).contiguous().numpy()
+    found = torch.empty(len(images), patch_count((height, width), stride), 9)
+    for image, patch in enumerate(found.numpy()):
+        lift(images[image], turn[image], eye[image], camera, stride, SLANT, patch)
+    return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
+
+
+def patch_count(size: tuple[int, int], stride: int) -> int:
+    """Patches of a depth image of `size`."""
+    return len(range(stride // 2, size[0], stride)) * len(range(stride // 2, size[1], stride))
+
+
+def patches_slowly(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
+    """The same as `patches`, in plain tensor algebra; the way on a GPU."""
     points = unproject(depth, pose, camera)
     across, down = _shorter_difference(points, -2), _shorter_difference(points, -3)
     first = stride // 2
@@ -63,12 +87,21 @@ def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tupl
     """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9]; FAR_M where it sees none."""
     if patch.device.type != "cpu":
         return cast_slowly(patch, pose, camera, size)
+    return torch.stack([cast_all([patch[view]], pose[view], camera, size) for view in range(len(pose))])
+
+
+def cast_all(
+    sets: Sequence[torch.Tensor], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]
+) -> torch.Tensor:
+    """Depth [H, W] that the view from `pose` [7] sees of several sets of patches [N, 9]; FAR_M where it sees none."""
+    depth = torch.full(size, FAR_M, device=pose.device)
+    if pose.device.type != "cpu":
+        return torch.stack([depth, *(cast_slowly(one[None], pose[None], camera, size)[0] for one in sets)]).amin(0)
     from .kernels_numba import cast_one
 
-    depth = torch.empty(len(pose), *size)
-    turn = rotation(pose).contiguous().numpy()
-    for view in range(len(pose)):
-        cast_one(patch[view].contiguous().numpy(), turn[view], pose[view, :3].numpy(), camera, depth[view].numpy())
+    turn, eye, into = rotation(pose).contiguous().numpy(), pose[:3].contiguous().numpy(), depth.numpy()
+    for one in sets:
+        cast_one(one.contiguous().numpy(), turn, eye, camera, into)
     return depth
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from .camera import Intrinsics, project, unproject
+from .camera import Intrinsics, project, rotation, unproject
 from .patches import FAR_M
 
 
@@ -38,6 +38,8 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     stack = []
     values, weights = inverse * weight, weight
     for _ in range(levels):
+        if (weights > 1e-6).all():
+            break  # nothing is left to fill from coarser averages
         stack.append((values, weights))
         values, weights = F.avg_pool2d(values, 2, ceil_mode=True), F.avg_pool2d(weights, 2, ceil_mode=True)
     filled = values / weights.clamp_min(1e-6)
@@ -57,7 +59,7 @@ def warp(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Colour of K keyframes fetched for every pixel of a target view.
 
-    rgb [B, K, 3, H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B, 7].
+    rgb [B, K, 3 (or any planes), H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B, 7].
     Returns colour [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw that very surface, 0 where it
     saw another or looked elsewhere), and closeness [B, K, H', W'] (distance in the target over distance in the
     keyframe: above 1 the keyframe was nearer and has more detail).
@@ -75,4 +77,32 @@ def warp(
     error = (held - seen_depth).abs() / seen_depth.clamp_min(0.05)
     agreement = torch.where(inside, (1.5 - error / 0.06).clamp(0, 1), 0.0)
     closeness = target_depth[:, None] / seen_depth.clamp_min(0.05)
-    return colour.view(batch, keys, 3, height, width), agreement, closeness
+    return colour.view(batch, keys, -1, height, width), agreement, closeness
+
+
+def carry_unknown(
+    rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, known: torch.Tensor,
+    target_depth: torch.Tensor, target_pose: torch.Tensor, camera: Intrinsics,
+) -> torch.Tensor:  # fmt: skip
+    """One frame (rgb uint8 [B, 3, H, W], depth [B, h, w], pose [B, 7]) warped into the view that sees target_depth
+    [B, H', W'] from target_pose [B, 7], where it does not know [B, H', W'] the surface: [B, 4, H', W'] of colour in [0, 1]
+    and trust, 0 elsewhere."""
+    if rgb.device.type != "cpu" or rgb.dtype != torch.uint8 or depth.requires_grad or target_depth.requires_grad:
+        return carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera)
+    from .kernels_numba import carry as kernel
+
+    carried = torch.zeros(len(rgb), 4, *target_depth.shape[-2:])
+    parts = rgb, depth, rotation(pose), pose[:, :3], known, target_depth, rotation(target_pose), target_pose[:, :3]
+    ready = [part.detach().contiguous().numpy() for part in parts]
+    for view, (colour, held, turn, eye, sure, seen, new_turn, new_eye) in enumerate(zip(*ready)):
+        kernel(colour, held, turn, eye, sure, seen, new_turn, new_eye, camera, carried[view].numpy())
+    return carried
+
+
+def carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera) -> torch.Tensor:
+    """The same as `carry_unknown`, in plain tensor algebra; the way on a GPU and for gradients."""
+    colour, agreement, _ = warp(
+        rgb.float().div(255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera
+    )
+    trust = agreement * (1 - known[:, None])
+    return torch.cat([colour[:, 0] * (trust > 0), trust], 1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,18 @@ from safetensors.torch import load_file, save_file
 
 from ..core.errors import CheckpointError
 from ..core.spec import DONE, REWARD, Spec
+from ..space.eye import Eye, eye_of, eye_weights
 from ..space.keyframes import Keyframes
-from .history import HistoryWorld
+from .controls import Controls
+from .doubt import Doubt, doubt_of, doubt_weights
+from .history import HistoryWorld, Starts
+from .outcome import Outcome, OutcomeConfig
 from .video import Generator, Motion, VideoConfig, VideoWorld
 
 KIND, VERSION = "video", 2
+MEMORY_FILE = "memory.safetensors"
+VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
+RETIRED = ("own_keyframes",)  # settings of older worlds that mean nothing any more
 
 
 def save_world(world: VideoWorld | HistoryWorld, path: str | Path, card: dict, quality: int = 92) -> None:
@@ -44,29 +51,45 @@ def _save(world: VideoWorld | HistoryWorld, path: Path, card: dict, quality: int
         packed = {f"memory.{k}": v for k, v in _pack(world.memory, quality).items()}
         packed |= {f"starts.{k}": v for k, v in _pack(world.starts, quality).items()}
         rewards = list(world.rewards)
+        controls, outcome = Controls.buttons(world.config.actions), world.outcome
     else:
-        packed = {f"starts.{k}": v for k, v in _pack_frames(world.starts.flatten(0, 1), quality).items()}
-        rewards = [world.reward, 0.0]
+        starts = world.starts
+        packed = {f"starts.{k}": v for k, v in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()}
+        packed |= {"starts.actions": starts.actions, "starts.vitals": starts.vitals}
+        rewards, controls, outcome = [world.reward, 0.0], world.controls, world.outcome
+    if outcome is not None:
+        weights |= {f"outcome.{k}": v for k, v in outcome.state_dict().items()}
+    eye, doubt = world.eye if isinstance(world, VideoWorld) else None, world.doubt
+    if eye is not None:
+        weights |= {f"eye.{k}": v for k, v in eye_weights(eye).items()}
+    if doubt is not None:
+        weights |= {f"doubt.{k}": v for k, v in doubt_weights(doubt).items()}
     about = {
         "kind": KIND,
         "version": VERSION,
         "name": world.spec.name,
         "config": asdict(world.config),
         "rewards": rewards,
+        "controls": asdict(controls),
+        "outcome": asdict(outcome.config) if outcome is not None else None,
+        "eye": asdict(eye.config) if eye is not None else None,
+        "doubt": asdict(doubt.config) if doubt is not None else None,
         "dt_s": world.spec.dt_s,
         "action_names": list(world.spec.action_names),
         "keys": dict(world.spec.keys),
         "card": card,
     }
     _replace(path / "weights.safetensors", lambda file: save_file(_whole(weights), file))
-    _replace(path / "memory.safetensors", lambda file: save_file(_whole(packed), file))
+    _replace(path / MEMORY_FILE, lambda file: save_file(_whole(packed), file))
     _replace(path / "README.md", lambda file: Path(file).write_text(_readme(about)))
     _replace(path / "world.json", lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
 
 
-def load_world(path: str | Path, memory: bool = True, device: str = "cpu") -> VideoWorld | HistoryWorld:
-    """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); the generator runs on
-    `device`, geometry on the CPU.
+def load_world(
+    path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
+) -> VideoWorld | HistoryWorld:
+    """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); `memory_mb` is the
+    budget of a story's own memory, where it is not to be the saved one; the generator runs on `device`, geometry on the CPU.
 
     CheckpointError says what is missing or foreign.
     """
@@ -74,21 +97,33 @@ def load_world(path: str | Path, memory: bool = True, device: str = "cpu") -> Vi
     about = _read_about(path)
     try:
         weights = load_file(path / "weights.safetensors")
-        packed = load_file(path / "memory.safetensors")
-        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in about["config"].items()}
+        packed = load_file(path / MEMORY_FILE)
+        told = {k: v for k, v in about["config"].items() if k not in RETIRED}
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in told.items()}
         config = VideoConfig(**settings)
+        if memory_mb is not None:
+            config = replace(config, memory_mb=memory_mb)
         generator = Generator(config)
         generator.load_state_dict({k[10:]: v for k, v in weights.items() if k.startswith("generator.")})
-        spec = video_spec(about["name"], config, about["dt_s"], about["action_names"], about["keys"], about["card"])
+        controls, outcome = _controls(about, config), _outcome(about, weights)
+        vitals = outcome.config.vitals if outcome is not None else ()
+        named = (about["dt_s"], about["action_names"], about["keys"], about["card"])
+        spec = video_spec(about["name"], config, *named, controls, vitals)
         starts = {k[7:]: v for k, v in packed.items() if k.startswith("starts.")}
         if not config.geometry:
-            frames = _unpack_frames(starts).unflatten(0, (-1, config.slots))
-            return HistoryWorld(spec, config, generator.to(device), frames, float(about["rewards"][0]))
+            begun = Starts.of(_unpack_frames(starts).unflatten(0, (-1, config.slots)), config.actions)
+            if "actions" in starts:
+                begun = replace(begun, actions=starts["actions"], vitals=starts["vitals"])
+            told = None if outcome is None else outcome.to(device)
+            usual = float(about["rewards"][0])
+            doubt = _doubt(about, weights)
+            return HistoryWorld(spec, config, generator.to(device), begun, usual, told, controls, doubt)
         motion = Motion(config)
         motion.load_state_dict({k[7:]: v for k, v in weights.items() if k.startswith("motion.")})
         kept = _unpack({k[7:]: v for k, v in packed.items() if k.startswith("memory.")}, config)
         rewards = (float(about["rewards"][0]), float(about["rewards"][1]))
-        world = VideoWorld(spec, config, generator, motion, kept, _unpack(starts, config), rewards)
+        senses = _eye(about, weights), _doubt(about, weights)
+        world = VideoWorld(spec, config, generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome)
     except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError, zlib.error) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is damaged or incomplete ({first}); copy or train it again.") from error
@@ -96,8 +131,45 @@ def load_world(path: str | Path, memory: bool = True, device: str = "cpu") -> Vi
     return world if memory else world.without_memory()
 
 
-def video_spec(name: str, config: VideoConfig, dt_s: float, action_names, keys, card) -> Spec:
-    """The spec of a VideoWorld that was learned from a world with these actions and this clock."""
+def _controls(about: dict, config: VideoConfig) -> Controls:
+    """What actions mean; in worlds of earlier releases they are buttons."""
+    told = about.get("controls")
+    if told is None:
+        return Controls.buttons(config.actions)
+    return Controls(told["kind"], tuple(told["low"]), tuple(told["high"]))
+
+
+def _outcome(about: dict, weights: dict[str, torch.Tensor]) -> Outcome | None:
+    told = about.get("outcome")
+    if told is None:
+        return None
+    settings = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
+    outcome = Outcome(OutcomeConfig(**{**settings, "changes": tuple(map(tuple, told["changes"]))}))
+    outcome.load_state_dict({k[8:]: v for k, v in weights.items() if k.startswith("outcome.")})
+    return outcome
+
+
+def _eye(about: dict, weights: dict[str, torch.Tensor]) -> Eye | None:
+    told = about.get("eye")
+    return None if told is None else eye_of(told, {k[4:]: v for k, v in weights.items() if k.startswith("eye.")})
+
+
+def _doubt(about: dict, weights: dict[str, torch.Tensor]) -> Doubt | None:
+    told = about.get("doubt")
+    return None if told is None else doubt_of(told, {k[6:]: v for k, v in weights.items() if k.startswith("doubt.")})
+
+
+def video_spec(
+    name: str,
+    config: VideoConfig,
+    dt_s: float,
+    action_names,
+    keys,
+    card,
+    controls: Controls | None = None,
+    vitals: tuple[str, ...] = (),
+) -> Spec:
+    """The spec of a VideoWorld or HistoryWorld that was learned from a world with these actions, clock and vitals."""
     height, width = config.size
     seen: dict[str, spaces.Space] = {"rgb": spaces.Box(0, 255, (height, width, 3), np.uint8)}
     units = {}
@@ -105,10 +177,11 @@ def video_spec(name: str, config: VideoConfig, dt_s: float, action_names, keys, 
         seen["depth"] = spaces.Box(0, 100, (height, width), np.float32)
         seen["pose"] = spaces.Box(-np.inf, np.inf, (7,), np.float32)
         units = {"depth": "m", "pose": "m, quaternion wxyz of T_world_cam"}
+    marks = {"things": spaces.Box(0, 1, (height, width), np.bool_)} if config.moving else {}  # pyright: ignore
     return Spec(
         name=name,
-        action=spaces.MultiBinary(config.actions),
-        channels={**seen, "reward": REWARD, "done": DONE},
+        action=(controls or Controls.buttons(config.actions)).space(),
+        channels={**seen, **marks, "reward": REWARD, "done": DONE, **dict.fromkeys(vitals, VITAL)},
         observes=tuple(seen),
         dt_s=dt_s,
         units=units,

@@ -9,7 +9,7 @@ completes it (`Generator`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -20,11 +20,21 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
 from ..space.camera import Intrinsics, planar_pose, yaw
+from ..space.eye import Eye
 from ..space.floorplan import floor_plan, slide
-from ..space.keyframes import Glimpse, Keyframes, look, retrieve
-from ..space.reproject import warp
+from ..space.keyframes import Glimpse, Keyframes, merge
+from ..space.memory import RECORDED, Memory, keyframe_table, remembering_spec
+from ..space.patches import FAR_M
+from ..space.recognise import thumbnails
+from ..space.reproject import carry_unknown, fill_holes
+from .arrival import AWAY_M, arrive
+from .doubt import GONE, Doubt, doubting_spec
+from .moving import PLANES, Frame, carry_frames, still
+from .outcome import Outcome
 
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
+LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
+SEEN = ("rgb", "depth", "things", "pose")  # of a frame in the state of a world in which things move
 MOOD = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
 
 
@@ -41,11 +51,14 @@ class VideoConfig:
     history: int = 8  # actions that the motion model remembers
     body_m: float = 0.0  # half the width of the body that slides along walls, as recordings show it; 0: none stops it
     short: float = 0.0  # the share of a step by which it stops short of a wall
-    own_keyframes: int = 24  # of its dream, the oldest is forgotten first
+    memory_mb: float = 16.0  # MiB of a story's own memory (space/memory.py); with 0 it holds the last frame alone
     known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
     new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
     geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/history.py)
     steps: int = 1  # flow-matching steps a frame
+    vitals: tuple[float, ...] = ()  # with which stories begin (names are its outcome's)
+    residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
+    moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
 
 
 class Block(nn.Module):
@@ -66,24 +79,29 @@ class Generator(nn.Module):
 
     Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what
     is known comes through as sharp as it was seen. It begins with a 2x pixel-unshuffle: a quarter of the cost.
+    With `residual` it is the newest frame and what the net changes in it: where hardly a pixel ever changes, a mixture
+    soon copies, and then no gradient tells it otherwise.
     """
 
     def __init__(self, config: VideoConfig):
         super().__init__()
         self.slots = config.slots
         self.choices = config.slots + 2  # merged, slots, last frame
-        inputs = 3 + 4 * config.slots + 4 + 2 + 4
+        self.moving = config.moving
+        inputs = 3 + 4 * config.slots + 4 + 2 + 4 + PLANES * config.moving
         widths = config.channels
         self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
-        told = 1 + 3 * MOOD[0] * MOOD[1] + (0 if config.geometry else config.actions * config.slots)
+        acts = config.history if config.moving else 0 if config.geometry else config.slots  # actions that it is told
+        told = 1 + 3 * MOOD[0] * MOOD[1] + config.actions * acts
         self.before = nn.ModuleList(Block(width, told) for width in widths)
         self.after = nn.ModuleList(Block(width, told) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
-        self.leave = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1), 3, padding=1)
+        self.leave = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1 + config.moving), 3, padding=1)
         nn.init.zeros_(self.leave.weight)
-        bias = torch.zeros(self.choices + 5)
-        bias[0] = 3.0  # at first, trust the merged colours
+        bias = torch.zeros(self.choices + 5 + config.moving)
+        bias[0] = 0.0 if config.residual else 3.0  # at first, trust the merged colours
+        self.residual = config.residual
         self.leave.bias.data = bias.repeat_interleave(4)
 
     def forward(
@@ -96,12 +114,17 @@ class Generator(nn.Module):
     ) -> torch.Tensor:
         """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]; last [B, 4, H, W] = the last frame's colour
         warped into this view and its trust; told [B, n]: the last frame's `mood`, and where there is no geometry to say
-        what they cause, the actions [slots * A], the newest first. Returns the clean frame in the code of `noisy`."""
+        what they cause, the actions [slots * A], the newest first. Returns the clean frame in the code of `noisy`.
+
+        Where things move, `last` [B, 4 + PLANES, H, W] is what moving.carry_frames makes, told also has the last `history`
+        actions, the newest last, and a fifth plane of the result is the logit that a thing is there."""
+        if self.residual:
+            noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
         told = torch.cat([time[:, None], told], 1)
         colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
         merged = merge(glimpse) * 2 - 1
         depth = encode_depth(glimpse.depth)[:, None]
-        last_rgb, last_trust = last[:, :3] * 2 - 1, last[:, 3:]
+        last_rgb, last_trust = last[:, :3] * 2 - 1, last[:, 3:4]
         parts = [
             merged,
             (colours * (trust > 0)[:, :, None]).flatten(1, 2),
@@ -109,8 +132,12 @@ class Generator(nn.Module):
             last_rgb * (last_trust > 0),
             last_trust,
         ]
-        parts += [depth, glimpse.known[:, None], noisy]
-        x = F.silu(self.enter(F.pixel_unshuffle(torch.cat(parts, 1), 2)))
+        parts += [depth, glimpse.known[:, None], noisy[:, :4]]
+        if self.moving:
+            carried = encode_depth(last[:, 4:5])
+            parts += [carried * (last_trust > 0), last[:, 5:]]
+        fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
+        x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
         kept = []
         for level, block in enumerate(self.before):
             x = block(x, told)
@@ -122,10 +149,21 @@ class Generator(nn.Module):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
             x = self.after[level](x, told)
         out = F.pixel_shuffle(self.leave(x), 2)
-        share = out[:, : self.choices + 1].softmax(1)
+        votes = out[:, : self.choices + 1]
+        if self.moving:  # a thing stays as it was unless the network knows better; what was not seen is not copied
+            thing = LASTING * last[:, 5:6] - 1e4 * (last_trust <= 0).float()
+            votes = torch.cat([votes[:, :-2], votes[:, -2:-1] + thing, votes[:, -1:]], 1)
+        share = votes.softmax(1)
         own = out[:, self.choices + 1 : self.choices + 4]
-        known = torch.cat([merged[:, None], colours, last_rgb[:, None]], 1)
-        rgb = (share[:, :-1, None] * known).sum(1) + share[:, -1:] * own
+        if self.residual:
+            rgb = colours[:, 0] + own
+        else:
+            rgb = share[:, :1] * merged + share[:, -2:-1] * last_rgb + share[:, -1:] * own
+            for slot in range(self.slots):
+                rgb = rgb + share[:, 1 + slot : 2 + slot] * colours[:, slot]
+        if self.moving:
+            trusted = share[:, -2:-1]  # as far as the last frame's colour is taken, so is its depth
+            return torch.cat([rgb, depth + trusted * (carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
         return torch.cat([rgb, depth + out[:, -1:]], 1)
 
 
@@ -135,12 +173,6 @@ def channels_last(generator: Generator) -> Generator:
         if weight.ndim == 4:
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
     return generator
-
-
-def merge(glimpse: Glimpse) -> torch.Tensor:
-    """The slots' colours averaged by their squared trust: [B, 3, H, W] in [0, 1]."""
-    weight = (glimpse.trust + 1e-4) ** 2
-    return (glimpse.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
 
 
 def encode_depth(depth: torch.Tensor) -> torch.Tensor:
@@ -179,7 +211,9 @@ class Motion(nn.Module):
 
     def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Logit that the episode ends at `place` [B, 2]: [B]."""
-        return self.ending(torch.cat([2 * (place - self.middle) / self.span, action], -1))[:, 0]
+        where = 2 * (place - self.middle) / self.span
+        logit = self.ending(torch.cat([where, action], -1))[:, 0]
+        return torch.where(where.abs().amax(1) < 1.2, logit, -20.0)  # what lies further away was never seen to end
 
 
 def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
@@ -197,11 +231,31 @@ class VideoWorld:
     def __init__(
         self, spec: Spec, config: VideoConfig, generator: Generator, motion: Motion,
         memory: Keyframes, starts: Keyframes, rewards: tuple[float, float],
+        eye: Eye | None = None, doubt: Doubt | None = None, outcome: Outcome | None = None,
     ):  # fmt: skip
-        self.spec, self.config = spec, config
+        self.config, self.memory, self.starts, self.rewards = config, memory, starts, rewards
+        self.eye, self.doubt = eye, doubt
+        self.outcome = outcome.eval() if outcome else None
+        self.own = own_memory(config)
+        self.spec = doubting_spec(
+            remembering_spec(spec, config.size, len(memory) + self.own.capacity), doubt is not None
+        )
         self.generator = channels_last(generator.eval())
         self.motion = motion.eval()
-        self.memory, self.starts, self.rewards = memory, starts, rewards
+
+    @cached_property
+    def _recorded(self) -> torch.Tensor:
+        """The recordings' part of the channel `keyframes`."""
+        return keyframe_table(self.memory.pose, torch.full((len(self.memory),), RECORDED))
+
+    @cached_property
+    def _headings(self) -> torch.Tensor:
+        return yaw(self.memory.pose)
+
+    @cached_property
+    def _small(self) -> torch.Tensor:
+        """By which a lone picture's place is sought."""
+        return thumbnails(self.memory.rgb)
 
     @cached_property
     def _walls(self) -> torch.Tensor:
@@ -215,15 +269,25 @@ class VideoWorld:
         keys = self.starts.at(pick)
         rgb = F.interpolate(keys.rgb.float(), self.config.size, mode="area")
         seen = {"rgb": rgb.round().to(torch.uint8).permute(0, 2, 3, 1), "depth": keys.depth, "pose": keys.pose}
+        if self.config.moving:  # of what moves, a keyframe keeps the place only
+            seen |= {"things": keys.depth <= 0, "depth": fill_holes(torch.where(keys.depth > 0, keys.depth, FAR_M))}
         return self.observe(seen, None, rng)
 
     @torch.inference_mode()
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """Evidence: rgb, depth and pose together become a keyframe of the state; a pose alone moves the eye there
-        (it needs a prior) and the frame is dreamt."""
+        (it needs a prior) and the frame is dreamt; a picture alone is seen from the prior's pose, or without a prior from
+        the remembered place that it shows, else from an empty corner (arrival.py). Its depth is then the eye's."""
+        if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and self.eye is not None:
+            return self._arrive(torch.as_tensor(observation["rgb"]), self.eye, prior, rng)
         if "pose" not in observation:
+            alone = (
+                "a picture alone"
+                if self.eye is not None
+                else "no picture alone (`terrella train senses` gives it an eye)"
+            )
             raise ObservationError(
-                f"{self.spec.name} observes rgb, depth and pose, or a pose alone; got {list(observation)}."
+                f"{self.spec.name} observes rgb, depth and pose, a pose alone, or {alone}; got {list(observation)}."
             )
         pose = torch.as_tensor(observation["pose"]).float()
         batch = len(pose)
@@ -242,16 +306,28 @@ class VideoWorld:
         speed = torch.where((speed.norm(dim=-1) < 1.0)[:, None], speed, 0.0)
         no, nothing = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
         state = prior.replace(pose=pose, speed=speed, dreamt=no, done=no, reward=nothing)
+        if self.outcome is not None:
+            told = enumerate(self.outcome.config.vitals)
+            given = [torch.as_tensor(observation.get(name, state["vitals"][:, at])).float() for at, name in told]
+            state = state.replace(vitals=torch.stack(given, 1) if given else state["vitals"])
         if not {"rgb", "depth"} <= set(observation):
-            return self._draw(state, prior, rng)
+            return self._draw(self._gone(self.aged(state, prior), prior, None), prior, rng)
         height, width = self.config.size
         rgb, depth = torch.as_tensor(observation["rgb"]), torch.as_tensor(observation["depth"])
         if rgb.shape != (batch, height, width, 3) or depth.shape != (batch, height, width):
             raise ObservationError(f"rgb is uint8 [B, {height}, {width}, 3] and depth [B, {height}, {width}].")
         if rgb.dtype != torch.uint8 or not (torch.isfinite(depth).all() and (depth > 0).all()):
             raise ObservationError("rgb must be uint8, and depth finite and above 0 metres.")
-        state = state.replace(rgb=rgb.permute(0, 3, 1, 2).contiguous(), depth=depth.float())
-        return self._remember(state, torch.ones(batch, dtype=torch.bool))
+        rgb, depth = rgb.permute(0, 3, 1, 2).contiguous(), depth.float()
+        if self.config.moving:
+            things = torch.as_tensor(observation.get("things", prior["things"])).float()  # else where they were dreamt
+            if things.shape != depth.shape:
+                raise ObservationError(f"things is bool [B, {height}, {width}]; got {tuple(things.shape)}.")
+            state = state.replace(things=things)
+        kept = self.own.observed(state, rgb, self._lasting(state, depth), pose)
+        if self.doubt is not None:
+            kept |= {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}
+        return state.replace(rgb=rgb, depth=depth, known=torch.full(depth.shape, 255, dtype=torch.uint8), **kept)
 
     @torch.inference_mode()
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
@@ -261,106 +337,207 @@ class VideoWorld:
         heading, wish = self.motion(yaw(pose), state["speed"], acts)
         moved, speed = self._walk(state, wish)
         place = pose[:, :2] + moved
-        pose = planar_pose(place[:, 0], place[:, 1], pose[:, 2], heading)
+        height = self._height(pose[:, :2], place, pose[:, 2]) if self.config.moving else pose[:, 2]
+        pose = planar_pose(place[:, 0], place[:, 1], height, heading)
         still = state["done"]
-        done = still | (self.motion.ends(place, action) > 0)
+        done = still if self.outcome else still | (self.motion.ends(place, action) > 0)
         next_state = state.replace(
             pose=torch.where(still[:, None], state["pose"], pose), speed=torch.where(still[:, None], 0.0, speed),
             actions=acts[:, 1:], dreamt=torch.ones_like(done), done=done,
             reward=torch.where(still, 0.0, self.rewards[0] + self.rewards[1] * done.float()),
         )  # fmt: skip
-        return self._draw(next_state, state, rng)
+        drawn = self._draw(self._gone(self.aged(next_state, state), state, moved), state, rng)
+        return drawn if self.outcome is None else self._followed(self.outcome, state, drawn, action, rng)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
-        show = {"rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous()}
+        vitals = self.outcome.config.vitals if self.outcome else ()
+        show = {
+            "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
+            "known": lambda: state["known"].float() / 255,
+            "things": lambda: state["things"] > 0.5,
+            **{name: lambda at=at: state["vitals"][:, at].clone() for at, name in enumerate(vitals)},
+            "keyframes": lambda: torch.cat([self._recorded.expand(state.batch, -1, -1), self.own.table(state)], 1),
+        }
         return {name: show[name]() if name in show else state[name] for name in channels}
 
     def without_memory(self) -> VideoWorld:
         """The same world, with nothing of its recordings but where they began."""
-        none = self.memory.at(slice(0, 0))
-        return VideoWorld(self.spec, self.config, self.generator, self.motion, none, self.starts, self.rewards)
+        return self.with_memory(self.memory.at(slice(0, 0)))
+
+    def with_memory(self, memory: Keyframes) -> VideoWorld:
+        """The same world with other keyframes of recordings."""
+        parts = self.generator, self.motion, memory, self.starts, self.rewards, self.eye, self.doubt, self.outcome
+        return VideoWorld(self.spec, self.config, *parts)
+
+    def with_senses(self, eye: Eye | None, doubt: Doubt | None) -> VideoWorld:
+        """The same world with another eye and another doubt, or without."""
+        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, eye, doubt, self.outcome
+        return VideoWorld(self.spec, self.config, *parts)
+
+    def with_memory_of(self, budget_mb: float) -> VideoWorld:
+        """The same world with another budget for a story's own memory; with 0 it holds the last frame alone."""
+        config = replace(self.config, memory_mb=budget_mb)
+        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, self.eye, self.doubt, self.outcome
+        return VideoWorld(self.spec, config, *parts)
 
     def _blank(self, batch: int, pose: torch.Tensor) -> State:
-        config = self.config
-        (height, width), own = config.size, config.own_keyframes
-        nothing = Keyframes.of(
-            torch.zeros(1, 3, 2 * height, 2 * width, dtype=torch.uint8),
-            torch.ones(1, height, width),
-            pose[:1],
-            config.camera,
-        )
-        keys = {f"key_{name}": tensor.expand(batch, own, *tensor.shape[1:]) for name, tensor in vars(nothing).items()}
-        return State(
+        config, (height, width) = self.config, self.config.size
+        state = State(
             {
                 "pose": pose, "speed": torch.zeros(batch, 2), "dreamt": torch.zeros(batch, dtype=torch.bool),
                 "actions": torch.zeros(batch, config.history, config.actions),
                 "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool),
                 "rgb": torch.zeros(batch, 3, height, width, dtype=torch.uint8), "depth": torch.ones(batch, height, width),
-                "key_count": torch.zeros(batch, dtype=torch.int64), **keys,
+                "known": torch.zeros(batch, height, width, dtype=torch.uint8), **self.own.empty(batch),
+                **({} if self.doubt is None else {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}),
             }
         )  # fmt: skip
+        if self.outcome is not None:
+            vitals = torch.tensor(config.vitals).expand(batch, -1)
+            state = state.replace(vitals=vitals, hidden=self.outcome.begin(batch))
+        if not config.moving:
+            return state
+        state = state.replace(things=torch.zeros(batch, height, width))
+        return self.aged(state, state)
 
-    def _own(self, state: State, view: int) -> Keyframes:
-        """The keyframes of one story's own dream."""
-        count = min(int(state["key_count"][view]), self.config.own_keyframes)
-        return Keyframes(*(state[f"key_{name}"][view, :count] for name in vars(self.memory)))
+    def _arrive(self, rgb: torch.Tensor, eye: Eye, prior: State | None, rng: torch.Generator) -> State:
+        height, width = self.config.size
+        if rgb.dtype != torch.uint8 or rgb.ndim != 4 or rgb.shape[1:] != (height, width, 3):
+            raise ObservationError(f"rgb is uint8 [B, {height}, {width}, 3]; got {tuple(rgb.shape)}.")
+        picture = rgb.permute(0, 3, 1, 2).contiguous()
+        if prior is None:
+            config = self.config
+            seen = arrive(picture, eye, self.memory, self._small, self.starts, config.camera, config.sources)
+            pose, depth, lone = seen.pose, seen.depth, ~seen.found
+        else:
+            pose, depth = prior["pose"], eye.depth(picture)
+            lone = prior["gone"][:, 3] > 0 if self.doubt is not None else None
+        state = self.observe({"rgb": rgb, "depth": depth, "pose": pose}, prior, rng)
+        if self.doubt is None or lone is None:
+            return state
+        strange = (10 * (eye.strangeness(picture) - 0.95)).clamp(0, 1) * lone
+        gone = torch.cat([torch.zeros(len(rgb), 3), lone[:, None].float(), strange[:, None]], 1)
+        state = state.replace(gone=gone)
+        glimpse, last, told = self.shown(state, state)  # what the world itself would draw of the picture
+        noise = torch.randn(len(rgb), 4, height, width, generator=rng)
+        there = next(self.generator.parameters()).device
+        parts = noise.to(there), glimpse.to(there), last.to(there), told.to(there)
+        clean = generate(self.generator, *parts, self.config.steps).cpu()
+        return state.replace(uncertainty=self._doubted(state, glimpse, last, clean))
+
+    def _gone(self, state: State, before: State, moved: torch.Tensor | None) -> State:
+        """`state`, one step further from its evidence than `before`: after a predicted step `moved` [B, 2], or (None) where
+        a pose was given."""
+        if self.doubt is None:
+            return state
+        gone = before["gone"].clone()
+        gone[:, 0] += 1
+        if moved is None:
+            gone[:, 1:3] = 0
+        else:
+            turn = yaw(state["pose"]) - yaw(before["pose"])
+            gone[:, 1] += moved.norm(dim=-1)
+            gone[:, 2] += torch.atan2(turn.sin(), turn.cos()).abs()
+        return state.replace(gone=gone)
+
+    def _doubted(self, state: State, glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
+        """The error [B] to expect of a frame `clean` that was drawn for `state` from `glimpse` and `last`."""
+        assert self.doubt is not None
+        pose, gone = state["pose"], state["gone"]
+        angle = (self._headings - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
+        apart = (
+            torch.cdist(pose[:, :3], self.memory.pose[:, :3], compute_mode="donot_use_mm_for_euclid_dist")
+            + 2 * angle.abs()
+        )
+        nearest = apart.min(1).values if len(self.memory) else torch.full((state.batch,), AWAY_M)
+        own = self.own.count(state).float() / max(1, self.own.capacity)
+        said = [gone[:, :4].clamp_max(128).log1p(), nearest.clamp_max(20)[:, None].log1p(), own[:, None]]
+        return self.doubt.expected(glimpse, last, clean, torch.cat(said, 1), gone[:, 4])
+
+    def aged(self, state: State, before: State) -> State:
+        """`state`, in which the frame of `before` is the one before the last, where things move."""
+        return state.replace(**{f"earlier_{part}": before[part] for part in SEEN}) if self.config.moving else state
+
+    def _followed(self, outcome: Outcome, before: State, after: State, action: torch.Tensor, rng) -> State:
+        """`after`, the step from `before`, with the reward, end and vitals that `outcome` reads off the two frames: what
+        may happen to vitals happens as often as it does."""
+        found = outcome(before["rgb"], after["rgb"], action, before["vitals"], before["hidden"], rng)
+        dead = before["done"]
+        return after.replace(
+            vitals=torch.where(dead[:, None], before["vitals"], found.vitals), hidden=found.hidden,
+            reward=torch.where(dead, 0.0, found.reward), done=dead | (found.done > 0),
+        )  # fmt: skip
+
+    def _height(self, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        """The eye's height after a step from place `before` to `after` [B, 2], coming from `z` [B]: it rises as the recorded
+        places around do, as far as a step up or down leads there, and leans towards them as it walks."""
+        if not len(self.memory):
+            return z
+        kept = self.memory.pose
+        levels = []
+        for place in (before, after):
+            near = torch.cdist(place, kept[:, :2])
+            weight = 1 / (near**2 + 0.01) ** 2 * ((near < 2.5) & ((kept[:, 2] - z[:, None]).abs() < 1.5))
+            total = weight.sum(1)
+            levels.append(torch.where(total > 0, (weight * kept[:, 2]).sum(1) / total.clamp_min(1e-9), z))
+        lean = (0.5 * (after - before).norm(dim=-1)).clamp(max=1.0)
+        return z + (levels[1] - levels[0] + lean * (levels[1] - z)).clamp(-0.3, 0.3)
+
+    def _lasting(self, state: State, depth: torch.Tensor) -> torch.Tensor:
+        """What a keyframe may keep of the frame's depth."""
+        return still(depth, state["things"]) if self.config.moving else depth
 
     def _walk(self, state: State, wish: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The displacement [B, 2] and the speed left [B, 2] of a body that wishes to move by `wish` [B, 2] among the walls
         that memory and the dream have seen."""
         walks = []
         for view in range(state.batch):
-            one, own = slice(view, view + 1), self._own(state, view)
-            walls = torch.cat([self._walls, own.walls.flatten(0, 1)])
+            one = slice(view, view + 1)
+            walls = torch.cat([self._walls, self.own.walls(state, view)])
             walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
         moved, speed = zip(*walks)
         return torch.cat(moved), torch.cat(speed)
 
     def _draw(self, state: State, before: State, rng: torch.Generator) -> State:
         """The frame at `state`'s pose, from memory, `before`'s frame and the generator."""
-        config, pose = self.config, state["pose"]
-        chosen = []
-        for view in range(state.batch):
-            memories = [keys for keys in (self.memory, self._own(state, view)) if len(keys)]
-            picks = retrieve(memories, pose[view], config.camera, config.size, config.sources)
-            chosen.append(_joined([keys.at(pick) for keys, pick in zip(memories, picks)]))
-        glimpse = look(chosen, pose, config.camera, config.size, config.slots)
-        last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
-        noise = torch.randn(state.batch, 4, *config.size, generator=rng)
+        glimpse, last, told = self.shown(state, before)
+        noise = torch.randn(state.batch, 4, *self.config.size, generator=rng)
         there = next(self.generator.parameters()).device
-        told = mood(before["rgb"]).to(there)
-        clean = generate(self.generator, noise.to(there), glimpse.to(there), last.to(there), told, config.steps).cpu()
+        parts = noise.to(there), glimpse.to(there), last.to(there), told.to(there)
+        clean = generate(self.generator, *parts, self.config.steps).cpu()
+        if self.doubt is not None:
+            state = state.replace(uncertainty=self._doubted(state, glimpse, last, clean))
+        return self.drawn(state, glimpse, clean)
+
+    def shown(self, state: State, before: State) -> tuple[Glimpse, torch.Tensor, torch.Tensor]:
+        """What the generator gets (glimpse, last, told) to draw the frame at `state`'s pose, `before` being the last."""
+        config, pose = self.config, state["pose"]
+        glimpse = self.own.look(state, pose, config.sources, config.slots, self.memory)
+        if config.moving:
+            frames = [Frame(*(before[f"{age}{part}"] for part in SEEN)) for age in ("", "earlier_")]
+            told = torch.cat([mood(before["rgb"]), state["actions"].flatten(1)], 1)
+            return glimpse, carry_frames(frames[0], frames[1], pose, config.camera), told
+        last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
+        return glimpse, last, mood(before["rgb"])
+
+    def drawn(self, state: State, glimpse: Glimpse, clean: torch.Tensor) -> State:
+        """`state` with the frame `clean` [B, 4, H, W] that the generator drew of it from `glimpse`, remembered if new."""
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        drawn = state.replace(rgb=rgb, depth=decode_depth(clean[:, 3]))
-        invented = glimpse.known.mean((1, 2)) < self.config.known_enough
-        return self._remember(drawn, invented & (self._nearest_own(drawn)[0] > 1))
+        depth, known = decode_depth(clean[:, 3]), glimpse.known
+        if self.config.moving:
+            state = state.replace(things=clean[:, 4].sigmoid())
+            known = known * (state["things"] < 0.5)
+        kept = self.own.dreamt(state, rgb, self._lasting(state, depth), state["pose"], known)
+        return state.replace(rgb=rgb, depth=depth, known=(known * 255).round().to(torch.uint8), **kept)
 
-    def _nearest_own(self, state: State) -> tuple[torch.Tensor, torch.Tensor]:
-        """How far [B] the eye is from the nearest keyframe of the story's own, above 1 for a new view; and its slot."""
-        far, turn = self.config.new_view
-        pose, kept = state["pose"][:, None], state["key_pose"]
-        away = (kept[..., :3] - pose[..., :3]).norm(dim=-1) / far
-        angle = yaw(kept) - yaw(pose)
-        apart = away + torch.atan2(angle.sin(), angle.cos()).abs() / turn
-        used = torch.arange(kept.shape[1]) < state["key_count"][:, None]
-        return torch.where(used, apart, 9.0).min(1)
 
-    def _remember(self, state: State, which: torch.Tensor) -> State:
-        """The current frame kept as a keyframe in the stories `which` [B]; the oldest is forgotten when full."""
-        if not which.any():
-            return state
-        new = Keyframes.of(doubled(state["rgb"]), state["depth"], state["pose"], self.config.camera)
-        apart, nearest = self._nearest_own(state)
-        fresh = apart > 1  # else it takes the place of the keyframe that it is too near to: evidence beats a dream
-        slot = torch.where(fresh, state["key_count"] % self.config.own_keyframes, nearest)
-        rows = which.nonzero()[:, 0]
-        changed = {"key_count": state["key_count"] + (which & fresh).long()}
-        for name, tensor in vars(new).items():
-            kept = state[f"key_{name}"].clone()
-            kept[rows, slot[rows]] = tensor[rows].to(kept.dtype)
-            changed[f"key_{name}"] = kept
-        return state.replace(**changed)
+def own_memory(config: VideoConfig) -> Memory:
+    """The memory of a story's own; without a budget one of the last frame, which each new one replaces."""
+    if config.memory_mb > 0:
+        return Memory(config.camera, config.size, config.memory_mb, config.new_view, config.known_enough)
+    frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
+    return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0)
 
 
 def mood(rgb: torch.Tensor) -> torch.Tensor:
@@ -377,7 +554,7 @@ def generate(
     for step in range(steps):
         now, after = step / steps, (step + 1) / steps
         clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, told)
-        x = clean if after == 1 else x + (clean - x) * (after - now) / (1 - now)
+        x = clean if after == 1 else x + (clean[:, :4] - x) * (after - now) / (1 - now)
     return x
 
 
@@ -391,18 +568,4 @@ def carry(
 ) -> torch.Tensor:
     """The last frame (rgb uint8 [B, 3, H, W]) warped into the new view where no keyframe knows it, and its trust:
     [B, 4, H, W], 0 elsewhere. A frame that is warped again at every step blurs; a keyframe is warped once."""
-    colour, agreement, _ = warp(
-        rgb.float().div(255)[:, None], depth[:, None], pose[:, None], glimpse.depth, target_pose, camera
-    )
-    trust = agreement * (1 - glimpse.known[:, None])
-    return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
-
-
-def doubled(rgb: torch.Tensor) -> torch.Tensor:
-    """uint8 [..., 3, H, W] -> [..., 3, 2H, 2W], every pixel four times: a warp then blurs it by half a pixel only."""
-    return rgb.repeat_interleave(2, -1).repeat_interleave(2, -2)
-
-
-def _joined(parts: list[Keyframes]) -> Keyframes:
-    full = [part for part in parts if len(part)] or parts[:1]
-    return Keyframes(*(torch.cat([vars(part)[name] for part in full]) for name in vars(full[0])))
+    return carry_unknown(rgb, depth, pose, glimpse.known, glimpse.depth, target_pose, camera)

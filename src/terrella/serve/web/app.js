@@ -4,6 +4,9 @@ import { drawCard } from './card.js';
 import { Controls } from './controls.js';
 import { drawKeycaps, keyLabel, keyMeaning } from './keycaps.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
+import { MemoryMap } from './map.js';
+import { Doubt } from './doubt.js';
+import { takePictures } from './picture.js';
 
 const $ = (id) => document.getElementById(id);
 const app = $('app'), glow = $('glow').getContext('2d', { alpha: false });
@@ -12,7 +15,7 @@ const shade = glow.createRadialGradient(16, 10, 3, 16, 10, 17);
 shade.addColorStop(0, '#0b0c0f70');
 shade.addColorStop(1, '#0b0c0f');
 
-const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0 };
+const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
 let worlds = [], screens = [], light = () => {}, status = {}, noRewind = '', noRecord = '';
 let pending = null, keysId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
@@ -20,6 +23,8 @@ let state = 'connecting';
 
 // -- the connection -------------------------------------------------------------------------------------------------
 
+const doubt = new Doubt($('doubt'), $('doubt-fill'));
+const map = new MemoryMap($('map')), show = { map: false, invented: false };
 const link = new Link({ frame: onFrame, event: onEvent, state: showState });
 const controls = new Controls((held, time) => {
   light(held);
@@ -37,13 +42,40 @@ function sendKeys(time) {
 function onEvent(body) {
   if (body.type === 'hello') hello(body);
   if (body.type === 'status') onStatus(body);
+  if (body.type === 'chart' && show.map) map.show(body);
   if (body.type === 'error') toast(body.text);
+}
+
+/** Shows or hides the map, or the tint of what is invented, and asks the server for what is shown alone. */
+function showMemory(change) {
+  Object.assign(show, change);
+  show.map &&= worlds.some((world) => world.mapped);
+  show.invented &&= worlds.some((world) => world.tells_known);
+  $('map').hidden = !show.map;
+  $('map-open').setAttribute('aria-pressed', show.map);
+  $('tint').setAttribute('aria-pressed', show.invented);
+  link.send({ type: 'show', ...show });
+}
+
+function toggleMap() {
+  if ($('map-open').hidden) return;
+  showMemory({ map: !show.map });
+  localStorage.setItem('terrella-map', show.map ? 'open' : 'closed');
+}
+
+function toggleTint() {
+  if (!$('tint').hidden) showMemory({ invented: !show.invented });
 }
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
   ({ worlds, no_rewind: noRewind, no_record: noRecord } = body);
   if (!same) build();
+  if (!body.resumed) map.clear();
+  $('map-open').hidden = !worlds.some((world) => world.mapped);
+  $('tint').hidden = !worlds.some((world) => world.tells_known);
+  const wish = localStorage.getItem('terrella-map'), open = worlds.length === 1 ? wish !== 'closed' : wish === 'open';
+  showMemory(same ? {} : { map: open && innerWidth > 1000 });
   now.actionId = keysId;
   sendKeys(performance.now());
   showState('starting');
@@ -93,8 +125,9 @@ function paint(time) {
     ticks.push(frame.step);
     flash();
   }
-  Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags });
+  Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
+  doubt.show(frame.doubt, !!(frame.flags & FRESH) || !live);
   seen.painted += 1;
   keep(seen.times, time);
   keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });
@@ -127,6 +160,14 @@ function build() {
   drawTouch();
   drawCard($('facts'), worlds);
   $('score-cell').hidden = !worlds[0].scored;
+  document.querySelectorAll('.vital').forEach((cell) => cell.remove());
+  for (const name of worlds[0].vitals) {
+    const cell = Object.assign(document.createElement('div'), { className: 'vital' });
+    cell.append(Object.assign(document.createElement('dt'), { textContent: name }));
+    cell.append(Object.assign(document.createElement('dd'), { id: `vital-${name}`, textContent: '–' }));
+    $('score-cell').after(cell);
+  }
+  doubt.levels = worlds[worlds.length - 1].doubtful;
   $('sync').hidden = worlds.length < 2;
   app.classList.toggle('no-rewind', !!noRewind);
   able($('rewind'), noRewind, 'Hold to rewind (Backspace)');
@@ -223,6 +264,7 @@ function drawFigures() {
   if (recent.length) write('latency', Math.round(recent[recent.length >> 1]), 'ms');
   write('step', now.step.toLocaleString('en'));
   write('score', +now.score.toFixed(2));
+  worlds.length && worlds[0].vitals.forEach((name, at) => write(`vital-${name}`, +(now.vitals[at] ?? 0).toFixed(1)));
   if (status.recording) {
     const s = Math.floor((performance.now() - recordSince) / 1000);
     write('rec-time', `${Math.floor(s / 60)}:${String(s % 60).padStart(2, '0')}`);
@@ -337,7 +379,7 @@ function drawTouch() {
 
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
-const SHORTCUTS = { KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 function fullscreen() {
   return document.fullscreenElement ? document.exitFullscreen() : app.requestFullscreen?.();
@@ -363,6 +405,8 @@ $('record').onclick = record;
 $('clip').onclick = clip;
 $('sync').onclick = () => link.send({ type: 'sync' });
 $('full').onclick = fullscreen;
+$('map-open').onclick = toggleMap;
+$('tint').onclick = toggleTint;
 $('smooth').onclick = () => $('smooth').setAttribute('aria-pressed', app.classList.toggle('smooth'));
 $('branch').onclick = () => link.send({ type: 'branch' });
 $('now').onclick = () => link.send({ type: 'resume' });
@@ -384,6 +428,7 @@ $('timeline').onpointerdown = (event) => { if (noRewind) return; scrubbing = tru
 $('timeline').onpointermove = (event) => { if (scrubbing) scrub(event); };
 $('timeline').onpointerup = $('timeline').onpointercancel = (event) => { if (scrubbing && event.type === 'pointerup') { scrubbed = 0; scrub(event); } scrubbing = false; };
 
+takePictures($('app'), $('picture'), () => worlds[0]?.size, (bytes) => link.sendPicture(bytes), toast);
 controls.bindPad($('stick'), 'stick', (x, y) => controls.axes(x, y));
 controls.bindPad($('turn'), 'turn', (x) => controls.turns(x));
 const coarse = matchMedia('(pointer: coarse)');
@@ -418,6 +463,9 @@ window.terrella = Object.freeze({
   get held() { return [...controls.held]; },
   get recording() { return !!status.recording; },
   get seed() { return status.seed; },
+  get doubt() { return doubt.value; },
+  get doubtful() { return doubt.level; },
+  get map() { return { shown: show.map, step: map.step, eye: map.eye, keyframes: map.keys.length, path: map.path.length }; },
   get done() { return !!(now.flags & DONE); },
   get latencies() { return [...seen.latencies]; },
   get latencyCount() { return seen.latencyCount; },

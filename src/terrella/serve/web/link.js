@@ -1,6 +1,6 @@
 // The connection: one WebSocket, frames decoded off the main thread, acknowledged, and reconnection.
 
-const VERSION = 1, HEADER = 48;
+const VERSION = 2, HEADER = 52;
 export const DONE = 1, FRESH = 2, REPLAY = 4;
 
 /** A frame message (see serve/protocol.py) as its numbers and its JPEG bytes. */
@@ -10,7 +10,7 @@ export function readFrame(buffer) {
   const frame = {
     flags: view.getUint8(1), seq: view.getUint32(4, true), step: view.getUint32(8, true), oldest: view.getUint32(12, true),
     newest: view.getUint32(16, true), actionId: view.getUint32(20, true), generationMs: view.getFloat32(24, true),
-    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), images: [],
+    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), doubt: view.getFloat32(48, true), images: [],
   };
   let at = HEADER;
   for (let left = view.getUint16(2, true); left > 0; left--) {
@@ -18,6 +18,8 @@ export function readFrame(buffer) {
     frame.images.push(new Uint8Array(buffer, at + 4, length));
     at += 4 + length;
   }
+  frame.vitals = [];
+  for (; at + 4 <= buffer.byteLength; at += 4) frame.vitals.push(view.getFloat32(at, true));
   return frame;
 }
 
@@ -107,6 +109,11 @@ export class Link {
 
   send(message) {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  /** The bytes of an image file (at most 64 kB): a new episode begins with it. */
+  sendPicture(bytes) {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(bytes);
   }
 
   clipAddress() {

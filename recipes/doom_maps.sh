@@ -1,0 +1,17 @@
+#!/bin/sh
+# Two worlds in which things move, 48x64: monsters in a corridor, and three maps of Freedoom with a fourth never seen. Run it in
+# the folder of a checkout after `make test`; every command goes on where it was stopped.
+set -e
+PATH=.venv/bin:$PATH
+export OMP_NUM_THREADS=1
+terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 16000 --seed 0 --out recordings/monsters
+terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 3000 --seed 1 --out recordings/monsters-test
+terrella train video recordings/monsters --out runs/monsters --name doom-monsters --size 48 64 --steps 4000 \
+    --motion-steps 2500 --outcome-steps 700 --keyframes 160 --critic-from 900 --eye-steps 0 --doubt-frames 0
+terrella score runs/monsters --data recordings/monsters-test --fresh --out scores/monsters --horizons 1 8 32
+
+terrella record doom --height 96 --scenario freedoom2/MAP01,MAP02,MAP05 --frames 18000 --seed 0 --out recordings/maps
+terrella record doom --height 96 --scenario freedoom2/MAP03 --frames 3000 --seed 1 --out recordings/map03
+terrella train video recordings/maps --out runs/maps --name doom-maps --size 48 64 --steps 4000 \
+    --motion-steps 2500 --outcome-steps 700 --keyframes 420 --critic-from 900 --eye-steps 0 --doubt-frames 0
+terrella score runs/maps --data recordings/maps --new recordings/map03 --out scores/maps --horizons 1 8 32

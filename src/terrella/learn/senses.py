@@ -1,0 +1,99 @@
+"""The senses of a trained world: an eye, so that it can begin with a lone picture, and a doubt, so that it says when it
+invents. `train video` ends with them; `train senses` gives them to a world that has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import DatasetError, TrainingError
+from ..data import ClipCache, Dataset, split
+from ..space.eye import load_eye, save_eye
+from ..worlds.folder import MEMORY_FILE, load_world, save_world
+from ..worlds.history import HistoryWorld
+from ..worlds.video import VideoWorld
+from .doubt import DoubtTraining, learn_doubt
+from .eye import EyeTraining, learn_eye, recording_of, sight
+from .samples import Recording, controls_of
+
+Report = Callable[[float, float, str], None]
+Learned = VideoWorld | HistoryWorld
+
+
+@dataclass(frozen=True)
+class SensesConfig:
+    """Settings of the training of a world's senses.
+
+    Args:
+        eye_steps: Training steps of the eye; 0 leaves it out.
+        doubt_frames: Dreamt frames that the doubt learns from; 0 leaves it out.
+        seed: Of everything random.
+    """
+
+    eye_steps: int = 2500
+    doubt_frames: int = 9000
+    seed: int = 0
+
+
+def train_senses(world: str | Path, data: str | Path, out: str | Path, config: SensesConfig, report: Report) -> dict:
+    """Gives the world in the folder `world` senses, learned from its own recording `data`, and writes it to `out` (which may
+    be `world`); returns its facts. What was kept out of its training is kept out here too."""
+    learned = load_world(world)
+    dataset, size = Dataset(data), learned.config.size
+    cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
+    if cache.rgb is None or cache.action.shape[1] != learned.config.actions and isinstance(learned, VideoWorld):
+        raise TrainingError(f"{data} is no recording of {learned.spec.name}: its pictures or actions are others.")
+    box: Any = learned.spec.card.get("keep_out")
+    posed = cache.depth is not None and cache.pose is not None and bool(cache.world.get("camera"))
+    if isinstance(learned, VideoWorld) and not posed:
+        raise DatasetError(f"{data} lacks depth, poses or a camera, from which {learned.spec.name} was learned.")
+    train, held_out = split(len(cache.episodes))
+    recording = recording_of(cache, train, tuple(box) if box and posed else None, controls_of(cache))
+    keep = Path(out) / "eye.safetensors.partial"
+    sensing, facts = learn_senses(learned, recording, held_out, tuple(box) if box else None, config, report, keep)
+    remembered = (Path(world) / MEMORY_FILE).read_bytes()  # as they are: pictures that are packed again lose a little
+    save_world(sensing, out, {**learned.spec.card, **facts})
+    (Path(out) / f"{MEMORY_FILE}.partial").write_bytes(remembered)
+    (Path(out) / f"{MEMORY_FILE}.partial").replace(Path(out) / MEMORY_FILE)
+    keep.unlink(missing_ok=True)
+    return {"world": str(out), **facts}
+
+
+def learn_senses(
+    world: Learned,
+    recording: Recording,
+    held_out: list[int],
+    keep_out,
+    config: SensesConfig,
+    report: Report,
+    keep: Path,
+) -> tuple[Learned, dict]:
+    """`world` with an eye (where it has geometry) and a doubt, and what its card says of them. The eye is kept in the file
+    `keep` as soon as it is learned: a run that is stopped goes on from there."""
+    facts: dict[str, Any] = {}
+    eye = None
+    if isinstance(world, VideoWorld) and config.eye_steps:
+        if keep.exists():
+            eye = load_eye(keep)
+        else:
+            eye = learn_eye(recording, EyeTraining(steps=config.eye_steps, keep_out=keep_out, seed=config.seed), report)
+            keep.parent.mkdir(parents=True, exist_ok=True)
+            save_eye(eye, keep)
+        facts["eye"] = {
+            place: {name: round(value, 4) for name, value in errors.items()}
+            for place, errors in sight(eye, recording.cache, held_out, keep_out).items()
+            if errors
+        }
+    sensing = world.with_senses(eye, None) if isinstance(world, VideoWorld) else world
+    if config.doubt_frames:
+        try:
+            horizon, steps = min(64, max(8, config.doubt_frames // 40)), min(1500, max(20, config.doubt_frames // 6))
+            settings = DoubtTraining(config.doubt_frames, horizon, steps=steps, seed=config.seed)
+            doubt, found = learn_doubt(sensing, recording, settings, report)
+        except DatasetError as error:  # the world is as good without it
+            return sensing, {**facts, "uncertainty": f"none: {error}"}
+        facts["uncertainty"] = {name: round(value, 4) for name, value in found.items()}
+        sensing = sensing.with_senses(eye, doubt)
+    return sensing, facts

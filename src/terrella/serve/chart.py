@@ -1,0 +1,65 @@
+"""What a world remembers, for the page: the map of its keyframes, and its pictures with what it invented tinted.
+
+It knows no kind of world: a world with the channels `pose` and `keyframes` [N, 4] (x, y in metres, heading in radians, kind:
+0 empty, 1 recorded, 2 observed, 3 dreamt) is drawn as a map, one with `known` [H, W] in 0..1 can be tinted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from ..core.spec import Spec
+from ..core.state import State
+from ..core.world import World
+
+AMBER = (1.25, 0.95, 0.5)  # of what is invented: its brightness in this colour
+STRENGTH = 0.85
+
+
+def mapped(spec: Spec) -> bool:
+    return {"pose", "keyframes"} <= set(spec.channels)
+
+
+def tells_known(spec: Spec) -> bool:
+    return "known" in spec.channels
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One moment's map: where the eye is [x, y, heading], what share of the picture memory knew (None where the world does
+    not say), and its keyframes [n, 4] without the empty slots."""
+
+    eye: list[float]
+    known: float | None
+    keyframes: torch.Tensor
+
+    def body(self, before: Chart | None) -> dict:
+        """As the page gets it: numbers to the centimetre and half a degree, and keyframes only if they are not those of
+        `before`."""
+        body: dict = {"eye": [round(number, 3) for number in self.eye], "known": self.known}
+        if before is None or not torch.equal(before.keyframes, self.keyframes):
+            body["keyframes"] = [round(number, 2) for number in self.keyframes.flatten().tolist()]
+        return body
+
+
+def chart(world: World, state: State) -> Chart:
+    """The map of the first story of `state`."""
+    wanted = ["pose", "keyframes", *(["known"] if tells_known(world.spec) else [])]
+    seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
+    x, y, _, w, qx, qy, z = seen["pose"].tolist()
+    heading = math.atan2(2 * (w * z + qx * qy), 1 - 2 * (qy * qy + z * z))
+    held = seen["keyframes"][seen["keyframes"][:, 3] > 0]
+    known = round(float(seen["known"].mean()), 3) if "known" in seen else None
+    return Chart([x, y, heading], known, held)
+
+
+def tinted(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """rgb uint8 [B, H, W, 3] in which what memory does not know (`known` [B, H, W] in 0..1) has turned to amber."""
+    picture = rgb.float()
+    brightness = picture @ torch.tensor([0.299, 0.587, 0.114], device=rgb.device)
+    amber = brightness[..., None] * torch.tensor(AMBER, device=rgb.device) + 8
+    share = STRENGTH * (1 - known)[..., None]
+    return (picture + share * (amber - picture)).round().clamp(0, 255).to(torch.uint8)

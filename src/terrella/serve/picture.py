@@ -1,0 +1,94 @@
+"""Pictures that people bring: bytes of an image file, from the disk or the page, as a frame of the world's size."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from ..core.errors import ServeError
+from ..core.spec import Spec
+
+FORMATS = (
+    "JPEG",
+    "PNG",
+    "WEBP",
+    "GIF",
+    "BMP",
+    "TIFF",
+    "PPM",
+)  # those that are tried: a small part of what Pillow can read
+MAX_FILE = 2**26  # bytes of a file
+MAX_PIXELS = 2**26
+MAX_DROPPED_PIXELS = 2**22  # of one from the page, which scales it down itself
+_GROUND = (40, 40, 44)  # behind what is transparent
+
+
+def read_picture(path: str | Path, size: tuple[int, int]) -> torch.Tensor:
+    """The image file at `path` as `picture_of` gives it; ServeError where there is none that can be read."""
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise ServeError(f"{path} is no file; give an image file (JPEG, PNG, WebP, GIF, BMP or TIFF).")
+        if path.stat().st_size > MAX_FILE:
+            raise ServeError(f"{path} has more than {MAX_FILE >> 20} MiB; save it smaller first.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise ServeError(f"{path} cannot be read ({error.strerror}); check the file.") from error
+    return picture_of(data, size, MAX_PIXELS, str(path))
+
+
+def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS, name: str = "this") -> torch.Tensor:
+    """An image of any size and aspect, upright as its EXIF says, cut from its middle and scaled: uint8 [H, W, 3] of `size`.
+
+    Its size is checked before a pixel is decoded, and none of Pillow's plug-ins outside FORMATS see it. ServeError where it
+    is no such image, is damaged, or has more than `most_pixels`.
+    """
+    height, width = size
+    try:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            if image.width * image.height > most_pixels:
+                raise Image.DecompressionBombError
+            turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+            across, down = (height, width) if turned else (width, height)
+            image.draft("RGB", (4 * across, 4 * down))  # a JPEG is decoded at a fraction of its size
+            upright = ImageOps.exif_transpose(image)
+            rgb = ImageOps.fit(_plain(upright), (width, height), Image.Resampling.LANCZOS)
+            return torch.from_numpy(np.array(rgb))
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ServeError(f"{name} has too many pixels; scale it to at most {most_pixels / 1e6:.0f} million.") from error
+    except UnidentifiedImageError as error:
+        raise ServeError(f"{name} is no image that is known here: JPEG, PNG, WebP, GIF, BMP or TIFF.") from error
+    except Exception as error:  # a decoder is fed a stranger's bytes, and may raise anything
+        raise ServeError(
+            f"{name} is an image that cannot be decoded ({type(error).__name__}); save it again."
+        ) from error
+
+
+def doubtful(spec: Spec) -> tuple[float, float] | None:
+    """For a world that has the channel `uncertainty`: the value that is usual for it, and from which it invents."""
+    if "uncertainty" not in spec.channels:
+        return None
+    told = spec.card.get("uncertainty")
+    known = told if isinstance(told, dict) else {}
+    sure, invents = (known.get(name, usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
+    return float(sure), max(float(invents), 1.01 * float(sure))
+
+
+def _plain(image: Image.Image) -> Image.Image:
+    """RGB, 8 bits, without transparency."""
+    if image.mode.startswith("I;16") or image.mode in ("I", "F"):
+        values = np.asarray(image, np.float32)
+        low, high = float(values.min()), float(values.max())
+        scale = (
+            65535.0 if image.mode.startswith("I") and high > 255 else max(high, 1e-6) if image.mode == "F" else 255.0
+        )
+        return Image.fromarray(np.uint8(np.clip(values - min(low, 0), 0, scale) * (255 / scale))).convert("RGB")
+    if "A" in image.getbands() or "transparency" in image.info:
+        shown = image.convert("RGBA")
+        ground = Image.new("RGBA", shown.size, (*_GROUND, 255))
+        return Image.alpha_composite(ground, shown).convert("RGB")
+    return image.convert("RGB")

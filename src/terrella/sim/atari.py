@@ -1,0 +1,164 @@
+"""Atari games (ale-py) as Gymnasium environments that draw as learners of them see: every fourth frame, small, exact copies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import ale_py
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from PIL import Image
+
+from ..core.errors import TerrellaError
+from .gymnasium import GymnasiumWorld, check_size
+from .snapshot import NotCopyable
+
+FRAMES_PER_SECOND = 60
+_ARROWS = {"ArrowUp": "UP", "ArrowDown": "DOWN", "ArrowLeft": "LEFT", "ArrowRight": "RIGHT", "Space": "FIRE"}
+_LETTERS = {"KeyW": "ArrowUp", "KeyS": "ArrowDown", "KeyA": "ArrowLeft", "KeyD": "ArrowRight"}
+
+
+class AtariWorld(GymnasiumWorld):
+    """`AtariWorld("ALE/Breakout-v5")`: one step is `frames` frames of the console (Mnih et al. 2015).
+
+    size:   (height, width) of rgb, area-averaged from the screen of 210x160; None keeps the screen.
+    frames: of the console in a step, its last two merged by maximum, for sprites that flicker.
+    sticky: the chance that a step repeats the last action (Machado et al. 2018). With 0 the game is deterministic and
+            its states are values; else they are tickets.
+    noops:  a story begins after 1 to `noops` frames without a button, drawn from the rng.
+
+    Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, when the game is over; lives float32 [B].
+    """
+
+    def __init__(
+        self,
+        game: str,
+        *,
+        size: tuple[int, int] | None = (64, 64),
+        frames: int = 4,
+        sticky: float = 0.0,
+        noops: int = 30,
+        forkable: bool | None = None,
+    ):
+        if not (0 <= sticky <= 1 and 1 <= frames <= 60 and noops >= 0):
+            raise TerrellaError(
+                f"sticky={sticky} is a chance, 0 to 1; frames={frames} in a step are 1 to 60; noops={noops} are 0 or more."
+            )
+        screen = check_size(size)
+
+        def build() -> gymnasium.Env:
+            return _Screen(_make(game, sticky), screen, frames, noops, sticky)
+
+        names = tuple(_make(game, sticky).unwrapped.get_action_meanings())  # pyright: ignore[reportAttributeAccessIssue]
+        super().__init__(
+            build,
+            dt_s=frames / FRAMES_PER_SECOND,
+            forkable=forkable if sticky == 0 else False,
+            snapshots=_Savestates,
+            told=("lives",),
+            name=f"gym:{game}",
+            action_names=names,
+            keys=keys_of(names),
+        )
+
+
+def keys_of(names: Sequence[str]) -> dict[str, list[float]]:
+    """Arrow keys, WASD and the space bar for the actions of these names (NOOP, FIRE, UP, RIGHT, ...); a game that moves
+    along one axis listens to both pairs of arrows."""
+    found = {key: [float(names.index(name))] for key, name in _ARROWS.items() if name in names}
+    for key, other in (("ArrowUp", "RIGHT"), ("ArrowDown", "LEFT"), ("ArrowLeft", "DOWN"), ("ArrowRight", "UP")):
+        if key not in found and other in names:
+            found[key] = [float(names.index(other))]
+    return found | {letter: found[arrow] for letter, arrow in _LETTERS.items() if arrow in found}
+
+
+def _make(game: str, sticky: float) -> gymnasium.Env:
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # its greeting would stand among our results
+    gymnasium.register_envs(ale_py)
+    try:
+        return gymnasium.make(
+            game,
+            obs_type="ram",  # the screen is fetched where it is needed
+            frameskip=1,
+            repeat_action_probability=sticky,
+            max_episode_steps=-1,
+            disable_env_checker=True,
+        )
+    except (gymnasium.error.Error, TypeError) as error:
+        raise TerrellaError(f"Gymnasium cannot make '{game}': {error}") from error
+
+
+class _Screen(gymnasium.Wrapper):
+    """Steps of several frames; observations are small pictures."""
+
+    def __init__(self, env: gymnasium.Env, size: tuple[int, int] | None, frames: int, noops: int, sticky: float):
+        super().__init__(env)
+        self.sticky, self.loaded = sticky, False
+        self.size = size or tuple(self.ale.getScreenDims())
+        self.frames, self.noops = frames, noops
+        self.observation_space = spaces.Box(0, 255, (*self.size, 3), np.uint8)
+
+    @property
+    def ale(self) -> ale_py.ALEInterface:
+        return self.unwrapped.ale  # pyright: ignore[reportAttributeAccessIssue]
+
+    def reset(self, *, seed=None, options=None):
+        if self.sticky or not self.loaded:
+            self.env.reset(seed=seed, options=options)
+            self.loaded = True
+        elif seed is not None:  # a full reset loads the game anew, 0.2 s, to seed dice that are not thrown
+            self.unwrapped.np_random, _ = np_random(seed)
+        self.ale.reset_game()
+        info: dict = {"lives": self.ale.lives()}
+        for _ in range(int(self.unwrapped.np_random.integers(1, self.noops + 1)) if self.noops else 0):
+            *_, over, _, info = self.env.step(0)
+            if over:
+                self.ale.reset_game()
+        return self._picture(self.ale.getScreenRGB()), info
+
+    def step(self, action):
+        total, screens = 0.0, []
+        terminated = truncated = False
+        info: dict = {}
+        for frame in range(self.frames):
+            _, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            if frame >= self.frames - 2 or terminated or truncated:
+                screens.append(self.ale.getScreenRGB())
+            if terminated or truncated:
+                break
+        return self._picture(np.maximum.reduce(screens)), total, terminated, truncated, info
+
+    def _picture(self, screen: np.ndarray) -> np.ndarray:
+        height, width = self.size
+        if screen.shape[:2] == (height, width):
+            return screen
+        return np.asarray(Image.fromarray(screen).resize((width, height), Image.Resampling.BOX))
+
+
+class _Savestates:
+    """The console's own save states in place of sim/snapshot.py's numbers: see Snapshots for `take` and `put`."""
+
+    def __init__(self, env: gymnasium.Env):
+        self._width = len(self._bytes(env))
+
+    def take(self, env: gymnasium.Env) -> tuple[list[float], list[int]]:
+        state = self._bytes(env)
+        if len(state) != self._width:
+            raise NotCopyable("its save states differ in length")
+        return [], list(state)
+
+    def put(self, env: gymnasium.Env, numbers: Sequence[float], kinds: Sequence[int]) -> None:
+        state = ale_py._ale_py.ALEState.__new__(ale_py._ale_py.ALEState)  # pyright: ignore[reportAttributeAccessIssue]
+        state.__setstate__(bytes(kinds))
+        _ale(env).restoreState(state)
+
+    @staticmethod
+    def _bytes(env: gymnasium.Env) -> bytes:
+        return _ale(env).cloneState().__getstate__()  # pyright: ignore[reportReturnType]
+
+
+def _ale(env: gymnasium.Env) -> ale_py.ALEInterface:
+    return env.unwrapped.ale  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,187 @@
+"""Remembering: a World around any generator of pictures, that shows again what was shown before.
+
+After the inner world imagines, memory (memory.py) splats its geometry into the new view. Where it is dense its pixels
+reconstruct, where it is sparse the inner world's invention stays; the two are blended, and the inner world observes the
+blend, so that it goes on from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+
+from ..core.errors import ContractError, ObservationError
+from ..core.spec import Spec, shape_of
+from ..core.state import State
+from ..core.world import World
+from .camera import Intrinsics, planar_pose, rays, yaw
+from .eye import Eye
+from .keyframes import Glimpse, merge
+from .memory import Memory, remembering_spec
+
+SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
+_INNER = "world_"  # what the names of the inner world's tensors begin with
+_OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
+
+
+def remember(world: World, memory_mb: float = 16.0, eye: Eye | None = None, camera: Intrinsics | None = None) -> World:
+    """`world` with a spatial memory. One that shows the channel `known` has its own and draws from it: it stays as it is."""
+    return world if "known" in world.spec.channels else Remembering(world, memory_mb, eye, camera)
+
+
+class Remembering:
+    """The wrapped world. Pose and depth are the inner world's channels; where it lacks one, the eye's: odometry adds up
+    its motions, level and from the origin. Without depth and eye all is taken to lie on a sphere around the viewer.
+
+    memory_mb: budget of a story's memory; camera: intrinsics, where neither the inner world's spec nor the eye has them.
+    """
+
+    def __init__(self, world: World, memory_mb: float = 16.0, eye: Eye | None = None, camera: Intrinsics | None = None):
+        spec = world.spec
+        camera = camera or spec.camera or (eye.config.camera if eye is not None else None)
+        if "known" in spec.channels:
+            raise ContractError(f"{spec.name} remembers by itself: it shows what it knows; use it as it is.")
+        if "rgb" not in spec.channels or "rgb" not in spec.observes:
+            raise ContractError(f"{spec.name} does not show and observe rgb, so memory cannot draw into its pictures.")
+        if "pose" not in spec.channels and eye is None:
+            raise ContractError(
+                f"{spec.name} shows no pose, so memory cannot know where its pictures belong: give an eye."
+            )
+        if camera is None:
+            raise ContractError(f"{spec.name} has no camera in its spec, nor the eye: give the intrinsics.")
+        height, width, _ = shape_of(spec.channels["rgb"])
+        self.world, self.eye = world, eye
+        self.memory = Memory(camera, (height, width), memory_mb)
+        self.spec = remembering_spec(
+            _posed_spec(spec, (height, width), eye, camera), (height, width), self.memory.capacity
+        )
+        self._shown = tuple(name for name in _OWN_CHANNELS if name in spec.channels)
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        return self._witnessed(self.world.start(batch, rng), None)
+
+    def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
+        """Evidence goes to the inner world; a picture among it is kept in memory, else (a pose alone) the new view is drawn
+        with what memory knows."""
+        if "rgb" not in observation and not set(observation) & set(self.world.spec.observes):
+            raise ObservationError(
+                f"{self.spec.name} observes {', '.join(self.world.spec.observes)}; got {list(observation)}."
+            )
+        inner = self.world.observe(observation, None if prior is None else _inner(prior), rng)
+        if "rgb" in observation or prior is None:
+            return self._witnessed(inner, prior)
+        return self._drawn(inner, prior, rng)
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        after = self._drawn(self.world.imagine(_inner(state), action, rng), state, rng)
+        if "done" not in state or not state["done"].any():
+            return after
+        still = state["done"]  # what is over stays as it is, and pays no more
+        ended = state.replace(reward=torch.zeros_like(state["reward"])) if "reward" in state else state
+        return State(
+            {name: torch.where(still.view(-1, *[1] * (new.ndim - 1)), ended[name], new) for name, new in after.items()}
+        )
+
+    def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
+        self.spec.check_channels(channels)
+        show = {
+            "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
+            "known": lambda: state["known"].float() / 255,
+            "keyframes": lambda: self.memory.table(state),
+            **{name: lambda name=name: state[name] for name in ("pose", "depth", "reward", "done") if name in state},
+        }
+        theirs = [name for name in channels if name not in show]
+        seen = dict(self.world.render(_inner(state), theirs)) if theirs else {}
+        return {name: show[name]() if name in show else seen[name] for name in channels}
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _witnessed(self, inner: State, prior: State | None) -> State:
+        """The state in which the inner world's picture is evidence."""
+        seen, rgb, depth, pose = self._seen(inner, prior)
+        held = self.memory.empty(len(rgb)) if prior is None else self.memory.of(prior)
+        held |= self.memory.observed(held, rgb, depth, pose)
+        known = torch.full(depth.shape, 255, dtype=torch.uint8)
+        return _joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
+
+    def _drawn(self, inner: State, before: State, rng: torch.Generator) -> State:
+        """The state in which the inner world's invention and what memory knows of the view are one picture."""
+        seen, rgb, depth, pose = self._seen(inner, before)
+        glimpse = self.memory.look(before, pose)
+        rgb, known = blend(glimpse, rgb)
+        depth = torch.where(known > 0.5, glimpse.depth, depth)
+        evidence = self.world.render(inner, [name for name in self.world.spec.observes if name != "rgb"])
+        inner = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
+        held = self.memory.of(before)
+        held |= self.memory.dreamt(held, rgb, depth, pose, glimpse.known)
+        known = (known * 255).round().to(torch.uint8)
+        return _joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
+
+    def _seen(self, inner: State, before: State | None) -> tuple[dict, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What the inner world shows, and of it rgb uint8 [B, 3, H, W], depth [B, H, W] metres and pose [B, 7]."""
+        seen = dict(self.world.render(inner, self._shown))
+        rgb = seen["rgb"].permute(0, 3, 1, 2).contiguous()
+        if "depth" in seen:
+            depth = F.interpolate(seen["depth"].float()[:, None], self.memory.size, mode="nearest-exact")[:, 0]
+            depth = depth.clamp_min(0.05)
+        elif self.eye is not None:
+            with torch.inference_mode():
+                depth = self.eye.depth(rgb).clone()
+        else:
+            beams = rays(self.memory.camera, *self.memory.size)
+            depth = (SHELL_M / beams.norm(dim=-1)).expand(len(rgb), -1, -1)
+        return seen, rgb, depth, seen["pose"].float() if "pose" in seen else self._felt(rgb, before)
+
+    def _felt(self, rgb: torch.Tensor, before: State | None) -> torch.Tensor:
+        """Where odometry says that the picture was taken, `before` being the last; the origin for a first one."""
+        assert self.eye is not None
+        zero = torch.zeros(len(rgb))
+        if before is None:
+            return planar_pose(zero, zero, zero, zero)
+        with torch.inference_mode():
+            forward, left, turn = self.eye.motion(before["rgb"], rgb, before["depth"]).clone().unbind(-1)
+        pose, heading = before["pose"], yaw(before["pose"])
+        x = pose[:, 0] + forward * heading.cos() - left * heading.sin()
+        y = pose[:, 1] + forward * heading.sin() + left * heading.cos()
+        return planar_pose(x, y, pose[:, 2], heading + turn)
+
+
+def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """What memory knows over what was invented, uint8 [B, 3, H, W]: the picture, and the share of memory in each of its
+    pixels [B, H, W]. That fades out over three pixels towards what is unknown, and where memory saw the place from much
+    farther off; beyond, the invention is brought to the colours that memory has nearby."""
+    inside = -F.max_pool2d(-glimpse.known[:, None], 3, 1, 1)
+    share = F.avg_pool2d(inside, 5, 1, 2, count_include_pad=False) * glimpse.known[:, None]
+    share = share * (3 * glimpse.trust[:, :1]).clamp(0, 1)
+    recalled, guess = merge(glimpse), invented.float() / 255
+    cell = max(min(invented.shape[-2:]) // 6, 1)
+    near = F.avg_pool2d(share, cell, ceil_mode=True)
+    off = F.avg_pool2d((recalled - guess) * share, cell, ceil_mode=True) / (near + 0.1)
+    off = F.interpolate(off, invented.shape[-2:], mode="bilinear", align_corners=False)
+    mixed = share * recalled + (1 - share) * (guess + off)
+    return (mixed * 255).round().clamp(0, 255).to(torch.uint8), share[:, 0]
+
+
+def _posed_spec(spec: Spec, size: tuple[int, int], eye: Eye | None, camera: Intrinsics) -> Spec:
+    """With the pose and the depth that memory goes by."""
+    channels, units = dict(spec.channels), dict(spec.units)
+    if "pose" not in channels:
+        channels["pose"] = spaces.Box(-np.inf, np.inf, (7,), np.float32)
+        units["pose"] = "m, quaternion wxyz of T_world_cam"
+    if "depth" in channels or eye is not None:  # of the pictures' size
+        channels["depth"], units["depth"] = spaces.Box(0, np.inf, size, np.float32), "m"
+    return replace(spec, channels=channels, units=units, camera=camera)
+
+
+def _inner(state: State) -> State:
+    return State({name[len(_INNER) :]: tensor for name, tensor in state.items() if name.startswith(_INNER)})
+
+
+def _joined(inner: State, seen: Mapping, held: Mapping, **own: torch.Tensor) -> State:
+    followed = {name: seen[name] for name in ("reward", "done") if name in seen}
+    return State({**{f"{_INNER}{name}": tensor for name, tensor in inner.items()}, **followed, **own, **held})

@@ -1,0 +1,50 @@
+"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how a network is told it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+BUTTONS, CHOICE, AXES = "buttons", "choice", "axes"
+
+
+@dataclass(frozen=True)
+class Controls:
+    """kind: "buttons", each 0 or 1; "choice", a whole number from low to high; "axes", numbers between low and high.
+    low and high: limits, one for each number of an action."""
+
+    kind: str
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @staticmethod
+    def buttons(count: int) -> Controls:
+        return Controls(BUTTONS, (0.0,) * count, (1.0,) * count)
+
+    @property
+    def told(self) -> int:
+        """How many numbers a network is told of an action."""
+        return int(self.high[0] - self.low[0]) + 1 if self.kind == CHOICE else len(self.low)
+
+    def space(self) -> spaces.Space:
+        """The space of one action."""
+        if self.kind == BUTTONS:
+            return spaces.MultiBinary(len(self.low))
+        if self.kind == CHOICE:
+            return spaces.Discrete(self.told, start=int(self.low[0]))
+        return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
+
+    def tell(self, action: torch.Tensor) -> torch.Tensor:
+        """[B, ...], as recorded or as `space` has it, to float32 [B, told]: buttons as they are, a choice one-hot (all zero
+        would be no choice at all), axes so that their limits are -1 and 1."""
+        numbers = action.reshape(len(action), -1).float()
+        if self.kind == CHOICE:
+            picked = (numbers[:, 0].round().long() - int(self.low[0])).clamp(0, self.told - 1)
+            return torch.nn.functional.one_hot(picked, self.told).float()
+        if self.kind == AXES:
+            low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
+            return (2 * (numbers - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
+        return numbers

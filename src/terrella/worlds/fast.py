@@ -1,0 +1,176 @@
+"""Fast play: a learned world's generator through ONNX Runtime, or torch.compile on a GPU, where that is faster here.
+
+The graph is made in memory from the weights at hand, when the world is loaded; nothing is stored and nothing unpickled.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from torch import nn
+
+from ..core.errors import TerrellaError
+from ..core.world import make_rng
+from ..space.keyframes import Glimpse
+from .history import HistoryWorld
+from .video import VideoWorld
+
+Forward = Callable[..., torch.Tensor]
+TURNS = 15  # frames that each way draws when they are held against one another
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which way won; milliseconds a frame of the generator alone (medians, drawn in turns), seconds to prepare it."""
+
+    way: str
+    eager_ms: float
+    other_ms: float
+    prepared_s: float
+
+    def __str__(self) -> str:
+        other = f"{self.other_ms:.1f} ms" if self.way != EAGER else f"no faster way was found ({self.other_ms:.1f} ms)"
+        return f"{self.way}: {other}, eager torch {self.eager_ms:.1f} ms; {self.prepared_s:.1f} s to prepare"
+
+
+EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
+
+
+def quicken(world: VideoWorld | HistoryWorld) -> Choice:
+    """Gives the world's generator the faster way of drawing, ONNX Runtime on a CPU or a compiled graph on a GPU, if it
+    is faster than eager torch when both draw the same frames in turns. Its weights must not change afterwards.
+
+    TerrellaError where ONNX Runtime is not installed. Eager torch goes on drawing whatever needs a gradient.
+    """
+    generator: nn.Module = world.generator
+    inputs = example(world)
+    on_cpu = next(generator.parameters()).device.type == "cpu"
+    began = time.perf_counter()
+    eager: Forward = generator.forward
+    other = through_onnx(generator, inputs) if on_cpu else compiled(generator)
+    with torch.inference_mode():
+        other(*inputs)
+        prepared = time.perf_counter() - began
+        slow, quick = in_turns([lambda: eager(*inputs), lambda: other(*inputs)])
+    wins = quick < slow
+    if wins:
+        way_of_drawing = lambda *given: eager(*given) if torch.is_grad_enabled() else other(*given)  # noqa: E731
+        vars(generator)["forward"] = way_of_drawing
+    way = EAGER if not wins else ONNX if on_cpu else COMPILED
+    choice = Choice(way, slow, quick, prepared)
+    world.spec = replace(world.spec, card={**world.spec.card, "fast": str(choice)})
+    return choice
+
+
+def example(world: VideoWorld | HistoryWorld) -> tuple:
+    """What the generator is given for a frame of one story."""
+    given: list[tuple] = []
+    hook = world.generator.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
+    try:
+        rng = make_rng(0)
+        world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng)
+    finally:
+        hook.remove()
+    return tuple(part.clone() if isinstance(part, torch.Tensor) else part for part in given[-1])
+
+
+def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
+    """The generator as ONNX Runtime runs it on the CPU, for any batch; it keeps to torch's number of threads."""
+    missing = [
+        package for package in ("onnxruntime", "onnx") if not find_spec(package)
+    ]  # torch writes graphs with onnx
+    if missing:
+        raise TerrellaError(
+            f"Fast play needs {' and '.join(missing)}: pip install 'terrella[fast]', or leave --fast out."
+        )
+    import onnxruntime
+
+    graph, sessions = _exported(generator, inputs), {}
+
+    def forward(*given) -> torch.Tensor:
+        threads = torch.get_num_threads()
+        if threads not in sessions:
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = threads
+            options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # others need the cores too
+            sessions.clear()
+            sessions[threads] = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        tensors = [tensor.numpy() for tensor in _flat(given)]
+        wanted = [node.name for node in sessions[threads].get_inputs()]
+        return torch.from_numpy(sessions[threads].run(None, {name: tensors[int(name[1:])] for name in wanted})[0])
+
+    return forward
+
+
+def compiled(generator: nn.Module) -> Forward:
+    """The generator as torch.compile makes it: for one batch size, CUDA graphs on a GPU; other batches are drawn eagerly.
+    The first frame waits for the compiler. The GPU's way is written, but was never run on one."""
+    on_gpu = next(generator.parameters()).device.type == "cuda"
+    eager: Forward = generator.forward
+    quick: Forward = torch.compile(eager, mode="reduce-overhead" if on_gpu else None, dynamic=False)
+    sizes: set[int] = set()
+
+    def forward(*given) -> torch.Tensor:
+        sizes.update([len(given[0])] if not sizes else [])
+        return quick(*given).clone() if len(given[0]) in sizes else eager(*given)  # a graph's output is overwritten
+
+    return forward
+
+
+def in_turns(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float]:
+    """Median milliseconds of each way, run one after the other so that all meet the same machine."""
+    times: list[list[float]] = [[] for _ in ways]
+    for _ in range(turns):
+        for way, took in zip(ways, times):
+            began = time.perf_counter()
+            way()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            took.append((time.perf_counter() - began) * 1e3)
+    return [statistics.median(took) for took in times]
+
+
+def _exported(generator: nn.Module, inputs: tuple) -> bytes:
+    """The generator as an ONNX graph, the batch free."""
+    glimpses = [isinstance(part, Glimpse) for part in inputs]
+
+    class Flat(nn.Module):
+        """Tensors in, since a graph knows no dataclasses."""
+
+        def __init__(self):
+            super().__init__()
+            self.generator = generator
+
+        def forward(self, *tensors: torch.Tensor) -> torch.Tensor:
+            left = iter(tensors)
+            given = (Glimpse(*(next(left) for _ in fields(Glimpse))) if glimpse else next(left) for glimpse in glimpses)
+            return self.generator(*given)
+
+    tensors = _flat(inputs)
+    names = [f"x{number}" for number in range(len(tensors))]
+    with warnings.catch_warnings(), torch.no_grad(), TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")  # of torch about its own exporter
+        free = {name: {0: "batch"} for name in [*names, "clean"]}
+        torch.onnx.export(
+            Flat(),
+            tuple(tensors),
+            str(Path(folder, "graph.onnx")),
+            input_names=names,
+            output_names=["clean"],
+            dynamic_axes=free,
+            dynamo=False,
+        )
+        return Path(folder, "graph.onnx").read_bytes()
+
+
+def _flat(inputs: tuple) -> list[torch.Tensor]:
+    parts = [list(vars(part).values()) if isinstance(part, Glimpse) else [part] for part in inputs]
+    return [tensor for part in parts for tensor in part]

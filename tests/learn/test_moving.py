@@ -1,0 +1,135 @@
+"""Learning from a recording that marks what moves: the world that comes of it keeps the contract and what it learned of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tests.data.corridor import DEPTH, Corridor
+
+from terrella.core import check_world, make_rng
+from terrella.data import ClipCache, Explorer, record
+from terrella.learn.moving import mirrored, moving_lesson, other_side
+from terrella.learn.samples import THINGS, Recording, choose_keyframes
+from terrella.learn.train_video import TrainConfig, train_video
+from terrella.worlds.folder import load_world
+from terrella.worlds.video import VideoConfig, VideoWorld
+
+CONFIG = TrainConfig(
+    size=(24, 32),
+    steps=3,
+    batch=2,
+    motion_steps=20,
+    outcome_steps=5,
+    keyframes=8,
+    critic_from=1,
+    eye_steps=0,
+    doubt_frames=0,
+    strip_every_s=1e9,
+)
+
+
+class Haunted(Corridor):
+    """The corridor with a thing before the middle of the picture, 1.5 m away, and a health that falls as one walks."""
+
+    def __init__(self):
+        super().__init__(goal_m=12.0)
+        mask = spaces.Box(0, 1, DEPTH, np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        more = {"things": mask, "health": spaces.Box(0, 100, (), np.float32)}
+        self.spec = replace(self.spec, channels={**self.spec.channels, **more})
+
+    def render(self, state, channels):
+        seen = super().render(state, [name for name in channels if name not in ("things", "health")])
+        mark = torch.zeros(1, *DEPTH, dtype=torch.bool)
+        mark[:, 4:8, 6:10] = True
+        if "depth" in seen:
+            seen["depth"] = torch.where(mark, 1.5, seen["depth"])
+        told = {"things": mark, "health": (100 - (state["walked"] * 8).round()).float()}
+        return {name: told[name] if name in told else seen[name] for name in channels}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("moving") / "set"
+    world = Haunted()
+    record(world, Explorer(world.spec), folder, 300, make_rng(0), max_episode_steps=80)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(recording):
+    cache = ClipCache.open(recording, CONFIG.size)
+    start = np.zeros(cache.length, np.int64)
+    for first, last in cache.episodes:
+        start[first:last] = first
+    return Recording(cache, start, np.ones(cache.length, bool))
+
+
+def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path):
+    train_video(recording, tmp_path, CONFIG, lambda *told: None)
+    for memory in (True, False):
+        world = load_world(tmp_path / "world", memory=memory)
+        assert isinstance(world, VideoWorld) and (world.starts.depth == 0).any(), "what moves is in no keyframe"
+        assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
+        assert "observes" in check_world(world)
+    state = world.start(2, make_rng(0))
+    assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
+    still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
+    assert not load_world(still["world"]).config.moving
+
+
+def test_evidence_of_vitals_and_things_is_taken(recording, tmp_path):
+    train_video(recording, tmp_path, CONFIG, lambda *told: None)
+    world, rng = load_world(tmp_path / "world"), make_rng(0)
+    state = world.start(1, rng)
+    seen = world.render(state, ("rgb", "depth", "pose"))
+    things = torch.zeros(1, 24, 32, dtype=torch.bool)
+    things[:, 3:6, 3:6] = True
+    told = world.observe({**seen, "health": torch.tensor([42.0]), "things": things}, state, rng)
+    assert float(world.render(told, ("health",))["health"]) == 42.0
+    assert torch.equal(world.render(told, ("things",))["things"], things)
+
+
+def test_a_lesson_masks_memory_and_shows_the_thing_in_the_last_frame(rows):
+    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
+    picks = choose_keyframes(np.asarray(rows.cache.pose), np.flatnonzero(rows.usable), 12)
+    memory = rows.keyframes(picks, config.camera)
+    assert (memory.depth == 0).float().mean() == pytest.approx(16 / (DEPTH[0] * DEPTH[1]), abs=0.02)
+    lesson = moving_lesson(rows, memory, config, 8, np.random.default_rng(1), None)
+    assert lesson.last.shape == (8, 10, 24, 32) and lesson.truth.shape == (8, 5, 24, 32)
+    truth = lesson.truth[:, 4] > 0.5
+    shown = lesson.last[:, 3].amax((1, 2)) > 0  # in some samples the last frame is unknown
+    assert shown.any() and (lesson.last[shown, 5] > 0.5)[truth[shown]].float().mean() > 0.6
+    assert lesson.weight is not None and lesson.weight[:, 0][truth].min() > lesson.weight[:, 0][~truth].min()
+
+
+def test_a_mirrored_lesson_mirrored_again_is_itself(rows):
+    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
+    memory = rows.keyframes(np.arange(4), config.camera)
+    lesson = moving_lesson(rows, memory, config, 2, np.random.default_rng(0), None)
+    names = rows.cache.action_names
+    once = mirrored(lesson, names)
+    again = mirrored(once, names)
+    assert torch.equal(again.truth, lesson.truth) and torch.equal(again.told, lesson.told)
+    assert not torch.equal(once.told, lesson.told)
+
+
+def test_the_other_side_of_a_button():
+    names = ("MOVE_FORWARD", "MOVE_LEFT", "TURN_LEFT", "MOVE_RIGHT", "TURN_RIGHT", "ATTACK")
+    assert other_side(names) == [0, 3, 4, 1, 2, 5]
+    assert THINGS == "observation.things"
+
+
+def test_the_eye_rises_with_the_recorded_ground_and_stays_where_it_stands(recording, tmp_path):
+    train_video(recording, tmp_path, CONFIG, lambda *told: None)
+    world = load_world(tmp_path / "world")
+    assert isinstance(world, VideoWorld)
+    pose = torch.tensor([[0.0, 0, 1, 1, 0, 0, 0], [2.0, 0, 2, 1, 0, 0, 0]])  # a step up of a metre within two
+    stairs = world.with_memory(replace(world.memory.at([0, 1]), pose=pose))
+    here, ahead, z = torch.tensor([[0.5, 0.0]]), torch.tensor([[0.8, 0.0]]), torch.tensor([1.4])
+    assert stairs._height(here, here, z).item() == pytest.approx(1.4)
+    assert 1.4 < stairs._height(ahead, ahead + 0.2, z).item() < 1.71
+    assert world.without_memory()._height(here, ahead, z).item() == pytest.approx(1.4)

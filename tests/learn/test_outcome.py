@@ -1,0 +1,152 @@
+"""A made-up game: a light that moves when told to, pays and takes a life where it should, and is learned from pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from terrella.core import check_world, make_rng
+from terrella.data import ClipCache, Layout, Recorder
+from terrella.learn.lessons import changing, history_lesson
+from terrella.learn.outcome import Happenings, examine_outcome, levels, train_outcome, two_hot
+from terrella.learn.samples import Recording, controls_of
+from terrella.learn.train_video import TrainConfig, train_video
+from terrella.worlds.folder import load_world, video_spec
+from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.outcome import Outcome
+from terrella.worlds.video import Generator, VideoConfig
+
+SIZE, FACTS = (16, 24), {"discrete": True, "action_low": [0], "action_high": [2], "action_names": ["STAY", "L", "R"]}
+
+
+def picture(place: int) -> np.ndarray:
+    rgb = np.full((*SIZE, 3), 30, np.uint8)
+    rgb[6:10, 4 * place : 4 * place + 4] = (240, 200, 90)
+    return rgb
+
+
+def quiet(done, total, words=""):
+    pass
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Six places in a row: the rightmost pays 2 on arrival, the leftmost takes one of 3 lives, and the last life ends it."""
+    folder, rng = tmp_path_factory.mktemp("outcome") / "set", np.random.default_rng(0)
+    layout = Layout.of_channels(15.0, ("action_0",), rgb=SIZE, vectors={"lives": 1}, world=FACTS)
+    with Recorder(folder, layout) as recorder:
+        for _ in range(24):
+            place, lives = int(rng.integers(1, 5)), 3
+            for _ in range(60):
+                action = int(rng.integers(0, 3))
+                went = min(max(place + (0, -1, 1)[action], 0), 5)
+                reward = 2.0 if went == 5 and place != 5 else 0.0
+                fell = went == 0 and place != 0
+                seen = {"rgb": picture(place), "lives": np.array([lives], np.float32)}
+                recorder.add(seen, np.array([action]), reward, lives - fell == 0)
+                place, lives = went, lives - fell
+                if lives == 0:
+                    break
+            recorder.add({"rgb": picture(place), "lives": np.array([lives], np.float32)}, None, 0.0, False)
+            recorder.end_episode()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def learned(recording):
+    cache = ClipCache.open(recording, SIZE)
+    start = np.zeros(cache.length, np.int64)
+    for first, last in cache.episodes:
+        start[first:last] = first
+    usable = np.arange(cache.length) < cache.episodes[20][0]
+    seen = Recording(cache, start, usable, controls_of(cache))
+    happened = Happenings.of(cache, seen.action(slice(None)).numpy(), usable)
+    torch.manual_seed(0)
+    outcome = Outcome(happened.config())
+    train_outcome(outcome, seen.rgb, happened, 300, 0, quiet, batch=6, learning_rate=5e-3)
+    return cache, seen, happened, outcome
+
+
+def test_levels_and_shares_are_those_of_the_recording(learned):
+    _, seen, happened, outcome = learned
+    assert outcome.config.rewards == (0.0, 2.0) and outcome.config.vitals == ("lives",)
+    assert outcome.config.changes == ((-1.0, 0.0),) and seen.controls.told == 3
+    among = torch.tensor([-1.0, 0.0, 4.0])
+    values = torch.tensor([-9.0, -0.25, 3.0, 4.0])
+    shares = two_hot(values, among)
+    assert torch.allclose(shares.sum(1), torch.ones(4))
+    assert torch.allclose(shares @ among, torch.tensor([-1.0, -0.25, 3.0, 4.0]))
+    many = levels(np.random.default_rng(0).normal(size=5000))
+    assert len(many) <= 33 and list(many) == sorted(set(many))
+
+
+def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
+    cache, seen, happened, outcome = learned
+    for first, stop in list(cache.episodes)[20:]:
+        found = examine_outcome(outcome, seen.rgb, happened, first, stop)
+        steps = slice(first, stop - 1)
+        assert np.abs(found["reward"] - cache.reward[steps]).max() < 0.5
+        lives = np.asarray(cache.arrays["observation.lives"]).reshape(-1)
+        assert np.array_equal(found["change"][:, 0], np.diff(lives[first:stop]))
+        assert ((found["done"] > 0.5) == cache.done[steps]).all()
+
+
+def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_path):
+    config = TrainConfig(
+        size=SIZE, steps=4, batch=2, outcome_steps=8, doubt_frames=0, strip_every_s=1e9, channels=(8, 8, 8)
+    )
+    train_video(recording, tmp_path, config, quiet)
+    world = load_world(tmp_path / "world")
+    assert world.spec.action.n == 3 and world.spec.action_names == ("STAY", "L", "R")
+    assert {"reward", "done", "lives"} <= set(world.spec.channels)
+    assert "states_can_be_saved" in check_world(world)
+    began = world.render(world.start(16, make_rng(0)), ("lives",))["lives"]
+    assert set(began.tolist()) <= {1.0, 2.0, 3.0} and len(set(began.tolist())) > 1, "a story begins with its own lives"
+
+
+def test_a_dream_pays_costs_lives_and_ends(learned):
+    _, seen, _, outcome = learned
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8, 8), slots=4, geometry=False)
+    spec = video_spec("row", config, 1 / 15, (), {}, {}, seen.controls, ("lives",))
+    starts = replace(Starts.of(torch.zeros(1, 4, 3, *SIZE, dtype=torch.uint8), 3), vitals=torch.full((1, 1), 3.0))
+    world, rng = HistoryWorld(spec, config, Generator(config), starts, 0.0, outcome, seen.controls), make_rng(0)
+    before, after = (torch.from_numpy(np.stack([picture(place) for place in pair])) for pair in ((1, 4), (0, 5)))
+    state = world.observe({"rgb": before, "lives": torch.tensor([1.0, 3.0])}, None, rng)
+    told = world.controls.tell(torch.tensor([1, 2]))[:, None]
+    shown = world.observe({"rgb": after}, state, rng).replace(actions=torch.cat([told, state["actions"][:, 1:]], 1))
+    then = world.followed(state, shown)  # as if these frames had been dreamt
+    assert then["vitals"][:, 0].tolist() == [0.0, 3.0] and then["done"].tolist() == [True, False]
+    assert then["reward"][1] > 1.5 and then["reward"][0] < 0.5
+    still = world.imagine(then, torch.tensor([2, 2]), rng)
+    assert torch.equal(still.at(0)["frames"], then.at(0)["frames"]) and float(still["reward"][0]) == 0
+    assert not torch.equal(still.at(1)["frames"], then.at(1)["frames"])
+
+
+def test_before_an_episode_began_it_stood_still_and_nobody_acted(learned):
+    _, seen, _, _ = learned
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, slots=4, geometry=False)
+    told, moods = [], 36
+    for number in range(40):
+        lesson = history_lesson(seen, config, 8, np.random.default_rng(number), None)
+        actions = lesson.told[:, moods:].unflatten(1, (4, 3))
+        early = actions.sum(2) == 0
+        told.append(early.any(1))
+        for one in early.any(1).nonzero()[:, 0].tolist():
+            assert not early[one, 0], "the action that led to the target was recorded"
+            first = int(early[one].float().argmax())
+            shown = lesson.glimpse.rgb[one]
+            assert all(torch.equal(shown[first - 1 + k], shown[first - 1]) for k in range(1, 4 - first + 1))
+    assert torch.cat(told).any() and not torch.cat(told).all()
+
+
+def test_pixels_that_change_count_for_more_and_one_in_the_mean():
+    before = torch.full((2, 1, 3, 16, 16), 10, dtype=torch.uint8)
+    found = before[:, 0].clone()
+    found[0, :, 3, 4] = 200
+    weight = changing(found, before, often=20.0)
+    assert weight.mean().item() == pytest.approx(1.0, abs=1e-5)
+    assert weight[0, 0, 3, 4] / weight[0, 0, 0, 0] == pytest.approx(21.0, rel=1e-4)
+    assert (weight[1] == weight[1, 0, 0, 0]).all()

@@ -1,0 +1,249 @@
+"""Post-training (fewer steps, own dreams) on a small made-up place: laws, exact resume, honest failures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+from tests.data.corridor import Corridor
+from tests.learn.test_moving import Haunted
+
+from terrella.core import check_world, make_rng
+from terrella.core.errors import DatasetError, TrainingError
+from terrella.data import Explorer, Layout, Recorder, record
+from terrella.learn.distil import DistilConfig, Matching, distil, drawn, recorded_lesson
+from terrella.learn.post_training import Updates, beside
+from terrella.learn.self_forcing import Dreams, DreamsConfig, beginnings, train_dreams
+from terrella.learn.train_video import TrainConfig, train_video
+from terrella.worlds.folder import load_world
+from terrella.worlds.history import HistoryWorld
+from terrella.worlds.video import generate
+
+TEACHER = TrainConfig(
+    size=(24, 32),
+    channels=(8, 8, 8),
+    geometry=False,
+    flow_steps=4,
+    steps=3,
+    batch=2,
+    eye_steps=0,
+    doubt_frames=0,
+    outcome_steps=2,
+)
+PLACES = replace(TEACHER, geometry=True, flow_steps=1, motion_steps=5, keyframes=6, critic_from=9)
+FEW = DistilConfig(steps=3, batch=2)
+DREAMS = DreamsConfig(steps=2, horizon=3, batch=2)
+
+
+def quiet(done, total, words=""):
+    pass
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("post") / "set"
+    world = Corridor()
+    record(world, Explorer(world.spec), folder, 240, make_rng(0), max_episode_steps=80)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def teacher(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("teacher")
+    train_video(recording, out, TEACHER, quiet)
+    return load_world(out / "world")
+
+
+@pytest.fixture(scope="module")
+def places(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("places")
+    train_video(recording, out, PLACES, quiet)
+    return load_world(out / "world")
+
+
+@pytest.fixture(scope="module")
+def haunted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("haunted") / "set"
+    world = Haunted()
+    record(world, Explorer(world.spec), folder, 240, make_rng(0), max_episode_steps=80)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def moving(haunted, tmp_path_factory):
+    out = tmp_path_factory.mktemp("moving")
+    train_video(haunted, out, PLACES, quiet)
+    return load_world(out / "world")
+
+
+def saved_facts(run) -> str:
+    with safe_open(run / "resume.safetensors", "pt") as file:
+        return file.metadata()["facts"]
+
+
+def wild(world):
+    """The same world with a generator whose every weight counts (a fresh one only copies)."""
+    with torch.no_grad():
+        for weight in world.generator.parameters():
+            weight.add_(0.1 * torch.randn(weight.shape, generator=make_rng(weight.numel())))
+    return world
+
+
+def test_a_teacher_is_a_history_world_of_many_steps(teacher):
+    assert isinstance(teacher, HistoryWorld) and teacher.config.steps == 4
+    assert teacher.config.channels == (8, 8, 8)
+
+
+def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(recording, teacher, tmp_path):
+    facts = distil(teacher, recording, tmp_path, FEW, quiet)
+    student = load_world(tmp_path / "world")
+    assert facts["step"] == 3 and student.config.steps == 1
+    assert "observes" in check_world(student)
+    assert "4 to 1 steps" in str(student.spec.card["distilled"])
+    changed = zip(student.generator.parameters(), teacher.generator.parameters())
+    assert any(not torch.equal(a, b) for a, b in changed)
+    assert list(tmp_path.glob("strip-*.png"))
+
+
+@pytest.mark.parametrize("train, config", [(distil, FEW), (train_dreams, DREAMS)])
+def test_a_stopped_run_goes_on_exactly(train, config, recording, teacher, tmp_path, monkeypatch):
+    train(teacher, recording, tmp_path / "whole", config, quiet)
+    save = Updates.save
+
+    class Stop(Exception):
+        pass
+
+    def stop(self):
+        save(self)
+        raise Stop
+
+    monkeypatch.setattr(Updates, "save", stop)
+    with pytest.raises(Stop):
+        train(teacher, recording, tmp_path / "cut", replace(config, save_every_s=-1.0), quiet)
+    monkeypatch.undo()
+    assert json.loads(saved_facts(tmp_path / "cut"))["step"] == 1, "it goes on from the middle"
+    assert train(teacher, recording, tmp_path / "cut", config, quiet)["step"] == config.steps
+    whole, cut = (load_file(tmp_path / name / "resume.safetensors") for name in ("whole", "cut"))
+    assert whole.keys() == cut.keys()
+    assert all(torch.equal(whole[name], cut[name]) for name in whole)
+
+
+def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(recording, teacher, places, tmp_path):
+    train_dreams(teacher, recording, tmp_path, DREAMS, quiet)
+    with pytest.raises(TrainingError, match="other settings"):
+        train_dreams(teacher, recording, tmp_path, replace(DREAMS, horizon=2), quiet)
+    with pytest.raises(TrainingError, match="other settings"):
+        train_dreams(places, recording, tmp_path, DREAMS, quiet)
+
+
+@pytest.mark.parametrize("kind, data, seed", [("teacher", "recording", 0), ("places", "recording", 0),
+                                              ("places", "recording", 1), ("moving", "haunted", 0)])  # fmt: skip
+def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
+    world = wild(request.getfixturevalue(kind))
+    pair = beside(world, request.getfixturevalue(data), None, quiet)
+    dreams = Dreams(pair, 4, 2, np.random.default_rng(seed), make_rng(0))
+    world, state = dreams.world, dreams.state
+    for step in range(4):
+        noise_rng = make_rng(step)
+        action = pair.recording.action(dreams.row)
+        if kind == "teacher":
+            state = world.imagine(state, action.to(torch.int8), noise_rng)
+        else:
+            state = state.replace(actions=torch.cat([state["actions"][:, 1:], action[:, None]], 1))
+            state = world.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, noise_rng)
+        lesson = dreams.next_lesson()
+        noise = torch.randn(2, 4, *world.config.size, generator=make_rng(step))
+        with torch.inference_mode():
+            clean = generate(world.generator, noise, lesson.glimpse, lesson.last, lesson.told, world.config.steps)
+        dreams.go_on(clean.clone())
+        assert torch.equal(world.render(state, ("rgb",))["rgb"], world.render(dreams.state, ("rgb",))["rgb"])
+        truth = pair.recording.rgb(dreams.row).float() / 127.5 - 1
+        assert torch.equal(lesson.truth[:, :3], truth)
+
+
+def test_a_teacher_may_watch_the_dreams(recording, teacher, places, tmp_path):
+    distil(teacher, recording, tmp_path / "few", FEW, quiet)
+    student = load_world(tmp_path / "few" / "world")
+    train_dreams(student, recording, tmp_path / "watched", DREAMS, quiet, teacher)
+    train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet)
+    watched, alone = (load_file(tmp_path / name / "world" / "weights.safetensors") for name in ("watched", "alone"))
+    assert any(not torch.equal(watched[name], alone[name]) for name in alone)
+    with pytest.raises(TrainingError, match="other settings"):
+        train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet, teacher)
+    with pytest.raises(TrainingError, match="cannot teach"):
+        train_dreams(student, recording, tmp_path / "run", DREAMS, quiet, places)
+
+
+def test_a_world_in_which_things_move_learns_from_its_dreams(haunted, moving, tmp_path):
+    assert moving.config.moving
+    train_dreams(moving, haunted, tmp_path, DREAMS, quiet)
+    assert "observes" in check_world(load_world(tmp_path / "world"))
+
+
+def test_dreams_begin_where_the_episode_lasts(recording, teacher):
+    pair = beside(teacher, recording, None, quiet)
+    rows = beginnings(pair, 20)
+    start = pair.recording.start
+    assert len(rows) and all(start[row - 9] == start[row + 20] for row in rows)
+    assert pair.recording.usable[np.concatenate([rows - 9, rows + 20])].all()
+    with pytest.raises(DatasetError, match="shorter --horizon"):
+        beginnings(pair, 200)
+
+
+def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(recording, teacher):
+    pair = beside(wild(teacher), recording, None, quiet)
+    generator = pair.world.generator.requires_grad_(True)
+    lesson = recorded_lesson(pair, 2, np.random.default_rng(0))
+    seen = lesson.glimpse, lesson.last, lesson.told
+    noise, exits = torch.randn(lesson.truth.shape, generator=make_rng(1)), set()
+    for seed in range(12):
+        exit_at = int(np.random.default_rng(seed).integers(4))
+        exits.add(exit_at)
+        x = noise
+        with torch.no_grad():
+            for step in range(exit_at):
+                x = x + (generator(x, torch.full((2,), step / 4), *seen) - x) / (4 - step)
+        alone = torch.autograd.grad(generator(x, torch.full((2,), exit_at / 4), *seen).sum(), generator.enter.weight)
+        clean = drawn(generator, noise, lesson, 4, np.random.default_rng(seed))
+        torch.testing.assert_close(torch.autograd.grad(clean.sum(), generator.enter.weight), alone)
+        if exit_at == 3:
+            torch.testing.assert_close(clean, generate(generator, noise, *seen, 4))
+    assert exits == {0, 1, 2, 3}
+
+
+def test_where_the_student_draws_as_the_teacher_nothing_pulls(recording, teacher):
+    pair = beside(wild(teacher), recording, None, quiet)
+    lesson, matching = recorded_lesson(pair, 2, np.random.default_rng(0)), Matching(teacher.generator)
+    clean = lesson.truth.clone().requires_grad_()
+    (still,) = torch.autograd.grad(matching.towards_teacher(clean, lesson, make_rng(2)), clean)
+    assert not still.any()
+    with torch.no_grad():
+        for weight in matching.mimic.parameters():
+            weight.mul_(1.05)
+    (pull,) = torch.autograd.grad(matching.towards_teacher(clean, lesson, make_rng(2)), clean)
+    assert pull.abs().sum() > 0
+
+
+def test_a_world_of_one_step_teaches_nobody(recording, places, tmp_path):
+    with pytest.raises(TrainingError, match="--flow-steps 8"):
+        distil(places, recording, tmp_path, FEW, quiet)
+
+
+def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
+    with pytest.raises(TrainingError, match="no world of pictures"):
+        train_dreams(Corridor(), recording, tmp_path / "run", DREAMS, quiet)
+    with Recorder(tmp_path / "other", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
+        for _ in range(2):
+            for step in range(60):
+                picture = np.full((24, 32, 3), 40 + step, np.uint8)
+                recorder.add({"rgb": picture}, np.array([step % 2]) if step < 59 else None, 0.5, False)
+            recorder.end_episode()
+    with pytest.raises(DatasetError, match="the same game"):
+        train_dreams(teacher, tmp_path / "other", tmp_path / "run", DREAMS, quiet)
+    with pytest.raises(TrainingError, match="1 or more"):
+        train_dreams(teacher, recording, tmp_path / "run", replace(DREAMS, horizon=0), quiet)

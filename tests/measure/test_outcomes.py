@@ -1,0 +1,94 @@
+"""Fates: errors of reward, health and end are what they should be for worlds that are right, blind, or always wrong."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.core import Spec, State, make_rng
+from terrella.core.errors import DatasetError
+from terrella.core.spec import DONE, REWARD
+from terrella.measure.outcomes import auc, fates, passages
+
+HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
+
+
+class Game:
+    """Each step pays what is pressed and costs one of health; at 0 it is over. `blind` says that nothing ever happens."""
+
+    def __init__(self, blind: bool = False):
+        self.blind = blind
+        channels = {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8), "reward": REWARD, "done": DONE, "health": HEALTH}
+        self.spec = Spec("game", spaces.MultiBinary(1), channels, ("rgb",), 0.1)
+
+    def start(self, batch, rng) -> State:
+        return State({"health": torch.full((batch,), 9.0), "reward": torch.zeros(batch)})
+
+    def observe(self, observation, prior, rng) -> State:
+        count = len(observation["rgb"])
+        return State({"health": observation["health"].float(), "reward": torch.zeros(count)})
+
+    def imagine(self, state, action, rng) -> State:
+        if self.blind:
+            return state
+        alive = state["health"] > 0
+        return State({"health": state["health"] - alive.float(), "reward": action[:, 0].float() * alive})
+
+    def render(self, state, channels):
+        seen = {"health": state["health"], "reward": state["reward"], "done": state["health"] <= 0}
+        return {name: seen[name] for name in channels}
+
+
+def recording(lengths=(40, 30, 50)):
+    """Episodes of the game, of `lengths` rows each, the last without an action."""
+    health = np.concatenate([np.arange(length)[::-1] for length in lengths]).astype(np.float32)
+    rows, stops = len(health), np.cumsum(lengths)
+    action = np.random.default_rng(0).integers(0, 2, (rows, 1)).astype(np.float32)
+    done = health == 1
+    reward = action[:, 0] * (health > 0)
+    return SimpleNamespace(
+        episodes=[(stop - length, stop) for length, stop in zip(lengths, stops)], length=rows, depth=None, pose=None,
+        rgb=np.zeros((rows, 8, 8, 3), np.uint8), action=action, reward=reward, done=done,
+        arrays={"observation.health": health[:, None]},
+    )  # fmt: skip
+
+
+def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
+    shown = passages(recording(), (0, 1, 2), 5, 16, 24, make_rng(0))
+    arms = {"right": Game(), "blind": Game(blind=True)}
+    rows = {(row.arm, row.horizon): row for row in fates(arms, "recorded", shown, (4, 16), make_rng(0), batch=5)}
+    for horizon in (4, 16):
+        right, blind = rows["right", horizon], rows["blind", horizon]
+        assert right.reward.value == right.vitals["health"].value == 0
+        assert blind.vitals["health"].value == blind.vitals_copied["health"].value > 1
+        assert blind.done_auc == 0.5
+    assert rows["right", 16].done_auc == 1.0 and 0 < rows["right", 16].ended < 24
+    assert rows["right", 16].reward_auc == 1.0 or np.isnan(rows["right", 16].reward_auc)
+
+
+def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
+    shown = passages(recording(), (0, 1, 2), 5, 16, 20, make_rng(1))
+    short = [passage for passage in shown if not passage.real.all()]
+    assert len(short) >= 10
+    for passage in short:
+        after = passage.vitals["health"][int(passage.real.sum()) :]
+        assert (after == after[0]).all() and (passage.clip.action[~passage.real] == 0).all()
+        assert passage.real[:5].all()
+
+
+def test_auc_counts_pairs():
+    score, positive = torch.tensor([3.0, 1.0, 2.0, 2.0]), torch.tensor([True, False, True, False])
+    assert auc(score, positive) == pytest.approx((1 + 1 + 1 + 0.5) / 4)
+    assert np.isnan(auc(score, torch.ones(4, dtype=torch.bool)))
+
+
+def test_what_is_too_short_is_refused():
+    with pytest.raises(DatasetError, match="longer than"):
+        passages(recording((4, 5)), (0, 1), 5, 8, 4, make_rng(0))
+    shown = passages(recording(), (0, 1, 2), 5, 8, 4, make_rng(0))
+    with pytest.raises(DatasetError, match="shorter than 16"):
+        fates({"right": Game()}, "recorded", shown, (16,), make_rng(0))

@@ -1,0 +1,188 @@
+"""Fast play draws what eager torch draws, for any batch, and leaves eager torch to whatever needs a gradient."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import terrella
+from terrella.cli import main
+from terrella.core import check_world, make_rng
+from terrella.core.errors import TerrellaError
+from terrella.space.keyframes import Glimpse
+from terrella.worlds import fast
+from terrella.worlds.fast import EAGER, ONNX, compiled, example, quicken, through_onnx
+from terrella.worlds.folder import video_spec
+from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.moving import PLANES
+from terrella.worlds.video import Generator, VideoConfig, generate
+
+PARITY = 2e-6  # of colours in [-1, 1], so far below one level of 255
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """The bundled world, eager and through ONNX Runtime."""
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
+    eager, quick = terrella.load("doom-maze"), terrella.load("doom-maze")
+    quick.generator.forward = through_onnx(quick.generator, example(quick))
+    return eager, quick
+
+
+def small_world() -> HistoryWorld:
+    """A world of history alone, its network untrained but not silent."""
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), geometry=False)
+    torch.manual_seed(0)
+    generator = Generator(config)
+    torch.nn.init.normal_(generator.leave.weight, std=0.1)
+    spec = video_spec("small", config, 0.1, ("a", "b"), {}, {})
+    frames = torch.randint(0, 256, (4, 3, 3, 32, 48), dtype=torch.uint8, generator=make_rng(0))
+    return HistoryWorld(spec, config, generator, Starts.of(frames, 2))
+
+
+def walk(world, batch: int, steps: int):
+    rng = make_rng(5)
+    state = world.start(batch, rng)
+    for step in range(steps):
+        state = world.imagine(state, world.spec.sample_action(batch, make_rng(step)), rng)
+        yield state
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_one_frame_is_that_of_eager_torch(worlds, batch):
+    eager, quick = worlds
+    noisy, time, glimpse, last, told = example(eager)
+    glimpse = type(glimpse)(*(part.repeat(batch, *[1] * (part.ndim - 1)) for part in vars(glimpse).values()))
+    rest = [part.repeat(batch, *[1] * (part.ndim - 1)) for part in (time, last, told)]
+    noise = torch.randn(batch, *noisy.shape[1:], generator=make_rng(1))
+    given = (noise, rest[0], glimpse, rest[1], rest[2])
+    with torch.inference_mode():
+        one, other = eager.generator(*given), quick.generator(*given)
+    assert one.shape == other.shape == (batch, 4, 96, 128)
+    assert 0 < (one - other).abs().max() < PARITY, "it drew by another way, the same"
+
+
+@pytest.mark.parametrize("kind", [{}, {"moving": True}, {"geometry": False}])
+def test_every_kind_of_generator_is_drawn_alike(kind):
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), **kind)
+    torch.manual_seed(0)
+    generator, rng = Generator(config).eval(), make_rng(0)
+    torch.nn.init.normal_(generator.leave.weight, std=0.1)
+
+    def given(batch: int) -> tuple:
+        def some(*shape: int) -> torch.Tensor:
+            return torch.rand(batch, *shape, generator=rng)
+
+        glimpse = Glimpse(some(3, 3, 32, 48), some(3, 32, 48), 1 + 5 * some(32, 48), some(32, 48).round())
+        told = some(generator.before[0].time.in_features - 1)
+        return some(4, 32, 48), some(), glimpse, some(4 + PLANES * config.moving, 32, 48), told
+
+    quick = through_onnx(generator, given(1))
+    with torch.inference_mode():
+        for batch in (1, 4):
+            inputs = given(batch)
+            torch.testing.assert_close(quick(*inputs), generator(*inputs), atol=2e-5, rtol=1e-5)
+
+
+def test_a_dream_of_32_steps_is_that_of_eager_torch(worlds):
+    off = [
+        (one["rgb"].int() - other["rgb"].int()).abs() for one, other in zip(*(walk(world, 2, 32) for world in worlds))
+    ]
+    share = [float((part > 0).float().mean()) for part in off]
+    assert max(share) < 5e-3, "a pixel on the edge of a surface may fall to its other side"
+    assert max(share[:8]) < 1e-4 and max(float(part.float().square().mean()) for part in off) < 0.065, "60 dB"
+
+
+def test_the_faster_way_is_taken_and_said(monkeypatch):
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
+    for times, way in (((9.0, 4.0), ONNX), ((4.0, 9.0), EAGER)):
+        monkeypatch.setattr(fast, "in_turns", lambda ways, taken=times: list(taken))
+        world = small_world()
+        choice = quicken(world)
+        assert choice.way == way and world.spec.card["fast"] == str(choice)
+        assert ("forward" in vars(world.generator)) == (way == ONNX)
+        assert "eager torch" in str(choice)
+
+
+def test_a_quickened_world_keeps_the_contract_and_its_weights(monkeypatch):
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
+    monkeypatch.setattr(fast, "in_turns", lambda ways: [2.0, 1.0])
+    world, eager = small_world(), small_world()
+    quicken(world)
+    assert {"states_are_values", "batches"} <= set(check_world(world))
+    assert world.generator.state_dict().keys() == eager.generator.state_dict().keys(), "it can be saved as it was"
+    for one, other in zip(walk(eager, 2, 8), walk(world, 2, 8)):
+        assert (one["frames"].int() - other["frames"].int()).abs().max() <= 1
+    given = example(world)
+    world.generator(*given).mean().backward()
+    assert world.generator.enter.weight.grad is not None, "a gradient comes from eager torch"
+
+
+def test_it_keeps_to_the_threads_that_torch_has(worlds):
+    quick, threads = worlds[1], torch.get_num_threads()
+    given = example(quick)
+    try:
+        frames = []
+        for count in (1, 2, 1):
+            torch.set_num_threads(count)
+            with torch.inference_mode():
+                frames.append(quick.generator(*given))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(frames[0], frames[2]) and (frames[0] - frames[1]).abs().max() < PARITY
+
+
+def test_without_the_packages_a_sentence_says_what_to_install(monkeypatch):
+    world = small_world()
+    for absent, said in ((("onnx",), "needs onnx: "), (("onnx", "onnxruntime"), "needs onnxruntime and onnx: ")):
+        monkeypatch.setattr(fast, "find_spec", lambda name, absent=absent: None if name in absent else True)
+        with pytest.raises(TerrellaError, match=said + r"pip install 'terrella\[fast\]'"):
+            quicken(world)
+
+
+def test_fast_is_for_learned_worlds(capsys):
+    assert main(["play", "gym:CartPole-v1", "--fast"]) == 2
+    assert "--fast is for learned worlds" in capsys.readouterr().err
+
+
+def test_other_batches_than_the_compiled_one_are_drawn_eagerly(monkeypatch):
+    """Without the compiler, which needs a minute: what matters here is who draws what."""
+    drawn = []
+
+    def compiler(function, mode, dynamic):
+        assert mode is None and dynamic is False
+        return lambda *given: (drawn.append(len(given[0])), function(*given))[1]
+
+    monkeypatch.setattr(torch, "compile", compiler)
+    world = small_world()
+    quick, given = compiled(world.generator), example(world)
+    noisy, time, glimpse, last, told = given
+    two = (noisy.repeat(2, 1, 1, 1), time.repeat(2), replace_all(glimpse), last.repeat(2, 1, 1, 1), told.repeat(2, 1))
+    with torch.inference_mode():
+        assert quick(*given).shape[0] == 1 and quick(*two).shape[0] == 2 and quick(*given).shape[0] == 1
+    assert drawn == [1, 1]
+
+
+def replace_all(glimpse):
+    return replace(glimpse, **{k: v.repeat(2, *[1] * (v.ndim - 1)) for k, v in vars(glimpse).items()})
+
+
+@pytest.mark.gpu
+def test_cuda_graphs_draw_the_same():
+    if not torch.cuda.is_available():
+        pytest.skip("NOT MEASURED: the CUDA-graph path of worlds/fast.py needs a GPU, and there is none here")
+    eager, quick = terrella.load("doom-maze", device="cuda"), terrella.load("doom-maze", device="cuda", fast=True)
+    for one, other in zip(walk(eager, 1, 8), walk(quick, 1, 8)):
+        np.testing.assert_allclose(one["rgb"].int(), other["rgb"].int(), atol=2)
+
+
+def test_several_flow_steps_go_through_it_too(worlds):
+    eager, quick = worlds
+    noisy, _, glimpse, last, told = example(eager)
+    with torch.inference_mode():
+        one, other = (generate(world.generator, noisy, glimpse, last, told, 3) for world in worlds)
+    assert (one - other).abs().max() < 3 * PARITY

@@ -1,0 +1,81 @@
+"""HistoryWorld: a story begins, stands still until it has learned otherwise, and is the same after a save."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.core import check_world, make_rng
+from terrella.core.errors import ActionError
+from terrella.worlds.controls import AXES, CHOICE, Controls
+from terrella.worlds.folder import load_world, save_world, video_spec
+from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.outcome import Outcome, OutcomeConfig
+from terrella.worlds.video import Generator, VideoConfig
+
+SIZE = (16, 24)
+
+
+def made(controls: Controls, vitals: tuple[str, ...] = ()) -> HistoryWorld:
+    torch.manual_seed(0)
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), controls.told, SIZE, (8, 8), slots=4, geometry=False, residual=True)
+    spec = video_spec("made", config, 0.1, (), {}, {}, controls, vitals)
+    frames = torch.randint(0, 255, (3, 4, 3, *SIZE), dtype=torch.uint8)
+    starts = Starts(frames, torch.rand(3, 4, controls.told), torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)])
+    outcome = Outcome(
+        OutcomeConfig(controls.told, (0.0, 1.0), vitals, ((-1.0, 0.0),) * len(vitals), (3.0,) * len(vitals))
+    )
+    return HistoryWorld(spec, config, Generator(config), starts, 0.0, outcome, controls)
+
+
+CHOICES = Controls(CHOICE, (2.0,), (5.0,))
+STEERING = Controls(AXES, (-1.0, 0.0), (1.0, 4.0))
+
+
+@pytest.mark.parametrize("controls", [Controls.buttons(3), CHOICES, STEERING])
+def test_every_kind_of_action_keeps_the_contract(controls):
+    assert "states_are_values" in check_world(made(controls, ("lives",)), steps=3)
+
+
+def test_what_a_network_is_told_of_an_action():
+    assert CHOICES.space() == spaces.Discrete(4, start=2)
+    assert CHOICES.tell(torch.tensor([2, 5, 3])).tolist() == [[1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 0, 0]]
+    assert STEERING.tell(torch.tensor([[-1.0, 4.0], [0.0, 2.0], [1.0, 0.0]])).tolist() == [[-1, 1], [0, 0], [1, -1]]
+    buttons = torch.tensor([[1, 0, 1]], dtype=torch.int8)
+    assert Controls.buttons(3).tell(buttons).tolist() == [[1, 0, 1]]
+    with pytest.raises(ActionError):
+        made(CHOICES).imagine(made(CHOICES).start(1, make_rng(0)), torch.tensor([1]), make_rng(0))
+
+
+def test_untrained_it_stands_still():
+    """What is learned is what changes: before that, nothing does, to the last digit."""
+    world, rng = made(CHOICES), make_rng(0)
+    state = world.start(3, rng)
+    after = world.imagine(state, torch.tensor([2, 3, 4]), rng)
+    assert torch.equal(after["frames"][:, 0], state["frames"][:, 0])
+    assert torch.equal(after["frames"][:, 1:], state["frames"][:, :-1])
+
+
+def test_a_saved_world_begins_and_goes_on_alike(tmp_path):
+    world = made(CHOICES, ("lives",))
+    with torch.no_grad():
+        world.generator.leave.weight.normal_(0, 0.05)
+    save_world(world, tmp_path / "world", {})
+    loaded = load_world(tmp_path / "world")
+    assert loaded.controls == CHOICES and loaded.outcome.config == world.outcome.config
+    assert torch.equal(loaded.starts.vitals, world.starts.vitals)
+    assert torch.equal(loaded.starts.actions, world.starts.actions)
+    assert (loaded.starts.frames.int() - world.starts.frames.int()).abs().float().mean() < 2, "kept as fine JPEG"
+    state = world.start(2, make_rng(0))
+    ways = [one.imagine(state, torch.tensor([2, 5]), make_rng(1)) for one in (world, loaded)]
+    assert ways[0] == ways[1]
+
+
+def test_a_lone_picture_begins_with_the_usual_vitals_and_says_what_it_is_told(tmp_path):
+    world, picture = made(CHOICES, ("lives",)), torch.from_numpy(np.full((2, *SIZE, 3), 7, np.uint8))
+    alone = world.observe({"rgb": picture}, None, make_rng(0))
+    assert alone["vitals"].tolist() == [[2.0], [2.0]]
+    told = world.observe({"rgb": picture, "lives": torch.tensor([3.0, 1.0])}, alone, make_rng(0))
+    assert world.render(told, ("lives",))["lives"].tolist() == [3.0, 1.0]
