@@ -3,7 +3,7 @@
     git clone https://github.com/eloialonso/diamond CHECKOUT       # MIT; Alonso et al. 2024
     python recipes/atari.py record breakout OUT                    # OUT/rec, OUT/test
     python recipes/atari_beside_diamond.py ours CHECKOUT OUT 20    # minutes on one thread; goes on where it stopped
-    python recipes/atari_beside_diamond.py theirs CHECKOUT OUT 20  # its Denoiser, loss, sampler of batches and settings
+    python recipes/atari_beside_diamond.py theirs CHECKOUT OUT M   # its Denoiser, loss, sampler; M: cpu_s / 60 of OUT/run/cpu.json
     python recipes/atari_beside_diamond.py score CHECKOUT OUT      # OUT/beside-terrella.json, OUT/beside-diamond.json
     python recipes/atari_beside_diamond.py pace CHECKOUT OUT       # milliseconds a frame, in turns
 
@@ -150,6 +150,7 @@ def train_ours(out: Path, minutes: float, **settings) -> None:
         before = json.loads((folder / "cpu.json").read_text())["cpu_s"]
 
     def report(done: float, total: float, words: str = "") -> None:
+        (folder / "cpu.json").write_text(json.dumps({"cpu_s": before + time.process_time()}))
         print(f"{before + time.process_time():.0f} s", f"{done / total:.3f}", words, flush=True)
 
     config = TrainConfig(name=out.name, size=SIZE, hours=minutes / 60, doubt_frames=0, **settings)

@@ -48,6 +48,8 @@ def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = N
     if eye is not None:
         raise TerrellaError("an eye is for remembering: ask for that too, or leave the eye out.")
     text = str(name)
+    if options.get("fast") and text.partition(":")[0] in ("doom", "gym"):
+        raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
     if text == "doom" or text.startswith("doom:"):
         return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
     if text.startswith("gym:ALE/"):

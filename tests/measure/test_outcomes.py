@@ -53,7 +53,7 @@ def recording(lengths=(40, 30, 50)):
     return SimpleNamespace(
         episodes=[(stop - length, stop) for length, stop in zip(lengths, stops)], length=rows, depth=None, pose=None,
         rgb=np.zeros((rows, 8, 8, 3), np.uint8), action=action, reward=reward, done=done,
-        arrays={"observation.health": health[:, None]},
+        vitals={"health": health[:, None]},
     )  # fmt: skip
 
 

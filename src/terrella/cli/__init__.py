@@ -595,12 +595,12 @@ def score(
 
 def _fates(arms: dict[str, World], sources: dict[str, tuple], horizons: tuple[int, ...], clips: int, rng) -> list:
     """What the arms' dreams tell of rewards, vitals and ends, where world and recordings have vitals."""
-    from ..measure.outcomes import fates, passages, vitals_of
+    from ..measure.outcomes import fates, passages
 
     spec, found = next(iter(arms.values())).spec, []
-    for place, (cache, episodes, _) in sources.items():
-        if set(vitals_of(cache)) & set(spec.channels):
-            shown = passages(cache, episodes, CONTEXT, max(horizons), clips, rng)
+    for place, (cache, episodes, where) in sources.items():
+        if set(cache.vitals) & set(spec.channels):
+            shown = passages(cache, episodes, CONTEXT, max(horizons), clips, rng, where)
             found += fates(arms, place, shown, horizons, rng)
     return found
 

@@ -81,6 +81,11 @@ class State(Mapping):
         """Each batch entry n times in a row: [a, b].fork(2) = [a, a, b, b]."""
         return State({name: tensor.repeat_interleave(n, dim=0) for name, tensor in self.items()})
 
+    def where(self, which: torch.Tensor, other: State) -> State:
+        """This state's entries where `which` (bool [B]), the other's elsewhere."""
+        flags = {name: which.view(-1, *[1] * (tensor.ndim - 1)) for name, tensor in other.items()}
+        return State({name: torch.where(flags[name], self[name], tensor) for name, tensor in other.items()})
+
     @staticmethod
     def stack(states: Sequence[State]) -> State:
         """States joined along the batch axis."""

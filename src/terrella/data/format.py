@@ -92,7 +92,8 @@ class Layout:
         vectors = {
             name: int(np.prod(shape_of(space)))
             for name, space in channels.items()
-            if name not in KNOWN_CHANNELS and len(shape_of(space)) <= 1
+            if name not in (*KNOWN_CHANNELS, "uncertainty")
+            and len(shape_of(space)) <= 1  # a dream's doubt is no evidence
         }
         masks = {
             name: _height_width(space)

@@ -72,8 +72,8 @@ class Dreamt:
 
 
 def learn_doubt(world: Learned, recording: Recording, config: DoubtTraining, report: Report) -> tuple[Doubt, dict]:
-    """The doubt of `world` and what is known of it: its `sure` and `invents` levels, and of stories kept for calibration
-    the mean error and the mean that was expected."""
+    """The doubt of `world` and what is known of it: its `sure` and `invents` levels, and of stories that
+    neither taught nor calibrated it the mean error and the mean that was expected."""
     shown = max(SHOWN)
     horizon = min(config.horizon, int(_ahead(recording).max()) - shown)
     if horizon < 8:
@@ -90,7 +90,11 @@ def learn_doubt(world: Learned, recording: Recording, config: DoubtTraining, rep
     kept = seen.story % _APART == 0
     lessons, others = seen.at((~kept).nonzero()[:, 0]), seen.at(kept.nonzero()[:, 0])
     doubt = fit(lessons, config, report)
-    calibrate(doubt, others)
+    apart = others.story // _APART % 2 == 0
+    if apart.all() or not apart.any():
+        apart = torch.arange(len(apart)) % 2 == 0
+    calibrate(doubt, others.at(apart.nonzero()[:, 0]))
+    others = others.at((~apart).nonzero()[:, 0])
     expected = answers(doubt, others)
     facts = {"sure": float(doubt.sure), "invents": float(doubt.invents), "frames": len(others.error)}
     facts |= {"error": float(others.error.mean()), "expected": float(expected.mean())}
@@ -119,7 +123,7 @@ def dreams(world: Learned, recording: Recording, config: DoubtTraining, batches:
             arm = NONE
         shown = 1 if arm == LONE else int(rng.choice(SHOWN))
         begins = _begins(recording, shown + config.horizon, config.batch, rng)
-        poses_given = arm != LONE and isinstance(world, VideoWorld) and rng.random() < 0.35
+        poses_given = arm != LONE and isinstance(world, VideoWorld) and not world.config.moving and rng.random() < 0.35
         yield _dream(world, recording, begins, shown, config.horizon, arm, poses_given, number * config.batch, rng)
 
 
@@ -173,6 +177,8 @@ def _evidence(world: Learned, recording: Recording, rows: np.ndarray, alone: boo
     seen = {"rgb": recording.rgb(rows).permute(0, 2, 3, 1).contiguous()}
     if not alone and "pose" in world.spec.observes:
         seen |= {"depth": recording.depth(rows), "pose": recording.pose(rows)}
+        if world.config.moving:
+            seen["things"] = recording.things(rows)
     return seen
 
 

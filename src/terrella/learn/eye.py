@@ -183,7 +183,8 @@ def _errors(eye: Eye, recording: Recording, frames: int) -> dict[str, float]:
     ends, true_ends = _summed(found), _summed(true)
     walked = way.sum(1)
     went = walked > 0.5
-    facts["drift_off"] = float(((ends - true_ends)[went, :2].norm(dim=-1) / walked[went]).mean())
+    if went.any():
+        facts["drift_off"] = float(((ends - true_ends)[went, :2].norm(dim=-1) / walked[went]).mean())
     facts["drift_deg"] = float((ends - true_ends)[:, 2].abs().mean().rad2deg())
     return facts
 

@@ -14,7 +14,6 @@ from ..worlds.outcome import Logits, Outcome, OutcomeConfig
 
 PIECE = 8  # steps that are learned from at a time
 _LEVELS = 33  # values, at most, that a reward or a change is told apart into
-_PREFIX = "observation."
 
 
 @dataclass(frozen=True)
@@ -33,10 +32,10 @@ class Happenings:
     @staticmethod
     def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray) -> Happenings:
         """`action`: float [N, A] as it is told to networks; `usable`: bool [N], rows that training may see."""
-        names = vital_names(cache)
+        names = tuple(cache.vitals)
         vitals = np.zeros((cache.length, len(names)), np.float32)
         for column, name in enumerate(names):
-            vitals[:, column] = np.asarray(cache.arrays[_PREFIX + name], np.float32).reshape(cache.length)
+            vitals[:, column] = np.asarray(cache.vitals[name], np.float32).reshape(cache.length)
         real = usable & np.roll(usable, -1) & np.asarray(cache.action_valid, bool)
         real[[stop - 1 for _, stop in cache.episodes]] = False  # nothing follows an episode's last row
         change = np.where(real[:, None], np.roll(vitals, -1, 0) - vitals, 0.0)
@@ -60,15 +59,6 @@ class Happenings:
             float(max(np.abs(self.vitals[self.real, column]).max(), 1e-6)) for column in range(len(self.names))
         )
         return OutcomeConfig(self.action.shape[1], levels(self.reward[self.real]), self.names, changes, spans)
-
-
-def vital_names(cache: ClipCache) -> tuple[str, ...]:
-    """The recording's channels of one number a row, such as "health" or "lives"."""
-    return tuple(
-        name.removeprefix(_PREFIX)
-        for name, array in cache.arrays.items()
-        if name.startswith(_PREFIX) and int(np.prod(array.shape[1:])) == 1
-    )
 
 
 def levels(values: np.ndarray) -> tuple[float, ...]:

@@ -91,7 +91,8 @@ def with_generator(world: Learned, generator: Generator, steps: int, card: dict)
     fresh = world.with_senses(world.eye if isinstance(world, VideoWorld) else None, None)
     fresh.generator = channels_last(copy.deepcopy(generator).eval().requires_grad_(False))
     fresh.config = replace(world.config, steps=steps)
-    fresh.spec = replace(fresh.spec, card={**world.spec.card, **card})
+    kept = {name: value for name, value in world.spec.card.items() if name != "uncertainty"}
+    fresh.spec = replace(fresh.spec, card={**kept, **card})
     return fresh
 
 
@@ -193,15 +194,18 @@ def leave(beside: Beside, world: Learned, old: Learned, out: Path, step: int) ->
 
 
 def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or the recorded actions."""
-    rng, geometry = make_rng(1), world.config.geometry
+    """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
+    move, the recorded actions."""
+    rng, config = make_rng(1), world.config
     seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
-    if geometry:
+    if config.geometry:
         seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
+    if config.moving:
+        seen["things"] = recording.things(rows[:1])
     state = world.observe(seen, None, rng)
     frames = [world.render(state, ("rgb",))["rgb"]]
     for row in rows[1:]:
-        if geometry:
+        if config.geometry and not config.moving:  # what moves answers to actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
             action = (

@@ -3,10 +3,14 @@ invents. `train video` ends with them; `train senses` gives them to a world that
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..core.errors import DatasetError, TrainingError
 from ..data import ClipCache, Dataset, split
@@ -27,8 +31,8 @@ class SensesConfig:
     """Settings of the training of a world's senses.
 
     Args:
-        eye_steps: Training steps of the eye; 0 leaves it out.
-        doubt_frames: Dreamt frames that the doubt learns from; 0 leaves it out.
+        eye_steps: Training steps of the eye; with 0 the world keeps the one it has, if any.
+        doubt_frames: Dreamt frames that the doubt learns from; with 0 the world keeps the one it has, if any.
         seed: Of everything random.
     """
 
@@ -51,7 +55,9 @@ def train_senses(world: str | Path, data: str | Path, out: str | Path, config: S
         raise DatasetError(f"{data} lacks depth, poses or a camera, from which {learned.spec.name} was learned.")
     train, held_out = split(len(cache.episodes))
     recording = recording_of(cache, train, tuple(box) if box and posed else None, controls_of(cache))
-    keep = Path(out) / "eye.safetensors.partial"
+    told = json.dumps([config.eye_steps, config.seed, box, cache.length, [list(span) for span in cache.episodes]])
+    mark = hashlib.sha256(told.encode() + np.ascontiguousarray(cache.pose).tobytes()) if posed else hashlib.sha256()
+    keep = Path(out) / f"eye-{mark.hexdigest()[:12]}.safetensors.partial"  # of these settings and this recording alone
     sensing, facts = learn_senses(learned, recording, held_out, tuple(box) if box else None, config, report, keep)
     remembered = (Path(world) / MEMORY_FILE).read_bytes()  # as they are: pictures that are packed again lose a little
     save_world(sensing, out, {**learned.spec.card, **facts})
@@ -73,7 +79,7 @@ def learn_senses(
     """`world` with an eye (where it has geometry) and a doubt, and what its card says of them. The eye is kept in the file
     `keep` as soon as it is learned: a run that is stopped goes on from there."""
     facts: dict[str, Any] = {}
-    eye = None
+    eye = world.eye if isinstance(world, VideoWorld) else None
     if isinstance(world, VideoWorld) and config.eye_steps:
         if keep.exists():
             eye = load_eye(keep)
@@ -86,12 +92,12 @@ def learn_senses(
             for place, errors in sight(eye, recording.cache, held_out, keep_out).items()
             if errors
         }
-    sensing = world.with_senses(eye, None) if isinstance(world, VideoWorld) else world
+    sensing = world.with_senses(eye, world.doubt)
     if config.doubt_frames:
         try:
             horizon, steps = min(64, max(8, config.doubt_frames // 40)), min(1500, max(20, config.doubt_frames // 6))
             settings = DoubtTraining(config.doubt_frames, horizon, steps=steps, seed=config.seed)
-            doubt, found = learn_doubt(sensing, recording, settings, report)
+            doubt, found = learn_doubt(world.with_senses(eye, None), recording, settings, report)
         except DatasetError as error:  # the world is as good without it
             return sensing, {**facts, "uncertainty": f"none: {error}"}
         facts["uncertainty"] = {name: round(value, 4) for name, value in found.items()}

@@ -367,7 +367,7 @@ class _Run:
         starts = open_views(self.memory, 32)
         if self.video.moving:  # monsters wait where episodes begin, and the player is well
             first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
-            starts = self._keyframes_at(first[:: max(1, len(first) // 32)][:32])
+            starts = self._keyframes_at(first[:: max(1, len(first) // 32)][:32]) if len(first) else starts
         body = {name: value for name, value in (self.facts["motion"] or {}).items() if name in ("body_m", "short")}
         return VideoWorld(
             spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards, outcome=outcome
@@ -378,6 +378,8 @@ class _Run:
         slots, recording = self.video.slots, self.recording
         since = np.arange(self.cache.length) - recording.start
         rows = np.flatnonzero(self.happened.real & (since >= slots))  # from which it goes on
+        if not len(rows):
+            raise DatasetError(f"no episode is longer than the {slots} frames of history that a story begins with.")
         rows = rows[:: max(1, len(rows) // 32)]
         frames, led = rows[:, None] - np.arange(slots), rows[:, None] - 1 - np.arange(slots)
         return Starts(

@@ -122,19 +122,21 @@ def _closure_bars(card: Scorecard, arm: str, place: str) -> list[Bar]:
     """Each way there and back that was gone; at least those along poses."""
     rows = {row.way: row for row in card.closures if (row.arm, row.place) == (arm, place)}
     found = []
-    for way in dict.fromkeys(("yaw 0-180-0", "yaw 0-90-0", *rows)):
+    asked = () if any(row.acted for row in rows.values()) else ("yaw 0-180-0", "yaw 0-90-0")  # where poses move the eye
+    for way in dict.fromkeys((*asked, *rows)):
         name, least, row = f"closure of {way}", 27.0 if way == "yaw 0-180-0" else 25.0, rows.get(way)
         target = f"\u2265 {least:g} dB"
         if row is None:
             found.append(_bar(name, place, "true", None, card.dt_s, target, "dB", None, least, math.inf))
             continue
+        motion = PREDICTED if row.acted else "true"
         far = f"{row.far_m:.1f} m away, the far view" if row.far_m > 0.1 else "far view"
         note = f"{far} against the first: {row.far.value:.1f} dB; it seen again: {row.again.value:.1f} dB"
         if row.void:
             note += ", not different enough: the picture hardly changed, so closure proves nothing"
-            found.append(Bar(name, place, "true", row.steps, None, target, "dB", row.closed, VOID, False, note=note))
+            found.append(Bar(name, place, motion, row.steps, None, target, "dB", row.closed, VOID, False, note=note))
         else:
-            bar = _bar(name, place, "true", row.steps, None, target, "dB", row.closed, least, math.inf, note=note)
+            bar = _bar(name, place, motion, row.steps, None, target, "dB", row.closed, least, math.inf, note=note)
             found.append(bar)
     return found
 

@@ -25,13 +25,14 @@ class Closure:
     """There and back, and there again. closed: PSNR of the frame after coming back against the first; far: of the view at
     the far end against the first; again: of the far view, mostly dreamt, when it is come to a second time against the first
     time. void: the far views are not different (far >= 20 dB), so `closed` proves nothing; void_again: the frames after
-    coming back are like the far ones, so `again` proves nothing (fog looks alike wherever it is drawn). far_deg and far_m: how
-    far the way leads, the latter a mean over clips; steps: there and back. `picture` holds the first clip's frames, uint8
-    [6, H, W, 3]: first, half way out, far, half way back, back, far again."""
+    coming back are like the far ones, so `again` proves nothing (fog looks alike wherever it is drawn). acted: gone by keys,
+    not along poses; far_deg and far_m: how far the way leads, the latter a mean over clips; steps: there and back. `picture`
+    holds the first clip's frames, uint8 [6, H, W, 3]: first, half way out, far, half way back, back, far again."""
 
     arm: str
     place: str
     way: str
+    acted: bool
     far_deg: float
     far_m: float
     steps: int
@@ -133,6 +134,7 @@ def closure(
         arm,
         place,
         way.name,
+        way.acted,
         way.far_deg,
         far_m,
         count,

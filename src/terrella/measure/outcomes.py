@@ -10,11 +10,9 @@ import torch
 
 from ..core.errors import DatasetError
 from ..core.world import World, make_rng
-from .clips import Clip, evidence
+from .clips import Clip, Where, evidence
 from .roll import actions_at
 from .statistics import Figure, mean_interval
-
-PREFIX = "observation."  # of a recording's channels in a clip cache
 
 
 @dataclass(frozen=True)
@@ -53,12 +51,21 @@ class Passage:
 
 
 def passages(
-    cache, episodes: Sequence[int], context: int, horizon: int, count: int, rng: torch.Generator
+    cache,
+    episodes: Sequence[int],
+    context: int,
+    horizon: int,
+    count: int,
+    rng: torch.Generator,
+    where: Where | None = None,
 ) -> list[Passage]:
-    """`count` windows of the episodes, half of them shortly before an end where there are ends; DatasetError without any."""
-    whole = [cache.episodes[number] for number in episodes]
+    """`count` windows of the episodes, of rows that `where` allows, half of them shortly before an end where there are ends;
+    DatasetError without any."""
+    spans = [cache.episodes[number] for number in episodes]
+    whole = [part for first, stop in spans for part in _allowed(cache, first, stop, where)]
     long = [(first, stop) for first, stop in whole if stop - first > context + 1]
-    ending = [(first, stop) for first, stop in long if bool(np.asarray(cache.done[first:stop]).any())]
+    ends = cache.done is not None
+    ending = [(first, stop) for first, stop in long if ends and bool(np.asarray(cache.done[first:stop]).any())]
     if not long:
         raise DatasetError(f"no episode is longer than the {context} rows of context; record longer ones.")
     found = []
@@ -157,13 +164,13 @@ def _follow(world: World, shown: Sequence[Passage], steps: int, rng: torch.Gener
     return {name: torch.stack(values, 1) for name, values in found.items()}
 
 
-def vitals_of(cache) -> dict[str, np.ndarray]:
-    """The recording's channels of one number a row, such as "health", by name."""
-    return {
-        name.removeprefix(PREFIX): array
-        for name, array in cache.arrays.items()
-        if name.startswith(PREFIX) and int(np.prod(array.shape[1:])) == 1
-    }
+def _allowed(cache, first: int, stop: int, where: Where | None) -> list[tuple[int, int]]:
+    """The stretches [first, stop) of an episode whose rows `where` allows."""
+    if where is None:
+        return [(first, stop)]
+    inside = np.concatenate([[False], np.asarray(where(cache, first, stop), bool), [False]]).astype(int)
+    begins, ends = np.flatnonzero(np.diff(inside) > 0), np.flatnonzero(np.diff(inside) < 0)
+    return [(first + int(a), first + int(b)) for a, b in zip(begins, ends)]
 
 
 def _passage(cache, start: int, stop: int, context: int, horizon: int) -> Passage:
@@ -180,7 +187,7 @@ def _passage(cache, start: int, stop: int, context: int, horizon: int) -> Passag
         np.asarray(cache.rgb[rows]), part(cache.depth), part(cache.pose), action, zeros if reward is None else reward,
         zeros.astype(bool) if done is None else done, context, 0, start,
     )  # fmt: skip
-    vitals = {name: np.asarray(array[rows], np.float32).reshape(-1) for name, array in vitals_of(cache).items()}
+    vitals = {name: np.asarray(array[rows], np.float32).reshape(-1) for name, array in cache.vitals.items()}
     return Passage(clip, real, vitals)
 
 

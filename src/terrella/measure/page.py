@@ -224,13 +224,17 @@ def _fates(card: Scorecard) -> str:
             found = f"{share:.2f}" if math.isfinite(share) else "-"
             cells.append(f"{found}<small>{count} of {row.reward.count} clips</small>")
         for vital in vitals:
+            if vital not in row.vitals:  # recorded elsewhere alone
+                cells.append("-")
+                continue
             error, copied = row.vitals[vital], row.vitals_copied[vital]
             cells.append(f"{error.value:.3g}<small>{copied.value:.3g} by a copy</small>")
         rows.append([name, *cells])
     lead = (
         "What dreams tell of rewards, vitals and ends: the mean absolute error of the reward summed over the steps, beside "
         "that of always paying the usual; how well the dreamt sum tells clips that paid more, and the dream's end tells clips "
-        "that ended (area under the ROC curve: 1 always, 0.5 by chance); the error of each vital, beside leaving it as it was."
+        "that ended (area under the ROC curve: 1 always, 0.5 by chance); the error of each vital, beside leaving it as it was. "
+        "Half of the stretches are taken from shortly before an end, where there are ends."
     )
     return _section("What it pays and costs", lead, _table(heads, rows))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -92,7 +92,7 @@ class History:
         self._count(gone, -1)
         if self._pictures and self._pictures[0].step <= gone.step:  # the picture stays, without its state
             index = gone.step - self._pictures[0].step
-            self._pictures[index] = Moment(gone.step, gone.images, gone.flags, gone.episode_return)
+            self._pictures[index] = replace(gone, states=None, rng=None)
 
     def _count(self, moment: Moment, sign: int) -> None:
         seen = {}

@@ -74,14 +74,19 @@ def doubtful(spec: Spec) -> tuple[float, float] | None:
         return None
     told = spec.card.get("uncertainty")
     known = told if isinstance(told, dict) else {}
-    sure, invents = (known.get(name, usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
-    return float(sure), max(float(invents), 1.01 * float(sure))
+    sure, invents = (_share(known.get(name), usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
+    return sure, max(invents, 1.01 * sure)
+
+
+def _share(told: object, usual: float) -> float:
+    """What a stranger's card tells, if it is a share of full brightness."""
+    return float(told) if isinstance(told, int | float) and 0 < told <= 1 else usual
 
 
 def _plain(image: Image.Image) -> Image.Image:
     """RGB, 8 bits, without transparency."""
     if image.mode.startswith("I;16") or image.mode in ("I", "F"):
-        values = np.asarray(image, np.float32)
+        values = np.nan_to_num(np.asarray(image, np.float32))
         low, high = float(values.min()), float(values.max())
         scale = (
             65535.0 if image.mode.startswith("I") and high > 255 else max(high, 1e-6) if image.mode == "F" else 255.0

@@ -228,7 +228,7 @@ def _integer(body: dict, name: str, low: int, high: int) -> int:
 
 def _number(body: dict, name: str) -> float:
     value = body.get(name, 0.0)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1e15:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e15:
         raise ProtocolError(f"'{name}' must be a finite number.")
     return float(value)
 

@@ -272,11 +272,17 @@ class Session:
 
     async def _chart(self, story: Story) -> None:
         self._chart_due = time.perf_counter() + CHART_S
-        found = await self._beside(story.chart)
-        if found is not None:
-            number, chart = found
-            before, self._charted = self._charted, chart
-            await self._event(protocol.encode_event("chart", world=number, step=story.shown.step, **chart.body(before)))
+        text = await self._beside(self._charted_text, story)
+        if text is not None:
+            await self._event(text)
+
+    def _charted_text(self, story: Story) -> str | None:
+        found = story.chart()
+        if found is None:
+            return None
+        number, chart = found
+        before, self._charted = self._charted, chart
+        return protocol.encode_event("chart", world=number, step=story.shown.step, **chart.body(before))
 
     async def _beside(self, function: Callable, *arguments):
         """What the story says of memory; None, and no more of it, where its world cannot."""

@@ -166,6 +166,9 @@ class Doom:
             place = found[int(torch.randint(len(found), (1,), generator=rng))]
             self._game.send_game_command(f"warp {place.position_x:.0f} {place.position_y:.0f}")
             self._game.make_action([0.0] * len(self.buttons), 2)
+            if self._game.is_episode_finished():  # it lay behind the exit
+                self._game.new_episode()
+                self._enter()
 
     def _check_present(self, state: State) -> None:
         if int(state["ticket"][0]) != self._ticket:

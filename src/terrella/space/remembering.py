@@ -26,6 +26,7 @@ from .memory import Memory, remembering_spec
 
 SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
 _INNER = "world_"  # what the names of the inner world's tensors begin with
+_DREAMT = ("gone", "uncertainty")  # what worlds with a doubt note in their states
 _OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 
 
@@ -83,9 +84,7 @@ class Remembering:
             return after
         still = state["done"]  # what is over stays as it is, and pays no more
         ended = state.replace(reward=torch.zeros_like(state["reward"])) if "reward" in state else state
-        return State(
-            {name: torch.where(still.view(-1, *[1] * (new.ndim - 1)), ended[name], new) for name, new in after.items()}
-        )
+        return ended.where(still, after)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
@@ -116,7 +115,9 @@ class Remembering:
         rgb, known = blend(glimpse, rgb)
         depth = torch.where(known > 0.5, glimpse.depth, depth)
         evidence = self.world.render(inner, [name for name in self.world.spec.observes if name != "rgb"])
-        inner = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
+        blended = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
+        # a blend is no evidence: how far the dream has gone from any, and what to expect of it, stay as they were
+        inner = blended.replace(**{name: inner[name] for name in _DREAMT if name in inner})
         held = self.memory.of(before)
         held |= self.memory.dreamt(held, rgb, depth, pose, glimpse.known)
         known = (known * 255).round().to(torch.uint8)

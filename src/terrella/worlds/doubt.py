@@ -94,7 +94,7 @@ def clues(glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor) -> torch.Te
     apart = ((glimpse.rgb[:, 0] - second).abs().mean(1, keepdim=True)) * (trust[:, 1:] > 0)
     edges = F.pad(drawn.diff(dim=3).abs().mean(1, keepdim=True), (0, 1))
     own = ((drawn - merged).abs() * glimpse.known[:, None]).mean(1, keepdim=True)
-    maps = [drawn, merged, own, glimpse.known[:, None], trust, last[:, 3:], apart, clean[:, 3:], edges]
+    maps = [drawn, merged, own, glimpse.known[:, None], trust, last[:, 3:4], apart, clean[:, 3:4], edges]
     whole = torch.cat(maps, 1)
     soft = F.avg_pool2d(whole, CELLS)
     here = soft[:, :3] - F.avg_pool2d(F.pad(soft[:, :3], (1, 1, 1, 1), mode="replicate"), 3, 1)

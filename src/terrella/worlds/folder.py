@@ -124,7 +124,16 @@ def load_world(
         rewards = (float(about["rewards"][0]), float(about["rewards"][1]))
         senses = _eye(about, weights), _doubt(about, weights)
         world = VideoWorld(spec, config, generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome)
-    except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError, zlib.error) as error:
+    except (
+        OSError,
+        SafetensorError,
+        RuntimeError,
+        LookupError,
+        AttributeError,
+        TypeError,
+        ValueError,
+        zlib.error,
+    ) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is damaged or incomplete ({first}); copy or train it again.") from error
     world.generator.to(device)

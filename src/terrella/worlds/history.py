@@ -20,7 +20,7 @@ from ..space.eye import Eye
 from ..space.keyframes import Glimpse
 from .controls import Controls
 from .doubt import SITUATION, Doubt, doubting_spec
-from .outcome import Outcome
+from .outcome import Outcome, told_vitals
 from .video import Generator, VideoConfig, channels_last, generate, mood
 
 TRUST = 0.03  # in a frame, against the one after it: what is merged from all of them is nearly the newest alone
@@ -78,7 +78,11 @@ class HistoryWorld:
         rgb = torch.as_tensor(observation["rgb"])
         if rgb.ndim != 4 or rgb.shape[1:] != (height, width, 3):
             raise ObservationError(f"rgb is uint8 [B, {height}, {width}, 3]; got {tuple(rgb.shape)}.")
-        frame = rgb.to(torch.uint8).permute(0, 3, 1, 2)[:, None]
+        if rgb.dtype != torch.uint8:
+            raise ObservationError(f"rgb must be uint8, 0 to 255; got {rgb.dtype}.")
+        if prior is not None and prior.batch != len(rgb):
+            raise ObservationError(f"the prior holds {prior.batch} stories, the evidence tells of {len(rgb)}.")
+        frame = rgb.permute(0, 3, 1, 2)[:, None]
         if prior is None:
             slots = self.config.slots
             usual = self.starts.vitals.median(0).values if self.starts.vitals.numel() else self.starts.vitals[:1]
@@ -88,10 +92,7 @@ class HistoryWorld:
             state = prior.replace(frames=torch.cat([frame, prior["frames"][:, 1:]], 1), **self._sure(len(rgb)))
         if self.outcome is None:
             return state
-        vitals = state["vitals"].clone()
-        for column, name in enumerate(self.outcome.config.vitals):
-            if name in observation:
-                vitals[:, column] = torch.as_tensor(observation[name]).float()
+        vitals = told_vitals(self.outcome, observation, state["vitals"])
         going = {"reward": torch.zeros(len(rgb)), "done": torch.zeros(len(rgb), dtype=torch.bool)}
         return state.replace(vitals=vitals, **going)
 
@@ -135,13 +136,10 @@ class HistoryWorld:
             return after
         frames, action = (before["frames"][:, 0], after["frames"][:, 0]), after["actions"][:, 0]
         found = self.outcome(frames[0], frames[1], action, before["vitals"], before["hidden"])
-        still = before["done"]
-        ended = still | (found.done > 0)
-        moved = after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=ended)
-        if not still.any():
+        moved = after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=found.done > 0)
+        if not before["done"].any():
             return moved
-        kept = {name: torch.where(_beside(still, new), before[name], new) for name, new in moved.items()}
-        return State({**kept, "reward": torch.where(still, 0.0, moved["reward"]), "done": ended})
+        return before.replace(reward=torch.zeros_like(before["reward"])).where(before["done"], moved)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
@@ -175,8 +173,3 @@ def past(frames: torch.Tensor) -> Glimpse:
     return Glimpse(
         frames.float() / 255, trust[None, :, None, None].expand(batch, -1, height, width), everywhere, everywhere
     )
-
-
-def _beside(flags: torch.Tensor, tensor: torch.Tensor) -> torch.Tensor:
-    """[B] as [B, 1, ...] beside `tensor`."""
-    return flags.view(-1, *[1] * (tensor.ndim - 1))

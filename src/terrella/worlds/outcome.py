@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import nn
+
+from ..core.errors import ObservationError
 
 
 @dataclass(frozen=True)
@@ -140,3 +143,16 @@ def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:
     size = [max(8, 2 * round(length * share / 2)) for length in (height, width)]
     picture = frame.float() / 127.5 - 1
     return picture if size == [height, width] else F.interpolate(picture, size, mode="area")
+
+
+def told_vitals(outcome: Outcome, observation: Mapping[str, torch.Tensor], before: torch.Tensor) -> torch.Tensor:
+    """The vitals [B, V] that evidence tells, and those of `before` [B, V] where it is silent; ObservationError for what is
+    not one finite number a story."""
+    vitals = before.clone()
+    for column, name in enumerate(outcome.config.vitals):
+        if name in observation:
+            told = torch.as_tensor(observation[name]).float()
+            if told.shape != (len(before),) or not torch.isfinite(told).all():
+                raise ObservationError(f"{name} is finite float [B]; got {tuple(told.shape)}.")
+            vitals[:, column] = told
+    return vitals

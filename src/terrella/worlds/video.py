@@ -30,7 +30,7 @@ from ..space.reproject import carry_unknown, fill_holes
 from .arrival import AWAY_M, arrive
 from .doubt import GONE, Doubt, doubting_spec
 from .moving import PLANES, Frame, carry_frames, still
-from .outcome import Outcome
+from .outcome import Outcome, told_vitals
 
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
 LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
@@ -279,20 +279,20 @@ class VideoWorld:
         (it needs a prior) and the frame is dreamt; a picture alone is seen from the prior's pose, or without a prior from
         the remembered place that it shows, else from an empty corner (arrival.py). Its depth is then the eye's."""
         if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and self.eye is not None:
-            return self._arrive(torch.as_tensor(observation["rgb"]), self.eye, prior, rng)
+            return self._arrive(observation, self.eye, prior, rng)
         if "pose" not in observation:
-            alone = (
-                "a picture alone"
-                if self.eye is not None
-                else "no picture alone (`terrella train senses` gives it an eye)"
-            )
+            alone = ", a picture alone" if self.eye else ""
+            blind = "" if self.eye else " For a picture alone it needs an eye: `terrella train senses`."
             raise ObservationError(
-                f"{self.spec.name} observes rgb, depth and pose, a pose alone, or {alone}; got {list(observation)}."
+                f"{self.spec.name} observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
             )
         pose = torch.as_tensor(observation["pose"]).float()
         batch = len(pose)
         if pose.shape != (batch, 7) or not torch.isfinite(pose).all():
             raise ObservationError(f"pose is finite float [B, 7] (x, y, z, quaternion wxyz); got {tuple(pose.shape)}.")
+        if prior is not None and prior.batch != batch:
+            raise ObservationError(f"the prior holds {prior.batch} stories, the evidence tells of {batch}.")
+        begins = prior is None
         if prior is None:
             if not {"rgb", "depth"} <= set(observation):
                 raise ObservationError(
@@ -307,9 +307,7 @@ class VideoWorld:
         no, nothing = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
         state = prior.replace(pose=pose, speed=speed, dreamt=no, done=no, reward=nothing)
         if self.outcome is not None:
-            told = enumerate(self.outcome.config.vitals)
-            given = [torch.as_tensor(observation.get(name, state["vitals"][:, at])).float() for at, name in told]
-            state = state.replace(vitals=torch.stack(given, 1) if given else state["vitals"])
+            state = state.replace(vitals=told_vitals(self.outcome, observation, state["vitals"]))
         if not {"rgb", "depth"} <= set(observation):
             return self._draw(self._gone(self.aged(state, prior), prior, None), prior, rng)
         height, width = self.config.size
@@ -327,7 +325,8 @@ class VideoWorld:
         kept = self.own.observed(state, rgb, self._lasting(state, depth), pose)
         if self.doubt is not None:
             kept |= {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}
-        return state.replace(rgb=rgb, depth=depth, known=torch.full(depth.shape, 255, dtype=torch.uint8), **kept)
+        seen = state.replace(rgb=rgb, depth=depth, known=torch.full(depth.shape, 255, dtype=torch.uint8), **kept)
+        return self.aged(seen, seen) if begins else seen  # a story that begins has stood still
 
     @torch.inference_mode()
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
@@ -347,7 +346,10 @@ class VideoWorld:
             reward=torch.where(still, 0.0, self.rewards[0] + self.rewards[1] * done.float()),
         )  # fmt: skip
         drawn = self._draw(self._gone(self.aged(next_state, state), state, moved), state, rng)
-        return drawn if self.outcome is None else self._followed(self.outcome, state, drawn, action, rng)
+        after = drawn if self.outcome is None else self._followed(self.outcome, state, drawn, action, rng)
+        if not still.any():
+            return after
+        return state.replace(reward=torch.zeros_like(state["reward"])).where(still, after)  # what is over stands still
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
@@ -401,8 +403,10 @@ class VideoWorld:
         state = state.replace(things=torch.zeros(batch, height, width))
         return self.aged(state, state)
 
-    def _arrive(self, rgb: torch.Tensor, eye: Eye, prior: State | None, rng: torch.Generator) -> State:
-        height, width = self.config.size
+    def _arrive(
+        self, observation: Mapping[str, torch.Tensor], eye: Eye, prior: State | None, rng: torch.Generator
+    ) -> State:
+        rgb, (height, width) = torch.as_tensor(observation["rgb"]), self.config.size
         if rgb.dtype != torch.uint8 or rgb.ndim != 4 or rgb.shape[1:] != (height, width, 3):
             raise ObservationError(f"rgb is uint8 [B, {height}, {width}, 3]; got {tuple(rgb.shape)}.")
         picture = rgb.permute(0, 3, 1, 2).contiguous()
@@ -413,7 +417,7 @@ class VideoWorld:
         else:
             pose, depth = prior["pose"], eye.depth(picture)
             lone = prior["gone"][:, 3] > 0 if self.doubt is not None else None
-        state = self.observe({"rgb": rgb, "depth": depth, "pose": pose}, prior, rng)
+        state = self.observe({**observation, "rgb": rgb, "depth": depth, "pose": pose}, prior, rng)
         if self.doubt is None or lone is None:
             return state
         strange = (10 * (eye.strangeness(picture) - 0.95)).clamp(0, 1) * lone
@@ -463,11 +467,7 @@ class VideoWorld:
         """`after`, the step from `before`, with the reward, end and vitals that `outcome` reads off the two frames: what
         may happen to vitals happens as often as it does."""
         found = outcome(before["rgb"], after["rgb"], action, before["vitals"], before["hidden"], rng)
-        dead = before["done"]
-        return after.replace(
-            vitals=torch.where(dead[:, None], before["vitals"], found.vitals), hidden=found.hidden,
-            reward=torch.where(dead, 0.0, found.reward), done=dead | (found.done > 0),
-        )  # fmt: skip
+        return after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=found.done > 0)
 
     def _height(self, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         """The eye's height after a step from place `before` to `after` [B, 2], coming from `z` [B]: it rises as the recorded
@@ -533,9 +533,10 @@ class VideoWorld:
 
 
 def own_memory(config: VideoConfig) -> Memory:
-    """The memory of a story's own; without a budget one of the last frame, which each new one replaces."""
-    if config.memory_mb > 0:
-        return Memory(config.camera, config.size, config.memory_mb, config.new_view, config.known_enough)
+    """The memory of a story's own; where its budget has no room, one of the last frame, which each new one replaces."""
+    whole = Memory(config.camera, config.size, config.memory_mb, config.new_view, config.known_enough)
+    if whole.capacity:
+        return whole
     frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
     return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0)
 

@@ -89,6 +89,15 @@ class ClipCache:
         for name in _TYPES:
             setattr(self, name, self.arrays.get(name))
 
+    @property
+    def vitals(self) -> dict[str, np.ndarray]:
+        """What else was recorded as one number a row, such as "health" or "lives", by name."""
+        return {
+            name.removeprefix("observation."): array
+            for name, array in self.arrays.items()
+            if name.startswith("observation.") and int(np.prod(array.shape[1:])) == 1
+        }
+
     @staticmethod
     def open(
         dataset: Dataset | str | Path,
