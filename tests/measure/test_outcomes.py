@@ -92,3 +92,13 @@ def test_what_is_too_short_is_refused():
     shown = passages(recording(), (0, 1, 2), 5, 8, 4, make_rng(0))
     with pytest.raises(DatasetError, match="shorter than 16"):
         fates({"right": Game()}, "recorded", shown, (16,), make_rng(0))
+
+
+def test_passages_stay_where_they_may():
+    cache = recording()
+    allowed = np.zeros(cache.length, bool)
+    allowed[cache.episodes[1][0] + 3 : cache.episodes[1][1] - 2] = True
+    shown = passages(cache, (0, 1, 2), 2, 4, 12, make_rng(0), lambda cache, first, stop: allowed[first:stop])
+    for passage in shown:
+        rows = passage.clip.start + np.arange(len(passage.real) + 1)
+        assert allowed[rows[:-1][passage.real]].all() and allowed[passage.clip.start]

@@ -215,3 +215,10 @@ def test_a_page_of_a_world_without_doubt_has_no_bar(serve_world, open_page):  # 
     page = open_page(serve_world([Panorama()]).url)
     assert page.evaluate("document.getElementById('doubt').hidden")
     assert page.evaluate("terrella.doubt") == -1
+
+
+@pytest.mark.parametrize("told", ["x", float("nan"), -1, None, [0.1]])
+def test_a_strangers_card_does_not_set_the_bar(told):
+    space = spaces.Box(0, 1, (), np.float32)
+    spec = Spec("strange", spaces.Discrete(2), {"uncertainty": space}, (), 0.1, card={"uncertainty": {"sure": told}})
+    assert doubtful(spec) == (0.02, 0.08)

@@ -142,3 +142,12 @@ def test_a_story_among_known_walls_stays_in_the_map():
         state = hold(world, state, 20, "MOVE_FORWARD", *(("TURN_LEFT",) if press % 2 else ("MOVE_RIGHT",)))
         away = (world.memory.pose[:, :2] - state["pose"][0, :2]).norm(dim=-1).min()
         assert away < 1.5, "nobody has ever been so far from where it stands"
+
+
+def test_a_story_that_is_over_stands_still(world):
+    rng = terrella.make_rng(0)
+    state = world.start(2, rng)
+    over = state.replace(done=torch.tensor([True, False]), reward=torch.ones(2))
+    after = world.imagine(over, world.spec.sample_action(2, rng), rng)
+    assert after.at(0) == over.at(0).replace(reward=torch.zeros(1))
+    assert not torch.equal(after["rgb"][1], over["rgb"][1]) or not torch.equal(after["pose"][1], over["pose"][1])
