@@ -127,6 +127,9 @@ def test_foreign_files_are_refused_in_one_sentence(tmp_path):
 
 
 def test_where_takes_whole_entries():
-    ours, theirs = State({"a": torch.zeros(3, 2), "b": torch.zeros(3)}), State({"a": torch.ones(3, 2), "b": torch.ones(3)})
+    ours, theirs = (
+        State({"a": torch.zeros(3, 2), "b": torch.zeros(3)}),
+        State({"a": torch.ones(3, 2), "b": torch.ones(3)}),
+    )
     mixed = ours.where(torch.tensor([True, False, True]), theirs)
     assert mixed["a"].tolist() == [[0, 0], [1, 1], [0, 0]] and mixed["b"].tolist() == [0, 1, 0]
