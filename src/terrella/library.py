@@ -38,15 +38,14 @@ def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = N
              compiled graph where that is faster here: worlds/fast.py), for the game the fields of
              DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
-             `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not.
+             `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not (to give one
+             asks to remember).
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
-    if remember:
+    if remember or eye is not None:
         from .space import remembering
 
         return remembering.remember(load(name, **options), eye=None if eye is None else open_eye(eye))
-    if eye is not None:
-        raise TerrellaError("an eye is for remembering: ask for that too, or leave the eye out.")
     text = str(name)
     if options.get("fast") and text.partition(":")[0] in ("doom", "gym"):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")

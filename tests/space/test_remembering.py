@@ -247,5 +247,5 @@ def test_a_seam_between_memory_and_invention_does_not_show():
 def test_the_bundled_world_remembers_by_itself():
     world = terrella.load("doom-maze", remember=True, memory_mb=2)
     assert isinstance(world, VideoWorld) and world.own.nbytes <= 2 * 2**20
-    with pytest.raises(TerrellaError, match="an eye is for remembering"):
+    with pytest.raises(TerrellaError, match="There is no world"):
         terrella.load("doom-maze", eye="no such file")

@@ -146,7 +146,7 @@ def test_without_the_packages_a_sentence_says_what_to_install(monkeypatch):
 
 def test_fast_is_for_learned_worlds(capsys):
     assert main(["play", "gym:CartPole-v1", "--fast"]) == 2
-    assert "--fast is for learned worlds" in capsys.readouterr().err
+    assert "only a learned world can be drawn faster" in capsys.readouterr().err
 
 
 def test_other_batches_than_the_compiled_one_are_drawn_eagerly(monkeypatch):

@@ -406,12 +406,7 @@ def play(
     from ..core.errors import TerrellaError
     from ..serve import serve
 
-    learned = _load(name, device, memory, fast)
-    if remember or eye is not None:
-        from ..library import open_eye
-        from ..space import remembering
-
-        learned = remembering.remember(learned, eye=None if eye is None else open_eye(eye))
+    learned = _load(name, device, memory, fast, remember=remember, eye=eye)
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
     if compare and picture is not None:
@@ -455,17 +450,14 @@ def _game_like(learned: World, name: str) -> World:
     return library.load(name, **like)
 
 
-def _load(name: str, device: str, memory: bool = True, fast: bool = False) -> World:
+def _load(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:
     """A world by name; only learned worlds have a device, a memory and a faster way of drawing."""
     from .. import library
-    from ..core.errors import TerrellaError
 
-    if name == "doom" or name.startswith(("doom:", "gym:")):
-        if fast:
-            raise TerrellaError(f"--fast is for learned worlds; {name} runs its own engine: leave it out.")
-        return library.load(name)
-    options: dict[str, Any] = {"fast": True} if fast else {}
-    world = library.load(name, device=_device(device), memory=memory, **options)
+    options: dict[str, Any] = {**remembering, **({"fast": True} if fast else {})}
+    if not (name == "doom" or name.startswith(("doom:", "gym:"))):
+        options |= {"device": _device(device), "memory": memory}
+    world = library.load(name, **options)
     if fast:
         say(f"{name}: {world.spec.card.get('fast')}")
     return world
