@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json as json_text
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from tyro.extras import SubcommandApp
 
 from .. import progress
 from . import data as data_room
+from .named import Device, device_of, load_named
 from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ Watch = Annotated[
     str | None,
     arg(name="live-mcap", help="Log while recording: to a file NAME.mcap, or to Foxglove at a port of this machine."),
 ]
-Device = Annotated[str, arg(help="cpu, cuda, or auto: a GPU where there is one.")]
 Fast = Annotated[bool, arg(help="Draw through ONNX Runtime, or a compiled graph on a GPU, if that is faster here.")]
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
@@ -70,12 +70,21 @@ def _app(given: Sequence[str]) -> SubcommandApp:
     recording, training, data, app = SubcommandApp(), SubcommandApp(), SubcommandApp(), SubcommandApp()
     recording.command(name="doom")(record_doom)
     recording.command(name="world")(record_world)
-    training.command(name="video")(_train_video_command() if given[:1] == ["train"] else play)
-    training.command(name="eye")(_train_eye_command() if given[:1] == ["train"] else play)
-    training.command(name="senses")(_train_senses_command() if given[:1] == ["train"] else play)
-    training.command(name="latent-actions")(_train_latent_command() if given[:1] == ["train"] else play)
-    training.command(name="distil")(_train_distil_command() if given[:1] == ["train"] else play)
-    training.command(name="dreams")(_train_dreams_command() if given[:1] == ["train"] else play)
+    if given[:1] == ["train"]:
+        from . import train
+
+        training_commands = {
+            "video": train.video,
+            "eye": train.eye,
+            "senses": train.senses,
+            "latent-actions": train.latent_actions,
+            "distil": train.few_steps,
+            "dreams": train.dreams,
+        }
+        for name, command in training_commands.items():
+            training.command(name=name)(command)
+    else:
+        training.command(name="video")(play)  # never run: it stands for them all
     data.command(data_room.label)
     data.command(data_room.doctor)
     data.command(data_room.convert)
@@ -224,152 +233,6 @@ def _contact_sheet(dataset, path: Path) -> Path:
     return path
 
 
-# -- train ----------------------------------------------------------------------------------------------------------
-
-
-def _train_video_command() -> Callable[..., None]:
-    from ..learn.train_video import TrainConfig, train_video
-
-    defaults = TrainConfig()
-
-    def video(data: Positional[Path], out: Path, config: TrainConfig = defaults, json: Json = False) -> None:
-        """Train a world of pictures on a recording; the same command goes on where it was stopped.
-
-        Args:
-            data: Folder of the dataset.
-            out: Folder of the run: checkpoint, log, and pictures of truth against dream.
-        """
-        with progress.shown("training") as report:
-            facts = train_video(data, out, config, report)
-        result({"run": str(out), **(facts or {})}, json)
-
-    video.__annotations__["config"] = TrainConfig  # it lives in a room that is slow to import, so not in this module
-    return video
-
-
-def _train_eye_command() -> Callable[..., None]:
-    from ..learn.eye import EyeTraining, train_eye
-
-    defaults = EyeTraining()
-
-    def eye(data: Positional[Path], out: Path, config: EyeTraining = defaults, json: Json = False) -> None:
-        """Train an eye that sees depth in one picture, and motion between two, on any recording with depth and poses.
-
-        Args:
-            data: Folder of the dataset.
-            out: Folder for eye.safetensors and eye.json, its errors on the episodes kept out.
-        """
-        with progress.shown("training") as report:
-            facts = train_eye(data, out, config, report)
-        result(facts, json)
-
-    eye.__annotations__["config"] = EyeTraining
-    return eye
-
-
-def _train_senses_command() -> Callable[..., None]:
-    from .. import library
-    from ..learn.senses import SensesConfig, train_senses
-
-    defaults = SensesConfig()
-
-    def senses(
-        name: Positional[str], data: Path, out: Path, config: SensesConfig = defaults, json: Json = False
-    ) -> None:
-        """Give a trained world an eye for lone pictures and a doubt that says when it invents (train video ends with them).
-
-        Args:
-            name: What `terrella list` shows, or the path of a checkpoint.
-            data: The recording that it was trained on.
-            out: Folder for the world with its senses.
-        """
-        with progress.shown("training") as report:
-            facts = train_senses(library.folder_of(name), data, out, config, report)
-        result(facts, json)
-
-    senses.__annotations__["config"] = SensesConfig
-    return senses
-
-
-def _train_latent_command() -> Callable[..., None]:
-    from ..learn.latent_actions import LatentConfig, train_latent_actions
-
-    defaults = LatentConfig()
-
-    def latent_actions(data: Positional[Path], out: Path, config: LatentConfig = defaults, json: Json = False) -> None:
-        """Learn a few actions from pictures alone; `terrella data label` then writes them into a recording.
-
-        Args:
-            data: Folder of the dataset; its own actions, if it has any, are not looked at.
-            out: Folder of the run: checkpoint, log, and pictures of truth, inferred and random actions.
-        """
-        with progress.shown("training") as report:
-            facts = train_latent_actions(data, out, config, report)
-        result({"run": str(out), **(facts or {})}, json)
-
-    latent_actions.__annotations__["config"] = LatentConfig
-    return latent_actions
-
-
-def _train_distil_command() -> Callable[..., None]:
-    from ..learn.distil import DistilConfig, distil
-
-    defaults = DistilConfig()
-
-    def few_steps(
-        name: Positional[str],
-        data: Path,
-        out: Path,
-        config: DistilConfig = defaults,
-        device: Device = "auto",
-        json: Json = False,
-    ) -> None:
-        """Teach a world that draws a frame in many steps (`train video --flow-steps 8`) to draw it in one or two.
-
-        Args:
-            name: The world that teaches: what `terrella list` shows, or a path.
-            data: Folder of a recording of the same game.
-            out: Folder of the run: checkpoint, log, and pictures of truth against dream.
-        """
-        with progress.shown("training") as report:
-            facts = distil(_load(name, device), data, out, config, report)
-        result({"run": str(out), **facts}, json)
-
-    few_steps.__annotations__["config"] = DistilConfig
-    return few_steps
-
-
-def _train_dreams_command() -> Callable[..., None]:
-    from ..learn.self_forcing import DreamsConfig, train_dreams
-
-    defaults = DreamsConfig()
-
-    def dreams(
-        name: Positional[str],
-        data: Path,
-        out: Path,
-        config: DreamsConfig = defaults,
-        teacher: str | None = None,
-        device: Device = "auto",
-        json: Json = False,
-    ) -> None:
-        """Go on training a world inside its own dreams, so that long play drifts less.
-
-        Args:
-            name: The world: what `terrella list` shows, or a path.
-            data: Folder of a recording of the same game.
-            out: Folder of the run: checkpoint, log, and pictures of truth, the old dream and the new.
-            teacher: A world that draws a frame in many steps, of which the dreams should be as sharp: see `train distil`.
-        """
-        master = None if teacher is None else _load(teacher, device)
-        with progress.shown("training") as report:
-            facts = train_dreams(_load(name, device), data, out, config, report, master)
-        result({"run": str(out), **facts}, json)
-
-    dreams.__annotations__["config"] = DreamsConfig
-    return dreams
-
-
 # -- play -----------------------------------------------------------------------------------------------------------
 
 
@@ -406,7 +269,7 @@ def play(
     from ..core.errors import TerrellaError
     from ..serve import serve
 
-    learned = _load(name, device, memory, fast, remember=remember, eye=eye)
+    learned = load_named(name, device, memory, fast, remember=remember, eye=eye)
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
     if compare and picture is not None:
@@ -448,31 +311,6 @@ def _game_like(learned: World, name: str) -> World:
     shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
     like: dict[str, Any] = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
     return library.load(name, **like)
-
-
-def _load(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:
-    """A world by name; only learned worlds have a device, a memory and a faster way of drawing."""
-    from .. import library
-
-    options: dict[str, Any] = {**remembering, **({"fast": True} if fast else {})}
-    if not (name == "doom" or name.startswith(("doom:", "gym:"))):
-        options |= {"device": _device(device), "memory": memory}
-    world = library.load(name, **options)
-    if fast:
-        say(f"{name}: {world.spec.card.get('fast')}")
-    return world
-
-
-def _device(name: str) -> str:
-    import torch
-
-    from ..core.errors import TerrellaError
-
-    if name != "auto":
-        if name.startswith("cuda") and not torch.cuda.is_available():
-            raise TerrellaError(f"--device {name}: this PyTorch finds no GPU here; use --device cpu, or auto.")
-        return name
-    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 # -- score ----------------------------------------------------------------------------------------------------------
@@ -529,8 +367,8 @@ def score(
         raise TerrellaError(
             "--horizons and --clips are whole numbers from 1 up, --drift from 0 up, --long-steps is 0 or at least 100."
         )
-    world, rng, steps = _load(name, device, fast=fast), make_rng(seed), max(horizons)
-    arms = {"memory": world, "no memory": _load(name, device, memory=False, fast=fast)}
+    world, rng, steps = load_named(name, device, fast=fast), make_rng(seed), max(horizons)
+    arms = {"memory": world, "no memory": load_named(name, device, memory=False, fast=fast)}
     if "pose" not in world.spec.observes:  # it lives on history alone: there is no memory to leave out
         arms = {"history": world}
     cache = _cache(data, world)
@@ -566,7 +404,7 @@ def score(
     album = None if cache.pose is None else Album.of_cache(cache)
     closing = {}  # what is seen again by a world that keeps nothing but its last frame
     if len(arms) > 1:
-        closing = {"last frame only": library.load(name, device=_device(device), memory=False, memory_mb=0)}
+        closing = {"last frame only": library.load(name, device=device_of(device), memory=False, memory_mb=0)}
     with progress.shown("scoring") as report:
         tell = lambda share, words: report(share, 1, words)  # noqa: E731
         card = examine(arms, places, rng, config, album, tell, long_clips, closing)
