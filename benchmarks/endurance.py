@@ -1,8 +1,11 @@
 """Runs a world for an hour of its own time without a pause, and prints whether its steps stay as quick and its memory as small.
 
     python benchmarks/endurance.py doom-maze --hours 1 --fast
+    python benchmarks/endurance.py doom-maze --steps 20000 --alone
 
 No browser and no clock hold it back (benchmarks/play.py has both): an hour of a world of 35 steps a second is 126,000 steps.
+A story's own memory goes on from story to story, so that it fills up and stays full. Processor time stands beside the
+clock's, for a machine that is not quiet.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ def main(
     steps: int | None = None,
     threads: int = 1,
     fast: bool = False,
+    alone: bool = False,
+    memory_mb: float = 16.0,
     seed: int = 0,
     json: bool = False,
 ) -> None:
@@ -42,22 +47,31 @@ def main(
         steps: Steps instead of hours.
         threads: Threads that torch is given.
         fast: Draw as `terrella play --fast` does.
+        alone: Leave the recorded keyframes out, so that the story's own memory is all there is.
+        memory_mb: Budget of a story's own memory, in MiB.
         seed: Of the keys that are held and of the world's chance.
         json: Print one JSON document instead of lines.
     """
     torch.set_num_threads(threads)
-    learned = terrella.load(world, **({"fast": True} if fast else {}))
+    learned = terrella.load(world, memory=not alone, memory_mb=memory_mb, fast=fast)
     count = steps or round(hours * 3600 / learned.spec.dt_s)
     if count < 10 * STRETCHES:
         sys.exit(f"{count} steps are too few to compare stretches of; give {10 * STRETCHES} or more.")
     found = run(learned, count, seed)
-    found |= {"world": world, "threads": threads, "way": learned.spec.card.get("fast", "eager torch"), "seed": seed}
+    found |= {
+        "world": world,
+        "memory_mb": memory_mb,
+        "alone": alone,
+        "threads": threads,
+        "way": learned.spec.card.get("fast", "eager torch"),
+        "seed": seed,
+    }
     print(jsonlib.dumps(found, indent=1) if json else report(found))
 
 
 def run(learned, steps: int, seed: int) -> dict:
     """One story after the other, under keys held for a quarter of a second to a second; per stretch of the run the wall and
-    processor time of a step (imagine and draw), the resident memory and the size of the state."""
+    processor time of a step (imagine and draw), the resident memory, the size of the state, and of its own memory."""
     rng, keys = terrella.make_rng(seed), terrella.make_rng(seed + 1)
     state, stories, left, stretches = learned.start(1, rng), 1, 0, []
     for _ in range(20):
@@ -76,10 +90,12 @@ def run(learned, steps: int, seed: int) -> dict:
             wall.append((time.perf_counter() - then) * 1e3)
             cpu.append((time.process_time() - worked) * 1e3)
             if bool(learned.render(state, ("done",))["done"][0]):
-                state, stories = learned.start(1, rng), stories + 1
+                kept = {name: state[name] for name in state if name.startswith("memory_")}
+                state, stories = learned.start(1, rng).replace(**kept), stories + 1
         gc.collect()
         row = {"steps": stop, "ms": statistics.median(wall), "p95_ms": late(wall), "cpu_ms": statistics.median(cpu)}
-        stretches.append({**row, "resident_mib": resident_mib(), "state_mib": state.nbytes / 2**20})
+        row |= {"resident_mib": resident_mib(), "state_mib": state.nbytes / 2**20, **own_memory(learned, state)}
+        stretches.append(row)
         print(f"  {stop:,} of {steps:,} steps: {row['ms']:.1f} ms", file=sys.stderr, flush=True)
     lasted = time.perf_counter() - begun
     first, last = stretches[0], stretches[-1]
@@ -95,6 +111,15 @@ def run(learned, steps: int, seed: int) -> dict:
         "peak_resident_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform != "darwin" else 2**20),
     }
+
+
+def own_memory(learned, state) -> dict:
+    """Keyframes of the story's own, and the MiB that they take."""
+    if "keyframes" not in learned.spec.channels:
+        return {}
+    kinds = learned.render(state, ("keyframes",))["keyframes"][0, :, 3]
+    taken = sum(tensor.numel() * tensor.element_size() for name, tensor in state.items() if name.startswith("memory_"))
+    return {"keyframes": int((kinds > 1).sum()), "memory_mib": taken / 2**20}
 
 
 def late(times: list[float]) -> float:
@@ -117,6 +142,11 @@ def report(found: dict) -> str:
         lines.append(
             f"  to {row['steps']:9,}: {row['ms']:6.2f} ms (95%: {row['p95_ms']:.2f}; processor {row['cpu_ms']:.2f}), resident "
             f"{row['resident_mib']:,.0f} MiB, state {row['state_mib']:.1f} MiB"
+            + (
+                f", {row['keyframes']} keyframes of its own in {row['memory_mib']:.2f} MiB"
+                if "keyframes" in row
+                else ""
+            )
         )
     growth = found["growth"]
     lines.append(

@@ -32,7 +32,9 @@ from terrella.measure import (
     speed,
     write_report,
 )
-from terrella.worlds.video import VideoWorld, encode_depth, merge
+from terrella.space.keyframes import merge
+from terrella.worlds.generator import encode_depth
+from terrella.worlds.video import VideoWorld
 
 ARMS = ("memory", "no memory", "no network")
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)

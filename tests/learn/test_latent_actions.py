@@ -113,17 +113,17 @@ def test_a_stopped_run_goes_on_exactly(recording, tmp_path, monkeypatch):
     class Stop(Exception):
         pass
 
-    original = module._Run._step
+    original = module._Run.step
 
     def stopping(self, step):
         if step == 2:
             raise Stop
         return original(self, step)
 
-    monkeypatch.setattr(module._Run, "_step", stopping)
+    monkeypatch.setattr(module._Run, "step", stopping)
     with pytest.raises(Stop):
         train_latent_actions(recording, tmp_path / "cut", replace(config, save_every_s=-1.0), quiet)
-    monkeypatch.setattr(module._Run, "_step", original)
+    monkeypatch.setattr(module._Run, "step", original)
     train_latent_actions(recording, tmp_path / "cut", config, quiet)
     whole, cut = (load_file(tmp_path / name / "resume.safetensors") for name in ("whole", "cut"))
     assert whole.keys() == cut.keys() and all(torch.equal(whole[name], cut[name]) for name in whole)

@@ -15,7 +15,8 @@ from terrella.learn.samples import Recording
 from terrella.space.camera import planar_pose, rays, rotation, yaw
 from terrella.space.floorplan import slide
 from terrella.space.keyframes import Keyframes
-from terrella.worlds.video import Motion, VideoConfig, turned
+from terrella.worlds.generator import VideoConfig
+from terrella.worlds.motion import Motion, turned
 
 CAMERA, HALF_ROOM = (0.5, 0.8, 0.5, 0.5), 3.0
 DRAG, THRUST, TURN, BODY, SHORT = 0.9, 0.01, 0.06, 0.35, 1 / 16

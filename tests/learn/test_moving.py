@@ -16,7 +16,8 @@ from terrella.learn.moving import mirrored, moving_lesson, other_side
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.worlds.folder import load_world
-from terrella.worlds.video import VideoConfig, VideoWorld
+from terrella.worlds.generator import VideoConfig
+from terrella.worlds.video import VideoWorld
 
 CONFIG = TrainConfig(
     size=(24, 32),

@@ -15,9 +15,9 @@ from terrella.learn.outcome import Happenings, examine_outcome, levels, train_ou
 from terrella.learn.samples import Recording, controls_of
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.worlds.folder import load_world, video_spec
+from terrella.worlds.generator import Generator, VideoConfig
 from terrella.worlds.history import HistoryWorld, Starts
 from terrella.worlds.outcome import Outcome
-from terrella.worlds.video import Generator, VideoConfig
 
 SIZE, FACTS = (16, 24), {"discrete": True, "action_low": [0], "action_high": [2], "action_names": ["STAY", "L", "R"]}
 

@@ -16,13 +16,14 @@ from tests.learn.test_moving import Haunted
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import Explorer, Layout, Recorder, record
-from terrella.learn.distil import DistilConfig, Matching, distil, drawn, recorded_lesson
-from terrella.learn.post_training import Updates, beside
+from terrella.learn.distil import DistilConfig, Matching, distil, drawn
+from terrella.learn.post_training import beside
 from terrella.learn.self_forcing import Dreams, DreamsConfig, beginnings, train_dreams
 from terrella.learn.train_video import TrainConfig, train_video
+from terrella.learn.updates import Updates
 from terrella.worlds.folder import load_world
+from terrella.worlds.generator import generate
 from terrella.worlds.history import HistoryWorld
-from terrella.worlds.video import generate
 
 TEACHER = TrainConfig(
     size=(24, 32),
@@ -198,7 +199,7 @@ def test_dreams_begin_where_the_episode_lasts(recording, teacher):
 def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(recording, teacher):
     pair = beside(wild(teacher), recording, None, quiet)
     generator = pair.world.generator.requires_grad_(True)
-    lesson = recorded_lesson(pair, 2, np.random.default_rng(0))
+    lesson = pair.lesson(2, np.random.default_rng(0))
     seen = lesson.glimpse, lesson.last, lesson.told
     noise, exits = torch.randn(lesson.truth.shape, generator=make_rng(1)), set()
     for seed in range(12):
@@ -218,7 +219,7 @@ def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(recording
 
 def test_where_the_student_draws_as_the_teacher_nothing_pulls(recording, teacher):
     pair = beside(wild(teacher), recording, None, quiet)
-    lesson, matching = recorded_lesson(pair, 2, np.random.default_rng(0)), Matching(teacher.generator)
+    lesson, matching = pair.lesson(2, np.random.default_rng(0)), Matching(teacher.generator)
     clean = lesson.truth.clone().requires_grad_()
     (still,) = torch.autograd.grad(matching.towards_teacher(clean, lesson, make_rng(2)), clean)
     assert not still.any()

@@ -21,7 +21,7 @@ from terrella.learn.samples import Lesson, choose_keyframes, usable_rows
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.video import mood
+from terrella.worlds.generator import mood
 
 CONFIG = TrainConfig(
     size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, eye_steps=0,
@@ -102,7 +102,7 @@ def test_a_foreign_resume_file_is_refused(recording, tmp_path):
 
 
 def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp_path, monkeypatch):
-    from terrella.learn import train_video as module
+    from terrella.learn import losses as module
 
     monkeypatch.setattr(module, "_l1", lambda a, b: (a - b).abs().mean() * float("nan"))
     with pytest.raises(TrainingError, match="not a number at step 0"):

@@ -16,9 +16,9 @@ from terrella.space.keyframes import Glimpse
 from terrella.worlds import fast
 from terrella.worlds.fast import EAGER, ONNX, compiled, example, quicken, through_onnx
 from terrella.worlds.folder import video_spec
+from terrella.worlds.generator import Generator, VideoConfig, generate
 from terrella.worlds.history import HistoryWorld, Starts
 from terrella.worlds.moving import PLANES
-from terrella.worlds.video import Generator, VideoConfig, generate
 
 PARITY = 2e-6  # of colours in [-1, 1], so far below one level of 255
 

@@ -11,9 +11,9 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import ActionError
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world, video_spec
+from terrella.worlds.generator import Generator, VideoConfig
 from terrella.worlds.history import HistoryWorld, Starts
 from terrella.worlds.outcome import Outcome, OutcomeConfig
-from terrella.worlds.video import Generator, VideoConfig
 
 SIZE = (16, 24)
 

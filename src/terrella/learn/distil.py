@@ -13,12 +13,11 @@ from torch import nn
 
 from ..core.errors import TrainingError
 from ..core.world import World, make_rng
-from ..worlds.video import Generator, VideoWorld, generate
-from .lessons import Dream, history_lesson, place_lesson
-from .moving import moving_lesson
-from .post_training import Beside, Report, Updates, beside, descend, leave, recipe_of, with_generator
+from ..worlds.generator import Generator, generate
+from .losses import Critic, flow_losses, frame_losses, half_precision, sharpened
+from .post_training import Beside, beside, leave, recipe_of, with_generator
 from .samples import Box, Lesson
-from .train_video import Critic, flow_losses, frame_losses, half_precision, sharpened
+from .updates import Report, Updates, descend
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Matching:
             noisy, time = _noised(clean.detach()[:, :4], rng)
             again = self.mimic(noisy, time, lesson.glimpse, lesson.last, lesson.told)[:, :4].float()
             losses = flow_losses(again, clean.detach()[:, :4], time)
-        descend(self.optimiser, self.mimic, losses["rgb"] + 0.5 * losses["depth"], step)
+        descend(self.optimiser, losses["rgb"] + 0.5 * losses["depth"], step, self.mimic)
         return float(losses["rgb"].detach())
 
 
@@ -100,7 +99,7 @@ def learn_critic(
     with half_precision(clean.device):
         true, dreamt = critic(real.truth[:, :3], real.glimpse), critic(clean.detach()[:, :3], lesson.glimpse)
         loss = F.relu(1 - true).mean() + F.relu(1 + dreamt).mean()
-    descend(optimiser, critic, loss, step)
+    descend(optimiser, loss, step, critic)
     return float(loss.detach())
 
 
@@ -156,13 +155,13 @@ def distil(teacher: World, data: str | Path, out: str | Path, config: DistilConf
             with torch.no_grad(), half_precision(pair.device):
                 return generate(student, noise, shown.glimpse, shown.last, shown.told, config.flow_steps).float().cpu()
 
-        lesson = recorded_lesson(pair, config.batch, rng, dream).to(pair.device)
+        lesson = pair.lesson(config.batch, rng, dream).to(pair.device)
         clean = drawn(student, noise_for(pair, config.batch, noise_rng), lesson, config.flow_steps, rng)
         losses = truth_losses(clean, lesson)
         teacher = matching.towards_teacher(clean, lesson, noise_rng)
         loss = config.truth_weight * sum_of(losses) + config.teacher_weight * teacher
         loss = loss + sharpened(critic, clean, loss, lesson.glimpse, config.critic_weight * trusted(step))
-        descend(optimiser, student, loss, step)
+        descend(optimiser, loss, step, student)
         follow(smooth, student, step)
         told = {name: float(value.detach()) for name, value in losses.items()}
         told["teacher"] = float(teacher.detach())
@@ -174,10 +173,11 @@ def distil(teacher: World, data: str | Path, out: str | Path, config: DistilConf
         facts = {
             "distilled": f"{world.config.steps} to {config.flow_steps} steps a frame, {updates.facts['step']} updates"
         }
-        leave(pair, with_generator(world, smooth, config.flow_steps, facts), world, updates.out, updates.facts["step"])
+        leave(pair, with_generator(world, smooth, config.flow_steps, facts), world, updates)
 
     updates.run(config.steps, update, draw, config.save_every_s, config.strip_every_s, report)
-    return {"world": str(updates.out / "world"), **{k: v for k, v in updates.facts.items() if k != "recipe"}}
+    draw()
+    return {"world": str(updates.out / "world"), **updates.told}
 
 
 def truth_losses(clean: torch.Tensor, lesson: Lesson) -> dict[str, torch.Tensor]:
@@ -197,15 +197,6 @@ def sum_of(losses: dict[str, torch.Tensor]) -> torch.Tensor:
 def noise_for(pair: Beside, batch: int, rng: torch.Generator) -> torch.Tensor:
     """What `batch` frames are drawn from: [B, 4, H, W]."""
     return torch.randn(batch, 4, *pair.world.config.size, generator=rng).to(pair.device)
-
-
-def recorded_lesson(pair: Beside, batch: int, rng: np.random.Generator, dream: Dream | None = None) -> Lesson:
-    """A lesson as in `train video`; with `dream`, the last frame is in half of them one of the generator's own."""
-    if isinstance(pair.world, VideoWorld) and pair.world.config.moving:
-        return moving_lesson(pair.recording, pair.world.memory, pair.world.config, batch, rng, dream)
-    if isinstance(pair.world, VideoWorld):
-        return place_lesson(pair.recording, pair.world.memory, pair.world.config, batch, rng, dream)
-    return history_lesson(pair.recording, pair.world.config, batch, rng, dream)
 
 
 def follow(smooth: nn.Module, raw: nn.Module, step: int) -> None:

@@ -8,23 +8,21 @@ to name it from the two frames. Recorded actions are never looked at.
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import nn
 
 from ..core.errors import DatasetError, TrainingError
 from ..data import ClipCache, Dataset, split
 from .latent_model import Forward, Inverse
-from .run_folder import load_run, save_run
+from .run_folder import load_run
+from .strips import write_lines
+from .updates import Report, Updates, descend, device_named
 
-Report = Callable[[float, float, str], None]
 EVEN_FOR = 0.5  # share of the training in which the codes are shared out evenly
 
 BENDING = 0.003  # of the loss, for each pixel by which a frame bends the motion of a code
@@ -67,14 +65,12 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 32 or more.")
     if not 2 <= config.codes <= 64 or config.stride < 1 or config.steps < 1 or config.batch < 1:
         raise TrainingError("--codes is 2 to 64, and --stride, --steps and --batch are 1 or more.")
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise TrainingError("there is no GPU that PyTorch can use here: leave --device out, or say cpu.")
+    device_named(config.device)
     cache = pictures(data, config.size, report)
-    out.mkdir(parents=True, exist_ok=True)
     run = _Run(cache, out, config)
-    run.learn(report)
+    run.updates.run(config.steps, run.step, run.draw_strip, config.save_every_s, config.strip_every_s, report)
     run.draw_strip()
-    return {"run": str(out), **{key: value for key, value in run.facts.items() if key != "recipe"}}
+    return {"run": str(out), **run.updates.told}
 
 
 def pictures(data: str | Path, size: tuple[int, int], report: Report) -> ClipCache:
@@ -102,7 +98,7 @@ class LatentModel:
 
     def __init__(self, config: LatentConfig):
         self.config = config
-        self.device = torch.device(_device(config.device))
+        self.device = device_named(config.device)
         self.inverse, self.forward = Inverse(config.codes).to(self.device), Forward(config.codes).to(self.device)
         self.modules: dict[str, nn.Module] = {"inverse": self.inverse, "forward": self.forward}
 
@@ -147,48 +143,15 @@ class _Run:
                 "64 are needed: record more, or give a smaller --stride."
             )
         weights = [weight for module in self.model.modules.values() for weight in module.parameters()]
-        self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "optimiser": torch.optim.AdamW(weights, config.learning_rate, (0.9, 0.99), weight_decay=1e-4)
-        }
-        self.facts = {"recipe": _recipe(config, cache), "step": 0, "seconds": 0.0}
+        self.optimiser = torch.optim.AdamW(weights, config.learning_rate, (0.9, 0.99), weight_decay=1e-4)
+        self.updates = Updates(out, _recipe(config, cache), self.model.modules, {"optimiser": self.optimiser})
 
-    def learn(self, report: Report) -> None:
-        found = load_run(self.out, {}, {})
-        if found:
-            if found.get("recipe") != self.facts["recipe"]:
-                raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
-            self.facts = load_run(self.out, self.model.modules, self.optimisers) or found
-        began = saved = drawn = time.monotonic()
-        before, recent, whole = self.facts["seconds"], [], True
-        try:
-            while self.facts["step"] < self.config.steps:
-                whole = False  # a step that Ctrl-C cuts is not saved: the last save goes on exactly
-                recent.append(self._step(self.facts["step"]))
-                self.facts["step"] += 1
-                whole = True
-                now = time.monotonic()
-                self.facts["seconds"] = before + now - began
-                if len(recent) == 20:
-                    self._log(recent, report)
-                    recent = []
-                if now - saved > self.config.save_every_s:
-                    self._save()
-                    saved = now
-                if now - drawn > self.config.strip_every_s:
-                    self.draw_strip()
-                    drawn = time.monotonic()
-        except KeyboardInterrupt:
-            if whole:
-                self._save()
-            raise
-        self._save()
-
-    def _step(self, step: int) -> dict[str, float]:
+    def step(self, step: int) -> dict[str, float]:
         """One step; all its randomness comes from (seed, step), so a resumed run sees what an unbroken one would."""
         config, model = self.config, self.model
         rng = np.random.default_rng([config.seed, step])
         share = step / config.steps
-        for group in self.optimisers["optimiser"].param_groups:
+        for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * min(1, (step + 1) / 50) * (0.525 + 0.475 * np.cos(np.pi * share))
         rows = rng.choice(self.rows, config.batch)
         before = frames_at(self.cache, rows).to(model.device)
@@ -206,22 +169,8 @@ class _Run:
             raise TrainingError(
                 f"the loss is not a number at step {step}; the last save is good: lower --learning-rate."
             )
-        self.optimisers["optimiser"].zero_grad()
-        total.backward()
-        for module in model.modules.values():
-            nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-        self.optimisers["optimiser"].step()
+        descend(self.optimiser, total, step, *model.modules.values())
         return {name: float(value.detach()) for name, value in losses.items()}
-
-    def _log(self, recent: list[dict], report: Report) -> None:
-        mean = {name: float(np.mean([one[name] for one in recent])) for name in recent[-1]}
-        line = {"step": self.facts["step"], "seconds": round(self.facts["seconds"]), **mean}
-        with open(self.out / "log.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
-        report(self.facts["step"], self.config.steps, " ".join(f"{name} {value:.4f}" for name, value in mean.items()))
-
-    def _save(self) -> None:
-        save_run(self.out, self.model.modules, self.optimisers, self.facts)
 
     def draw_strip(self) -> None:
         """Eight held-out moments from left to right; from above: the frame, what followed, the outcome of the inferred code,
@@ -237,9 +186,8 @@ class _Run:
             for _ in range(3):
                 frame = self.model.predict(frame, torch.full((8,), code))[0]
             lines.append(frame)
-        picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0)
-        picture = (255 * picture).round().to(torch.uint8).numpy()
-        Image.fromarray(picture).save(self.out / f"strip-{self.facts['step']:06d}.png")
+        coded = [(255 * line).round().to(torch.uint8) for line in lines]
+        write_lines(coded, self.out / f"strip-{self.updates.facts['step']:06d}.png")
 
 
 def posterior(errors: torch.Tensor, share: float) -> torch.Tensor:
@@ -265,7 +213,3 @@ def _recipe(config: LatentConfig, cache: ClipCache) -> dict:
     """What must not change within a run; where it runs, and how often it saves, may."""
     fixed = asdict(replace(config, device="", save_every_s=0, strip_every_s=0))
     return json.loads(json.dumps({**fixed, "frames": cache.length}))
-
-
-def _device(name: str) -> str:
-    return name if name != "auto" else "cuda" if torch.cuda.is_available() else "cpu"

@@ -13,7 +13,8 @@ from ..core.errors import DatasetError
 from ..data import ClipCache, Dataset, Readings, Sensor, Source, Take, split, write_source
 from ..data.source import is_action
 from ..space.camera import yaw
-from .latent_actions import LatentModel, Report, frames_at, load_latent, pair_rows, pictures
+from .latent_actions import LatentModel, frames_at, load_latent, pair_rows, pictures
+from .updates import Report
 
 ROLLED = 4  # predictions in a row, for the figure over several steps
 CLIP = 16  # rows of the clips over which intervals are drawn

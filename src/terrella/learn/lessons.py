@@ -5,20 +5,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 
 from ..space.keyframes import Glimpse, Keyframes
+from ..worlds.generator import MOOD, VideoConfig, decode_depth, encode_depth, mood
 from ..worlds.history import past
-from ..worlds.video import MOOD, VideoConfig, decode_depth, encode_depth, mood
-from .samples import Lesson, Recording, carried, draw, glimpse_of
+from .moving import moving_lesson
+from .samples import Dream, Lesson, Recording, carried, draw, glimpse_of
 
 DREAMT, OFTEN = (0, 1, 2, 4), (0.4, 0.3, 0.2, 0.1)  # frames of a history that are dreamt, and in what share of lessons
 CHANGED = 20.0  # see `changing`
-# Dream(lesson without truth) -> clean frames [B, 4, H, W] in the generator's code
-Dream = Callable[[Lesson], torch.Tensor]
+
+
+def recorded_lesson(
+    recording: Recording,
+    memory: Keyframes | None,
+    config: VideoConfig,
+    batch: int,
+    rng: np.random.Generator,
+    dream: Dream | None,
+) -> Lesson:
+    """A batch for a world of this kind: with a `memory` it is a place, where things may move; without, a history."""
+    if memory is None:
+        return history_lesson(recording, config, batch, rng, dream)
+    of_place = moving_lesson if config.moving else place_lesson
+    return of_place(recording, memory, config, batch, rng, dream)
 
 
 def place_lesson(

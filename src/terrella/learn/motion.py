@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from ..space.camera import yaw
 from ..space.floorplan import floor_plan, slide
 from ..space.keyframes import Keyframes
-from ..worlds.video import Motion, VideoConfig
+from ..worlds.generator import VideoConfig
+from ..worlds.motion import Motion
 from .samples import Recording
 
 Report = Callable[[int, int, str], None]

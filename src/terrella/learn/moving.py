@@ -9,10 +9,9 @@ import torch
 import torch.nn.functional as F
 
 from ..space.keyframes import Glimpse, Keyframes
+from ..worlds.generator import MOOD, VideoConfig, decode_depth, encode_depth, mood
 from ..worlds.moving import Frame, carry_frames
-from ..worlds.video import MOOD, VideoConfig, decode_depth, encode_depth, mood
-from .lessons import Dream
-from .samples import Lesson, Recording, draw, glimpse_of
+from .samples import Dream, Lesson, Recording, draw, glimpse_of
 
 OFTEN = (0.4, 0.3, 0.2, 0.1)  # the share of lessons in which 0, 1, 2, 3 frames are dreamt
 COUNTS = 4.0  # a pixel of a thing counts for so many others more: else a far monster is cheaper to forget than to draw

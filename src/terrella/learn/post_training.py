@@ -1,32 +1,27 @@
-"""What further training of a finished world shares: the world and a recording beside it, updates with exact resume."""
+"""What further training of a finished world shares: the world with a recording beside it, and what it leaves."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
-import json
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
-from torch import nn
 
 from ..core.errors import DatasetError, TrainingError
-from ..core.world import World, make_rng
+from ..core.world import World
 from ..data import ClipCache, Dataset, split
 from ..worlds.controls import Controls
 from ..worlds.folder import save_world
+from ..worlds.generator import Generator, channels_last
 from ..worlds.history import HistoryWorld
-from ..worlds.video import Generator, VideoWorld, channels_last
-from .run_folder import load_run, save_run
-from .samples import THINGS, Box, Recording, controls_of, usable_rows
-
-Report = Callable[[float, float, str], None]
-Learned = VideoWorld | HistoryWorld
+from ..worlds.video import VideoWorld
+from .lessons import Dream, recorded_lesson
+from .samples import THINGS, Box, Lesson, Recording, controls_of, usable_rows
+from .strips import Learned, draw_strip
+from .updates import Report, Updates
 
 
 @dataclass(frozen=True)
@@ -41,6 +36,10 @@ class Beside:
     @property
     def device(self) -> torch.device:
         return next(self.world.generator.parameters()).device
+
+    def lesson(self, batch: int, rng: np.random.Generator, dream: Dream | None = None) -> Lesson:
+        memory = self.world.memory if isinstance(self.world, VideoWorld) else None
+        return recorded_lesson(self.recording, memory, self.world.config, batch, rng, dream)
 
 
 def beside(world: World, data: str | Path, keep_out: Box | None, report: Report) -> Beside:
@@ -104,113 +103,14 @@ def fingerprint(generator: Generator) -> str:
     return digest.hexdigest()[:16]
 
 
-class Updates:
-    """The steps of a run in the folder `out`: resumed exactly, logged, saved, and drawn now and then.
-
-    All of a step's randomness comes from (seed, step): an interrupted run sees what an unbroken one would.
-    """
-
-    def __init__(self, out: str | Path, recipe: dict, modules: dict[str, nn.Module], optimisers: dict):
-        self.out, self.modules, self.optimisers = Path(out), modules, optimisers
-        self.out.mkdir(parents=True, exist_ok=True)
-        self.facts = {"recipe": json.loads(json.dumps(recipe)), "step": 0, "seconds": 0.0}
-        found = load_run(self.out, {}, {})
-        if found and found.get("recipe") != self.facts["recipe"]:
-            raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
-        if found:
-            self.facts = load_run(self.out, modules, optimisers) or found
-
-    def run(
-        self,
-        steps: int,
-        update: Callable[[int], dict[str, float]],
-        draw: Callable[[], None],
-        save_every_s: float,
-        strip_every_s: float,
-        report: Report,
-    ) -> None:
-        """`update(step)` until `steps` are done; `draw()` leaves the world as it now is, and a picture of it."""
-        facts, recent, whole = self.facts, [], True
-        began = saved = drawn = time.monotonic()
-        before = facts["seconds"]
-        try:
-            while facts["step"] < steps:
-                whole = False  # a step that Ctrl-C cuts is not saved: the last save goes on exactly
-                recent.append(update(facts["step"]))
-                facts["step"] += 1
-                whole = True
-                now = time.monotonic()
-                facts["seconds"] = before + now - began
-                if now - saved > save_every_s:
-                    self.save()
-                    saved = now
-                if len(recent) == 20 or facts["step"] == steps:
-                    self._log(recent, steps, report)
-                    recent = []
-                if now - drawn > strip_every_s:
-                    draw()
-                    drawn = time.monotonic()
-        except KeyboardInterrupt:
-            if whole:
-                self.save()
-            raise
-        self.save()
-        draw()
-
-    def save(self) -> None:
-        save_run(self.out, self.modules, self.optimisers, self.facts)
-
-    def _log(self, recent: list[dict[str, float]], steps: int, report: Report) -> None:
-        mean = {name: float(np.mean([one[name] for one in recent])) for name in recent[-1]}
-        with open(self.out / "log.jsonl", "a") as file:
-            file.write(json.dumps({"step": self.facts["step"], "seconds": round(self.facts["seconds"]), **mean}) + "\n")
-        report(self.facts["step"] / steps, 1.0, " ".join(f"{name} {value:.4f}" for name, value in mean.items()))
-
-
 def recipe_of(config, world: Learned, dataset: Dataset) -> dict:
     """What must not change within a run; where and how often it is saved may."""
     fixed = {k: v for k, v in asdict(config).items() if k not in ("save_every_s", "strip_every_s", "device")}
     return {**fixed, "world": fingerprint(world.generator), "frames": dataset.length}
 
 
-def descend(optimiser: torch.optim.Optimizer, module: nn.Module, loss: torch.Tensor, step: int) -> None:
-    """One step down the gradient, its norm cut at 1; TrainingError where it is not a number."""
-    optimiser.zero_grad()
-    loss.backward()
-    if not torch.isfinite(nn.utils.clip_grad_norm_(module.parameters(), 1.0)):
-        raise TrainingError(f"a gradient is not a number at step {step}; the last save is good: lower --learning-rate.")
-    optimiser.step()
-
-
-def leave(beside: Beside, world: Learned, old: Learned, out: Path, step: int) -> None:
-    """The world in out/world, and 64 steps of a held-out episode: truth above the old world's dream above the new's."""
-    save_world(world, out / "world", dict(world.spec.card))
-    recording = beside.recording
-    first, last = recording.cache.episodes[(beside.held_out or [0])[0]]
-    rows = np.arange(max(first, min(first + 40, last - 65)), last)[:65]
-    lines = [recording.rgb(rows[::8]), *(_dream(one, recording, rows) for one in (old, world))]
-    picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
-    Image.fromarray(picture).save(out / f"strip-{step:06d}.png")
-
-
-def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
-    move, the recorded actions."""
-    rng, config = make_rng(1), world.config
-    seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
-    if config.geometry:
-        seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
-    if config.moving:
-        seen["things"] = recording.things(rows[:1])
-    state = world.observe(seen, None, rng)
-    frames = [world.render(state, ("rgb",))["rgb"]]
-    for row in rows[1:]:
-        if config.geometry and not config.moving:  # what moves answers to actions
-            state = world.observe({"pose": recording.pose([row])}, state, rng)
-        else:
-            action = (
-                recording.cache.action[row - 1].astype(world.spec.action.dtype).reshape(world.spec.action.shape or ())
-            )
-            state = world.imagine(state, torch.from_numpy(action)[None], rng)
-        frames.append(world.render(state, ("rgb",))["rgb"])
-    return torch.cat(frames)[::8].permute(0, 3, 1, 2)
+def leave(beside: Beside, world: Learned, old: Learned, updates: Updates) -> None:
+    """The world in the run's folder, and a strip of the old world's dream above the new one's."""
+    save_world(world, updates.out / "world", dict(world.spec.card))
+    path = updates.out / f"strip-{updates.facts['step']:06d}.png"
+    draw_strip((old, world), beside.recording, beside.held_out, path)

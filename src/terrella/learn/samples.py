@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,9 @@ from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
 from ..worlds.controls import AXES, CHOICE, Controls
+from ..worlds.generator import VideoConfig
 from ..worlds.moving import still
-from ..worlds.video import VideoConfig, carry
+from ..worlds.video import carry
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish
 
@@ -128,6 +130,10 @@ class Lesson:
         weight = None if self.weight is None else self.weight.to(device)
         glimpse, last = self.glimpse.to(device), self.last.to(device)
         return Lesson(glimpse, last, self.told.to(device), self.truth.to(device), weight)
+
+
+# Dream(lesson without truth) -> clean frames [B, 4, H, W] in the generator's code
+Dream = Callable[[Lesson], torch.Tensor]
 
 
 @dataclass(frozen=True)

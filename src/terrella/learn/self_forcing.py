@@ -18,24 +18,15 @@ import torch
 
 from ..core.errors import DatasetError, TrainingError
 from ..core.world import World, make_rng
+from ..worlds.generator import encode_depth
 from ..worlds.history import HistoryWorld
-from ..worlds.video import VideoWorld, encode_depth
-from .distil import Matching, drawn, follow, learn_critic, noise_for, recorded_lesson, sum_of, trusted, truth_losses
+from ..worlds.video import VideoWorld
+from .distil import Matching, drawn, follow, learn_critic, noise_for, sum_of, trusted, truth_losses
 from .lessons import changing
-from .post_training import (
-    Beside,
-    Learned,
-    Report,
-    Updates,
-    beside,
-    descend,
-    fingerprint,
-    leave,
-    recipe_of,
-    with_generator,
-)
+from .losses import Critic, sharpened
+from .post_training import Beside, Learned, beside, fingerprint, leave, recipe_of, with_generator
 from .samples import Box, Lesson
-from .train_video import Critic, sharpened
+from .updates import Report, Updates, descend
 
 CONTEXT = 10  # recorded frames before a dream
 
@@ -207,9 +198,9 @@ def train_dreams(
                 loss = loss + config.teacher_weight * losses["teacher"]
             if config.critic_weight:
                 loss = loss + sharpened(critic, clean, loss, lesson.glimpse, config.critic_weight * trusted(number))
-            descend(optimiser, generator, loss, number)
+            descend(optimiser, loss, number, generator)
             follow(smooth, generator, number)
-            real = recorded_lesson(pair, config.batch, rng).to(pair.device)
+            real = pair.lesson(config.batch, rng).to(pair.device)
             told = {name: float(value.detach()) for name, value in losses.items()}
             told["critic"] = learn_critic(critic, critic_optimiser, clean, lesson, real, number)
             if matching is not None:
@@ -220,7 +211,8 @@ def train_dreams(
 
     def draw() -> None:
         facts = {"dreams": f"{updates.facts['step'] * config.batch:,} of {config.horizon} frames"}
-        leave(pair, with_generator(old, smooth, flow_steps, facts), old, updates.out, updates.facts["step"])
+        leave(pair, with_generator(old, smooth, flow_steps, facts), old, updates)
 
     updates.run(config.steps, update, draw, config.save_every_s, config.strip_every_s, report)
-    return {"world": str(updates.out / "world"), **{k: v for k, v in updates.facts.items() if k != "recipe"}}
+    draw()
+    return {"world": str(updates.out / "world"), **updates.told}

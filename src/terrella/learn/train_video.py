@@ -4,33 +4,33 @@ from __future__ import annotations
 
 import copy
 import json
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import nn
 
 from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
-from ..space.keyframes import Glimpse, Keyframes
+from ..space.keyframes import Keyframes
 from ..worlds.controls import BUTTONS
 from ..worlds.folder import save_world, video_spec
+from ..worlds.generator import Generator, VideoConfig, channels_last, generate
 from ..worlds.history import HistoryWorld, Starts
+from ..worlds.motion import Motion
 from ..worlds.outcome import Outcome
-from ..worlds.video import Generator, Motion, VideoConfig, VideoWorld, channels_last, generate, merge
-from .lessons import history_lesson, place_lesson
+from ..worlds.video import VideoWorld
+from .lessons import recorded_lesson
+from .losses import Critic, flow_losses, frame_losses, half_precision, sharpened
 from .motion import train_motion
-from .moving import moving_lesson
 from .outcome import Happenings, train_outcome
-from .run_folder import load_run, save_run
 from .samples import THINGS, Box, Lesson, Recording, choose_keyframes, controls_of, open_views, usable_rows
 from .senses import SensesConfig, learn_senses
+from .strips import draw_strip
+from .updates import Report, Updates, descend, device_named
 
 
 @dataclass(frozen=True)
@@ -89,39 +89,18 @@ class TrainConfig:
     device: str = "auto"
 
 
-class Critic(nn.Module):
-    """Judges 16-pixel patches: real or dreamt, given what memory knew (hinge loss)."""
-
-    def __init__(self):
-        super().__init__()
-        widths = (3 + 3 + 1, 32, 48, 64)
-        self.layers = nn.ModuleList(
-            nn.utils.parametrizations.spectral_norm(nn.Conv2d(a, b, 4, 2, 1)) for a, b in zip(widths, widths[1:])
-        )
-        self.judge = nn.utils.parametrizations.spectral_norm(nn.Conv2d(widths[-1], 1, 3, 1, 1))
-
-    def forward(self, rgb: torch.Tensor, glimpse) -> torch.Tensor:
-        x = torch.cat([rgb, merge(glimpse) * 2 - 1, glimpse.known[:, None]], 1)
-        for layer in self.layers:
-            x = F.leaky_relu(layer(x), 0.2)
-        return self.judge(x)
-
-
-def train_video(
-    data: str | Path, out: str | Path, config: TrainConfig, report: Callable[[float, float, str], None]
-) -> dict:
+def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> dict:
     """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
     out = Path(out)
     if any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise TrainingError("there is no GPU that PyTorch can use here: leave --device out, or say cpu.")
+    device = device_named(config.device)
     out.mkdir(parents=True, exist_ok=True)
     dataset = Dataset(data)
     cache = ClipCache.open(dataset, config.size, lambda done, total: report(done, total, "building the clip cache"))
     if cache.rgb is None:
         raise DatasetError(f"{data} holds no pictures (rgb); a world of pictures cannot be learned from it.")
-    run = _Run(dataset, cache, out, config)
+    run = _Run(dataset, cache, out, config, device)
     run.learn(report)
     return run.finish(report)
 
@@ -129,9 +108,8 @@ def train_video(
 class _Run:
     """The pieces of one training run."""
 
-    def __init__(self, dataset: Dataset, cache: ClipCache, out: Path, config: TrainConfig):
-        self.dataset, self.cache, self.out, self.config = dataset, cache, out, config
-        self.device = torch.device(_device(config.device))
+    def __init__(self, dataset: Dataset, cache: ClipCache, out: Path, config: TrainConfig, device: torch.device):
+        self.dataset, self.cache, self.out, self.config, self.device = dataset, cache, out, config, device
         torch.manual_seed(config.seed)
         posed = (
             config.geometry and cache.depth is not None and cache.pose is not None and bool(cache.world.get("camera"))
@@ -172,21 +150,21 @@ class _Run:
         self.critic = Critic().to(self.device)
         self.motion = Motion(self.video)
         self.smooth = copy.deepcopy(self.generator).eval().requires_grad_(False)
-        self.modules = {
+        modules: dict[str, nn.Module] = {
             "generator": self.generator,
             "smooth": self.smooth,
             "motion": self.motion,
             "critic": self.critic,
         }
         if self.outcome is not None:
-            self.modules["outcome"] = self.outcome
-        self.optimisers = {
-            "optimiser": torch.optim.AdamW(
-                self.generator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4
-            ),
-            "critic_optimiser": torch.optim.Adam(self.critic.parameters(), 3e-4, (0.0, 0.99)),
-        }
-        self.facts = {"recipe": _recipe(config, dataset), "step": 0, "seconds": 0.0, "motion": None, "outcome": None}
+            modules["outcome"] = self.outcome
+        self.optimiser = torch.optim.AdamW(
+            self.generator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4
+        )
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), 3e-4, (0.0, 0.99))
+        optimisers = {"optimiser": self.optimiser, "critic_optimiser": self.critic_optimiser}
+        self.updates = Updates(out, _recipe(config, dataset), modules, optimisers, motion=None, outcome=None)
+        self.facts = self.updates.facts
 
     def _begin_outcome(self, usable: np.ndarray, posed: bool) -> tuple[Happenings, Outcome | None]:
         """What the recording tells of rewards, ends and vitals, and what will learn it, if there is anything to learn."""
@@ -210,47 +188,19 @@ class _Run:
             rgb.round().to(torch.uint8), self.recording.lasting(rows), self.recording.pose(rows), self.video.camera
         )
 
-    def learn(self, report) -> None:
-        found = load_run(self.out, self.modules, self.optimisers)
-        if found:
-            if found["recipe"] != self.facts["recipe"]:
-                raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
-            self.facts = found
+    def learn(self, report: Report) -> None:
+        config = self.config
         if self.facts["motion"] is None and self.memory is not None:
             self.facts["motion"] = train_motion(
-                self.motion, self.recording, self.memory, self.video, self.config.motion_steps, self.config.seed, report
+                self.motion, self.recording, self.memory, self.video, config.motion_steps, config.seed, report
             )
-            self._save()
-        if self.outcome is not None and self.facts.get("outcome") is None:
-            settings = self.config.outcome_steps, self.config.seed, report
+            self.updates.save()
+        if self.outcome is not None and self.facts["outcome"] is None:
+            settings = config.outcome_steps, config.seed, report
             self.facts["outcome"] = train_outcome(self.outcome, self.recording.rgb, self.happened, *settings)
-            self._save()
-        began = saved = drawn = time.monotonic()
-        before = self.facts["seconds"]
-        recent: list[dict] = []
-        self._whole = True
-        try:
-            while self.facts["step"] < self.config.steps and self.facts["seconds"] < 3600 * self.config.hours:
-                self._whole = False  # a step that Ctrl-C cuts is not saved: the last save goes on exactly
-                recent.append(self._step(self.facts["step"]))
-                self.facts["step"] += 1
-                self._whole = True
-                now = time.monotonic()
-                self.facts["seconds"] = before + now - began
-                if len(recent) == 20:
-                    self._log(recent, report)
-                    recent = []
-                if now - saved > self.config.save_every_s:
-                    self._save()
-                    saved = now
-                if now - drawn > self.config.strip_every_s:
-                    self.draw_strip()
-                    drawn = time.monotonic()
-        except KeyboardInterrupt:
-            if self._whole:
-                self._save()
-            raise
-        self._save()
+            self.updates.save()
+        every_s = config.save_every_s, config.strip_every_s
+        self.updates.run(config.steps, self._step, self.draw_strip, *every_s, report, config.hours)
 
     def _step(self, step: int) -> dict[str, float]:
         """One step; all its randomness comes from (seed, step), so a resumed run sees what an unbroken one would."""
@@ -258,7 +208,7 @@ class _Run:
         rng = np.random.default_rng([config.seed, step])
         batch = config.batch or (64 if self.device.type == "cuda" else 8)
         noise_rng = make_rng(int(rng.integers(2**62)))
-        for group in self.optimisers["optimiser"].param_groups:
+        for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * min(1, (step + 1) / 200) * (0.05 + 0.95 * _cosine(step / config.steps))
         with torch.no_grad():
             lesson = self._lesson(batch, rng, noise_rng).to(self.device)
@@ -287,12 +237,12 @@ class _Run:
             raise TrainingError(
                 f"the loss is not a number at step {step}; the last save is good: lower --learning-rate."
             )
-        self._descend("optimiser", self.generator, total)
+        descend(self.optimiser, total, step, self.generator)
         if judged and step >= config.critic_from - 200:
             with half_precision(self.device):
                 real, fake = self.critic(truth[:, :3], glimpse), self.critic(clean[:, :3].detach(), glimpse)
                 losses["critic"] = F.relu(1 - real).mean() + F.relu(1 + fake).mean()
-            self._descend("critic_optimiser", self.critic, losses["critic"])
+            descend(self.critic_optimiser, losses["critic"], step, self.critic)
         keep = min(0.999, (step + 1) / (step + 20))
         with torch.no_grad():
             for smooth, raw in zip(self.smooth.parameters(), self.generator.parameters()):
@@ -309,32 +259,7 @@ class _Run:
             return clean.float().cpu()
 
         dreamer = dream if self.config.flow_steps == 1 else None
-        if self.memory is not None and self.video.moving:
-            return moving_lesson(self.recording, self.memory, self.video, batch, rng, dreamer)
-        if self.memory is not None:
-            return place_lesson(self.recording, self.memory, self.video, batch, rng, dreamer)
-        return history_lesson(self.recording, self.video, batch, rng, dreamer)
-
-    def _descend(self, name: str, module: nn.Module, loss: torch.Tensor) -> None:
-        self.optimisers[name].zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-        if not torch.isfinite(norm):
-            raise TrainingError(
-                f"a gradient of the {name} is not a number; the last save is good: lower --learning-rate."
-            )
-        self.optimisers[name].step()
-
-    def _log(self, recent: list[dict], report) -> None:
-        mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
-        line = {"step": self.facts["step"], "seconds": round(self.facts["seconds"]), **mean}
-        with open(self.out / "log.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
-        share = max(self.facts["step"] / self.config.steps, self.facts["seconds"] / (3600 * self.config.hours))
-        report(share, 1.0, " ".join(f"{name} {value:.4f}" for name, value in mean.items()))
-
-    def _save(self) -> None:
-        save_run(self.out, self.modules, self.optimisers, self.facts)
+        return recorded_lesson(self.recording, self.memory, self.video, batch, rng, dreamer)
 
     def world(self) -> VideoWorld | HistoryWorld:
         """The world as it now is."""
@@ -349,7 +274,7 @@ class _Run:
             "keyframes": 0 if self.memory is None else len(self.memory),
             "parameters": sum(p.numel() for module in modules for p in module.parameters()),
             **(self.facts["motion"] or {}),
-            **(self.facts.get("outcome") or {}),
+            **(self.facts["outcome"] or {}),
         }
         dt_s = about.get("dt_s", 1 / self.cache.fps)
         outcome = None if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
@@ -389,47 +314,20 @@ class _Run:
         )
 
     def draw_strip(self) -> None:
-        """Truth above dream (64 steps of a held-out episode), with the memory and without; and the world as it now is,
-        so that it can be played while it learns."""
+        """Truth above dream, with the memory and without; and the world as it now is, so that it can be played while it
+        learns."""
         world = self.world()
-        first, last = self.cache.episodes[(self.held_out or [0])[0]]
-        begin = max(first, min(first + 40, last - 65))
-        rows = np.arange(begin, min(begin + 65, last))
-        lines = [self.recording.rgb(rows[::8])]
-        if isinstance(world, VideoWorld):
-            lines += [self._dream(one, rows, ("pose",)) for one in (world, world.without_memory())]
-        else:
-            lines.append(self._dream(world, rows, ()))
-        picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
-        Image.fromarray(picture).save(self.out / f"strip-{self.facts['step']:06d}.png")
+        worlds = (world, world.without_memory()) if isinstance(world, VideoWorld) else (world,)
+        draw_strip(worlds, self.recording, self.held_out, self.out / f"strip-{self.facts['step']:06d}.png")
         save_world(world, self.out / "world", dict(world.spec.card))
 
-    def _dream(self, world: VideoWorld | HistoryWorld, rows: np.ndarray, evidence: tuple[str, ...]) -> torch.Tensor:
-        """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or the recorded actions."""
-        rng, recording = make_rng(1), self.recording
-        seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
-        if evidence:
-            seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
-        if self.video.moving:  # what moves depends on what is done
-            seen, evidence = {**seen, "things": recording.things(rows[:1])}, ()
-        state = world.observe(seen, None, rng)
-        frames = [world.render(state, ("rgb",))["rgb"]]
-        for row in rows[1:]:
-            if evidence:
-                state = world.observe({"pose": recording.pose([row])}, state, rng)
-            else:
-                action = self.cache.action[row - 1].astype(world.spec.action.dtype).reshape(world.spec.action.shape)
-                state = world.imagine(state, torch.from_numpy(action)[None], rng)
-            frames.append(world.render(state, ("rgb",))["rgb"])
-        return torch.cat(frames)[::8].permute(0, 3, 1, 2)
-
-    def finish(self, report) -> dict:
+    def finish(self, report: Report) -> dict:
         config, done = self.config, (self.out / "world" / "world.json").exists()
         if not done or self.facts.get("sensed") != self.facts["step"]:
             self._finish(config, report)
-        return {"world": str(self.out / "world"), **{k: v for k, v in self.facts.items() if k != "recipe"}}
+        return {"world": str(self.out / "world"), **self.updates.told}
 
-    def _finish(self, config: TrainConfig, report) -> None:
+    def _finish(self, config: TrainConfig, report: Report) -> None:
         """The last strip, and the senses of the finished world."""
         self.draw_strip()
         world = self.world()
@@ -438,7 +336,7 @@ class _Run:
         sensing, facts = learn_senses(world, self.recording, self.held_out, config.keep_out, settings, report, keep)
         save_world(sensing, self.out / "world", {**world.spec.card, **facts})
         self.facts |= {**facts, "sensed": self.facts["step"]}
-        self._save()
+        self.updates.save()
 
 
 def _at_first(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:
@@ -461,61 +359,3 @@ def _recipe(config: TrainConfig, dataset: Dataset) -> dict:
 
 def _cosine(share: float) -> float:
     return 0.5 + 0.5 * float(np.cos(np.pi * min(share, 1.0)))
-
-
-def sharpened(critic: Critic, clean: torch.Tensor, loss: torch.Tensor, glimpse: Glimpse, weight: float) -> torch.Tensor:
-    """The critic's pull on dreamt frames, `weight` times as strong as the loss's own (Esser et al. 2021), and strongest
-    where memory knows nothing: there the loss alone would draw a mean of all that could be."""
-    dreamt = clean.detach()[:, :3].requires_grad_()
-    with half_precision(clean.device):
-        praise = critic(dreamt, glimpse).float()
-    known = glimpse.known[:, None]
-    if clean.shape[1] > 4:  # what moves is not known
-        known = known * (1 - clean.detach()[:, 4:].sigmoid())
-    invented = 1 - F.adaptive_avg_pool2d(known, praise.shape[-2:])
-    (pull,) = torch.autograd.grad(-(praise * (0.2 + 0.8 * invented)).mean(), dreamt)
-    (own,) = torch.autograd.grad(loss, clean, retain_graph=True)
-    return (clean[:, :3] * (weight * own[:, :3].norm() / pull.norm().clamp_min(1e-12) * pull)).sum()
-
-
-def frame_losses(
-    clean: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor | None = None
-) -> dict[str, torch.Tensor]:
-    """Mean absolute errors of frames [B, 4, H, W] in the generator's code: colour, depth, and colour's steps (edges).
-
-    Where pixels count by `weight` [B, 1, H, W] (lessons.changing), colour's squared errors are added: absolute ones alone
-    are least where nothing ever changes, for most pixels do not.
-    """
-    losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
-    if weight is not None:
-        away = clean[:, :3] - truth[:, :3]
-        losses["rgb"] = (weight * (0.2 * away.abs() + 2 * away.square())).mean()
-    losses["edges"] = _l1(clean[:, :3].diff(dim=2), truth[:, :3].diff(dim=2))
-    losses["edges"] = losses["edges"] + _l1(clean[:, :3].diff(dim=3), truth[:, :3].diff(dim=3))
-    return losses
-
-
-def flow_losses(clean: torch.Tensor, truth: torch.Tensor, time: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Squared errors, which alone make the flow end in the true distribution (Lipman et al. 2023), of frames predicted at
-    flow time [B]; late ones count for more, for they are small and are the detail."""
-    error = (clean - truth).square() / (1 - time).clamp_min(0.1)[:, None, None, None]
-    return {"rgb": error[:, :3].mean(), "depth": error[:, 3:].mean()}
-
-
-def _l1(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    return (a - b).abs().mean()
-
-
-def _device(name: str) -> str:
-    return name if name != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def half_precision(device: torch.device):
-    """bfloat16 where the device computes it natively."""
-    native = device.type == "cuda" or torch.backends.cpu.get_cpu_capability() == "AVX512" and _cpu_has_bf16()
-    return torch.autocast(device.type, torch.bfloat16, enabled=native)
-
-
-def _cpu_has_bf16() -> bool:
-    """In hardware: where oneDNN only emulates it, it is 2.7 times slower than float32."""
-    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()

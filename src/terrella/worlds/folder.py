@@ -25,9 +25,11 @@ from ..space.eye import Eye, eye_of, eye_weights
 from ..space.keyframes import Keyframes
 from .controls import Controls
 from .doubt import Doubt, doubt_of, doubt_weights
+from .generator import Generator, VideoConfig
 from .history import HistoryWorld, Starts
+from .motion import Motion
 from .outcome import Outcome, OutcomeConfig
-from .video import Generator, Motion, VideoConfig, VideoWorld
+from .video import VideoWorld
 
 KIND, VERSION = "video", 2
 MEMORY_FILE = "memory.safetensors"

@@ -20,8 +20,8 @@ from ..space.eye import Eye
 from ..space.keyframes import Glimpse
 from .controls import Controls
 from .doubt import SITUATION, Doubt, doubting_spec
+from .generator import Generator, VideoConfig, channels_last, generate, mood
 from .outcome import Outcome, told_vitals
-from .video import Generator, VideoConfig, channels_last, generate, mood
 
 TRUST = 0.03  # in a frame, against the one after it: what is merged from all of them is nearly the newest alone
 

@@ -9,12 +9,11 @@ completes it (`Generator`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import torch
 import torch.nn.functional as F
-from torch import nn
 
 from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
@@ -22,204 +21,19 @@ from ..core.state import State
 from ..space.camera import Intrinsics, planar_pose, yaw
 from ..space.eye import Eye
 from ..space.floorplan import floor_plan, slide
-from ..space.keyframes import Glimpse, Keyframes, merge
+from ..space.keyframes import Glimpse, Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table, remembering_spec
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
 from .arrival import AWAY_M, arrive
 from .doubt import GONE, Doubt, doubting_spec
-from .moving import PLANES, Frame, carry_frames, still
+from .generator import Generator, VideoConfig, channels_last, decode_depth, generate, mood
+from .motion import Motion
+from .moving import Frame, carry_frames, still
 from .outcome import Outcome, told_vitals
 
-FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
-LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
 SEEN = ("rgb", "depth", "things", "pose")  # of a frame in the state of a world in which things move
-MOOD = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
-
-
-@dataclass(frozen=True)
-class VideoConfig:
-    """size: (height, width) of the frames; camera: intrinsics as in Spec; actions: numbers in an action."""
-
-    camera: Intrinsics
-    actions: int
-    size: tuple[int, int] = (96, 128)
-    channels: tuple[int, ...] = (32, 56, 88, 128)  # of the generator at 1/2, 1/4, 1/8 and 1/16 of the size
-    sources: int = 6  # keyframes that are warped into a view
-    slots: int = 3  # of them, those that the generator sees at each pixel
-    history: int = 8  # actions that the motion model remembers
-    body_m: float = 0.0  # half the width of the body that slides along walls, as recordings show it; 0: none stops it
-    short: float = 0.0  # the share of a step by which it stops short of a wall
-    memory_mb: float = 16.0  # MiB of a story's own memory (space/memory.py); with 0 it holds the last frame alone
-    known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
-    new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
-    geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/history.py)
-    steps: int = 1  # flow-matching steps a frame
-    vitals: tuple[float, ...] = ()  # with which stories begin (names are its outcome's)
-    residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
-    moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
-
-
-class Block(nn.Module):
-    """Two 3x3 convolutions around a SiLU, told the flow time and more (see Generator), with a residual path."""
-
-    def __init__(self, channels: int, told: int):
-        super().__init__()
-        self.first, self.second = (nn.Conv2d(channels, channels, 3, padding=1) for _ in range(2))
-        self.time = nn.Linear(told, channels)
-
-    def forward(self, x: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
-        inner = F.silu(self.first(x) + self.time(told)[:, :, None, None])
-        return F.silu(x + self.second(inner))
-
-
-class Generator(nn.Module):
-    """A U-Net that, from noise and what memory knows, predicts the clean frame (flow matching, x-prediction).
-
-    Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what
-    is known comes through as sharp as it was seen. It begins with a 2x pixel-unshuffle: a quarter of the cost.
-    With `residual` it is the newest frame and what the net changes in it: where hardly a pixel ever changes, a mixture
-    soon copies, and then no gradient tells it otherwise.
-    """
-
-    def __init__(self, config: VideoConfig):
-        super().__init__()
-        self.slots = config.slots
-        self.choices = config.slots + 2  # merged, slots, last frame
-        self.moving = config.moving
-        inputs = 3 + 4 * config.slots + 4 + 2 + 4 + PLANES * config.moving
-        widths = config.channels
-        self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
-        acts = config.history if config.moving else 0 if config.geometry else config.slots  # actions that it is told
-        told = 1 + 3 * MOOD[0] * MOOD[1] + config.actions * acts
-        self.before = nn.ModuleList(Block(width, told) for width in widths)
-        self.after = nn.ModuleList(Block(width, told) for width in widths)
-        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
-        self.leave = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1 + config.moving), 3, padding=1)
-        nn.init.zeros_(self.leave.weight)
-        bias = torch.zeros(self.choices + 5 + config.moving)
-        bias[0] = 0.0 if config.residual else 3.0  # at first, trust the merged colours
-        self.residual = config.residual
-        self.leave.bias.data = bias.repeat_interleave(4)
-
-    def forward(
-        self,
-        noisy: torch.Tensor,
-        time: torch.Tensor,
-        glimpse: Glimpse,
-        last: torch.Tensor,
-        told: torch.Tensor,
-    ) -> torch.Tensor:
-        """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]; last [B, 4, H, W] = the last frame's colour
-        warped into this view and its trust; told [B, n]: the last frame's `mood`, and where there is no geometry to say
-        what they cause, the actions [slots * A], the newest first. Returns the clean frame in the code of `noisy`.
-
-        Where things move, `last` [B, 4 + PLANES, H, W] is what moving.carry_frames makes, told also has the last `history`
-        actions, the newest last, and a fifth plane of the result is the logit that a thing is there."""
-        if self.residual:
-            noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
-        told = torch.cat([time[:, None], told], 1)
-        colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
-        merged = merge(glimpse) * 2 - 1
-        depth = encode_depth(glimpse.depth)[:, None]
-        last_rgb, last_trust = last[:, :3] * 2 - 1, last[:, 3:4]
-        parts = [
-            merged,
-            (colours * (trust > 0)[:, :, None]).flatten(1, 2),
-            trust,
-            last_rgb * (last_trust > 0),
-            last_trust,
-        ]
-        parts += [depth, glimpse.known[:, None], noisy[:, :4]]
-        if self.moving:
-            carried = encode_depth(last[:, 4:5])
-            parts += [carried * (last_trust > 0), last[:, 5:]]
-        fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
-        x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
-        kept = []
-        for level, block in enumerate(self.before):
-            x = block(x, told)
-            if level < len(self.down):
-                kept.append(x)
-                x = self.down[level](x)
-        x = self.after[-1](x, told)
-        for level in reversed(range(len(self.down))):
-            x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level](x, told)
-        out = F.pixel_shuffle(self.leave(x), 2)
-        votes = out[:, : self.choices + 1]
-        if self.moving:  # a thing stays as it was unless the network knows better; what was not seen is not copied
-            thing = LASTING * last[:, 5:6] - 1e4 * (last_trust <= 0).float()
-            votes = torch.cat([votes[:, :-2], votes[:, -2:-1] + thing, votes[:, -1:]], 1)
-        share = votes.softmax(1)
-        own = out[:, self.choices + 1 : self.choices + 4]
-        if self.residual:
-            rgb = colours[:, 0] + own
-        else:
-            rgb = share[:, :1] * merged + share[:, -2:-1] * last_rgb + share[:, -1:] * own
-            for slot in range(self.slots):
-                rgb = rgb + share[:, 1 + slot : 2 + slot] * colours[:, slot]
-        if self.moving:
-            trusted = share[:, -2:-1]  # as far as the last frame's colour is taken, so is its depth
-            return torch.cat([rgb, depth + trusted * (carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
-        return torch.cat([rgb, depth + out[:, -1:]], 1)
-
-
-def channels_last(generator: Generator) -> Generator:
-    """The same network with its weights laid out for faster convolutions on a CPU (a third less time)."""
-    for weight in generator.parameters():
-        if weight.ndim == 4:
-            weight.data = weight.data.contiguous(memory_format=torch.channels_last)
-    return generator
-
-
-def encode_depth(depth: torch.Tensor) -> torch.Tensor:
-    """Metres -> about [-1, 1], logarithmic."""
-    return depth.clamp(NEAR_DEPTH_M, FAR_DEPTH_M).log() / 2 - 0.6
-
-
-def decode_depth(code: torch.Tensor) -> torch.Tensor:
-    return ((code + 0.6) * 2).exp().clamp(NEAR_DEPTH_M, FAR_DEPTH_M)
-
-
-class Motion(nn.Module):
-    """How the eye moves where nothing is in its way: it turns by the actions, and glides by drag and thrust in its own
-    frame. Walls come after (space/floorplan.slide)."""
-
-    middle: torch.Tensor  # of the recorded places, and how far they reach, in metres
-    span: torch.Tensor
-
-    def __init__(self, config: VideoConfig):
-        super().__init__()
-        acts = config.actions * (config.history + 1)
-        self.turn = nn.Sequential(nn.Linear(acts, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, 1))
-        self.glide = nn.Linear(2 + config.actions, 2)
-        self.ending = nn.Sequential(
-            nn.Linear(2 + config.actions, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
-        )
-        self.register_buffer("middle", torch.zeros(2))
-        self.register_buffer("span", torch.ones(()))
-
-    def forward(self, heading, speed, actions):
-        """heading [B] radians; speed [B, 2] metres a step, world frame; actions [B, history + 1, A], the newest last.
-        Returns the new heading [B] and the displacement that this step wishes for [B, 2]."""
-        heading = heading + 0.1 * self.turn(actions.flatten(1))[:, 0]
-        glide = self.glide(torch.cat([10 * turned(speed, -heading), actions[:, -1]], -1))
-        return heading, 0.1 * turned(glide, heading)
-
-    def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Logit that the episode ends at `place` [B, 2]: [B]."""
-        where = 2 * (place - self.middle) / self.span
-        logit = self.ending(torch.cat([where, action], -1))[:, 0]
-        return torch.where(where.abs().amax(1) < 1.2, logit, -20.0)  # what lies further away was never seen to end
-
-
-def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """[B, 2] rotated counter-clockwise by [B] radians."""
-    c, s = angle.cos(), angle.sin()
-    return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)
 
 
 class VideoWorld:
@@ -539,24 +353,6 @@ def own_memory(config: VideoConfig) -> Memory:
         return whole
     frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
     return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0)
-
-
-def mood(rgb: torch.Tensor) -> torch.Tensor:
-    """The look of frames (uint8 [B, 3, H, W]) as a tiny picture in [-1, 1]: [B, 36]. Where nothing is known of a view,
-    what was just seen says best what the place is like."""
-    return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, MOOD).flatten(1)
-
-
-def generate(
-    generator: Generator, noise: torch.Tensor, glimpse: Glimpse, last: torch.Tensor, told: torch.Tensor, steps: int
-) -> torch.Tensor:
-    """Noise to frame in `steps` Euler steps of the straight flow."""
-    x = noise
-    for step in range(steps):
-        now, after = step / steps, (step + 1) / steps
-        clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, told)
-        x = clean if after == 1 else x + (clean[:, :4] - x) * (after - now) / (1 - now)
-    return x
 
 
 def carry(

@@ -1,0 +1,54 @@
+"""Strips: the truth of a held-out stretch of a recording above what worlds dream of it, to look at while they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..core.world import make_rng
+from ..worlds.history import HistoryWorld
+from ..worlds.video import VideoWorld
+from .samples import Recording
+
+Learned = VideoWorld | HistoryWorld
+
+
+def draw_strip(worlds: Sequence[Learned], recording: Recording, held_out: list[int], path: Path) -> None:
+    """64 steps of the first of the episodes `held_out`, every 8th frame: the truth above a dream of each world."""
+    first, last = recording.cache.episodes[(held_out or [0])[0]]
+    rows = np.arange(max(first, min(first + 40, last - 65)), last)[:65]
+    lines = [recording.rgb(rows[::8]), *(_dream(world, recording, rows) for world in worlds)]
+    write_lines(lines, path)
+
+
+def write_lines(lines: Sequence[torch.Tensor], path: Path) -> None:
+    """Each of `lines`, uint8 [n, 3, H, W], beneath the one before it, as one picture."""
+    picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
+    Image.fromarray(picture).save(path)
+
+
+def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
+    """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
+    move, the recorded actions."""
+    rng, config = make_rng(1), world.config
+    seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
+    if config.geometry:
+        seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
+    if config.moving:
+        seen["things"] = recording.things(rows[:1])
+    state = world.observe(seen, None, rng)
+    frames = [world.render(state, ("rgb",))["rgb"]]
+    for row in rows[1:]:
+        if config.geometry and not config.moving:  # what moves answers to actions
+            state = world.observe({"pose": recording.pose([row])}, state, rng)
+        else:
+            action = (
+                recording.cache.action[row - 1].astype(world.spec.action.dtype).reshape(world.spec.action.shape or ())
+            )
+            state = world.imagine(state, torch.from_numpy(action)[None], rng)
+        frames.append(world.render(state, ("rgb",))["rgb"])
+    return torch.cat(frames)[::8].permute(0, 3, 1, 2)
