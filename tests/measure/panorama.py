@@ -122,6 +122,7 @@ def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleName
     valid = np.ones(total, bool)
     valid[length - 1 :: length] = False
     return SimpleNamespace(
+        further={},
         rgb=look(pose).numpy(),
         depth=None,
         pose=pose.numpy(),

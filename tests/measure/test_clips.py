@@ -108,3 +108,19 @@ def test_depth_of_another_size_is_shown_at_the_size_of_the_world():
     assert seen.shape == (3, 12, 16) and torch.equal(
         seen[:, ::2, ::2], torch.from_numpy(np.stack([c.depth[0] for c in clips]))
     )
+
+
+def test_what_a_world_heeds_is_shown_to_it_where_it_was_recorded():
+    cache, spec = recording(), Panorama().spec
+    count = len(cache.pose)
+    things = np.zeros((count, 12, 16), bool)
+    things[:, 5, 7] = True
+    cache.further = {"health": np.arange(count, dtype=np.float32)[:, None], "things": things, "ammo": np.zeros(count)}
+    clips = clips_from_cache(cache, range(4), 2, 10, 3, make_rng(0))
+    channels = {"health": spaces.Box(-np.inf, np.inf, (), np.float32), "things": spaces.Box(0, 1, (6, 8), np.bool_)}
+    heeding = replace(spec, channels={**spec.channels, **channels}, heeds=("health", "things"))
+    seen = evidence(clips, heeding, 1)
+    assert seen["health"].tolist() == [clip.start + 1 for clip in clips] and "ammo" not in seen
+    assert seen["things"].dtype == torch.bool and seen["things"].nonzero().tolist() == [[k, 2, 3] for k in range(3)]
+    silent = [replace(clip, further={}) for clip in clips]
+    assert set(evidence(silent, heeding, 1)) == set(spec.observes), "nobody is asked for what was not recorded"

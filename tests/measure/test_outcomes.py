@@ -23,7 +23,7 @@ class Game:
     def __init__(self, blind: bool = False):
         self.blind = blind
         channels = {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8), "reward": REWARD, "done": DONE, "health": HEALTH}
-        self.spec = Spec("game", spaces.MultiBinary(1), channels, ("rgb",), 0.1)
+        self.spec = Spec("game", spaces.MultiBinary(1), channels, ("rgb",), 0.1, heeds=("health",))
 
     def start(self, batch, rng) -> State:
         return State({"health": torch.full((batch,), 9.0), "reward": torch.zeros(batch)})
@@ -53,7 +53,7 @@ def recording(lengths=(40, 30, 50)):
     return SimpleNamespace(
         episodes=[(stop - length, stop) for length, stop in zip(lengths, stops)], length=rows, depth=None, pose=None,
         rgb=np.zeros((rows, 8, 8, 3), np.uint8), action=action, reward=reward, done=done,
-        vitals={"health": health[:, None]},
+        further={"health": health[:, None]},
     )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
     short = [passage for passage in shown if not passage.real.all()]
     assert len(short) >= 10
     for passage in short:
-        after = passage.vitals["health"][int(passage.real.sum()) :]
+        after = passage.clip.further["health"][int(passage.real.sum()) :]
         assert (after == after[0]).all() and (passage.clip.action[~passage.real] == 0).all()
         assert passage.real[:5].all()
 

@@ -176,6 +176,20 @@ def test_a_dream_that_cannot_look_starts_on_its_own():
     assert "on its own" in story.notice and story.step(LEFT).step == 1
 
 
+def test_a_dream_is_told_what_it_heeds():
+    told = []
+
+    class Heeding(SlowDream):
+        def observe(self, observation, prior, rng):
+            told.append(set(observation))
+            return super().observe(observation, prior, rng)
+
+    dream = Heeding()
+    object.__setattr__(dream.spec, "heeds", ("reward", "sonar"))
+    Story([Panorama(), dream], seed=5)
+    assert told == [{"pose", "reward"}], "and not of what the game does not show"
+
+
 def test_a_recording_holds_each_observation_with_what_followed():
     sink = ListSink()
     story = Story([Panorama(length=5)], seed=0, sink_factory=lambda: sink)

@@ -99,7 +99,7 @@ def _spec_is_sound(world: World, seed: int, steps: int) -> None:
         _require(
             fits, f"channel '{name}' must be {np.dtype(dtype)} with {axes} axes after the batch; its space is {space}."
         )
-    for what, names in (("observes", spec.observes), ("units", spec.units)):
+    for what, names in (("observes", spec.observes), ("heeds", spec.heeds), ("units", spec.units)):
         strangers = sorted(set(names) - set(spec.channels))
         _require(not strangers, f"spec.{what} names {strangers}, which are not among spec.channels.")
     _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
@@ -191,9 +191,9 @@ def _observes(world: World, seed: int, steps: int) -> None:
     rng, channels = make_rng(seed), tuple(world.spec.channels)
     state = world.start(1, rng)
     held = _copy(state)
-    seen = _copy(world.render(state, world.spec.observes))
-    for prior in (state, None):
-        posterior = world.observe(seen, prior, rng)
+    seen, heeded = (_copy(world.render(state, names)) for names in (world.spec.observes, world.spec.heeds))
+    for prior, evidence in ((state, seen), (None, seen), (None, {**seen, **heeded})):
+        posterior = world.observe(evidence, prior, rng)
         _require(
             isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the evidence's batch."
         )

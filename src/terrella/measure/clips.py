@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ class Clip:
     """T = context + horizon rows of one episode; row t's action led from observation t to t + 1.
 
     rgb uint8 [T, H, W, 3]; depth [T, h, w] metres or None; pose float32 [T, 7] or None; action [T, A]; reward [T] and
-    done [T] are what followed each action. The first `context` frames are shown to a world, the rest are the truth.
-    Arrays may be views of a memory-mapped file.
+    done [T] are what followed each action; `further` has what else was recorded [T, ...], by channel. The first `context`
+    frames are shown to a world, the rest are the truth. Arrays may be views of a memory-mapped file.
     """
 
     rgb: np.ndarray
@@ -37,6 +37,7 @@ class Clip:
     context: int
     episode: int
     start: int
+    further: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def horizon(self) -> int:
@@ -128,16 +129,24 @@ def check_clips(place: str, clips: Sequence[Clip], steps: int) -> None:
 
 
 def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Tensor]:
-    """What `spec` observes of row `row` of each clip: name -> tensor [B, ...]; ObservationError where it cannot."""
+    """What `spec` observes, and heeds where it was recorded, of row `row` of each clip: name -> tensor [B, ...];
+    ObservationError where it cannot."""
     seen = {}
-    for name in spec.observes:
-        arrays = [array for clip in clips if (array := getattr(clip, name, None)) is not None]
+    for name in (*spec.observes, *spec.heeds):
+        told = [clip.further.get(name, getattr(clip, name, None)) for clip in clips]
+        arrays = [array for array in told if array is not None]
+        if len(arrays) < len(clips) and name in spec.heeds:
+            continue
         if len(arrays) < len(clips):
             raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
         stacked = torch.from_numpy(np.stack([np.asarray(array[row]) for array in arrays]))
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
         if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
+        if stacked.dtype == torch.bool and len(wanted) == 2:  # and so are marks: one pixel of many counts
+            stacked = F.adaptive_max_pool2d(stacked.float()[:, None], wanted)[:, 0] > 0
+        if wanted == () and stacked[0].numel() == 1:
+            stacked = stacked.reshape(-1)
         if tuple(stacked.shape[1:]) != wanted:
             raise ObservationError(
                 f"{spec.name} observes '{name}' of shape {wanted}, the clips hold {tuple(stacked.shape[1:])}; "
@@ -177,4 +186,5 @@ def _cut(cache, start: tuple[int, int], length: int, context: int) -> Clip:
         context=context,
         episode=episode,
         start=row,
+        further={name: array[row : row + length] for name, array in cache.further.items()},
     )

@@ -10,8 +10,8 @@ import torch
 
 from ..core.errors import DatasetError
 from ..core.world import World, make_rng
-from .clips import Clip, Where, evidence
-from .roll import actions_at
+from .clips import Clip, Where
+from .roll import actions_at, fold_context
 from .statistics import Figure, mean_interval
 
 
@@ -43,11 +43,10 @@ class Fate:
 @dataclass(frozen=True)
 class Passage:
     """A clip that may run into the end of its episode, from where it stands still: `real` bool [T] marks the rows whose
-    action was played; vitals float32 [T] by name."""
+    action was played."""
 
     clip: Clip
     real: np.ndarray
-    vitals: dict[str, np.ndarray]
 
 
 def passages(
@@ -106,7 +105,7 @@ def fates(
             paid = usual * torch.from_numpy(going[:, part].sum(1)).double()
             vitals, copied = {}, {}
             for name in (name for name in dreamt if name not in ("reward", "done")):
-                truth = np.stack([passage.vitals[name] for passage in shown])
+                truth = np.stack([passage.clip.further[name].reshape(-1) for passage in shown])
                 now, then = (torch.from_numpy(truth[:, row]).double() for row in (context - 1, context - 1 + horizon))
                 vitals[name] = mean_interval((dreamt[name][:, horizon - 1] - then).abs(), rng)
                 copied[name] = mean_interval((now - then).abs(), rng)
@@ -143,18 +142,10 @@ def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
 def _follow(world: World, shown: Sequence[Passage], steps: int, rng: torch.Generator) -> dict[str, torch.Tensor]:
     """reward, done and the vitals that both the world and the passages tell, after each step: float [B, steps]."""
     clips = [passage.clip for passage in shown]
-    vitals = [name for name in shown[0].vitals if name in world.spec.channels]
+    numbers = [name for name, array in clips[0].further.items() if array[0].size == 1]
+    vitals = [name for name in numbers if name in world.spec.channels]
     told = [name for name in ("reward", "done") if name in world.spec.channels] + vitals
-
-    def seen(row: int) -> dict[str, torch.Tensor]:
-        known = {name: torch.from_numpy(np.stack([one.vitals[name][row] for one in shown])) for name in vitals}
-        return {**evidence(clips, world.spec, row), **known}
-
-    state = world.observe(seen(0), None, rng)
-    context = clips[0].context
-    for row in range(1, context):
-        state = world.imagine(state, actions_at(world, clips, row - 1), rng)
-        state = world.observe(seen(row), state, rng)
+    state, context = fold_context(world, clips, rng), clips[0].context
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("reward", "done", *vitals)}
     for step in range(steps):
         state = world.imagine(state, actions_at(world, clips, context - 1 + step), rng)
@@ -186,9 +177,9 @@ def _passage(cache, start: int, stop: int, context: int, horizon: int) -> Passag
     clip = Clip(
         np.asarray(cache.rgb[rows]), part(cache.depth), part(cache.pose), action, zeros if reward is None else reward,
         zeros.astype(bool) if done is None else done, context, 0, start,
+        {name: np.asarray(array[rows]) for name, array in cache.further.items()},
     )  # fmt: skip
-    vitals = {name: np.asarray(array[rows], np.float32).reshape(-1) for name, array in cache.vitals.items()}
-    return Passage(clip, real, vitals)
+    return Passage(clip, real)
 
 
 def _whole(rng: torch.Generator, below: int) -> int:

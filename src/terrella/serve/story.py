@@ -273,7 +273,8 @@ class Story:
             self.notice = f"the dream starts on its own: it cannot look at {self.spec.name}."
             return dream.start(1, rng)
         try:
-            state = dream.observe(self.worlds[0].render(truth, dream.spec.observes), None, rng)
+            heeded = [name for name in dream.spec.heeds if name in self.spec.channels]
+            state = dream.observe(self.worlds[0].render(truth, [*dream.spec.observes, *heeded]), None, rng)
         except TerrellaError as error:
             self.notice = f"the dream starts on its own: {error}"
             return dream.start(1, rng)

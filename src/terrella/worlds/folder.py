@@ -200,6 +200,7 @@ def video_spec(
         keys=keys,
         camera=config.camera if config.geometry else None,
         card=card,
+        heeds=(*marks, *vitals),
     )
 
 

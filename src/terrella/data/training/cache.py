@@ -90,13 +90,15 @@ class ClipCache:
             setattr(self, name, self.arrays.get(name))
 
     @property
+    def further(self) -> dict[str, np.ndarray]:
+        """What else was recorded of the world's channels, such as "things" or "health", by name."""
+        prefix = "observation."
+        return {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
+
+    @property
     def vitals(self) -> dict[str, np.ndarray]:
-        """What else was recorded as one number a row, such as "health" or "lives", by name."""
-        return {
-            name.removeprefix("observation."): array
-            for name, array in self.arrays.items()
-            if name.startswith("observation.") and int(np.prod(array.shape[1:])) == 1
-        }
+        """Of these, what is one number a row."""
+        return {name: array for name, array in self.further.items() if int(np.prod(array.shape[1:])) == 1}
 
     @staticmethod
     def open(
