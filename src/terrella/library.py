@@ -29,7 +29,14 @@ class Entry:
         return asdict(self)
 
 
-def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = None, **options: Any) -> World:
+def load(
+    name: str | Path,
+    *,
+    remember: bool = False,
+    eye: str | Path | None = None,
+    memory_mb: float | None = None,
+    **options: Any,
+) -> World:
     """Opens a world.
 
     name:    a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment
@@ -40,12 +47,14 @@ def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = N
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
              `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not (to give one
              asks to remember).
+    memory_mb: the budget in MiB of what a story remembers, its world's own or that around it (16, or as it was saved).
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
     if remember or eye is not None:
         from .space import remembering
 
-        return remembering.remember(load(name, **options), eye=None if eye is None else open_eye(eye))
+        inner, seeing = load(name, memory_mb=memory_mb, **options), None if eye is None else open_eye(eye)
+        return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, seeing)
     text = str(name)
     if options.get("fast") and text.partition(":")[0] in ("doom", "gym"):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
@@ -57,7 +66,7 @@ def load(name: str | Path, *, remember: bool = False, eye: str | Path | None = N
         from .sim.gymnasium import GymnasiumWorld
 
         return GymnasiumWorld(text.partition(":")[2], **options)
-    return _open_checkpoint(folder_of(name), options)
+    return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
 
 
 def folder_of(name: str | Path) -> Path:

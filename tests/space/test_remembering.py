@@ -249,3 +249,17 @@ def test_the_bundled_world_remembers_by_itself():
     assert isinstance(world, VideoWorld) and world.own.nbytes <= 2 * 2**20
     with pytest.raises(TerrellaError, match="There is no world"):
         terrella.load("doom-maze", eye="no such file")
+
+
+def test_the_budget_reaches_the_memory_around_a_world(monkeypatch):
+    asked = {}
+    monkeypatch.setattr("terrella.library.folder_of", lambda name: name)
+    monkeypatch.setattr("terrella.library._open_checkpoint", lambda folder, options: asked.update(options) or Fickle())
+    world = terrella.load("fickle", remember=True, memory_mb=1)
+    assert isinstance(world, Remembering) and 0 < world.memory.nbytes <= 2**20 and asked["memory_mb"] == 1
+
+
+@pytest.mark.parametrize("budget", (0, 0.01, -1, math.nan))
+def test_a_budget_without_room_is_refused(budget):
+    with pytest.raises(ContractError, match="budget"):
+        Remembering(Fickle(), memory_mb=budget)

@@ -244,6 +244,7 @@ def play(
     memory: bool = True,
     remember: bool = False,
     eye: str | None = None,
+    memory_mb: float | None = None,
     record: Path | None = None,
     port: Port = 8765,
     host: Host = "127.0.0.1",
@@ -264,12 +265,13 @@ def play(
         remember: Give a world without a spatial memory one: what it showed, it shows again.
         eye: What tells depth and motion to a memory, where the world does not: a file of `terrella train eye`, or a world
             that has an eye.
+        memory_mb: What a story may remember, in MiB; 16 by itself.
         record: Folder of a dataset to which the page may record.
     """
     from ..core.errors import TerrellaError
     from ..serve import serve
 
-    learned = load_named(name, device, memory, fast, remember=remember, eye=eye)
+    learned = load_named(name, device, memory, fast, remember=remember, eye=eye, memory_mb=memory_mb)
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
     if compare and picture is not None:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from ..core.errors import ContractError
 from ..core.spec import Spec
 from .camera import Intrinsics, yaw
 from .floorplan import WALLS
@@ -46,6 +47,10 @@ class Memory:
     budget_mb: float = 16.0
     new_view: tuple[float, float] = (0.4, 0.2)
     known_enough: float = 0.95
+
+    def __post_init__(self):
+        if not 0 <= self.budget_mb < float("inf"):
+            raise ContractError(f"a memory's budget is 0 MiB or more; got {self.budget_mb}.")
 
     @cached_property
     def _parts(self) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:

@@ -58,6 +58,9 @@ class Remembering:
         height, width, _ = shape_of(spec.channels["rgb"])
         self.world, self.eye = world, eye
         self.memory = Memory(camera, (height, width), memory_mb)
+        if not self.memory.capacity:
+            least = self.memory.keyframe_bytes / 2**20
+            raise ContractError(f"a budget of {memory_mb} MiB has no room for a keyframe; give {least:.2f} or more.")
         self.spec = remembering_spec(
             _posed_spec(spec, (height, width), eye, camera), (height, width), self.memory.capacity
         )
