@@ -85,7 +85,17 @@ def test_unknown_games_are_named():
         AtariWorld("ALE/NoSuchGame-v5")
 
 
-@pytest.mark.parametrize("setting", [{"size": (0, 64)}, {"size": (64,)}, {"frames": 0}, {"sticky": 2.0}, {"noops": -1}])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"size": (0, 64)},
+        {"size": (64,)},
+        {"frames": 0},
+        {"sticky": 2.0},
+        {"noops": -1},
+        {"sticky": 0.5, "forkable": True},
+    ],
+)
 def test_settings_that_cannot_be_are_refused(setting):
     with pytest.raises(TerrellaError):
         AtariWorld("ALE/Breakout-v5", **setting)

@@ -46,6 +46,8 @@ class AtariWorld(GymnasiumWorld):
             raise TerrellaError(
                 f"sticky={sticky} is a chance, 0 to 1; frames={frames} in a step are 1 to 60; noops={noops} are 0 or more."
             )
+        if forkable and sticky:
+            raise TerrellaError(f"with sticky={sticky} the game draws chances of its own: its states cannot be forked.")
         screen = check_size(size)
 
         def build() -> gymnasium.Env:
