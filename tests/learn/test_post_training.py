@@ -186,6 +186,17 @@ def test_a_world_in_which_things_move_learns_from_its_dreams(haunted, moving, tm
     assert "observes" in check_world(load_world(tmp_path / "world"))
 
 
+def test_a_many_step_world_of_moving_things_teaches_a_student_and_its_dreams(haunted, tmp_path):
+    train_video(haunted, tmp_path / "teacher", replace(PLACES, flow_steps=4), quiet)
+    teacher = load_world(tmp_path / "teacher" / "world")
+    assert teacher.config.moving and teacher.config.steps == 4
+    distil(teacher, haunted, tmp_path / "student", FEW, quiet)
+    student = load_world(tmp_path / "student" / "world")
+    assert student.config.moving and student.config.steps == 1
+    train_dreams(student, haunted, tmp_path / "dreams", DREAMS, quiet, teacher)
+    assert "observes" in check_world(load_world(tmp_path / "dreams" / "world"))
+
+
 def test_dreams_begin_where_the_episode_lasts(recording, teacher):
     pair = beside(teacher, recording, None, quiet)
     rows = beginnings(pair, 20)
