@@ -1,15 +1,20 @@
 #!/bin/sh
-# A teacher of eight steps a frame, its one-step student, and the student trained on its own dreams: Doom from pictures and
-# actions alone, 48x64. Run it in the folder of a checkout after `make test`; every command goes on where it was stopped.
+# A teacher of eight steps a frame; one-step students pulled by the truth more and less, and their mean; and a student trained
+# on its own dreams: Doom from pictures and actions alone, 48x64. Run it in the folder of a checkout after `make test`; every
+# command goes on where it was stopped. About two hours of one core.
 set -e
 PATH=.venv/bin:$PATH
 export OMP_NUM_THREADS=1
-[ -d recordings/doom-maze ] || terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out recordings/doom-maze
-terrella train video recordings/doom-maze --out runs/few-teacher --name teacher --no-geometry --size 48 64 \
+data=recordings/doom-maze
+[ -d $data ] || terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out $data
+terrella train video $data --out runs/few-teacher --name teacher --no-geometry --size 48 64 \
     --channels 24 48 96 128 --flow-steps 8 --batch 16 --steps 8000 --doubt-frames 0
-terrella train distil runs/few-teacher --data recordings/doom-maze --out runs/few-student
-terrella train dreams runs/few-student --teacher runs/few-teacher --data recordings/doom-maze --out runs/few-dreams
-terrella record doom --scenario my_way_home --frames 24000 --seed 1 --out recordings/doom-maze-test
-for run in few-teacher few-student few-dreams; do
-    terrella score runs/$run --data recordings/doom-maze-test --fresh --out scores/$run
+terrella train distil runs/few-teacher --data $data --out runs/few-25 --steps 1400 --batch 12
+terrella train distil runs/few-teacher --data $data --out runs/few-40 --steps 1400 --batch 12 --truth-weight 0.4
+terrella train distil runs/few-teacher --data $data --out runs/few-60 --steps 1000 --batch 12 --truth-weight 0.6
+python recipes/average.py runs/few-mean runs/few-25:0.4 runs/few-40:0.4 runs/few-60:0.2
+terrella train dreams runs/few-25 --teacher runs/few-teacher --data $data --out runs/few-dreams --steps 60
+terrella record doom --scenario my_way_home --frames 24000 --seed 1 --out $data-test
+for run in few-teacher few-25 few-mean few-dreams; do
+    terrella score runs/$run --data $data-test --fresh --out scores/$run
 done
