@@ -18,7 +18,7 @@ import statistics
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -35,7 +35,7 @@ def main(
     threads: int = 1,
     fast: bool = False,
     alone: bool = False,
-    memory_mb: float = 16.0,
+    memory_mb: float | None = None,
     seed: int = 0,
     json: bool = False,
 ) -> None:
@@ -48,12 +48,13 @@ def main(
         threads: Threads that torch is given.
         fast: Draw as `terrella play --fast` does.
         alone: Leave the recorded keyframes out, so that the story's own memory is all there is.
-        memory_mb: Budget of a story's own memory, in MiB.
+        memory_mb: Budget of a story's own memory, in MiB; by itself as the world was saved.
         seed: Of the keys that are held and of the world's chance.
         json: Print one JSON document instead of lines.
     """
     torch.set_num_threads(threads)
-    learned = terrella.load(world, memory=not alone, memory_mb=memory_mb, fast=fast)
+    options: dict[str, Any] = {**({"fast": True} if fast else {}), **({"memory": False} if alone else {})}
+    learned = terrella.load(world, memory_mb=memory_mb, **options)
     count = steps or round(hours * 3600 / learned.spec.dt_s)
     if count < 10 * STRETCHES:
         sys.exit(f"{count} steps are too few to compare stretches of; give {10 * STRETCHES} or more.")

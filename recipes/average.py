@@ -11,8 +11,7 @@ import sys
 
 import terrella
 from terrella.learn.post_training import with_generator
-from terrella.learn.strips import Learned
-from terrella.worlds.folder import save_world
+from terrella.worlds.folder import Learned, save_world
 from terrella.worlds.history import HistoryWorld
 from terrella.worlds.video import VideoWorld
 

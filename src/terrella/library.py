@@ -47,15 +47,21 @@ def load(
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
              `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not (to give one
              asks to remember).
-    memory_mb: the budget in MiB of what a story remembers, its world's own or that around it (16, or as it was saved).
+    memory_mb: the budget in MiB of what a story remembers; as its world was saved, or 16.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
     if remember or eye is not None:
         from .space import remembering
 
-        inner, seeing = load(name, memory_mb=memory_mb, **options), None if eye is None else open_eye(eye)
+        truth = str(name).partition(":")[0] in ("doom", "gym")
+        inner = load(name, memory_mb=None if truth else memory_mb, **options)
+        seeing = None if eye is None else open_eye(eye)
         return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, seeing)
     text = str(name)
+    if memory_mb is not None and text.partition(":")[0] in ("doom", "gym"):
+        raise TerrellaError(
+            f"{text} is the truth itself and remembers nothing; leave `memory_mb` out, or remember=True."
+        )
     if options.get("fast") and text.partition(":")[0] in ("doom", "gym"):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
     if text == "doom" or text.startswith("doom:"):

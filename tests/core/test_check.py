@@ -153,6 +153,26 @@ class BrokenCamera(Walk):
     spec = replace(SPEC, camera=(0.0, 1.0, 0.5, 0.5))
 
 
+@broken("spec.heeds names ['sonar']")
+class HeedsTheUnseen(Walk):
+    spec = replace(SPEC, heeds=("sonar",))
+
+
+@broken("spec.heeds names ['at']")
+class HeedsTwice(Walk):
+    spec = replace(SPEC, heeds=("at",))
+
+
+@broken("the prior that it was given unchanged")
+class LearnsFromWhatItHeeds(Walk):
+    spec = replace(SPEC, heeds=("reward",))
+
+    def observe(self, observation, prior, rng):
+        if prior is not None and "reward" in observation:
+            prior["at"].add_(1)
+        return super().observe(observation, prior, rng)
+
+
 @broken("State with batch 1")
 class StartsTooMany(Walk):
     def start(self, batch, rng):

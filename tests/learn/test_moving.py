@@ -75,7 +75,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
         world = load_world(tmp_path / "world", memory=memory)
         assert isinstance(world, VideoWorld) and (world.starts.depth == 0).any(), "what moves is in no keyframe"
         assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
-        assert "observes" in check_world(world)
+        assert "observes" in check_world(world) and world.spec.heeds == ("things", "health")
     state = world.start(2, make_rng(0))
     assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
     still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)

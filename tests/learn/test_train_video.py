@@ -101,6 +101,12 @@ def test_a_foreign_resume_file_is_refused(recording, tmp_path):
         train_video(recording, tmp_path, CONFIG, quiet)
 
 
+def test_training_ends_after_its_hours_and_says_where(recording, tmp_path):
+    facts = train_video(recording, tmp_path, replace(CONFIG, hours=1e-9), quiet)
+    assert facts["step"] == 1 and facts["step"] < CONFIG.steps
+    assert json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])["step"] == 1
+
+
 def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp_path, monkeypatch):
     from terrella.learn import losses as module
 

@@ -122,5 +122,8 @@ def test_what_a_world_heeds_is_shown_to_it_where_it_was_recorded():
     seen = evidence(clips, heeding, 1)
     assert seen["health"].tolist() == [clip.start + 1 for clip in clips] and "ammo" not in seen
     assert seen["things"].dtype == torch.bool and seen["things"].nonzero().tolist() == [[k, 2, 3] for k in range(3)]
+    odd = {"health": np.full((12, 1), np.nan, np.float32), "things": np.zeros((12, 3), bool)}
+    strange = [replace(clip, further=odd) for clip in clips]
+    assert set(evidence(strange, heeding, 1)) == set(spec.observes), "what does not fit is left out"
     silent = [replace(clip, further={}) for clip in clips]
     assert set(evidence(silent, heeding, 1)) == set(spec.observes), "nobody is asked for what was not recorded"

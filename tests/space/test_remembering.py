@@ -263,3 +263,15 @@ def test_the_budget_reaches_the_memory_around_a_world(monkeypatch):
 def test_a_budget_without_room_is_refused(budget):
     with pytest.raises(ContractError, match="budget"):
         Remembering(Fickle(), memory_mb=budget)
+
+
+def test_the_budget_that_is_advised_has_room():
+    with pytest.raises(ContractError) as refused:
+        Remembering(Fickle(), memory_mb=0)
+    advised = float(str(refused.value).split("give ")[1].split()[0])
+    assert Remembering(Fickle(), memory_mb=advised).memory.capacity >= 1
+
+
+def test_the_truth_has_no_budget_of_its_own():
+    with pytest.raises(TerrellaError, match="remembers nothing"):
+        terrella.load("gym:CartPole-v1", memory_mb=4)

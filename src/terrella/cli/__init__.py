@@ -265,7 +265,7 @@ def play(
         remember: Give a world without a spatial memory one: what it showed, it shows again.
         eye: What tells depth and motion to a memory, where the world does not: a file of `terrella train eye`, or a world
             that has an eye.
-        memory_mb: What a story may remember, in MiB; 16 by itself.
+        memory_mb: What a story may remember, in MiB; as its world was saved, or 16.
         record: Folder of a dataset to which the page may record.
     """
     from ..core.errors import TerrellaError

@@ -102,6 +102,8 @@ def _spec_is_sound(world: World, seed: int, steps: int) -> None:
     for what, names in (("observes", spec.observes), ("heeds", spec.heeds), ("units", spec.units)):
         strangers = sorted(set(names) - set(spec.channels))
         _require(not strangers, f"spec.{what} names {strangers}, which are not among spec.channels.")
+    twice = sorted(set(spec.observes) & set(spec.heeds))
+    _require(not twice, f"spec.heeds names {twice}, which spec.observes names already.")
     _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
     _require(
         spec.camera is None or (len(spec.camera) == 4 and min(spec.camera) > 0), "spec.camera is four positive numbers."
@@ -189,16 +191,17 @@ def _refuses_junk(world: World, seed: int, steps: int) -> None:
 
 def _observes(world: World, seed: int, steps: int) -> None:
     rng, channels = make_rng(seed), tuple(world.spec.channels)
-    state = world.start(1, rng)
-    held = _copy(state)
-    seen, heeded = (_copy(world.render(state, names)) for names in (world.spec.observes, world.spec.heeds))
-    for prior, evidence in ((state, seen), (None, seen), (None, {**seen, **heeded})):
-        posterior = world.observe(evidence, prior, rng)
-        _require(
-            isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the evidence's batch."
-        )
-        _check_observation(world, world.render(posterior, channels), channels, 1)
-        _require(_same(held, state), "observe must leave the prior that it was given unchanged.")
+    for names in dict.fromkeys((world.spec.observes, (*world.spec.observes, *world.spec.heeds))):
+        state = world.start(1, rng)
+        held = _copy(state)
+        seen = _copy(world.render(state, names))
+        for prior in (state, None):
+            posterior = world.observe(seen, prior, rng)
+            _require(
+                isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the evidence's batch."
+            )
+            _check_observation(world, world.render(posterior, channels), channels, 1)
+            _require(_same(held, state), "observe must leave the prior that it was given unchanged.")
     if world.spec.observes:
         message = f"observe without {', '.join(world.spec.observes)} must raise ObservationError."
         _require_raises(ObservationError, message, world.observe, {}, None, rng)

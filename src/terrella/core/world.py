@@ -29,7 +29,8 @@ class World(Protocol):
         ...
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
-        """Evidence into state. Filtering is `observe(obs, imagine(state, action, rng), rng)`."""
+        """Evidence into state: all that `spec.observes` names, and of what `spec.heeds` names whatever is at hand.
+        Filtering is `observe(obs, imagine(state, action, rng), rng)`."""
         ...
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:

@@ -177,7 +177,7 @@ def distil(teacher: World, data: str | Path, out: str | Path, config: DistilConf
 
     updates.run(config.steps, update, draw, config.save_every_s, config.strip_every_s, report)
     draw()
-    return {"world": str(updates.out / "world"), **updates.told}
+    return {"world": str(updates.out / "world"), **updates.outcome}
 
 
 def truth_losses(clean: torch.Tensor, lesson: Lesson) -> dict[str, torch.Tensor]:

@@ -7,7 +7,7 @@ lone picture, under the recorded actions or along the recorded poses; so the dou
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +18,12 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.state import State
 from ..core.world import Observation, make_rng
 from ..worlds.doubt import CELLS, KNOTS, Doubt, DoubtConfig, clues
+from ..worlds.folder import Learned
 from ..worlds.history import HistoryWorld
 from ..worlds.video import VideoWorld
 from .samples import Recording
+from .updates import Report
 
-Report = Callable[[float, float, str], None]
-Learned = VideoWorld | HistoryWorld
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 SHOWN = (1, 3, 10)  # frames that a dream may be shown before it goes on alone
 _APART = 5  # one in so many stories is for calibration
@@ -138,7 +138,7 @@ def _dream(
     alone = arm == LONE
     state = dreamer.observe(_evidence(dreamer, recording, begins, alone), None, chance)
     for row in range(1, shown):
-        state = dreamer.imagine(state, _actions(dreamer, recording, begins + row - 1), chance)
+        state = dreamer.imagine(state, recording.played(dreamer.spec, begins + row - 1), chance)
         state = dreamer.observe(_evidence(dreamer, recording, begins + row, alone), state, chance)
     parts = []
     for step in range(horizon):
@@ -158,7 +158,7 @@ def _onward(
 ) -> State:
     if pose:
         return world.observe({"pose": recording.pose(rows)}, state, chance)
-    return world.imagine(state, _actions(world, recording, rows - 1), chance)
+    return world.imagine(state, recording.played(world.spec, rows - 1), chance)
 
 
 def _noted(world, recording, begins, horizon, arm, book, rng) -> Learned:
@@ -174,17 +174,8 @@ def _noted(world, recording, begins, horizon, arm, book, rng) -> Learned:
 
 
 def _evidence(world: Learned, recording: Recording, rows: np.ndarray, alone: bool) -> Observation:
-    seen = {"rgb": recording.rgb(rows).permute(0, 2, 3, 1).contiguous()}
-    if not alone and "pose" in world.spec.observes:
-        seen |= {"depth": recording.depth(rows), "pose": recording.pose(rows)}
-        if world.config.moving:
-            seen["things"] = recording.things(rows)
-    return seen
-
-
-def _actions(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    actions = np.asarray(recording.cache.action[rows]).astype(world.spec.action.dtype)
-    return torch.from_numpy(actions).view(len(rows), *(world.spec.action.shape or ()))
+    seen = recording.evidence(world.config, rows)
+    return {"rgb": seen["rgb"]} if alone else seen
 
 
 def _ahead(recording: Recording) -> np.ndarray:

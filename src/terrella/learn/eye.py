@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +20,8 @@ from ..space.eye import Eye, EyeConfig, normalised, save_eye
 from ..space.floorplan import Box
 from ..worlds.controls import Controls
 from .samples import Recording, usable_rows
+from .updates import Report
 
-Report = Callable[[float, float, str], None]
 DRIFT = 64  # steps over which odometry is summed when it is judged
 
 

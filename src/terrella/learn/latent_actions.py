@@ -70,7 +70,7 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
     run = _Run(cache, out, config)
     run.updates.run(config.steps, run.step, run.draw_strip, config.save_every_s, config.strip_every_s, report)
     run.draw_strip()
-    return {"run": str(out), **run.updates.told}
+    return {"run": str(out), **run.updates.outcome}
 
 
 def pictures(data: str | Path, size: tuple[int, int], report: Report) -> ClipCache:

@@ -1,4 +1,5 @@
-"""What frames are held against while a generator learns: the truth, and a critic that knows blur from detail."""
+"""What frames are held against while a generator learns: the truth, and a critic that knows blur from detail; in half
+precision where that is native."""
 
 from __future__ import annotations
 

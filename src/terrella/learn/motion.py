@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -14,8 +12,8 @@ from ..space.keyframes import Keyframes
 from ..worlds.generator import VideoConfig
 from ..worlds.motion import Motion
 from .samples import Recording
+from .updates import Report
 
-Report = Callable[[int, int, str], None]
 _WINDOWS, _LENGTH = 512, 24  # walks, and steps of each, on which the body is fitted
 
 

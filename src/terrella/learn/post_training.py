@@ -14,13 +14,13 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.world import World
 from ..data import ClipCache, Dataset, split
 from ..worlds.controls import Controls
-from ..worlds.folder import save_world
+from ..worlds.folder import Learned, save_world
 from ..worlds.generator import Generator, channels_last
 from ..worlds.history import HistoryWorld
 from ..worlds.video import VideoWorld
 from .lessons import Dream, recorded_lesson
 from .samples import THINGS, Box, Lesson, Recording, controls_of, usable_rows
-from .strips import Learned, draw_strip
+from .strips import draw_strip
 from .updates import Report, Updates
 
 
@@ -38,6 +38,7 @@ class Beside:
         return next(self.world.generator.parameters()).device
 
     def lesson(self, batch: int, rng: np.random.Generator, dream: Dream | None = None) -> Lesson:
+        """A lesson as in `train video`; with `dream`, some of the frames shown are the generator's own."""
         memory = self.world.memory if isinstance(self.world, VideoWorld) else None
         return recorded_lesson(self.recording, memory, self.world.config, batch, rng, dream)
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ..core.spec import Spec
 from ..data import ClipCache
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
@@ -59,6 +60,20 @@ class Recording:
     def lasting(self, rows) -> torch.Tensor:
         """The depth [n, H, W] that a keyframe may hold: 0 where things are."""
         return still(self.depth(rows), self.things(rows))
+
+    def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:
+        """What a world of this make observes of `rows`."""
+        seen = {"rgb": self.rgb(rows).permute(0, 2, 3, 1).contiguous()}
+        if config.geometry:
+            seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
+        if config.moving:
+            seen["things"] = self.things(rows)
+        return seen
+
+    def played(self, spec: Spec, rows) -> torch.Tensor:
+        """The actions of `rows` as the world of `spec` takes them: [n, *spec.action.shape]."""
+        actions = np.asarray(self.cache.action[rows]).astype(spec.action.dtype)
+        return torch.from_numpy(actions).view(len(rows), *(spec.action.shape or ()))
 
     def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
         """As a dream keeps its own."""

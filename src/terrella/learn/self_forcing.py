@@ -18,13 +18,14 @@ import torch
 
 from ..core.errors import DatasetError, TrainingError
 from ..core.world import World, make_rng
+from ..worlds.folder import Learned
 from ..worlds.generator import encode_depth
 from ..worlds.history import HistoryWorld
 from ..worlds.video import VideoWorld
 from .distil import Matching, drawn, follow, learn_critic, noise_for, sum_of, trusted, truth_losses
 from .lessons import changing
 from .losses import Critic, sharpened
-from .post_training import Beside, Learned, beside, fingerprint, leave, recipe_of, with_generator
+from .post_training import Beside, beside, fingerprint, leave, recipe_of, with_generator
 from .samples import Box, Lesson
 from .updates import Report, Updates, descend
 
@@ -75,11 +76,7 @@ class Dreams:
         self.row = rng.choice(beginnings(pair, horizon), batch)
         rows = self.row
         self.row = rows - CONTEXT + 1
-        seen = {"rgb": pair.recording.rgb(self.row).permute(0, 2, 3, 1)}
-        if self.world.config.geometry:
-            seen |= {"depth": pair.recording.depth(self.row), "pose": pair.recording.pose(self.row)}
-        if self.world.config.moving:
-            seen["things"] = pair.recording.things(self.row)
+        seen = pair.recording.evidence(self.world.config, self.row)
         self.state = self.world.observe(seen, None, noise_rng)
         while (self.row < rows).all():
             truth = self.next_lesson().truth
@@ -215,4 +212,4 @@ def train_dreams(
 
     updates.run(config.steps, update, draw, config.save_every_s, config.strip_every_s, report)
     draw()
-    return {"world": str(updates.out / "world"), **updates.told}
+    return {"world": str(updates.out / "world"), **updates.outcome}

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,15 +14,12 @@ import numpy as np
 from ..core.errors import DatasetError, TrainingError
 from ..data import ClipCache, Dataset, split
 from ..space.eye import load_eye, save_eye
-from ..worlds.folder import MEMORY_FILE, load_world, save_world
-from ..worlds.history import HistoryWorld
+from ..worlds.folder import MEMORY_FILE, Learned, load_world, save_world
 from ..worlds.video import VideoWorld
 from .doubt import DoubtTraining, learn_doubt
 from .eye import EyeTraining, learn_eye, recording_of, sight
 from .samples import Recording, controls_of
-
-Report = Callable[[float, float, str], None]
-Learned = VideoWorld | HistoryWorld
+from .updates import Report
 
 
 @dataclass(frozen=True)

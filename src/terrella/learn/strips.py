@@ -10,11 +10,8 @@ import torch
 from PIL import Image
 
 from ..core.world import make_rng
-from ..worlds.history import HistoryWorld
-from ..worlds.video import VideoWorld
+from ..worlds.folder import Learned
 from .samples import Recording
-
-Learned = VideoWorld | HistoryWorld
 
 
 def draw_strip(worlds: Sequence[Learned], recording: Recording, held_out: list[int], path: Path) -> None:
@@ -35,20 +32,12 @@ def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tens
     """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
     move, the recorded actions."""
     rng, config = make_rng(1), world.config
-    seen = {"rgb": recording.rgb(rows[:1]).permute(0, 2, 3, 1)}
-    if config.geometry:
-        seen |= {"depth": recording.depth(rows[:1]), "pose": recording.pose(rows[:1])}
-    if config.moving:
-        seen["things"] = recording.things(rows[:1])
-    state = world.observe(seen, None, rng)
+    state = world.observe(recording.evidence(config, rows[:1]), None, rng)
     frames = [world.render(state, ("rgb",))["rgb"]]
     for row in rows[1:]:
         if config.geometry and not config.moving:  # what moves answers to actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
-            action = (
-                recording.cache.action[row - 1].astype(world.spec.action.dtype).reshape(world.spec.action.shape or ())
-            )
-            state = world.imagine(state, torch.from_numpy(action)[None], rng)
+            state = world.imagine(state, recording.played(world.spec, [row - 1]), rng)
         frames.append(world.render(state, ("rgb",))["rgb"])
     return torch.cat(frames)[::8].permute(0, 3, 1, 2)

@@ -325,7 +325,7 @@ class _Run:
         config, done = self.config, (self.out / "world" / "world.json").exists()
         if not done or self.facts.get("sensed") != self.facts["step"]:
             self._finish(config, report)
-        return {"world": str(self.out / "world"), **self.updates.told}
+        return {"world": str(self.out / "world"), **self.updates.outcome}
 
     def _finish(self, config: TrainConfig, report: Report) -> None:
         """The last strip, and the senses of the finished world."""

@@ -47,7 +47,7 @@ class Updates:
         hours: float = float("inf"),
     ) -> None:
         """`update(step)` until `steps` are done, or `hours` are over, those of earlier runs counted in; `draw()` now and
-        then, which leaves the world as it now is and a picture of it."""
+        then, which leaves what there is to look at."""
         facts, recent, whole = self.facts, [], True
         began = saved = drawn = time.monotonic()
         before = facts["seconds"]
@@ -62,7 +62,8 @@ class Updates:
                 if now - saved > save_every_s:
                     self.save()
                     saved = now
-                if len(recent) == 20 or facts["step"] == steps:
+                over = facts["step"] >= steps or facts["seconds"] >= 3600 * hours
+                if len(recent) == 20 or over:
                     self._log(recent, max(facts["step"] / steps, facts["seconds"] / (3600 * hours)), report)
                     recent = []
                 if now - drawn > strip_every_s:
@@ -78,7 +79,7 @@ class Updates:
         save_run(self.out, self.modules, self.optimisers, self.facts)
 
     @property
-    def told(self) -> dict[str, Any]:
+    def outcome(self) -> dict[str, Any]:
         """The facts without the recipe."""
         return {name: fact for name, fact in self.facts.items() if name != "recipe"}
 

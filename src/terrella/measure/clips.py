@@ -133,7 +133,7 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
     ObservationError where it cannot."""
     seen = {}
     for name in (*spec.observes, *spec.heeds):
-        told = [clip.further.get(name, getattr(clip, name, None)) for clip in clips]
+        told = [getattr(clip, name, None) if hasattr(clip, name) else clip.further.get(name) for clip in clips]
         arrays = [array for array in told if array is not None]
         if len(arrays) < len(clips) and name in spec.heeds:
             continue
@@ -143,11 +143,14 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
         if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
-        if stacked.dtype == torch.bool and len(wanted) == 2:  # and so are marks: one pixel of many counts
+        if name in spec.heeds and stacked.ndim == 3 and len(wanted) == 2:  # and so are marks: one pixel of many counts
             stacked = F.adaptive_max_pool2d(stacked.float()[:, None], wanted)[:, 0] > 0
         if wanted == () and stacked[0].numel() == 1:
             stacked = stacked.reshape(-1)
-        if tuple(stacked.shape[1:]) != wanted:
+        fits = tuple(stacked.shape[1:]) == wanted
+        if name in spec.heeds and not (fits and torch.isfinite(stacked.float()).all()):
+            continue
+        if not fits:
             raise ObservationError(
                 f"{spec.name} observes '{name}' of shape {wanted}, the clips hold {tuple(stacked.shape[1:])}; "
                 "open the clip cache at the world's size."

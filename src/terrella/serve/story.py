@@ -45,6 +45,11 @@ def vitals(spec: Spec) -> list[str]:
     return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
 
 
+def _alike(one: Spec, other: Spec, name: str) -> bool:
+    """Whether both show the channel, in the same form."""
+    return name in one.channels and name in other.channels and one.channels[name].shape == other.channels[name].shape
+
+
 @dataclass(frozen=True)
 class StoryConfig:
     """history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory for the states among them."""
@@ -273,8 +278,8 @@ class Story:
             self.notice = f"the dream starts on its own: it cannot look at {self.spec.name}."
             return dream.start(1, rng)
         try:
-            heeded = [name for name in dream.spec.heeds if name in self.spec.channels]
-            state = dream.observe(self.worlds[0].render(truth, [*dream.spec.observes, *heeded]), None, rng)
+            shared = [name for name in dream.spec.heeds if _alike(self.spec, dream.spec, name)]
+            state = dream.observe(self.worlds[0].render(truth, [*dream.spec.observes, *shared]), None, rng)
         except TerrellaError as error:
             self.notice = f"the dream starts on its own: {error}"
             return dream.start(1, rng)

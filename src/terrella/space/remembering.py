@@ -7,6 +7,7 @@ blend, so that it goes on from it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -59,7 +60,7 @@ class Remembering:
         self.world, self.eye = world, eye
         self.memory = Memory(camera, (height, width), memory_mb)
         if not self.memory.capacity:
-            least = self.memory.keyframe_bytes / 2**20
+            least = math.ceil(100 * self.memory.keyframe_bytes / 2**20) / 100
             raise ContractError(f"a budget of {memory_mb} MiB has no room for a keyframe; give {least:.2f} or more.")
         self.spec = remembering_spec(
             _posed_spec(spec, (height, width), eye, camera), (height, width), self.memory.capacity
@@ -117,7 +118,8 @@ class Remembering:
         glimpse = self.memory.look(before, pose)
         rgb, known = blend(glimpse, rgb)
         depth = torch.where(known > 0.5, glimpse.depth, depth)
-        evidence = self.world.render(inner, [name for name in self.world.spec.observes if name != "rgb"])
+        told = (*self.world.spec.observes, *self.world.spec.heeds)
+        evidence = self.world.render(inner, [name for name in told if name != "rgb"])
         blended = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
         # a blend is no evidence: how far the dream has gone from any, and what to expect of it, stay as they were
         inner = blended.replace(**{name: inner[name] for name in _DREAMT if name in inner})

@@ -33,11 +33,12 @@ from .video import VideoWorld
 
 KIND, VERSION = "video", 2
 MEMORY_FILE = "memory.safetensors"
+Learned = VideoWorld | HistoryWorld
 VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
 RETIRED = ("own_keyframes",)  # settings of older worlds that mean nothing any more
 
 
-def save_world(world: VideoWorld | HistoryWorld, path: str | Path, card: dict, quality: int = 92) -> None:
+def save_world(world: Learned, path: str | Path, card: dict, quality: int = 92) -> None:
     """Writes the folder; each file is replaced whole. CheckpointError where it cannot be (a full disk): the old stay."""
     try:
         _save(world, Path(path), card, quality)
@@ -45,7 +46,7 @@ def save_world(world: VideoWorld | HistoryWorld, path: str | Path, card: dict, q
         raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
 
 
-def _save(world: VideoWorld | HistoryWorld, path: Path, card: dict, quality: int) -> None:
+def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
     path.mkdir(parents=True, exist_ok=True)
     weights = {f"generator.{k}": v for k, v in world.generator.state_dict().items()}
     if isinstance(world, VideoWorld):
@@ -87,9 +88,7 @@ def _save(world: VideoWorld | HistoryWorld, path: Path, card: dict, quality: int
     _replace(path / "world.json", lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
 
 
-def load_world(
-    path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
-) -> VideoWorld | HistoryWorld:
+def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None) -> Learned:
     """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); `memory_mb` is the
     budget of a story's own memory, where it is not to be the saved one; the generator runs on `device`, geometry on the CPU.
 
