@@ -59,6 +59,9 @@ def main(
     if count < 10 * STRETCHES:
         sys.exit(f"{count} steps are too few to compare stretches of; give {10 * STRETCHES} or more.")
     found = run(learned, count, seed)
+    budget = memory_mb if memory_mb is not None else getattr(getattr(learned, "config", None), "memory_mb", None)
+    taken = max((row["memory_mib"] for row in found["stretches"] if "memory_mib" in row), default=None)
+    found["within_budget"] = None if budget is None or taken is None else taken <= budget
     found |= {
         "world": world,
         "memory_mb": memory_mb,
@@ -154,6 +157,8 @@ def report(found: dict) -> str:
         f"  last tenth against first: wall {growth['ms']:+.1%}, 95% {growth['p95_ms']:+.1%}, processor {growth['cpu_ms']:+.1%}, "
         f"resident {found['resident_growth_mib']:+.0f} MiB (peak {found['peak_resident_mib']:,.0f})"
     )
+    if found["within_budget"] is not None:
+        lines.append(f"  memory within its budget: {'yes' if found['within_budget'] else 'NO'}")
     return "\n".join(lines)
 
 
