@@ -16,7 +16,8 @@ from terrella.cli import main
 OPTIONS = {
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--frames --human --json --live-mcap --out --pictures --port --seed --size",
-    "play": "--compare --device --eye --fast --host --image --json --memory-mb --no-memory --port --record --remember --seed --token --truth",
+    "play": "--compare --device --eye --fast --host --image --json --memory-mb --no-memory --port --record --remember --seed "
+    "--token --truth",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
     "data doctor": "--json --out --repair",
