@@ -17,7 +17,7 @@ from terrella.worlds.video import VideoWorld
 
 
 def average(worlds: list[Learned], weights: list[float]) -> Learned:
-    """Weights need not add up to 1."""
+    """Weights are 0 or more and need not add up to 1."""
     mixed, shares = worlds[0].generator, [weight / sum(weights) for weight in weights]
     states = [world.generator.state_dict() for world in worlds]
     mixed.load_state_dict({name: sum(s * state[name] for s, state in zip(shares, states)) for name in states[0]})
@@ -26,12 +26,19 @@ def average(worlds: list[Learned], weights: list[float]) -> Learned:
 
 
 def main() -> None:
-    if len(sys.argv) < 4:
+    try:
+        parts = [(run, float(weight)) for run, _, weight in (part.rpartition(":") for part in sys.argv[2:])]
+    except ValueError:
         sys.exit(__doc__)
-    parts = [part.rpartition(":") for part in sys.argv[2:]]
-    worlds = [terrella.load(run) for run, _, _ in parts]
+    weights = [weight for _, weight in parts]
+    if len(parts) < 2 or not (min(weights) >= 0 < sum(weights) < float("inf")):
+        sys.exit(__doc__)
+    worlds = [terrella.load(run) for run, _ in parts]
     learned = [world for world in worlds if isinstance(world, (VideoWorld, HistoryWorld))]
-    mean = average(learned, [float(weight) for _, _, weight in parts])
+    makes = {str({name: tuple(t.shape) for name, t in world.generator.state_dict().items()}) for world in learned}
+    if len(learned) < len(worlds) or len(makes) > 1:
+        sys.exit("these are not all learned worlds with generators of one make; give runs that began from one world.")
+    mean = average(learned, weights)
     save_world(mean, sys.argv[1], dict(mean.spec.card))
 
 

@@ -53,16 +53,15 @@ def load(
     if remember or eye is not None:
         from .space import remembering
 
-        truth = str(name).partition(":")[0] in ("doom", "gym")
-        inner = load(name, memory_mb=None if truth else memory_mb, **options)
+        inner = load(name, memory_mb=None if is_truth(name) else memory_mb, **options)
         seeing = None if eye is None else open_eye(eye)
         return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, seeing)
     text = str(name)
-    if memory_mb is not None and text.partition(":")[0] in ("doom", "gym"):
+    if memory_mb is not None and is_truth(name):
         raise TerrellaError(
             f"{text} is the truth itself and remembers nothing; leave `memory_mb` out, or remember=True."
         )
-    if options.get("fast") and text.partition(":")[0] in ("doom", "gym"):
+    if options.get("fast") and is_truth(name):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
     if text == "doom" or text.startswith("doom:"):
         return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
@@ -73,6 +72,11 @@ def load(
 
         return GymnasiumWorld(text.partition(":")[2], **options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
+
+
+def is_truth(name: str | Path) -> bool:
+    """Whether the name is that of a game or an environment, not of a learned world."""
+    return str(name).partition(":")[0] in ("doom", "gym")
 
 
 def folder_of(name: str | Path) -> Path:

@@ -19,7 +19,7 @@ def load_named(name: str, device: str, memory: bool = True, fast: bool = False, 
     from .. import library
 
     options: dict[str, Any] = {**remembering, **({"fast": True} if fast else {})}
-    if not (name == "doom" or name.startswith(("doom:", "gym:"))):
+    if not library.is_truth(name):
         options |= {"device": device_of(device), "memory": memory}
     world = library.load(name, **options)
     if fast:

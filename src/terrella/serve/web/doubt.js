@@ -1,4 +1,4 @@
-// The thin bar that says when the world invents: quiet while it is sure.
+// The thin bar that says how far to trust the picture: quiet while the world is sure.
 
 export class Doubt {
   constructor(root, fill) {
@@ -27,6 +27,6 @@ export class Doubt {
     this.root.dataset.level = this.level;
     this.root.ariaValueMax = 1.6 * invents;
     this.root.ariaValueNow = this.value;
-    this.root.title = `${{ sure: 'It knows this place', unsure: 'It is less sure here', inventing: 'It is inventing' }[this.level]}: the picture is expected to be off by ${(100 * this.value).toFixed(1)}% of full brightness`;
+    this.root.title = `${{ sure: 'It knows this place', unsure: 'It is less sure here', inventing: 'It trusts this little' }[this.level]}: the picture is expected to be off by ${(100 * this.value).toFixed(1)}% of full brightness`;
   }
 }
