@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,14 @@ from gymnasium import spaces
 from tests.data.corridor import DEPTH, Corridor
 
 from terrella.core import check_world, make_rng
+from terrella.core.errors import ObservationError
 from terrella.data import ClipCache, Explorer, record
 from terrella.learn.moving import mirrored, moving_lesson, other_side
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
 from terrella.learn.train_video import TrainConfig, train_video
-from terrella.worlds.folder import load_world
+from terrella.space.camera import yaw
+from terrella.worlds.cast import LOOK, NONE, NUMBER, ROWS
+from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import VideoConfig
 from terrella.worlds.video import VideoWorld
 
@@ -52,6 +56,35 @@ class Haunted(Corridor):
         return {name: told[name] if name in told else seen[name] for name in channels}
 
 
+class Peopled(Haunted):
+    """The same, told apart: the thing keeps 1.5 m before the eye."""
+
+    def __init__(self):
+        super().__init__()
+        marks = spaces.Box(0, ROWS, DEPTH, np.uint8)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        more = {"instances": marks, "cast": spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)}
+        self.spec = replace(self.spec, channels={**self.spec.channels, **more})
+
+    def render(self, state, channels):
+        seen = super().render(state, [*{*channels, "things", "pose"} - {"cast", "instances"}])
+        x, y, z, *_ = seen["pose"][0].tolist()
+        heading = float(yaw(seen["pose"])[0])
+        seen["instances"] = seen["things"].to(torch.uint8)
+        seen["cast"] = torch.zeros(1, ROWS, 4)
+        there = [5.0, x + 1.5 * math.cos(heading), y + 1.5 * math.sin(heading), z - 0.5]
+        seen["cast"][0, 0] = torch.tensor(there)
+        return {name: seen[name] for name in channels}
+
+
+@pytest.fixture(scope="module")
+def peopled(tmp_path_factory):
+    """A world learned of the same, and its recording."""
+    folder, world = tmp_path_factory.mktemp("peopled"), Peopled()
+    record(world, Explorer(world.spec), folder / "set", 300, make_rng(0), max_episode_steps=80)
+    train_video(folder / "set", folder / "run", replace(CONFIG, cast_steps=20), lambda *told: None)
+    return load_world(folder / "run" / "world"), folder
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("moving") / "set"
@@ -80,6 +113,67 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
     assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
     still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
     assert not load_world(still["world"]).config.moving
+
+
+def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
+    world, _ = peopled
+    assert world.config.cast and world.cast is not None and world.spec.card["cast_looks"] >= 1
+    assert "observes" in check_world(world) and world.spec.heeds == ("things", "instances", "cast", "health")
+    state = world.start(2, make_rng(0))
+    assert (state["cards"][:, 0, NUMBER] == 5).all() and (state["cards"][:, 0, LOOK] != NONE).all()
+    seen = world.render(state, ("cast", "instances", "things"))
+    assert (seen["instances"] == 1).any((1, 2)).all() and (seen["things"] | (seen["instances"] == 0)).all()
+    assert torch.equal(seen["cast"], state["cards"][..., :4])
+    save_world(world, tmp_path / "again", dict(world.spec.card))
+    again = load_world(tmp_path / "again")
+    kept, read = world.cast.state_dict(), again.cast.state_dict()
+    assert again.cast.config == world.cast.config and all(torch.equal(kept[name], read[name]) for name in kept)
+    cards = [one.imagine(one.start(2, make_rng(1)), torch.zeros(2, 6), make_rng(1))["cards"] for one in (world, again)]
+    assert torch.equal(*cards)
+    bare = world.without_memory()
+    assert bare.cast is world.cast
+
+
+def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
+    world, rng = peopled[0], make_rng(0)
+    state = world.start(1, rng)
+    seen = world.render(state, ("rgb", "depth", "pose", "things", "instances", "cast"))
+    told = seen["cast"].clone()
+    told[0, 0, 0] = 77.0
+    after = world.observe({**seen, "cast": told}, state, rng)
+    assert after["cards"][0, :, NUMBER].tolist()[:2] == [77.0, 5.0]  # the one not told of waits
+    blank = world.observe({name: seen[name] for name in ("rgb", "depth", "pose")}, state, rng)
+    assert not blank["cards"].any() and not blank["instances"].any()
+    for bad in (
+        {"cast": told[:, :3]},
+        {"cast": told[..., :3]},
+        {"instances": seen["instances"][0]},
+        {"cast": told * torch.nan},
+    ):
+        with pytest.raises(ObservationError, match="cast is"):
+            world.observe({**seen, **bad}, state, rng)
+
+
+def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled):
+    world, folder = peopled
+    cache = ClipCache.open(folder / "set", CONFIG.size)
+    marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "cast"))
+    assert (
+        marks.dtype == np.uint8
+        and marks.shape[1:] == DEPTH
+        and told.shape[1:] == (ROWS, 4)
+        and (told[:, 0, 0] == 5).all()
+    )
+    start = np.zeros(cache.length, np.int64)
+    rows = Recording(cache, start, np.ones(cache.length, bool))
+    lesson = moving_lesson(rows, world.memory, world.config, 8, np.random.default_rng(1), None)
+    covered = lesson.truth[:, 4] > 0.5  # nothing else moves here
+    assert covered.any() and (lesson.weight[:, 0][covered] == 0).all() and (lesson.weight[:, 0][~covered] > 0).all()
+    assert (lesson.last[:, 3][covered] == 0).float().mean() > 0.6 and not (lesson.last[:, 5] > 0.5).any()
+    drawn = torch.zeros_like(lesson.truth)
+    judged = lesson.judged(drawn)
+    assert torch.equal(judged[:, :3].movedim(1, -1)[covered], lesson.truth[:, :3].movedim(1, -1)[covered])
+    assert (judged[:, :3].movedim(1, -1)[~covered] == 0).all()
 
 
 def test_evidence_of_vitals_and_things_is_taken(recording, tmp_path):

@@ -8,7 +8,7 @@ import torch
 
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
-from terrella.space.camera import unproject
+from terrella.space.camera import project, unproject
 from terrella.space.reproject import warp
 
 pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install vizdoom")
@@ -56,6 +56,31 @@ def test_monsters_hurt_and_can_be_shot():
     game.close()
     assert health[0] == 100 and min(health) < 100
     assert paid >= 1
+
+
+def test_what_moves_is_told_apart_by_number_and_place():
+    """Each card's pixels lie about the column of its place, within `things`; who goes on being seen keeps the number, and
+    comes no further than a monster walks."""
+    game, rng = Doom(DoomConfig(scenario="defend_the_line")), make_rng(0)
+    state, before, met, kept = game.start(1, rng), {}, 0, 0
+    for _ in range(60):
+        seen = game.render(state, ("cast", "instances", "things", "pose"))
+        rows = (seen["cast"][0, :, 0] > 0).nonzero()[:, 0].tolist()
+        assert rows == list(range(len(rows))) and not (seen["instances"].bool() & ~seen["things"]).any()
+        where, _ = project(seen["cast"][:, :, 1:], seen["pose"], CAMERA)
+        for row in rows:
+            columns = (seen["instances"][0] == row + 1).any(0).nonzero()[:, 0].float()
+            if len(columns) > 2 and 5 < columns.min() and columns.max() < 122:
+                assert abs(float(where[0, row, 0]) * 128 - float(columns.mean()) - 0.5) < max(3, len(columns) / 2)
+                met += 1
+        now = {float(card[0]): card[1:] for card in seen["cast"][0][: len(rows)]}
+        for number in now.keys() & before.keys():
+            assert (now[number] - before[number]).norm() < 1.0
+            kept += 1
+        before = now
+        state = game.imagine(state, press(game, "ATTACK"), rng)
+    game.close()
+    assert met > 50 and kept > 100
 
 
 def test_who_dies_has_no_health_left():

@@ -35,6 +35,7 @@ POSE_CONVENTION = "T_world_cam: metres and quaternion w,x,y,z; world z up; camer
 DEPTH_UNIT_M = 0.001  # one step of the stored uint16
 DEPTH_BEYOND = 65535  # stored where nothing lies within range; reads back as 65.535 m
 KNOWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
+DREAMT = ("uncertainty", "known", "keyframes")  # what a dream tells of itself is no evidence
 
 
 @dataclass(frozen=True)
@@ -69,17 +70,17 @@ class Layout:
         pose: bool = False,
         vectors: Mapping[str, int] | None = None,
         world: Mapping[str, object] | None = None,
-        masks: Mapping[str, tuple[int, int]] | None = None,
+        arrays: Mapping[str, tuple[tuple[int, ...], str]] | None = None,
     ) -> Layout:
         """Of a World's channels: rgb (H, W), depth (h, w), the camera's pose, vectors by length, a name per number of an
-        action, masks (bool pictures) by (h, w)."""
+        action, arrays (masks, lists) by shape and type."""
         made = [Sensor(RGB, "image", (*rgb, 3), "uint8")] if rgb else []
         made += [Sensor(DEPTH, "depth", depth)] if depth else []
         made += [Sensor(STATE, "vector", (7,), names=POSE_NAMES)] if pose else []
         for name, length in (vectors or {}).items():
             names = tuple(f"{name}_{i}" for i in range(length))
             made.append(Sensor(f"observation.{name}", "vector", (length,), names=names))
-        made += [Sensor(f"observation.{name}", "vector", shape, "bool") for name, shape in (masks or {}).items()]
+        made += [Sensor(f"observation.{name}", "vector", *kind) for name, kind in (arrays or {}).items()]
         made.append(Sensor(ACTION, "vector", (len(action),), names=tuple(action)))
         made += [Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")]
         return Layout(fps, {sensor.name: sensor for sensor in made}, world=dict(world or {}))
@@ -92,13 +93,12 @@ class Layout:
         vectors = {
             name: int(np.prod(shape_of(space)))
             for name, space in channels.items()
-            if name not in (*KNOWN_CHANNELS, "uncertainty")
-            and len(shape_of(space)) <= 1  # a dream's doubt is no evidence
+            if name not in (*KNOWN_CHANNELS, *DREAMT) and len(shape_of(space)) <= 1
         }
-        masks = {
-            name: _height_width(space)
+        arrays = {
+            name: (shape_of(space), dtype_of(space).name)
             for name, space in channels.items()
-            if len(shape_of(space)) == 2 and dtype_of(space) == np.bool_
+            if name not in (*KNOWN_CHANNELS, *DREAMT) and len(shape_of(space)) == 2
         }
         width = int(np.prod(shape_of(spec.action)))
         names = spec.action_names if len(spec.action_names) == width else tuple(f"action_{i}" for i in range(width))
@@ -115,7 +115,7 @@ class Layout:
         }
         rate = tidy(fps if fps is not None else 1 / spec.dt_s)
         pictured = size.get("rgb"), size.get("depth"), "pose" in channels
-        return Layout.of_channels(rate, names, *pictured, vectors, world, masks)
+        return Layout.of_channels(rate, names, *pictured, vectors, world, arrays)
 
     @property
     def rows(self) -> dict[str, Sensor]:

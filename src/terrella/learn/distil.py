@@ -156,7 +156,7 @@ def distil(teacher: World, data: str | Path, out: str | Path, config: DistilConf
                 return generate(student, noise, shown.glimpse, shown.last, shown.told, config.flow_steps).float().cpu()
 
         lesson = pair.lesson(config.batch, rng, dream).to(pair.device)
-        clean = drawn(student, noise_for(pair, config.batch, noise_rng), lesson, config.flow_steps, rng)
+        clean = lesson.judged(drawn(student, noise_for(pair, config.batch, noise_rng), lesson, config.flow_steps, rng))
         losses = truth_losses(clean, lesson)
         teacher = matching.towards_teacher(clean, lesson, noise_rng)
         loss = config.truth_weight * sum_of(losses) + config.teacher_weight * teacher

@@ -29,7 +29,7 @@ def moving_lesson(
     `dream`), half of the last are worn, and in one sample of ten they are unknown."""
     dreamt = int(rng.choice(len(OFTEN), p=OFTEN)) if dream else 0
     shown = draw(recording, memory, config, batch, rng, back=len(OFTEN) + 1)
-    last, earlier = (_frame(recording, shown.target - dreamt - age) for age in (1, 2))
+    last, earlier = (_frame(recording, shown.target - dreamt - age, config.cast) for age in (1, 2))
     for back in range(dreamt, 0, -1):
         rows = shown.target - back
         before = carry_frames(last, earlier, recording.pose(rows), config.camera)
@@ -47,6 +47,8 @@ def moving_lesson(
     truth = torch.cat([coded, encode_depth(recording.depth(shown.target))[:, None], things[:, None]], 1)
     told = _told(recording, shown.target, last.rgb, config.history)
     weight = 1 + COUNTS * torch.maximum(things, (carried[:, 5] > 0.5).float())[:, None]
+    if config.cast:  # what cards cover is not to be drawn
+        weight = weight * (recording.instances(shown.target) == 0)[:, None]
     glimpse = glimpse_of(shown, shown.target, recording, config)
     lesson = Lesson(glimpse, carried, told, truth, weight / weight.mean())
     return mirrored(lesson, recording.cache.action_names) if rng.random() < 0.5 else lesson
@@ -78,8 +80,9 @@ def other_side(action_names: tuple[str, ...]) -> list[int]:
     return [action_names.index(name) if name in action_names else at for at, name in enumerate(names)]
 
 
-def _frame(recording: Recording, rows: np.ndarray) -> Frame:
-    return Frame(recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows))
+def _frame(recording: Recording, rows: np.ndarray, cast: bool) -> Frame:
+    covered = recording.instances(rows) > 0 if cast else None
+    return Frame(recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows), covered)
 
 
 def _told(recording: Recording, rows: np.ndarray, last: torch.Tensor, history: int) -> torch.Tensor:

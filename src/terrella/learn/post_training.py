@@ -19,7 +19,7 @@ from ..worlds.generator import Generator, channels_last
 from ..worlds.history import HistoryWorld
 from ..worlds.video import VideoWorld
 from .lessons import Dream, recorded_lesson
-from .samples import THINGS, Box, Lesson, Recording, controls_of, usable_rows
+from .samples import CAST, INSTANCES, THINGS, Box, Lesson, Recording, controls_of, usable_rows
 from .strips import draw_strip
 from .updates import Report, Updates
 
@@ -63,9 +63,10 @@ def beside(world: World, data: str | Path, keep_out: Box | None, report: Report)
             f"{data} has actions ({found.kind}, {found.told}) that {world.spec.name} does not know "
             f"({controls.kind}, {controls.told}: {', '.join(world.spec.action_names)}); give a recording of the same game."
         )
-    if config.moving and THINGS not in cache.arrays:
+    lacks = [name for name in (THINGS,) * config.moving + (CAST, INSTANCES) * config.cast if name not in cache.arrays]
+    if lacks:
         raise DatasetError(
-            f"{data} does not mark the `things` that move, which {world.spec.name} is shown; record them."
+            f"{data} does not tell of {', '.join(lacks)}, which {world.spec.name} is shown; record them."
         )
     if config.geometry and (cache.depth is None or cache.pose is None):
         raise DatasetError(f"{data} lacks the depth or the poses that {world.spec.name} is shown; record them as well.")

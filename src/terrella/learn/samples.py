@@ -20,6 +20,7 @@ from ..worlds.moving import still
 from ..worlds.video import carry
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish
+CAST, INSTANCES = "observation.cast", "observation.instances"  # those that tell it apart
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,11 @@ class Recording:
         things = torch.from_numpy(np.asarray(recorded[rows], np.float32))
         return F.adaptive_max_pool2d(things[:, None], (height, width))[:, 0]
 
+    def instances(self, rows) -> torch.Tensor:
+        """uint8 [n, H, W], which row of `cast` is seen at a pixel, counted from 1 (0: none)."""
+        told = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
+        return F.adaptive_max_pool2d(told[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
+
     def lasting(self, rows) -> torch.Tensor:
         """The depth [n, H, W] that a keyframe may hold: 0 where things are."""
         return still(self.depth(rows), self.things(rows))
@@ -68,6 +74,9 @@ class Recording:
             seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
         if config.moving:
             seen["things"] = self.things(rows)
+        if config.cast:
+            seen["instances"] = self.instances(rows)
+            seen["cast"] = torch.from_numpy(np.array(self.cache.arrays[CAST][rows], np.float32))
         return seen
 
     def played(self, spec: Spec, rows) -> torch.Tensor:
@@ -140,6 +149,10 @@ class Lesson:
     told: torch.Tensor
     truth: torch.Tensor
     weight: torch.Tensor | None = None  # [B, 1, H, W], how much each pixel counts; None: all alike
+
+    def judged(self, clean: torch.Tensor) -> torch.Tensor:
+        """Drawn frames `clean`, with the truth where nothing counts: no loss and no critic sees what was drawn there."""
+        return clean if self.weight is None else torch.where(self.weight > 0, clean, self.truth)
 
     def to(self, device) -> Lesson:
         weight = None if self.weight is None else self.weight.to(device)

@@ -78,9 +78,13 @@ class Dreams:
         self.row = rows - CONTEXT + 1
         seen = pair.recording.evidence(self.world.config, self.row)
         self.state = self.world.observe(seen, None, noise_rng)
+        if self.world.config.cast:  # these dreams are of what stands still
+            self.state = self.state.replace(cards=torch.zeros_like(self.state["cards"]))
         while (self.row < rows).all():
             truth = self.next_lesson().truth
             self.go_on(torch.cat([truth[:, :4], 40 * truth[:, 4:] - 20], 1))  # things are drawn as logits
+            if self.world.config.cast:
+                self.state = self.state.replace(instances=pair.recording.instances(self.row))
 
     def next_lesson(self) -> Lesson:
         """What the generator is shown of the next frame, and the truth."""
@@ -101,6 +105,8 @@ class Dreams:
         truth = torch.cat([found.float() / 127.5 - 1, encode_depth(depth)[:, None]], 1)
         if self.world.config.moving:
             truth = torch.cat([truth, recording.things(self.row)[:, None]], 1)
+        if self.world.config.cast:
+            weight = (recording.instances(self.row) == 0)[:, None].float()
         return Lesson(self.glimpse, last, told, truth, weight)
 
     @torch.no_grad()
@@ -187,7 +193,8 @@ def train_dreams(
         for frame in range(config.horizon):
             number = step * config.horizon + frame
             lesson = dreams.next_lesson().to(pair.device)
-            clean = drawn(generator, noise_for(pair, config.batch, noise_rng), lesson, flow_steps, rng)
+            fresh = drawn(generator, noise_for(pair, config.batch, noise_rng), lesson, flow_steps, rng)
+            clean = lesson.judged(fresh)
             losses = truth_losses(clean, lesson)
             loss = config.truth_weight * sum_of(losses)
             if matching is not None:
@@ -202,7 +209,7 @@ def train_dreams(
             told["critic"] = learn_critic(critic, critic_optimiser, clean, lesson, real, number)
             if matching is not None:
                 told["mimic"] = matching.learn(clean, lesson, noise_rng, number)
-            dreams.go_on(clean)
+            dreams.go_on(fresh)
             found.append(told)
         return {name: float(np.mean([one[name] for one in found])) for name in found[0]}
 

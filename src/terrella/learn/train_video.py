@@ -16,6 +16,7 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
 from ..space.keyframes import Keyframes
+from ..worlds.cast import STARTS, Cast, CastConfig
 from ..worlds.controls import BUTTONS
 from ..worlds.folder import save_world, video_spec
 from ..worlds.generator import Generator, VideoConfig, channels_last, generate
@@ -23,11 +24,23 @@ from ..worlds.history import HistoryWorld, Starts
 from ..worlds.motion import Motion
 from ..worlds.outcome import Outcome
 from ..worlds.video import VideoWorld
+from .cast import learn_cast
 from .lessons import recorded_lesson
 from .losses import Critic, flow_losses, frame_losses, half_precision, sharpened
 from .motion import train_motion
 from .outcome import Happenings, train_outcome
-from .samples import THINGS, Box, Lesson, Recording, choose_keyframes, controls_of, open_views, usable_rows
+from .samples import (
+    CAST,
+    INSTANCES,
+    THINGS,
+    Box,
+    Lesson,
+    Recording,
+    choose_keyframes,
+    controls_of,
+    open_views,
+    usable_rows,
+)
 from .senses import SensesConfig, learn_senses
 from .strips import draw_strip
 from .updates import Report, Updates, descend, device_named
@@ -43,6 +56,8 @@ class TrainConfig:
         geometry: Use the depth and poses of a recording that has them; --no-geometry learns from pictures and actions alone.
         channels: Of the generator at 1/2, 1/4, 1/8, ... of the size.
         frames: Last frames that a world without geometry sees.
+        cast_steps: Training steps of what things that the recording tells apart do next (`cast`, `instances`), which makes
+            cards of them that walk and fall; 0 leaves it out, and they are drawn as the rest.
         outcome_steps: Training steps of what reads reward, end and vitals off the frames, which is learned first.
         moving: Learn what moves (monsters, doors, pick-ups), where a recording with depth and poses marks it as `things`.
         flow_steps: Steps in which a frame is drawn. With more than one the whole flow from noise to frame is learned, so that
@@ -70,6 +85,7 @@ class TrainConfig:
     channels: tuple[int, ...] = (32, 56, 88, 128)
     frames: int = 4
     outcome_steps: int = 1500
+    cast_steps: int = 2500
     moving: bool = True
     flow_steps: int = 1
     steps: int = 8000
@@ -144,6 +160,11 @@ class _Run:
                 f"{dataset.root} leaves {usable.sum()} frames to train on; record more, or a smaller keep_out."
             )
         self.recording = Recording(cache, start, usable, controls)
+        told_apart = {CAST, INSTANCES} <= set(cache.arrays)
+        if self.video.moving and told_apart and config.cast_steps:
+            self.video = replace(self.video, cast=True)
+        known = CastConfig(controls.told, self.video.history)
+        self.cast = Cast(known).to(self.device) if self.video.cast else None
         self.happened, self.outcome = self._begin_outcome(usable, posed)
         self.memory = self._choose_memory() if posed else None
         self.generator = channels_last(Generator(self.video)).to(self.device)
@@ -158,12 +179,14 @@ class _Run:
         }
         if self.outcome is not None:
             modules["outcome"] = self.outcome
+        if self.cast is not None:
+            modules["cast"] = self.cast
         self.optimiser = torch.optim.AdamW(
             self.generator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4
         )
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), 3e-4, (0.0, 0.99))
         optimisers = {"optimiser": self.optimiser, "critic_optimiser": self.critic_optimiser}
-        self.updates = Updates(out, _recipe(config, dataset), modules, optimisers, motion=None, outcome=None)
+        self.updates = Updates(out, _recipe(config, dataset), modules, optimisers, motion=None, outcome=None, cast=None)
         self.facts = self.updates.facts
 
     def _begin_outcome(self, usable: np.ndarray, posed: bool) -> tuple[Happenings, Outcome | None]:
@@ -199,6 +222,11 @@ class _Run:
             settings = config.outcome_steps, config.seed, report
             self.facts["outcome"] = train_outcome(self.outcome, self.recording.rgb, self.happened, *settings)
             self.updates.save()
+        if self.cast is not None and self.facts["cast"] is None:
+            settings = self.video.camera, config.cast_steps, config.seed, report
+            part = self.recording
+            self.facts["cast"] = learn_cast(self.cast, part, self.dataset.rgb_at, self._beginnings(), *settings)
+            self.updates.save()
         every_s = config.save_every_s, config.strip_every_s
         self.updates.run(config.steps, self._step, self.draw_strip, *every_s, report, config.hours)
 
@@ -219,7 +247,7 @@ class _Run:
             time_ = torch.from_numpy(time_).float().to(self.device)
             noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
         with half_precision(self.device):
-            clean = self.generator(noisy, time_, glimpse, lesson.last, lesson.told).float()
+            clean = lesson.judged(self.generator(noisy, time_, glimpse, lesson.last, lesson.told).float())
             drawn, found = clean[:, :4], truth[:, :4]
             losses = (
                 frame_losses(drawn, found, lesson.weight)
@@ -275,6 +303,7 @@ class _Run:
             "parameters": sum(p.numel() for module in modules for p in module.parameters()),
             **(self.facts["motion"] or {}),
             **(self.facts["outcome"] or {}),
+            **(self.facts["cast"] or {}),
         }
         dt_s = about.get("dt_s", 1 / self.cache.fps)
         outcome = None if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
@@ -291,12 +320,18 @@ class _Run:
         rewards = (usual, _ending_pays(reward - usual, done & np.array(self.cache.action_valid)))
         starts = open_views(self.memory, 32)
         if self.video.moving:  # monsters wait where episodes begin, and the player is well
-            first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
-            starts = self._keyframes_at(first[:: max(1, len(first) // 32)][:32]) if len(first) else starts
+            first = self._beginnings()
+            starts = self._keyframes_at(first) if len(first) else starts
         body = {name: value for name, value in (self.facts["motion"] or {}).items() if name in ("body_m", "short")}
         return VideoWorld(
-            spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards, outcome=outcome
-        )
+            spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards,
+            outcome=outcome, cast=None if self.cast is None else copy.deepcopy(self.cast).cpu().float(),
+        )  # fmt: skip
+
+    def _beginnings(self) -> np.ndarray:
+        """Some 32 rows with which episodes begin."""
+        first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
+        return first[:: max(1, len(first) // STARTS)][:STARTS]
 
     def _starts(self) -> Starts:
         """Where stories begin, in a world of history: some 32 moments of the recording, evenly."""

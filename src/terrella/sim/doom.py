@@ -3,7 +3,7 @@
 Doom's own depth buffer has 8 bits (about 7 map units a level), so depth is cast exactly from the map's sectors, and
 the buffer is used only where it shows something else (a sprite). One metre is 32 map units, the usual reading.
 What may move or vanish (monsters, shots, pick-ups, doors, lifts) is marked in the channel `things`: no memory of the
-place should hold it.
+place should hold it. Each sprite among it is told apart: `cast` says where it stands, `instances` which pixels it covers.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ KEYS = {
 CAMERA = (0.5, 0.8, 0.5, 0.5)
 MAP_SPACING_M = 1024.0  # from one map of a game to the next: see `map_origin`
 HEALTH = spaces.Box(0, 1000, (), np.float32)
+CAST = 16  # sprites that are told apart at most, the nearest
 PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
 _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map units + offset), fitted on my_way_home
 
@@ -67,7 +68,9 @@ class Doom:
     """The game as a World. One process, one story: not forkable, batch 1; a state is a ticket for the present.
 
     A scenario that tells the player's health has the channels `health` and `things` (bool [h, w]: what may move or
-    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. On a map of a game
+    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. `cast` [CAST, 4] holds
+    of the sprites in sight, the nearest first, a number that stays its own (0: none) and where its feet are (x, y, z in
+    metres); `instances` uint8 [h, w] is at each pixel the row of `cast` that is seen there, counted from 1. On a map of a game
     a kill and the exit pay 1, death costs 1, and stories begin at the map's start or where a pick-up lies.
     """
 
@@ -91,6 +94,8 @@ class Doom:
         }
         if alive:
             channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
+            channels["instances"] = spaces.Box(0, CAST, config.depth_size, np.uint8)
+            channels["cast"] = spaces.Box(-np.inf, np.inf, (CAST, 4), np.float32)
             channels["health"] = HEALTH
         self.spec = Spec(
             name=f"doom:{config.scenario}",
@@ -204,6 +209,8 @@ class Doom:
             half = np.deg2rad(yaw_deg) / 2
             here = np.array([x, y, z]) / UNITS_PER_M + (*self._origin, 0.0)
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
+        if name in ("cast", "instances"):
+            return torch.from_numpy(self._told_apart(x, y)[name])
         depth, sector = self._cast(x, y, z, np.deg2rad(yaw_deg))
         if name == "things":
             moved = self._walls.moved()
@@ -226,6 +233,20 @@ class Doom:
         return _any_of(
             _any_of(values[self._present.labels_buffer], self.config.depth_size[0], 0), self.config.depth_size[1], 1
         )
+
+    def _told_apart(self, x: float, y: float) -> dict[str, np.ndarray]:
+        """`cast` and `instances` as seen from (x, y), in map units."""
+        labels = [label for label in self._present.labels if label.object_name != "DoomPlayer"]
+        labels.sort(key=lambda label: np.hypot(label.object_position_x - x, label.object_position_y - y))
+        cast, row_of = np.zeros((CAST, 4), np.float32), np.zeros(256, np.uint8)
+        for row, label in enumerate(labels[:CAST]):
+            feet = np.array([label.object_position_x, label.object_position_y, label.object_position_z]) / UNITS_PER_M
+            cast[row] = (label.object_id + 1, *(feet + (*self._origin, 0.0)))
+            row_of[label.value] = row + 1
+        return {
+            "cast": cast,
+            "instances": row_of[_sampled(np.asarray(self._present.labels_buffer), self.config.depth_size)],
+        }
 
 
 def map_origin(game: str, name: str) -> tuple[float, float]:
@@ -333,8 +354,13 @@ def _any_of(mask: np.ndarray, count: int, axis: int) -> np.ndarray:
 
 def _with_sprites(exact: np.ndarray, buffer: np.ndarray) -> np.ndarray:
     """Depth in map units; where the 8-bit buffer is clearly nearer than the map (a thing stands there), the buffer's."""
-    rows = (np.arange(exact.shape[0]) * 2 + 1) * buffer.shape[0] // (2 * exact.shape[0])
-    columns = (np.arange(exact.shape[1]) * 2 + 1) * buffer.shape[1] // (2 * exact.shape[1])
-    level = buffer[np.ix_(rows, columns)].astype(np.float32)
+    level = _sampled(buffer, exact.shape).astype(np.float32)
     coarse = (level + 0.5 - _BUFFER_OFFSET) / _BUFFER_SLOPE
     return np.where((coarse < exact * 0.85 - 16) & (level > 1), coarse, exact)
+
+
+def _sampled(buffer: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """[H, W] -> [h, w], the value in the middle of each pixel."""
+    rows = (np.arange(size[0]) * 2 + 1) * buffer.shape[0] // (2 * size[0])
+    columns = (np.arange(size[1]) * 2 + 1) * buffer.shape[1] // (2 * size[1])
+    return buffer[np.ix_(rows, columns)]

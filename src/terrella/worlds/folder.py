@@ -23,6 +23,7 @@ from ..core.errors import CheckpointError
 from ..core.spec import DONE, REWARD, Spec
 from ..space.eye import Eye, eye_of, eye_weights
 from ..space.keyframes import Keyframes
+from .cast import ROWS, Cast, CastConfig
 from .controls import Controls
 from .doubt import Doubt, doubt_of, doubt_weights
 from .generator import Generator, VideoConfig
@@ -63,6 +64,9 @@ def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
     if outcome is not None:
         weights |= {f"outcome.{k}": v for k, v in outcome.state_dict().items()}
     eye, doubt = world.eye if isinstance(world, VideoWorld) else None, world.doubt
+    cast = world.cast if isinstance(world, VideoWorld) else None
+    if cast is not None:
+        weights |= {f"cast.{k}": v for k, v in cast.state_dict().items()}
     if eye is not None:
         weights |= {f"eye.{k}": v for k, v in eye_weights(eye).items()}
     if doubt is not None:
@@ -75,6 +79,7 @@ def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
         "rewards": rewards,
         "controls": asdict(controls),
         "outcome": asdict(outcome.config) if outcome is not None else None,
+        "cast": asdict(cast.config) if cast is not None else None,
         "eye": asdict(eye.config) if eye is not None else None,
         "doubt": asdict(doubt.config) if doubt is not None else None,
         "dt_s": world.spec.dt_s,
@@ -124,7 +129,8 @@ def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memor
         kept = _unpack({k[7:]: v for k, v in packed.items() if k.startswith("memory.")}, config)
         rewards = (float(about["rewards"][0]), float(about["rewards"][1]))
         senses = _eye(about, weights), _doubt(about, weights)
-        world = VideoWorld(spec, config, generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome)
+        parts = generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome, _cast(about, weights)
+        world = VideoWorld(spec, config, *parts)
     except (
         OSError,
         SafetensorError,
@@ -159,6 +165,15 @@ def _outcome(about: dict, weights: dict[str, torch.Tensor]) -> Outcome | None:
     return outcome
 
 
+def _cast(about: dict, weights: dict[str, torch.Tensor]) -> Cast | None:
+    told = about.get("cast")
+    if told is None:
+        return None
+    cast = Cast(CastConfig(**told))
+    cast.load_state_dict({k[5:]: v for k, v in weights.items() if k.startswith("cast.")})
+    return cast
+
+
 def _eye(about: dict, weights: dict[str, torch.Tensor]) -> Eye | None:
     told = about.get("eye")
     return None if told is None else eye_of(told, {k[4:]: v for k, v in weights.items() if k.startswith("eye.")})
@@ -187,7 +202,12 @@ def video_spec(
         seen["depth"] = spaces.Box(0, 100, (height, width), np.float32)
         seen["pose"] = spaces.Box(-np.inf, np.inf, (7,), np.float32)
         units = {"depth": "m", "pose": "m, quaternion wxyz of T_world_cam"}
-    marks = {"things": spaces.Box(0, 1, (height, width), np.bool_)} if config.moving else {}  # pyright: ignore
+    marks: dict[str, spaces.Space] = {}
+    if config.moving:
+        marks["things"] = spaces.Box(0, 1, (height, width), np.bool_)  # pyright: ignore
+    if config.cast:
+        marks["instances"] = spaces.Box(0, ROWS, (height, width), np.uint8)
+        marks["cast"] = spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)
     return Spec(
         name=name,
         action=(controls or Controls.buttons(config.actions)).space(),

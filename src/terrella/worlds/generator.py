@@ -37,6 +37,7 @@ class VideoConfig:
     steps: int = 1  # flow-matching steps a frame
     vitals: tuple[float, ...] = ()  # with which stories begin (names are its outcome's)
     residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
+    cast: bool = False  # things are cards (worlds/cast.py): the generator neither sees nor draws what they cover
     moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
 
 

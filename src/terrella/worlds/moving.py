@@ -21,12 +21,14 @@ PLANES = 6  # that `carry_frames` adds to the last frame's colour and trust
 @dataclass(frozen=True)
 class Frame:
     """B frames as they were seen: rgb uint8 [B, 3, H, W]; depth [B, H, W] metres; things [B, H, W] in 0..1, where something
-    is that may move or vanish; pose [B, 7]."""
+    is that may move or vanish; pose [B, 7]; covered bool [B, H, W], where a card was painted (worlds/cast.py), which hides what
+    is there."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
     things: torch.Tensor
     pose: torch.Tensor
+    covered: torch.Tensor | None = None
 
 
 def still(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
@@ -55,9 +57,10 @@ def _carried(frame: Frame, pose: torch.Tensor, camera: Intrinsics):
         depth = torch.where(depth < FAR_M, depth, fill(depth))
     where, ahead = project(unproject(depth, pose, camera).flatten(1, 2), frame.pose, camera)
     grid, ahead = (where * 2 - 1).view(-1, height, width, 2), ahead.view(-1, height, width)
-    planes = torch.cat([frame.rgb.float() / 255, frame.things[:, None], flat[:, None]], 1)
+    hidden = torch.zeros_like(flat) if frame.covered is None else frame.covered.float()
+    planes = torch.cat([frame.rgb.float() / 255, frame.things[:, None], flat[:, None], hidden[:, None]], 1)
     found = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
-    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05)
+    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (found[:, 5] < 0.5)
     error = (found[:, 4] - ahead).abs() / ahead.clamp_min(0.05)
     trust = torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)[:, None]
     found = found * (trust > 0)

@@ -19,6 +19,7 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
 from ..space.camera import Intrinsics, planar_pose, yaw
+from ..space.cards import cut_out
 from ..space.eye import Eye
 from ..space.floorplan import floor_plan, slide
 from ..space.keyframes import Glimpse, Keyframes
@@ -27,13 +28,14 @@ from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
 from .arrival import AWAY_M, arrive
+from .cast import Cast
 from .doubt import GONE, Doubt, doubting_spec
 from .generator import Generator, VideoConfig, channels_last, decode_depth, generate, mood
 from .motion import Motion
 from .moving import Frame, carry_frames, still
 from .outcome import Outcome, told_vitals
 
-SEEN = ("rgb", "depth", "things", "pose")  # of a frame in the state of a world in which things move
+SEEN = ("rgb", "depth", "things", "pose", "instances")  # of a frame in the state of a world in which things move
 
 
 class VideoWorld:
@@ -45,11 +47,12 @@ class VideoWorld:
     def __init__(
         self, spec: Spec, config: VideoConfig, generator: Generator, motion: Motion,
         memory: Keyframes, starts: Keyframes, rewards: tuple[float, float],
-        eye: Eye | None = None, doubt: Doubt | None = None, outcome: Outcome | None = None,
+        eye: Eye | None = None, doubt: Doubt | None = None, outcome: Outcome | None = None, cast: Cast | None = None,
     ):  # fmt: skip
         self.config, self.memory, self.starts, self.rewards = config, memory, starts, rewards
         self.eye, self.doubt = eye, doubt
         self.outcome = outcome.eval() if outcome else None
+        self.cast = cast.eval() if cast else None
         self.own = own_memory(config)
         self.spec = doubting_spec(
             remembering_spec(spec, config.size, len(memory) + self.own.capacity), doubt is not None
@@ -85,7 +88,13 @@ class VideoWorld:
         seen = {"rgb": rgb.round().to(torch.uint8).permute(0, 2, 3, 1), "depth": keys.depth, "pose": keys.pose}
         if self.config.moving:  # of what moves, a keyframe keeps the place only
             seen |= {"things": keys.depth <= 0, "depth": fill_holes(torch.where(keys.depth > 0, keys.depth, FAR_M))}
-        return self.observe(seen, None, rng)
+        state = self.observe(seen, None, rng)
+        if self.cast is None:
+            return state
+        cards = self.cast.begun[pick % len(self.cast.begun)]
+        peopled, rgb, depth = self._painted(self.cast, state.replace(cards=cards), state["rgb"], state["depth"])
+        peopled = peopled.replace(rgb=rgb, depth=depth)
+        return self.aged(peopled, peopled)
 
     @torch.inference_mode()
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
@@ -123,6 +132,9 @@ class VideoWorld:
         if self.outcome is not None:
             state = state.replace(vitals=told_vitals(self.outcome, observation, state["vitals"]))
         if not {"rgb", "depth"} <= set(observation):
+            if self.cast is not None:
+                told = pose, state["actions"], self.config.camera
+                state = state.replace(cards=self.cast.step(state["cards"], *told, rng))
             return self._draw(self._gone(self.aged(state, prior), prior, None), prior, rng)
         height, width = self.config.size
         rgb, depth = torch.as_tensor(observation["rgb"]), torch.as_tensor(observation["depth"])
@@ -136,6 +148,8 @@ class VideoWorld:
             if things.shape != depth.shape:
                 raise ObservationError(f"things is bool [B, {height}, {width}]; got {tuple(things.shape)}.")
             state = state.replace(things=things)
+            if self.cast is not None:
+                state = state.replace(**self._recognised(self.cast, rgb, depth, pose, observation, prior))
         kept = self.own.observed(state, rgb, self._lasting(state, depth), pose)
         if self.doubt is not None:
             kept |= {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}
@@ -159,6 +173,9 @@ class VideoWorld:
             actions=acts[:, 1:], dreamt=torch.ones_like(done), done=done,
             reward=torch.where(still, 0.0, self.rewards[0] + self.rewards[1] * done.float()),
         )  # fmt: skip
+        if self.cast is not None:
+            cards = self.cast.step(state["cards"], next_state["pose"], acts[:, 1:], self.config.camera, rng)
+            next_state = next_state.replace(cards=cards)
         drawn = self._draw(self._gone(self.aged(next_state, state), state, moved), state, rng)
         after = drawn if self.outcome is None else self._followed(self.outcome, state, drawn, action, rng)
         if not still.any():
@@ -172,6 +189,7 @@ class VideoWorld:
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
             "things": lambda: state["things"] > 0.5,
+            "cast": lambda: state["cards"][..., :4].clone(),
             **{name: lambda at=at: state["vitals"][:, at].clone() for at, name in enumerate(vitals)},
             "keyframes": lambda: torch.cat([self._recorded.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
@@ -183,18 +201,38 @@ class VideoWorld:
 
     def with_memory(self, memory: Keyframes) -> VideoWorld:
         """The same world with other keyframes of recordings."""
-        parts = self.generator, self.motion, memory, self.starts, self.rewards, self.eye, self.doubt, self.outcome
+        parts = (
+            self.generator,
+            self.motion,
+            memory,
+            self.starts,
+            self.rewards,
+            self.eye,
+            self.doubt,
+            self.outcome,
+            self.cast,
+        )
         return VideoWorld(self.spec, self.config, *parts)
 
     def with_senses(self, eye: Eye | None, doubt: Doubt | None) -> VideoWorld:
         """The same world with another eye and another doubt, or without."""
-        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, eye, doubt, self.outcome
+        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, eye, doubt, self.outcome, self.cast
         return VideoWorld(self.spec, self.config, *parts)
 
     def with_memory_of(self, budget_mb: float) -> VideoWorld:
         """The same world with another budget for a story's own memory; with 0 it holds the last frame alone."""
         config = replace(self.config, memory_mb=budget_mb)
-        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, self.eye, self.doubt, self.outcome
+        parts = (
+            self.generator,
+            self.motion,
+            self.memory,
+            self.starts,
+            self.rewards,
+            self.eye,
+            self.doubt,
+            self.outcome,
+            self.cast,
+        )
         return VideoWorld(self.spec, config, *parts)
 
     def _blank(self, batch: int, pose: torch.Tensor) -> State:
@@ -214,8 +252,40 @@ class VideoWorld:
             state = state.replace(vitals=vitals, hidden=self.outcome.begin(batch))
         if not config.moving:
             return state
-        state = state.replace(things=torch.zeros(batch, height, width))
+        instances = torch.zeros(batch, height, width, dtype=torch.uint8)
+        state = state.replace(things=torch.zeros(batch, height, width), instances=instances)
+        if self.cast is not None:
+            state = state.replace(cards=self.cast.empty(batch))
         return self.aged(state, state)
+
+    def _recognised(
+        self, cast: Cast, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor,
+        observation: Mapping[str, torch.Tensor], prior: State,
+    ) -> dict[str, torch.Tensor]:  # fmt: skip
+        """The cards of a frame (rgb uint8 [B, 3, H, W], depth [B, H, W]) and their pixels, where the evidence tells things
+        apart; else what is seen is no card, and those that there were are gone from sight."""
+        if not {"cast", "instances"} <= set(observation):
+            return {"cards": cast.empty(len(rgb)), "instances": torch.zeros_like(depth, dtype=torch.uint8)}
+        told, instances = torch.as_tensor(observation["cast"]).float(), torch.as_tensor(observation["instances"])
+        fits = told.shape == (len(rgb), cast.config.rows, 4) and instances.ndim == 3 and len(instances) == len(rgb)
+        if not fits or not torch.isfinite(told).all():
+            raise ObservationError(
+                f"cast is finite float [B, {cast.config.rows}, 4] and instances uint8 [B, h, w]; got {tuple(told.shape)} "
+                f"and {tuple(instances.shape)}."
+            )
+        cut = cut_out(rgb, instances, depth, told[..., 1:], pose, self.config.camera)
+        instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
+        return {"cards": cast.recognised(cut, told, prior["cards"]), "instances": instances}
+
+    def _painted(
+        self, cast: Cast, state: State, rgb: torch.Tensor, depth: torch.Tensor
+    ) -> tuple[State, torch.Tensor, torch.Tensor]:
+        """The frame (rgb uint8 [B, 3, H, W], depth [B, H, W]) with the cards of `state` before it, and `state` that knows
+        where they are."""
+        parts = rgb.float() / 255, depth, state["pose"], self.config.camera
+        painted, depth, instances = cast.paint(state["cards"], *parts)
+        things = torch.maximum(state["things"], (instances > 0).float())
+        return state.replace(things=things, instances=instances), (painted * 255).round().to(torch.uint8), depth
 
     def _arrive(
         self, observation: Mapping[str, torch.Tensor], eye: Eye, prior: State | None, rng: torch.Generator
@@ -309,6 +379,9 @@ class VideoWorld:
         for view in range(state.batch):
             one = slice(view, view + 1)
             walls = torch.cat([self._walls, self.own.walls(state, view)])
+            if self.cast is not None:
+                place = state["pose"][view, :2]
+                walls = torch.cat([walls, self.cast.bodies(state["cards"][view], place, self.config.body_m)])
             walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
         moved, speed = zip(*walks)
         return torch.cat(moved), torch.cat(speed)
@@ -329,7 +402,10 @@ class VideoWorld:
         config, pose = self.config, state["pose"]
         glimpse = self.own.look(state, pose, config.sources, config.slots, self.memory)
         if config.moving:
-            frames = [Frame(*(before[f"{age}{part}"] for part in SEEN)) for age in ("", "earlier_")]
+            frames = []
+            for age in ("", "earlier_"):
+                *seen, instances = (before[f"{age}{part}"] for part in SEEN)
+                frames.append(Frame(*seen, covered=instances > 0))
             told = torch.cat([mood(before["rgb"]), state["actions"].flatten(1)], 1)
             return glimpse, carry_frames(frames[0], frames[1], pose, config.camera), told
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
@@ -341,6 +417,8 @@ class VideoWorld:
         depth, known = decode_depth(clean[:, 3]), glimpse.known
         if self.config.moving:
             state = state.replace(things=clean[:, 4].sigmoid())
+            if self.cast is not None:
+                state, rgb, depth = self._painted(self.cast, state, rgb, depth)
             known = known * (state["things"] < 0.5)
         kept = self.own.dreamt(state, rgb, self._lasting(state, depth), state["pose"], known)
         return state.replace(rgb=rgb, depth=depth, known=(known * 255).round().to(torch.uint8), **kept)

@@ -1,0 +1,123 @@
+"""What the things of a learned world do, beside what they did in a recording that it never saw: who falls, who goes how far.
+
+    python benchmarks/things.py runs/monsters/world recordings/monsters-test
+
+Stories begin with ten recorded frames; then the world's cast goes on by itself along the recorded poses and actions, and a
+second time as if ATTACK had never been pressed. Nothing is drawn: this is about what happens, `terrella score` about looks.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+
+import terrella
+from terrella.data import ClipCache
+from terrella.learn.samples import Recording, controls_of
+from terrella.space.cards import cut_out
+from terrella.worlds.cast import LOOK, NONE, NUMBER, PLACE
+from terrella.worlds.video import VideoWorld
+
+CONTEXT = 10
+TALL_M, LOW_M = 1.2, 0.75  # who was taller than the one and is lower than the other has fallen
+
+
+def main(
+    world: Annotated[str, tyro.conf.Positional],
+    data: Annotated[str, tyro.conf.Positional],
+    steps: int = 70,
+    every: int = 40,
+    dreams: int = 16,
+) -> None:
+    """Measure what things do.
+
+    Args:
+        world: A world whose things are cards.
+        data: A recording of the same game that its training did not see.
+        steps: Of a story.
+        every: Rows of the recording from one story's beginning to the next.
+        dreams: Of each story.
+    """
+    learned = terrella.load(world)
+    if not isinstance(learned, VideoWorld) or learned.cast is None or "ATTACK" not in learned.spec.action_names:
+        raise SystemExit(f"{world} is no world with a cast and a button ATTACK.")
+    cache = ClipCache.open(data, learned.config.size)
+    recording = Recording(cache, np.zeros(cache.length, np.int64), np.ones(cache.length, bool), controls_of(cache))
+    rows = np.array([row for a, b in cache.episodes for row in range(a + CONTEXT, b - steps, every)])
+    state = None
+    for back in range(CONTEXT - 1, -1, -1):
+        seen = recording.evidence(learned.config, rows - back)
+        state = learned.observe(seen, state, terrella.make_rng(0))
+    cards = state["cards"]
+    tall = learned.cast.boxes[cards[..., LOOK].long().clamp_min(0), 3]
+    standing = (cards[..., NUMBER] > 0) & (cards[..., LOOK] != NONE) & (tall >= TALL_M)
+    fell, known, truth = happened(cards[..., NUMBER], recording, rows, steps, learned.config.camera)
+    rng, chance, places = terrella.make_rng(0), {}, torch.zeros(0)
+    for pressed in (False, True):
+        found = [dreamt(learned, cards, recording, rows, steps, pressed, rng) for _ in range(dreams)]
+        chance[pressed] = torch.stack([fallen.float() for fallen, _ in found]).mean(0)[standing]
+        places = torch.stack([place for _, place in found])
+    fell = fell[standing]
+    print(f"{int(standing.sum())} standing things in {len(rows)} stories of {steps} steps, {dreams} dreams of each")
+    for who, some in (("all", fell | True), ("those who fell", fell), ("the others", ~fell)):
+        share = [float(part[some].float().mean()) for part in (fell, chance[True], chance[False])]
+        print(
+            f"falls of {who} ({int(some.sum())}): game {share[0]:.1%}, dreams {share[1]:.1%}, without ATTACK {share[2]:.1%}"
+        )
+    yes, no = chance[True][fell, None], chance[True][~fell]
+    print(f"who falls: AUC {float((yes > no).float().mean() + 0.5 * (yes == no).float().mean()):.2f}")
+    for step in (8, 32, 64):
+        there = known[min(step, steps) - 1] & standing
+        true, begun, dream = truth[step - 1][there], cards[..., PLACE][there], places[:, step - 1][:, there]
+        ways = [
+            float((a - b).norm(dim=-1).mean())
+            for a, b in ((true, begun), (dream, begun), (dream, true), (dream.mean(0), true))
+        ]
+        print(
+            f"after {step} steps ({int(there.sum())} in sight): {ways[0]:.3f} m from where they were, in dreams {ways[1]:.3f} m; a "
+            f"dream is off by {ways[2]:.3f} m, the mean of dreams by {ways[3]:.3f} m"
+        )
+
+
+def happened(numbers: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int, camera):
+    """Of the things `numbers` [B, K] at `rows`, in the recording: who falls [B, K]; who is in sight after each step
+    [steps, B, K], and where [steps, B, K, 3]."""
+    fell, known, places = torch.zeros(numbers.shape, dtype=torch.bool), [], []
+    for step in range(1, steps + 1):
+        at = rows + step
+        told = torch.from_numpy(np.array(recording.cache.arrays["observation.cast"][at], np.float32))
+        frames = recording.rgb(at), recording.instances(at), recording.depth(at)
+        cut = cut_out(*frames, told[..., 1:], recording.pose(at), camera)
+        low = torch.zeros(told.shape[:2], dtype=torch.bool)
+        low[cut.view, cut.row] = cut.whole & (cut.box[:, 3] < LOW_M)
+        same = (told[:, None, :, 0] == numbers[:, :, None]) & (numbers > 0)[:, :, None]
+        fell |= (same & low[:, None]).any(-1)
+        known.append(same.any(-1))
+        places.append(torch.einsum("bkj,bjc->bkc", same.float(), told[..., 1:]))
+    return fell, torch.stack(known), torch.stack(places)
+
+
+def dreamt(
+    world: VideoWorld, cards: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int, attack: bool, rng
+):
+    """The same of the cards [B, K, COLUMNS] in a dream: who falls, and where all are after each step."""
+    cast, history = world.cast, world.config.history
+    assert cast is not None
+    fell, places = torch.zeros(cards.shape[:2], dtype=torch.bool), []
+    button = world.spec.action_names.index("ATTACK")
+    for step in range(1, steps + 1):
+        led = rows[:, None] + step - history + np.arange(history)
+        acts = recording.action(led.ravel()).view(*led.shape, -1).clone()
+        acts[..., button] *= attack
+        cards = cast.step(cards, recording.pose(rows + step), acts, world.config.camera, rng)
+        look = cards[..., LOOK].long()
+        fell |= (cards[..., NUMBER] > 0) & (look != NONE) & (cast.boxes[look.clamp_min(0), 3] < LOW_M)
+        places.append(cards[..., PLACE])
+    return fell, torch.stack(places)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,321 @@
+"""learn_cast: the looks and moves that a recording's things have, and which follow which, into a Cast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ..core.world import make_rng
+from ..data import ClipCache
+from ..space.camera import Intrinsics, project
+from ..space.cards import cut_out
+from ..worlds.cast import LOOK, NONE, PLACE, Cast, fresh, marks, noted
+from .samples import CAST, INSTANCES, Recording
+from .updates import Report, descend
+
+CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
+ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
+STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
+SELDOM = 4  # sightings below which a look is none
+UPRIGHT_M = 1.0  # height of what may stand in the way
+BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known to
+NEVER_M = 1e3  # boxes of looks that are not used
+WAITS = 300  # steps from an episode's beginning in which things are found that waited there
+LASTS = 15  # steps in which a thing must have been seen to be one that waits
+CHUNK = 128  # frames that are cut at once
+
+
+class Sightings(NamedTuple):
+    """The n cards that frames show: frame and row of its list [n]; picture uint8 [n, 4, *PICTURE]; box [n, 4]; share [n] of the
+    frame that shows it; whole [n], all of it is seen."""
+
+    frame: np.ndarray
+    row: np.ndarray
+    picture: np.ndarray
+    box: np.ndarray
+    share: np.ndarray
+    whole: np.ndarray
+
+    def marks(self, which: np.ndarray) -> torch.Tensor:
+        """See worlds/cast.marks: [len(which), D]."""
+        parts = [
+            marks(torch.from_numpy(self.picture[some]).float() / 255, torch.from_numpy(self.box[some]))
+            for some in np.array_split(which, max(1, len(which) // 2048))
+        ]
+        return torch.cat(parts)
+
+
+class Tokens(NamedTuple):
+    """What was seen to follow what: cards [n, COLUMNS], and the pose [n, 7] from which they were seen a step later; their
+    next look [n] (NONE: not known) and move [n], and whether they were gone [n]; acts [n, history], rows of the last actions
+    (-1: none)."""
+
+    cards: torch.Tensor
+    pose: torch.Tensor
+    look: torch.Tensor
+    move: torch.Tensor
+    gone: torch.Tensor
+    acts: np.ndarray
+
+
+def learn_cast(
+    cast: Cast,
+    recording: Recording,
+    rgb: Callable[[np.ndarray], np.ndarray],
+    starts: np.ndarray,
+    camera: Intrinsics,
+    steps: int,
+    seed: int,
+    report: Report,
+) -> dict:
+    """Teaches `cast` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; stories begin with
+    the cards that waited in the episodes of the rows `starts`. Returns facts."""
+    cache, rows = recording.cache, np.flatnonzero(recording.usable)
+    seen = _cut(cache, rgb, rows, camera, report)
+    clear = np.flatnonzero(seen.whole & (seen.share >= LARGE))
+    if not len(clear):
+        return {"cast_looks": 0, "cast_steps": 0}
+    heads, off = _looks(seen, clear, cast.config.looks, seed)
+    cast.pictures[: len(heads)] = torch.from_numpy(seen.picture[heads])
+    cast.boxes[:] = NEVER_M
+    cast.boxes[: len(heads)] = torch.from_numpy(seen.box[heads])
+    moves = _moves(cache, rows, cast.config.moves, seed)
+    cast.moves[: len(moves)] = moves
+    known = _settled(off, seen, cache)
+    tokens, waiting = _followed(cast, recording, seen, known, camera)
+    cast.solid[:] = _reach(cast, tokens)
+    for story, row in enumerate(starts[: cast.config.starts]):
+        cards = waiting.get(int(row), [])[: cast.config.rows]
+        if cards:
+            cast.begun[story, : len(cards)] = torch.stack(cards)
+    loss = _train(cast.train(), tokens, recording, steps, seed, report)
+    cast.eval()
+    return {"cast_looks": len(heads), "cast_moves": len(moves) - 1, "cast_steps": steps, "cast_loss": loss}
+
+
+def told(cache: ClipCache) -> np.ndarray:
+    """float32 [N, K, 4]: number and place of each card of each row."""
+    return np.asarray(cache.arrays[CAST], np.float32).reshape(cache.length, -1, 4)
+
+
+def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Report) -> Sightings:
+    parts = []
+    for first in range(0, len(rows), CHUNK):
+        some = rows[first : first + CHUNK]
+        frames = torch.from_numpy(np.ascontiguousarray(rgb(some))).permute(0, 3, 1, 2)
+        instances = torch.from_numpy(np.asarray(cache.arrays[INSTANCES][some]))
+        depth, pose = (torch.from_numpy(np.asarray(array[some], np.float32)) for array in (cache.depth, cache.pose))
+        cut = cut_out(frames, instances, depth, torch.from_numpy(told(cache)[some, :, 1:]), pose, camera)
+        picture = (cut.picture * 255).round().clamp(0, 255).byte()
+        share = cut.pixels / (frames.shape[2] * frames.shape[3])
+        parts.append((some[cut.view.numpy()], *map(np.asarray, (cut.row, picture, cut.box, share, cut.whole))))
+        if first // CHUNK % 16 == 0:
+            report(first / len(rows), 1.0, "cutting out what stands in the frames")
+    return Sightings(*map(np.concatenate, zip(*parts)))
+
+
+def _looks(seen: Sightings, clear: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The sightings [looks] that show a look best, and how far from each every sighting is [n, looks]: k-means of those that
+    are `clear`, each look shown by the largest of its most typical."""
+    rng = np.random.default_rng(seed)
+    sample = clear if len(clear) <= 12000 else np.sort(rng.choice(clear, 12000, replace=False))
+    known = seen.marks(sample)
+    centres = _means(known, count, seed)
+    off, nearest = torch.cdist(known, centres).min(1)
+    heads = []
+    for look in range(len(centres)):
+        mine = (nearest == look).nonzero()[:, 0]
+        if len(mine) >= SELDOM:
+            typical = sample[mine[off[mine].argsort()[: max(SELDOM, len(mine) // 4)]].numpy()]
+            heads.append(typical[seen.share[typical].argmax()])
+    heads = np.array(heads if heads else sample[:1])
+    shown, every = seen.marks(heads), np.arange(len(seen.frame))
+    parts = [torch.cdist(seen.marks(some), shown) for some in np.array_split(every, max(1, len(every) // 4096))]
+    return heads, torch.cat(parts).numpy()
+
+
+def _settled(off: np.ndarray, seen: Sightings, cache: ClipCache) -> np.ndarray:
+    """The look of each sighting [n], `off` [n, looks] being how far it is from each; NONE where it is like none or not seen
+    well. A thing looks as it did unless it is clearly more like another: else what is far would flicker between likes."""
+    numbers = told(cache)[seen.frame, seen.row, 0]
+    nearest, clear = off.argmin(1), seen.whole & (seen.share >= CLEAR)
+    look, last = np.full(len(off), NONE), {}
+    for one in np.argsort(seen.frame, kind="stable"):
+        frame, number, best = seen.frame[one], numbers[one], nearest[one]
+        if not clear[one] or off[one, best] > ALIKE:
+            continue
+        before, was = last.get(number, (NONE, NONE))
+        if was != NONE and 0 < frame - before <= 8 and off[one, was] < off[one, best] + STICKS:
+            best = was
+        look[one] = best
+        last[number] = frame, best
+    return look
+
+
+def _reach(cast: Cast, tokens: Tokens) -> torch.Tensor:
+    """How near [looks], along x or y in metres, an eye can come to what looks upright: as near as it ever did (the nearest
+    few of a thousand left out); 0 for what is low, and for all where it came into them."""
+    look = tokens.cards[:, LOOK].long()
+    upright = (cast.boxes[:, 3] >= UPRIGHT_M) & (cast.boxes[:, 3] < NEVER_M)
+    near = (
+        (tokens.cards[:, PLACE] - tokens.pose[:, :3])[:, :2].abs().amax(1)[(look != NONE) & upright[look.clamp_min(0)]]
+    )
+    reach = float(near.quantile(0.002)) if len(near) >= FEWEST else 0.0
+    return torch.where(upright, reach if reach > BODY_M else 0.0, 0.0)
+
+
+def _moves(cache: ClipCache, rows: np.ndarray, count: int, seed: int) -> torch.Tensor:
+    """The moves [m, 3] that things make in a step, in metres, the first of them none: k-means."""
+    cards = told(cache)
+    follows = rows[:-1][np.diff(rows) == 1]
+    follows = follows[~np.isin(follows + 1, [first for first, _ in cache.episodes])]
+    same = (cards[follows, :, None, 0] == cards[follows + 1, None, :, 0]) & (cards[follows, :, 0] > 0)[:, :, None]
+    index, slot, after = same.nonzero()
+    moved = cards[follows[index] + 1, after, 1:] - cards[follows[index], slot, 1:]
+    far = np.linalg.norm(moved, axis=1)
+    moved = torch.from_numpy(moved[(far > 1e-3) & (far < 2)])
+    none = torch.zeros(1, 3)
+    if not len(moved):
+        return none
+    moved = moved[torch.randperm(len(moved), generator=make_rng(seed))[:20000]]
+    return torch.cat([none, _means(moved, count - 1, seed)])
+
+
+def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
+    """k-means of [n, D], begun with points far from each other (k-means++): at most [count, D]."""
+    rng = make_rng(seed)
+    picks = [int(torch.randint(len(points), (1,), generator=rng))]
+    gap = (points - points[picks[0]]).square().sum(1)
+    while len(picks) < min(count, len(points)) and float(gap.max()) > 1e-9:
+        picks.append(int(torch.multinomial(gap, 1, generator=rng)))
+        gap = torch.minimum(gap, (points - points[picks[-1]]).square().sum(1))
+    centres = points[picks]
+    for _ in range(12):
+        nearest = torch.cdist(points, centres).argmin(1)
+        sums = torch.zeros_like(centres).index_add_(0, nearest, points)
+        counts = torch.bincount(nearest, minlength=len(centres))[:, None]
+        centres = torch.where(counts > 0, sums / counts.clamp_min(1), centres)
+    return centres
+
+
+def _followed(
+    cast: Cast, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
+) -> tuple[Tokens, dict[int, list[torch.Tensor]]]:
+    """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the cards that waited
+    in it. The recording is walked through as a dream is, card by card."""
+    cache, back = recording.cache, np.arange(cast.config.history)[::-1]
+    cards = torch.from_numpy(told(cache).copy())
+    poses = torch.from_numpy(np.array(cache.pose, np.float32))
+    looks, share = torch.full(cards.shape[:2], float(NONE)), np.zeros(cards.shape[:2])
+    looks[seen.frame, seen.row] = torch.from_numpy(known).float()
+    share[seen.frame, seen.row] = seen.share
+    before, at, look, place, gone, acts = [], [], [], [], [], []
+    waiting: dict[int, list[torch.Tensor]] = {}
+    for first, stop in cache.episodes:
+        were: dict[float, torch.Tensor] = {}  # card by number, and the row of the list in which it was
+        slots: dict[float, int] = {}
+        met: dict[float, _Met] = {}
+        for row in range(first, stop):
+            here = {}
+            if recording.usable[row]:
+                here = {float(number): slot for slot, number in enumerate(cards[row, :, 0]) if number > 0}
+                lost = [n for n in were if n not in here and share[row - 1, slots[n]] >= 2 * CLEAR]
+                led = np.where(row - 1 - back >= first, row - 1 - back, -1)
+                for number in (*(n for n in here if n in were), *_in_sight(lost, were, poses[row], camera)):
+                    slot = here.get(number)
+                    before.append(were[number])
+                    at.append(row)
+                    acts.append(led)
+                    gone.append(slot is None)
+                    look.append(float(NONE) if slot is None else looks[row, slot])
+                    place.append(were[number][PLACE] if slot is None else cards[row, slot, 1:])
+            now = {}
+            for number, slot in here.items():
+                old, seen_as = were.get(number), looks[row, slot]
+                if old is None:
+                    now[number] = fresh(number, cards[row, slot, 1:], seen_as)
+                else:
+                    kept = torch.where(seen_as == NONE, old[LOOK], seen_as)
+                    now[number] = noted(old[None], cards[row, slot, 1:][None], kept[None])[0]
+                if number not in met and row < first + WAITS:
+                    met[number] = _Met(now[number].clone(), row > first and _open(now[number], row - 1, cache, camera))
+                if number in met:
+                    met[number].again(seen_as)
+            were, slots = now, here
+        waiting[first] = [one.card for one in met.values() if one.waited]
+    moved = torch.stack(place) - torch.stack(before)[:, PLACE] if before else torch.zeros(0, 3)
+    move = torch.cdist(moved, cast.moves).argmin(1)
+    move[moved.norm(dim=1) <= 1e-3] = 0
+    parts = torch.stack(before), poses[at], torch.tensor(look).long(), move, torch.tensor(gone), np.stack(acts)
+    return Tokens(*parts), waiting
+
+
+class _Met:
+    """A thing of an episode: its card as it was first seen, and whether it was seen to come into being."""
+
+    def __init__(self, card: torch.Tensor, born: bool):
+        self.card, self.born, self.often = card, born, 0
+
+    def again(self, look: torch.Tensor) -> None:
+        self.often += 1
+        if self.card[LOOK] == NONE:
+            self.card[LOOK] = look
+
+    @property
+    def waited(self) -> bool:
+        return self.often >= LASTS and not self.born and bool(self.card[LOOK] != NONE)
+
+
+def _in_sight(numbers: list[float], cards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
+    """Those of `numbers` whose cards should be well in sight from `pose` [7]."""
+    if not numbers:
+        return []
+    where, ahead = project(torch.stack([cards[number][PLACE] for number in numbers]), pose, camera)
+    seen = ((where[:, 0] - 0.5).abs() < 0.35) & (ahead > 0.5)
+    return [number for number, is_seen in zip(numbers, seen.tolist()) if is_seen]
+
+
+def _open(card: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
+    """Whether the eye of `row` saw as far as the place of `card`, a little above the ground."""
+    pose = torch.from_numpy(np.array(cache.pose[row], np.float32))
+    where, ahead = project(card[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
+    (u, v), far = where[0].tolist(), float(ahead[0])
+    if far < 0.3 or not (0 < u < 1 and 0 < v < 1):
+        return False
+    height, width = cache.depth.shape[1:]
+    return float(cache.depth[row, int(v * height), int(u * width)]) > far - 0.5
+
+
+def _train(
+    cast: Cast, tokens: Tokens, recording: Recording, steps: int, seed: int, report: Report, batch: int = 512
+) -> float:
+    """Half of each batch are tokens in which something happens: another look, a move, an end; each counts by how much likelier
+    than evenly it was drawn, so that what is rare stays as rare as it is. Returns the last loss, in nats a token."""
+    happens = ((tokens.look != NONE) & (tokens.look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
+    often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
+    often = often / often.sum()
+    device = cast.moves.device
+    actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
+    actions[torch.from_numpy(tokens.acts < 0)] = 0
+    optimiser = torch.optim.AdamW(cast.parameters(), 2e-3, weight_decay=1e-2)
+    recent: list[float] = []
+    for step in range(steps):
+        for group in optimiser.param_groups:
+            group["lr"] = 2e-3 * min(1, (step + 1) / 100) * (0.02 + 0.49 * (1 + np.cos(np.pi * step / steps)))
+        picks = torch.multinomial(often, batch, replacement=True, generator=make_rng(seed * 1_000_003 + step))
+        weight = (1 / len(often) / often[picks]).to(device)
+        cards, pose, look, move, gone = (part[picks].to(device) for part in tokens[:5])
+        said = cast.tell(cards, pose, actions[picks].to(device))
+        error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none") * (look != NONE)
+        error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
+        error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")
+        loss = (weight * error).mean()
+        descend(optimiser, loss, step, cast)
+        recent.append(float(loss.detach()))
+        if step % 50 == 49:
+            report((step + 1) / steps, 1.0, f"cast {np.mean(recent[-50:]):.4f}")
+    return round(float(np.mean(recent[-200:])), 4)

@@ -1,0 +1,136 @@
+"""Cards: what stands in a place, as upright pictures that face the eye: cut out of frames, and painted into them.
+
+A card has a place, its feet (x, y, z in metres, world frame), and a look: a picture [4, *PICTURE] (rgb and cover in [0, 1])
+and its box [4], how far it reaches to the left, the right, below and above of its feet, in metres across the line of sight.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+
+from .camera import Intrinsics, project
+
+PICTURE = (32, 24)  # rows and columns of a card's picture
+NEAREST_M = 0.25  # of a card that is still painted
+TOUCHED = 0.1  # of a pixel that a card covers, above which it is the card's
+BEHIND_M = 0.4  # by which a card may stand behind the surface that a frame shows: its feet are in the floor
+
+
+class Cut(NamedTuple):
+    """n cards that frames show: view and row [n], which frame and which row of its list; picture [n, 4, *PICTURE]; box
+    [n, 4]; pixels [n], how many show it; whole [n] bool, seen all of it: not cut off by the frame's edge or hidden in part."""
+
+    view: torch.Tensor
+    row: torch.Tensor
+    picture: torch.Tensor
+    box: torch.Tensor
+    pixels: torch.Tensor
+    whole: torch.Tensor
+
+
+def cut_out(
+    rgb: torch.Tensor,
+    instances: torch.Tensor,
+    depth: torch.Tensor,
+    places: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+) -> Cut:
+    """The cards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], which of the places [B, K, 3] is seen at a pixel,
+    counted from 1 (0: none); depth [B, h, w] metres; pose [B, 7]."""
+    height, width = rgb.shape[-2:]
+    there, depth = (
+        F.interpolate(part[:, None].float(), (height, width), mode="nearest-exact")[:, 0] for part in (instances, depth)
+    )
+    numbers = torch.arange(1, places.shape[1] + 1, device=rgb.device)
+    masks = there[:, None] == numbers[:, None, None]
+    view, row = masks.flatten(2).any(-1).nonzero(as_tuple=True)
+    masks = masks[view, row]
+    if not len(view):
+        nothing = torch.zeros(0)
+        return Cut(view, row, torch.zeros(0, 4, *PICTURE), torch.zeros(0, 4), nothing.long(), nothing.bool())
+    where, ahead = project(places, pose, camera)
+    where, ahead = where[view, row], ahead[view, row].clamp_min(NEAREST_M)
+    first_column, last_column = _ends(masks.any(1))
+    first_row, last_row = _ends(masks.any(2))
+    left, right = first_column / width, (last_column + 1) / width
+    top, bottom = first_row / height, (last_row + 1) / height
+    across, along = ahead / camera[0], ahead / camera[1]
+    box = torch.stack(
+        [(where[:, 0] - left) * across, (right - where[:, 0]) * across,
+         (bottom - where[:, 1]) * along, (where[:, 1] - top) * along], 1
+    )  # fmt: skip
+    grid = F.affine_grid(_onto(left, right, top, bottom), [len(view), 1, *PICTURE], align_corners=False)
+    frames = torch.cat([rgb.float()[view] / 255 * masks[:, None], masks[:, None].float()], 1)
+    picture = F.grid_sample(frames, grid, align_corners=False)
+    picture[:, :3] = picture[:, :3] / picture[:, 3:].clamp_min(1e-3)
+    around = F.max_pool2d(masks[:, None].float(), 5, 1, 2)[:, 0].bool() & ~masks
+    hidden = (around & (depth[view] < (ahead - 2 * BEHIND_M)[:, None, None])).flatten(1).any(1)
+    cut = (first_column == 0) | (last_column == width - 1) | (first_row == 0) | (last_row == height - 1)
+    return Cut(view, row, picture, box, masks.flatten(1).sum(1), ~(cut | hidden))
+
+
+def painted(
+    rgb: torch.Tensor,
+    depth: torch.Tensor,
+    cards: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    there: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Frames with cards in them, each hidden by what is nearer: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
+    which card is seen at a pixel, counted from 1 (uint8 [B, H, W], 0: none).
+
+    rgb and depth are what stands behind; cards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
+    [B, K] bool, which of them there are.
+    """
+    places, pictures, boxes = cards
+    instances = torch.zeros_like(depth, dtype=torch.uint8)
+    where, ahead = project(places, pose, camera)
+    view, row = (there & (ahead > NEAREST_M)).nonzero(as_tuple=True)
+    if not len(view):
+        return rgb, depth, instances
+    where, ahead, box = where[view, row], ahead[view, row], boxes[view, row]
+    height, width = depth.shape[-2:]
+    left = where[:, 0] - box[:, 0] / ahead * camera[0]
+    right = where[:, 0] + box[:, 1] / ahead * camera[0]
+    bottom = where[:, 1] + box[:, 2] / ahead * camera[1]
+    top = where[:, 1] - box[:, 3] / ahead * camera[1]
+    rows = (torch.arange(2 * height, device=depth.device) + 0.5) / (2 * height)
+    columns = (torch.arange(2 * width, device=depth.device) + 0.5) / (2 * width)
+    u = (columns - left[:, None]) / (right - left).clamp_min(1e-6)[:, None] * 2 - 1
+    v = (rows - top[:, None]) / (bottom - top).clamp_min(1e-6)[:, None] * 2 - 1
+    grid = torch.stack(
+        [u[:, None].expand(-1, 2 * height, -1), v[:, :, None].expand(-1, -1, 2 * width)], -1
+    )  # twice as fine, then averaged: edges are as soft as a game's
+    layers = F.grid_sample(pictures[view, row], grid, align_corners=False, padding_mode="border")
+    inside = (grid.abs().amax(-1) <= 1)[:, None] & (layers[:, 3:] > 0.5)
+    layers = F.avg_pool2d(torch.cat([layers[:, :3] * inside, inside.float()], 1), 2)
+    order = ahead.argsort(descending=True)  # the nearest is painted last
+    rgb, depth = rgb.clone(), depth.clone()
+    behind = depth.clone()
+    for card in order.tolist():
+        at = int(view[card])
+        seen = (behind[at] + BEHIND_M > ahead[card]).float()
+        cover = layers[card, 3] * seen
+        rgb[at] = rgb[at] * (1 - cover) + layers[card, :3] * seen
+        depth[at] = torch.where(cover > 0.5, ahead[card], depth[at])
+        instances[at] = torch.where(cover > TOUCHED, int(row[card]) + 1, instances[at])
+    return rgb, depth, instances
+
+
+def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The first and the last that is True in each of [n, L]: [n] each."""
+    whole = line.float()
+    return whole.argmax(1), line.shape[1] - 1 - whole.flip(1).argmax(1)
+
+
+def _onto(left, right, top, bottom) -> torch.Tensor:
+    """The affine map [n, 2, 3] from [-1, 1] onto a box of the image, whose sides are given in 0..1."""
+    zero = torch.zeros_like(left)
+    across = torch.stack([right - left, zero, right + left - 1], 1)
+    along = torch.stack([zero, bottom - top, bottom + top - 1], 1)
+    return torch.stack([across, along], 1).float()

@@ -1,0 +1,206 @@
+"""Cast: the things of a place as cards that stand in it, each with a place and a look that change as they did in recordings.
+
+A look is one of those that the recording showed (space/cards.py), a move one of those that it saw, and which comes next is
+drawn by chance from what a small network tells: a figure is never the mean of what it could do, so it stays sharp and whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from ..space.camera import Intrinsics, project, yaw
+from ..space.cards import PICTURE, Cut, painted
+
+# A card: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its last
+# move (x, y), steps since that, and its light, of its look's own.
+NUMBER, PLACE, LOOK, AGE, BEFORE, GOING, RESTED, LIGHT = 0, slice(1, 4), 4, 5, 6, slice(7, 9), 9, 10
+COLUMNS = 11
+NONE = -1
+ROWS = 16  # cards of a place at most
+STARTS = 32  # casts with which stories begin
+AGES = 24  # steps that are counted; more are as many
+FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
+
+
+@dataclass(frozen=True)
+class CastConfig:
+    """actions: numbers in an action; history: of the last actions that it is told, the present one among them; looks and
+    moves: that it has room for (move 0 is none); hidden: width of the network."""
+
+    actions: int
+    history: int
+    looks: int = 160
+    moves: int = 33
+    rows: int = ROWS
+    starts: int = STARTS
+    hidden: int = 192
+
+
+class Told(NamedTuple):
+    """Logits of the next look [n, looks], of the move [n, moves] and of its being gone [n]."""
+
+    look: torch.Tensor
+    move: torch.Tensor
+    gone: torch.Tensor
+
+
+class Cast(nn.Module):
+    """What the things of a place look like, and what they do next."""
+
+    pictures: torch.Tensor  # uint8 [looks, 4, *PICTURE]
+    boxes: torch.Tensor  # [looks, 4]
+    solid: torch.Tensor  # [looks] metres to which an eye can come near along x or y; 0: it can walk through
+    moves: torch.Tensor  # [moves, 3] metres
+    begun: torch.Tensor  # [starts, rows, COLUMNS], the cards with which stories begin
+
+    def __init__(self, config: CastConfig):
+        super().__init__()
+        self.config = config
+        self.register_buffer("pictures", torch.zeros(config.looks, 4, *PICTURE, dtype=torch.uint8))
+        self.register_buffer("boxes", torch.zeros(config.looks, 4))
+        self.register_buffer("solid", torch.zeros(config.looks))
+        self.register_buffer("moves", torch.zeros(config.moves, 3))
+        self.register_buffer("begun", torch.zeros(config.starts, config.rows, COLUMNS))
+        self.look, self.before = nn.Embedding(config.looks + 1, 32), nn.Embedding(config.looks + 1, 16)
+        self.age, self.rested = nn.Embedding(AGES + 1, 16), nn.Embedding(AGES + 1, 16)
+        inputs = 32 + 3 * 16 + 12 + config.actions * config.history
+        hidden = config.hidden
+        layers = [nn.Linear(inputs, hidden), nn.SiLU(), nn.Dropout(0.1), nn.Linear(hidden, hidden), nn.SiLU()]
+        self.think = nn.Sequential(*layers, nn.Dropout(0.1))
+        self.next_look, self.next_move = nn.Linear(hidden, config.looks), nn.Linear(hidden, config.moves)
+        self.goes = nn.Linear(hidden, 1)
+
+    def empty(self, batch: int) -> torch.Tensor:
+        """No cards: [batch, rows, COLUMNS]."""
+        return torch.zeros(batch, self.config.rows, COLUMNS)
+
+    def tell(self, cards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> Told:
+        """What comes next of cards [n, COLUMNS], seen from `pose` [n, 7] to which the actions [n, history, A], the newest
+        last, have led."""
+        apart, heading = cards[:, PLACE] - pose[:, :3], yaw(pose)
+        c, s = heading.cos(), heading.sin()
+        ahead, aside = apart[:, 0] * c + apart[:, 1] * s, apart[:, 1] * c - apart[:, 0] * s
+        far = apart[:, :2].norm(dim=1).clamp_min(0.1)
+        where = [
+            ahead / 10, torch.tanh(aside / 0.4), torch.tanh(aside), torch.tanh(aside / 4), far.log() / 2,
+            (aside.abs() < ahead).float(), (ahead > 0).float(), (apart[:, 2] / 2).clamp(-2, 2),
+            apart[:, 0] / far, apart[:, 1] / far, *(8 * cards[:, GOING]).unbind(1),
+        ]  # fmt: skip
+        look, before = ((cards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
+        age, rested = (cards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
+        parts = [self.look(look), self.before(before), self.age(age), self.rested(rested)]
+        known = self.think(torch.cat([*parts, torch.stack(where, 1), acts.flatten(1)], 1))
+        return Told(self.next_look(known), self.next_move(known), self.goes(known)[:, 0])
+
+    @torch.no_grad()
+    def step(
+        self, cards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, camera: Intrinsics, rng: torch.Generator
+    ) -> torch.Tensor:
+        """The cards [B, K, COLUMNS] one step later, by chance, arguments as for `tell`; what is out of sight waits."""
+        where, ahead = project(cards[..., PLACE], pose, camera)
+        seen = (cards[..., NUMBER] > 0) & (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.6)
+        view, row = seen.nonzero(as_tuple=True)
+        if not len(view):
+            return cards
+        some = cards[view, row]
+        told = self.tell(some, pose[view], acts[view])
+        look = torch.multinomial(told.look.softmax(1), 1, generator=rng)[:, 0]
+        move = torch.multinomial(told.move.softmax(1), 1, generator=rng)[:, 0]
+        gone = torch.rand(len(some), generator=rng) < told.gone.sigmoid()
+        after = noted(some, some[:, PLACE] + self.moves[move], look.float())
+        after[gone] = 0.0
+        return cards.index_put((view, row), after)
+
+    def paint(
+        self, cards: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Frames with cards [B, K, COLUMNS] in them: see space/cards.painted."""
+        look = cards[..., LOOK].long()
+        there = (cards[..., NUMBER] > 0) & (look != NONE)
+        look = look.clamp_min(0)
+        light = cards[..., LIGHT, None].expand(-1, -1, 3)
+        lit = torch.cat([light, torch.ones_like(light[..., :1])], -1)[..., None, None]
+        pictures = self.pictures[look].float() / 255 * lit
+        return painted(rgb, depth, (cards[..., PLACE], pictures, self.boxes[look]), there, pose, camera)
+
+    def bodies(self, cards: torch.Tensor, place: torch.Tensor, half_m: float) -> torch.Tensor:
+        """The sides [S, 4] of those cards [K, COLUMNS] that stop a body of half width `half_m` at `place` [2], as walls
+        (space/floorplan.py)."""
+        known = (cards[:, NUMBER] > 0) & (cards[:, LOOK] != NONE)
+        reach = self.solid[cards[:, LOOK].long().clamp_min(0)]
+        away = (cards[:, PLACE][:, :2] - place).abs().amax(1)
+        stops = known & (reach > half_m) & (away >= reach - 0.02)  # who stands in one may leave
+        (x, y), half = cards[stops][:, PLACE][:, :2].unbind(1), reach[stops] - half_m
+        left, right, low, high = x - half, x + half, y - half, y + half
+        sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
+        return torch.cat([torch.stack(side, 1) for side in sides])
+
+    def recognised(self, cut: Cut, told: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+        """The cards [B, K, COLUMNS] that evidence shows: told [B, K, 4] = number and place; of those `before` [B, K, COLUMNS]
+        that it does not tell of, as many as there is room for wait where they were."""
+        batch, rows = told.shape[:2]
+        pictures = self.pictures.float() / 255
+        look = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes)).argmin(1)
+        light = brightness(cut.picture) / brightness(pictures[look]).clamp_min(1e-3)
+        looks, lights, whole = torch.full((batch, rows), float(NONE)), torch.ones(batch, rows), torch.zeros(batch, rows)
+        looks[cut.view, cut.row], lights[cut.view, cut.row] = look.float(), light.clamp(0.25, 4)
+        whole[cut.view, cut.row] = cut.whole.float()
+        cards = self.empty(batch)
+        for story in range(batch):
+            kept = {float(card[NUMBER]): card for card in before[story] if card[NUMBER] > 0}
+            found = []
+            for row in (told[story, :, 0] > 0).nonzero()[:, 0]:
+                number, place, seen = float(told[story, row, 0]), told[story, row, 1:], looks[story, row]
+                old = kept.pop(number, None)
+                if old is None:
+                    card = fresh(number, place, seen)
+                else:  # what is seen in part looks as it did
+                    card = noted(old[None], place[None], torch.where(whole[story, row] > 0, seen, old[LOOK])[None])[0]
+                if old is None or whole[story, row] > 0:
+                    card[LIGHT] = lights[story, row]
+                found.append(card)
+            found = [*found, *kept.values()][:rows]
+            if found:
+                cards[story, : len(found)] = torch.stack(found)
+        return cards
+
+
+def fresh(number: float, place: torch.Tensor, look: torch.Tensor | float) -> torch.Tensor:
+    """A card [COLUMNS] that is seen for the first time, at place [3]."""
+    card = torch.zeros(COLUMNS)
+    card[NUMBER], card[PLACE], card[LOOK], card[BEFORE] = number, place, look, NONE
+    card[AGE] = card[RESTED] = AGES
+    card[LIGHT] = 1.0
+    return card
+
+
+def noted(cards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
+    """Cards [n, COLUMNS] one step later, at place [n, 3] with look [n]: their ages and last moves go on."""
+    after = cards.clone()
+    moved = place - cards[:, PLACE]
+    went, other = moved[:, :2].norm(dim=1) > 1e-3, look != cards[:, LOOK]
+    after[:, PLACE], after[:, LOOK] = place, look
+    after[:, BEFORE] = torch.where(other, cards[:, LOOK], cards[:, BEFORE])
+    after[:, AGE] = torch.where(other, 0.0, (cards[:, AGE] + 1).clamp_max(AGES))
+    after[:, GOING] = torch.where(went[:, None], moved[:, :2], cards[:, GOING])
+    after[:, RESTED] = torch.where(went, 0.0, (cards[:, RESTED] + 1).clamp_max(AGES))
+    return after
+
+
+def brightness(picture: torch.Tensor) -> torch.Tensor:
+    """Mean of the colours [n] where pictures [n, 4, h, w] cover."""
+    cover = picture[:, 3]
+    return (picture[:, :3].mean(1) * cover).sum((1, 2)) / cover.sum((1, 2)).clamp_min(1e-3)
+
+
+def marks(picture: torch.Tensor, box: torch.Tensor) -> torch.Tensor:
+    """By which looks are told apart: pictures [n, 4, h, w], small and at one brightness, and their boxes [n, 4]: [n, D]."""
+    cover = picture[:, 3:]
+    colour = 0.3 * picture[:, :3] / brightness(picture).clamp_min(0.02)[:, None, None, None]
+    small = F.adaptive_avg_pool2d(torch.cat([colour * cover, 0.5 * cover], 1), FINE)
+    return torch.cat([3 * small.flatten(1) / (FINE[0] * FINE[1]) ** 0.5, box], 1)
