@@ -12,8 +12,9 @@ from gymnasium import spaces
 from tests.data.corridor import DEPTH, Corridor
 
 from terrella.core import check_world, make_rng
-from terrella.core.errors import ObservationError
+from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.data import ClipCache, Explorer, record
+from terrella.learn.cast import ThingsConfig, train_things
 from terrella.learn.moving import mirrored, moving_lesson, other_side
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
 from terrella.learn.train_video import TrainConfig, train_video
@@ -132,6 +133,27 @@ def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     assert torch.equal(*cards)
     bare = world.without_memory()
     assert bare.cast is world.cast
+
+
+def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
+    world, folder = peopled
+    told = train_things(
+        folder / "run" / "world", folder / "set", tmp_path / "new", ThingsConfig(5, seed=1), lambda *told: None
+    )
+    new = load_world(told["world"])
+    assert torch.equal(new.memory.rgb, world.memory.rgb) and new.spec.heeds == world.spec.heeds
+    assert torch.equal(new.generator.enter.weight, world.generator.enter.weight)
+    assert not torch.equal(new.cast.goes.weight, world.cast.goes.weight) and told["cast_steps"] == 5
+    assert torch.equal(new.cast.begun[..., NUMBER], world.cast.begun[..., NUMBER])
+
+
+def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(peopled, recording, tmp_path):
+    _, folder = peopled
+    with pytest.raises(DatasetError, match=r"does not tell of observation\.cast"):
+        train_things(folder / "run" / "world", recording, tmp_path / "x", ThingsConfig(5), lambda *told: None)
+    still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
+    with pytest.raises(TrainingError, match="knows of no things"):
+        train_things(still["world"], folder / "set", tmp_path / "x", ThingsConfig(5), lambda *told: None)
 
 
 def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):

@@ -77,6 +77,7 @@ def _app(given: Sequence[str]) -> SubcommandApp:
             "video": train.video,
             "eye": train.eye,
             "senses": train.senses,
+            "things": train.things,
             "latent-actions": train.latent_actions,
             "distil": train.few_steps,
             "dreams": train.dreams,

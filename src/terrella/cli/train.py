@@ -7,6 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from .. import progress
+from ..learn.cast import ThingsConfig, train_things
 from ..learn.distil import DistilConfig, distil
 from ..learn.eye import EyeTraining, train_eye
 from ..learn.latent_actions import LatentConfig, train_latent_actions
@@ -17,13 +18,14 @@ from ..library import folder_of
 from .named import Device, load_named
 from .say import Json, result
 
-VIDEO, EYE, SENSES, LATENT, DISTIL, DREAMS = (
+VIDEO, EYE, SENSES, LATENT, DISTIL, DREAMS, THINGS = (
     TrainConfig(),
     EyeTraining(),
     SensesConfig(),
     LatentConfig(),
     DistilConfig(),
     DreamsConfig(),
+    ThingsConfig(),
 )
 
 
@@ -61,6 +63,19 @@ def senses(name: Positional[str], data: Path, out: Path, config: SensesConfig = 
     """
     with progress.shown("training") as report:
         facts = train_senses(folder_of(name), data, out, config, report)
+    result(facts, json)
+
+
+def things(name: Positional[str], data: Path, out: Path, config: ThingsConfig = THINGS, json: Json = False) -> None:
+    """Teach a trained world what its things do from another recording: more fights make better monsters in minutes.
+
+    Args:
+        name: What `terrella list` shows, or the path of a checkpoint.
+        data: Folder of a recording of the same game that tells things apart.
+        out: Folder for the world with its new cast.
+    """
+    with progress.shown("training") as report:
+        facts = train_things(folder_of(name), data, out, config, report)
     result(facts, json)
 
 

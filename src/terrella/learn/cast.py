@@ -1,25 +1,33 @@
-"""learn_cast: the looks and moves that a recording's things have, and which follow which, into a Cast."""
+"""learn_cast: the looks and moves that a recording's things have, and which follow which, into a Cast; and train_things, which
+gives such a cast to a world that is trained."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache
 from ..space.camera import Intrinsics, project
 from ..space.cards import cut_out
-from ..worlds.cast import LOOK, NONE, PLACE, Cast, fresh, marks, noted
+from ..worlds.cast import LOOK, NONE, PLACE, Cast, CastConfig, fresh, marks, noted
+from ..worlds.folder import load_world, save_again, video_spec
+from ..worlds.video import VideoWorld
+from .post_training import beside
 from .samples import CAST, INSTANCES, Recording
 from .updates import Report, descend
 
 CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
 ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
 STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
+TWICE = 2  # times that a look was seen to follow another, below which that was a mistake
 SELDOM = 4  # sightings below which a look is none
 UPRIGHT_M = 1.0  # height of what may stand in the way
 BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known to
@@ -27,6 +35,50 @@ NEVER_M = 1e3  # boxes of looks that are not used
 WAITS = 300  # steps from an episode's beginning in which things are found that waited there
 LASTS = 15  # steps in which a thing must have been seen to be one that waits
 CHUNK = 128  # frames that are cut at once
+
+
+@dataclass(frozen=True)
+class ThingsConfig:
+    """Settings of the training of a world's things.
+
+    Args:
+        steps: Training steps of what they do next.
+        seed: Of everything random.
+    """
+
+    steps: int = 2500
+    seed: int = 0
+
+
+def train_things(world: str | Path, data: str | Path, out: str | Path, config: ThingsConfig, report: Report) -> dict:
+    """Gives the world in the folder `world` the cast of the recording `data`, in place of its own, and writes it to `out`
+    (which may be `world`); returns its facts."""
+    learned = load_world(world)
+    if not isinstance(learned, VideoWorld) or not learned.config.moving:
+        raise TrainingError(
+            f"{learned.spec.name} knows of no things that move; `terrella train video` makes worlds that do."
+        )
+    learned.config = replace(learned.config, cast=True)
+    pair = beside(learned, data, None, report)
+    cast = Cast(CastConfig(learned.config.actions, learned.config.history))
+    facts = learn_cast(
+        cast,
+        pair.recording,
+        pair.dataset.rgb_at,
+        learned.starts.pose,
+        learned.config.camera,
+        config.steps,
+        config.seed,
+        report,
+    )
+    if not facts["cast_looks"]:
+        raise DatasetError(f"{data} shows no thing whole and near; record more of them.")
+    learned.cast, spec = cast, learned.spec
+    vitals = learned.outcome.config.vitals if learned.outcome else ()
+    named = (spec.dt_s, spec.action_names, spec.keys, {**spec.card, **facts})
+    learned.spec = video_spec(spec.name, learned.config, *named, None, vitals)
+    save_again(learned, out, dict(learned.spec.card), world)
+    return {"world": str(out), **facts}
 
 
 class Sightings(NamedTuple):
@@ -66,14 +118,15 @@ def learn_cast(
     cast: Cast,
     recording: Recording,
     rgb: Callable[[np.ndarray], np.ndarray],
-    starts: np.ndarray,
+    starts: torch.Tensor,
     camera: Intrinsics,
     steps: int,
     seed: int,
     report: Report,
 ) -> dict:
-    """Teaches `cast` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; stories begin with
-    the cards that waited in the episodes of the rows `starts`. Returns facts."""
+    """Teaches `cast` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; a story that
+    begins at one of the poses `starts` [S, 7] begins with the cards that waited in the episode that began nearest to it.
+    Returns facts."""
     cache, rows = recording.cache, np.flatnonzero(recording.usable)
     seen = _cut(cache, rgb, rows, camera, report)
     clear = np.flatnonzero(seen.whole & (seen.share >= LARGE))
@@ -88,8 +141,13 @@ def learn_cast(
     known = _settled(off, seen, cache)
     tokens, waiting = _followed(cast, recording, seen, known, camera)
     cast.solid[:] = _reach(cast, tokens)
-    for story, row in enumerate(starts[: cast.config.starts]):
-        cards = waiting.get(int(row), [])[: cast.config.rows]
+    cast.follows[:] = _follows(cast, tokens)
+    begun = np.array([first for first, _ in cache.episodes if recording.usable[first]])
+    nearest = torch.cdist(
+        starts[: cast.config.starts], torch.from_numpy(np.asarray(cache.pose[begun], np.float32))
+    ).argmin(1)
+    for story, episode in enumerate(nearest.tolist()):
+        cards = waiting[int(begun[episode])][: cast.config.rows]
         if cards:
             cast.begun[story, : len(cards)] = torch.stack(cards)
     loss = _train(cast.train(), tokens, recording, steps, seed, report)
@@ -154,6 +212,15 @@ def _settled(off: np.ndarray, seen: Sightings, cache: ClipCache) -> np.ndarray:
         look[one] = best
         last[number] = frame, best
     return look
+
+
+def _follows(cast: Cast, tokens: Tokens) -> torch.Tensor:
+    """bool [looks + 1, looks]: a look follows itself, and what it was seen to more than by mistake."""
+    looks, known = cast.config.looks, tokens.look != NONE
+    pair = (tokens.cards[known, LOOK].long() + 1) * looks + tokens.look[known]
+    seen = torch.bincount(pair, minlength=(looks + 1) * looks).view(looks + 1, looks) >= TWICE
+    seen[0] = True
+    return seen | torch.cat([torch.zeros(1, looks), torch.eye(looks)]).bool()
 
 
 def _reach(cast: Cast, tokens: Tokens) -> torch.Tensor:
@@ -310,7 +377,8 @@ def _train(
         weight = (1 / len(often) / often[picks]).to(device)
         cards, pose, look, move, gone = (part[picks].to(device) for part in tokens[:5])
         said = cast.tell(cards, pose, actions[picks].to(device))
-        error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none") * (look != NONE)
+        possible = (look != NONE) & cast.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
+        error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
         error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")
         loss = (weight * error).mean()

@@ -14,7 +14,7 @@ import numpy as np
 from ..core.errors import DatasetError, TrainingError
 from ..data import ClipCache, Dataset, split
 from ..space.eye import load_eye, save_eye
-from ..worlds.folder import MEMORY_FILE, Learned, load_world, save_world
+from ..worlds.folder import Learned, load_world, save_again
 from ..worlds.video import VideoWorld
 from .doubt import DoubtTraining, learn_doubt
 from .eye import EyeTraining, learn_eye, recording_of, sight
@@ -55,10 +55,7 @@ def train_senses(world: str | Path, data: str | Path, out: str | Path, config: S
     mark = hashlib.sha256(told.encode() + np.ascontiguousarray(cache.pose).tobytes()) if posed else hashlib.sha256()
     keep = Path(out) / f"eye-{mark.hexdigest()[:12]}.safetensors.partial"  # of these settings and this recording alone
     sensing, facts = learn_senses(learned, recording, held_out, tuple(box) if box else None, config, report, keep)
-    remembered = (Path(world) / MEMORY_FILE).read_bytes()  # as they are: pictures that are packed again lose a little
-    save_world(sensing, out, {**learned.spec.card, **facts})
-    (Path(out) / f"{MEMORY_FILE}.partial").write_bytes(remembered)
-    (Path(out) / f"{MEMORY_FILE}.partial").replace(Path(out) / MEMORY_FILE)
+    save_again(sensing, out, {**learned.spec.card, **facts}, world)
     keep.unlink(missing_ok=True)
     return {"world": str(out), **facts}
 

@@ -225,7 +225,9 @@ class _Run:
         if self.cast is not None and self.facts["cast"] is None:
             settings = self.video.camera, config.cast_steps, config.seed, report
             part = self.recording
-            self.facts["cast"] = learn_cast(self.cast, part, self.dataset.rgb_at, self._beginnings(), *settings)
+            self.facts["cast"] = learn_cast(
+                self.cast, part, self.dataset.rgb_at, part.pose(self._beginnings()), *settings
+            )
             self.updates.save()
         every_s = config.save_every_s, config.strip_every_s
         self.updates.run(config.steps, self._step, self.draw_strip, *every_s, report, config.hours)

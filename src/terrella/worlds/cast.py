@@ -55,6 +55,7 @@ class Cast(nn.Module):
     pictures: torch.Tensor  # uint8 [looks, 4, *PICTURE]
     boxes: torch.Tensor  # [looks, 4]
     solid: torch.Tensor  # [looks] metres to which an eye can come near along x or y; 0: it can walk through
+    follows: torch.Tensor  # bool [looks + 1, looks], which look was seen to follow which; the first row is that of NONE
     moves: torch.Tensor  # [moves, 3] metres
     begun: torch.Tensor  # [starts, rows, COLUMNS], the cards with which stories begin
 
@@ -64,6 +65,7 @@ class Cast(nn.Module):
         self.register_buffer("pictures", torch.zeros(config.looks, 4, *PICTURE, dtype=torch.uint8))
         self.register_buffer("boxes", torch.zeros(config.looks, 4))
         self.register_buffer("solid", torch.zeros(config.looks))
+        self.register_buffer("follows", torch.ones(config.looks + 1, config.looks, dtype=torch.bool))
         self.register_buffer("moves", torch.zeros(config.moves, 3))
         self.register_buffer("begun", torch.zeros(config.starts, config.rows, COLUMNS))
         self.look, self.before = nn.Embedding(config.looks + 1, 32), nn.Embedding(config.looks + 1, 16)
@@ -95,7 +97,8 @@ class Cast(nn.Module):
         age, rested = (cards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested)]
         known = self.think(torch.cat([*parts, torch.stack(where, 1), acts.flatten(1)], 1))
-        return Told(self.next_look(known), self.next_move(known), self.goes(known)[:, 0])
+        next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
+        return Told(next_look, self.next_move(known), self.goes(known)[:, 0])
 
     @torch.no_grad()
     def step(

@@ -93,6 +93,14 @@ def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
     _replace(path / "world.json", lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
 
 
+def save_again(world: Learned, path: str | Path, card: dict, source: str | Path) -> None:
+    """The same of a world that was loaded from the folder `source`, whose remembered pictures stay as they are: packed again
+    they would lose a little."""
+    remembered = (Path(source) / MEMORY_FILE).read_bytes()
+    save_world(world, path, card)
+    _replace(Path(path) / MEMORY_FILE, lambda file: Path(file).write_bytes(remembered))
+
+
 def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None) -> Learned:
     """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); `memory_mb` is the
     budget of a story's own memory, where it is not to be the saved one; the generator runs on `device`, geometry on the CPU.
