@@ -17,6 +17,7 @@ import tyro
 import terrella
 from terrella.data import ClipCache
 from terrella.learn.samples import Recording, controls_of
+from terrella.space.camera import project
 from terrella.space.cards import cut_out
 from terrella.worlds.cast import LOOK, NONE, NUMBER, PLACE
 from terrella.worlds.video import VideoWorld
@@ -70,7 +71,9 @@ def main(
     yes, no = chance[True][fell, None], chance[True][~fell]
     print(f"who falls: AUC {float((yes > no).float().mean() + 0.5 * (yes == no).float().mean()):.2f}")
     for step in (8, 32, 64):
-        there = known[min(step, steps) - 1] & standing
+        if step > steps:
+            break
+        there = known[step - 1] & standing
         true, begun, dream = truth[step - 1][there], cards[..., PLACE][there], places[:, step - 1][:, there]
         ways = [
             float((a - b).norm(dim=-1).mean())
@@ -112,7 +115,9 @@ def dreamt(
         led = rows[:, None] + step - history + np.arange(history)
         acts = recording.action(led.ravel()).view(*led.shape, -1).clone()
         acts[..., button] *= attack
-        cards = cast.step(cards, recording.pose(rows + step), acts, world.config.camera, rng)
+        pose = recording.pose(rows + step)
+        where, ahead = project(cards[..., PLACE], pose, world.config.camera)
+        cards = cast.step(cards, (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.5), pose, acts, rng)
         look = cards[..., LOOK].long()
         fell |= (cards[..., NUMBER] > 0) & (look != NONE) & (cast.boxes[look.clamp_min(0), 3] < LOW_M)
         places.append(cards[..., PLACE])

@@ -1,17 +1,19 @@
 #!/bin/sh
-# Two worlds in which things move, 48x64: monsters in a corridor, and three maps of Freedoom with a fourth never seen. Run it in
-# the folder of a checkout after `make test`; every command goes on where it was stopped.
+# Two worlds in which things move: the monsters of a corridor at 96x128 (the bundled doom-corridor), and three maps of Freedoom
+# at 48x64 with a fourth never seen. Run it in the folder of a checkout after `make test`; every command goes on where it was
+# stopped.
 set -e
 PATH=.venv/bin:$PATH
 export OMP_NUM_THREADS=1
-terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 16000 --seed 0 --out recordings/monsters
-terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 3000 --seed 1 --out recordings/monsters-test
-terrella train video recordings/monsters --out runs/monsters --name doom-monsters --size 48 64 --steps 4000 \
-    --motion-steps 2500 --outcome-steps 700 --keyframes 160 --critic-from 900 --eye-steps 0 --doubt-frames 0
+terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 30000 --seed 0 --out recordings/monsters
+terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 4000 --seed 1 --out recordings/monsters-test
+terrella train video recordings/monsters --out runs/monsters --name doom-corridor --steps 3500 --motion-steps 4000 \
+    --keyframes 200 --critic-from 900 --eye-steps 0 --doubt-frames 2000
 terrella score runs/monsters --data recordings/monsters-test --fresh --out scores/monsters --horizons 1 8 32
+python benchmarks/things.py runs/monsters/world recordings/monsters-test
 
 terrella record doom --height 96 --scenario freedoom2/MAP01,MAP02,MAP05 --frames 18000 --seed 0 --out recordings/maps
 terrella record doom --height 96 --scenario freedoom2/MAP03 --frames 3000 --seed 1 --out recordings/map03
-terrella train video recordings/maps --out runs/maps --name doom-maps --size 48 64 --steps 4000 \
+terrella train video recordings/maps --out runs/maps --name doom-maps --size 48 64 --steps 3000 \
     --motion-steps 2500 --outcome-steps 700 --keyframes 420 --critic-from 900 --eye-steps 0 --doubt-frames 0
 terrella score runs/maps --data recordings/maps --new recordings/map03 --out scores/maps --horizons 1 8 32

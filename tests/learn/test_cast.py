@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from terrella.core.errors import DatasetError
 from terrella.learn.cast import learn_cast
 from terrella.space.camera import planar_pose
 from terrella.space.cards import PICTURE, painted
@@ -48,7 +49,8 @@ def toy() -> SimpleNamespace:
         arrays=arrays, episodes=episodes, length=rows, depth=np.stack(depths), pose=pose(rows).numpy()
     )
     usable, rgb = np.ones(rows, bool), np.stack(pictures)
-    return SimpleNamespace(cache=cache, usable=usable, action=lambda at: torch.from_numpy(action[at]), rgb=rgb)
+    told = {"action": lambda at: torch.from_numpy(action[at]), "pose": lambda at: pose(rows)[at]}
+    return SimpleNamespace(cache=cache, usable=usable, rgb=rgb, **told)
 
 
 def pose(count: int) -> torch.Tensor:
@@ -62,7 +64,7 @@ def learned():
     cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     starts = pose(2)
     starts[1, 1] = 1.0  # whichever episode began nearest
-    facts = learn_cast(cast, recording, recording.rgb.__getitem__, starts, CAMERA, 250, 0, lambda *told: None)  # pyright: ignore
+    facts = learn_cast(cast, recording, recording.rgb.__getitem__, starts, CAMERA, 500, 0, lambda *told: None)  # pyright: ignore
     return cast, facts, recording
 
 
@@ -99,5 +101,16 @@ def test_who_is_shot_at_falls_and_who_is_not_walks_on(learned):
 def test_a_recording_that_shows_no_thing_whole_teaches_nothing():
     cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     recording.cache.arrays["observation.instances"] = np.zeros_like(recording.cache.arrays["observation.instances"])
-    facts = learn_cast(cast, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
-    assert facts == {"cast_looks": 0, "cast_steps": 0} and not cast.begun.any()
+    with pytest.raises(DatasetError, match="no thing whole and near: record more"):
+        learn_cast(cast, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+
+
+def test_the_same_seed_teaches_the_same():
+    casts = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+        learn_cast(cast, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+        torch.rand(3)
+        casts.append(cast.state_dict())
+    assert all(torch.equal(casts[0][name], casts[1][name]) for name in casts[0])

@@ -19,7 +19,7 @@ from terrella.learn.moving import mirrored, moving_lesson, other_side
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.space.camera import yaw
-from terrella.worlds.cast import LOOK, NONE, NUMBER, ROWS
+from terrella.worlds.cast import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import VideoConfig
 from terrella.worlds.video import VideoWorld
@@ -124,7 +124,7 @@ def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     assert (state["cards"][:, 0, NUMBER] == 5).all() and (state["cards"][:, 0, LOOK] != NONE).all()
     seen = world.render(state, ("cast", "instances", "things"))
     assert (seen["instances"] == 1).any((1, 2)).all() and (seen["things"] | (seen["instances"] == 0)).all()
-    assert torch.equal(seen["cast"], state["cards"][..., :4])
+    assert torch.equal(seen["cast"][:, 0], state["cards"][:, 0, :4]) and (seen["instances"] <= 1).all()
     save_world(world, tmp_path / "again", dict(world.spec.card))
     again = load_world(tmp_path / "again")
     kept, read = world.cast.state_dict(), again.cast.state_dict()
@@ -164,12 +164,18 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
     told[0, 0, 0] = 77.0
     after = world.observe({**seen, "cast": told}, state, rng)
     assert after["cards"][0, :, NUMBER].tolist()[:2] == [77.0, 5.0]  # the one not told of waits
+    dreamt = world.imagine(state, torch.zeros(1, 6), rng)
+    again = world.observe(seen, dreamt, rng)["cards"][0, 0]  # a step after `state`, whatever was dreamt in between
+    assert again[RESTED] == min(24, state["cards"][0, 0, RESTED] + 1) and not again[GOING].any()
+    stray = {**seen, "instances": torch.where(seen["instances"] == 0, 200, seen["instances"])}
+    assert (world.observe(stray, state, rng)["instances"] <= 1).all()
     blank = world.observe({name: seen[name] for name in ("rgb", "depth", "pose")}, state, rng)
     assert not blank["cards"].any() and not blank["instances"].any()
     for bad in (
         {"cast": told[:, :3]},
         {"cast": told[..., :3]},
         {"instances": seen["instances"][0]},
+        {"instances": seen["instances"].float()},
         {"cast": told * torch.nan},
     ):
         with pytest.raises(ObservationError, match="cast is"):

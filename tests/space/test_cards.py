@@ -69,7 +69,7 @@ def test_what_was_painted_is_cut_out_again():
     assert cut.view.tolist() == [0, 0] and cut.row.tolist() == [0, 1] and cut.whole.all()
     pixel_m = torch.tensor(places)[:, 0] / CAMERA[0] / SIZE[1]
     assert ((cut.box - BOX).abs().amax(1) < 1.3 * pixel_m).all()
-    upper, lower = cut.picture[0, :, 6, 12], cut.picture[0, :, 26, 12]
+    upper, lower = cut.picture[0, :, 9, 16], cut.picture[0, :, 40, 16]
     assert upper[1] > 0.9 and lower[1] < 0.1 and upper[0] > 0.9 and upper[3] > 0.9
     assert cut.picture[1, 2].mean() > 0.85
 

@@ -21,6 +21,7 @@ from terrella.worlds.cast import (
     Cast,
     CastConfig,
     fresh,
+    likest,
     noted,
 )
 
@@ -63,8 +64,8 @@ def cards(cast: Cast, *places: tuple[float, float, float]) -> torch.Tensor:
     return whole
 
 
-def step(cast: Cast, before: torch.Tensor, pose: torch.Tensor | None = None) -> torch.Tensor:
-    return cast.step(before, eye() if pose is None else pose, torch.zeros(1, 2, 3), CAMERA, make_rng(0))
+def step(cast: Cast, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
+    return cast.step(before, torch.tensor([seen]), eye(), torch.zeros(1, 2, 3), make_rng(0))
 
 
 def test_a_card_does_what_is_told_of_it_and_its_ages_go_on():
@@ -80,19 +81,18 @@ def test_a_card_does_what_is_told_of_it_and_its_ages_go_on():
 def test_what_is_out_of_sight_waits_and_what_is_gone_is_gone():
     cast = sure(cast_of_two(), BLUE, 1, gone=True)
     there = cards(cast, (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
-    after = step(cast, there)
+    after = step(cast, there, (True, False, True, True))
     assert after[0, :, NUMBER].tolist() == [0, 2, 0, 0] and torch.equal(after[0, 1], there[0, 1])
-    turned = step(cast, there, eye(heading=3.14159))
-    assert turned[0, :, NUMBER].tolist() == [1, 0, 0, 0]
 
 
 def test_by_chance_as_often_as_told():
     cast = sure(cast_of_two(), BLUE, 0)
     cast.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
     many, rng = cards(cast, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
-    looks = cast.step(many, eye().expand(800, 7), torch.zeros(800, 2, 3), CAMERA, rng)[:, 0, LOOK]
+    seen = torch.ones(800, 4, dtype=torch.bool)
+    looks = cast.step(many, seen, eye().expand(800, 7), torch.zeros(800, 2, 3), rng)[:, 0, LOOK]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = cast.step(many, eye().expand(800, 7), torch.zeros(800, 2, 3), CAMERA, make_rng(1))[:, 0, LOOK]
+    again = cast.step(many, seen, eye().expand(800, 7), torch.zeros(800, 2, 3), make_rng(1))[:, 0, LOOK]
     assert torch.equal(looks, again)
 
 
@@ -129,11 +129,25 @@ def test_who_stands_upright_stops_a_body_and_who_is_walked_through_does_not():
     cast.solid[RED] = 1.0
     there = cards(cast, (2.0, 0.0, 0.0))
     place, wish = torch.zeros(1, 2), torch.tensor([[3.0, 0.0]])
-    moved, _ = slide(cast.bodies(there[0], place[0], 0.5), place, wish, 0.5)
+    moved, _ = slide(cast.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5), place, wish, 0.5)
     assert abs(float(moved[0, 0]) - 1.0) < 1e-3
+    assert not len(cast.bodies(there[0], torch.tensor([0.0, 0.0, 4.3]), 0.5))  # a floor below
     there[0, 0, LOOK] = BLUE
-    moved, _ = slide(cast.bodies(there[0], place[0], 0.5), place, wish, 0.5)
-    assert moved.tolist() == wish.tolist()
+    assert not len(cast.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5))
+
+
+def test_what_is_lit_more_than_its_picture_does_not_turn_dark():
+    cast = cast_of_two()
+    there = cards(cast, (4.0, 0.0, 0.0))
+    there[0, 0, LIGHT] = 4.0
+    rgb, _, seen = cast.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), eye(), CAMERA)
+    assert seen.any() and rgb.max() == 1.0
+
+
+def test_a_look_lasts_unless_another_is_clearly_nearer():
+    off = torch.tensor([0.30, 0.20, 2.0])
+    assert likest(off, NONE) == 1 and likest(off, 0) == 0 and likest(torch.tensor([0.5, 0.2, 2.0]), 0) == 1
+    assert likest(torch.tensor([0.9, 0.8, 2.0]), 0) == NONE
 
 
 def test_a_look_that_is_not_known_is_not_painted():

@@ -17,16 +17,15 @@ from ..core.world import make_rng
 from ..data import ClipCache
 from ..space.camera import Intrinsics, project
 from ..space.cards import cut_out
-from ..worlds.cast import LOOK, NONE, PLACE, Cast, CastConfig, fresh, marks, noted
-from ..worlds.folder import load_world, save_again, video_spec
+from ..worlds.cast import LOOK, NONE, PLACE, Cast, CastConfig, fresh, likest, marks, noted
+from ..worlds.folder import load_world, save_again
 from ..worlds.video import VideoWorld
 from .post_training import beside
 from .samples import CAST, INSTANCES, Recording
 from .updates import Report, descend
 
 CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
-ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
-STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
+FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
 TWICE = 2  # times that a look was seen to follow another, below which that was a mistake
 SELDOM = 4  # sightings below which a look is none
 UPRIGHT_M = 1.0  # height of what may stand in the way
@@ -34,7 +33,8 @@ BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known t
 NEVER_M = 1e3  # boxes of looks that are not used
 WAITS = 300  # steps from an episode's beginning in which things are found that waited there
 LASTS = 15  # steps in which a thing must have been seen to be one that waits
-CHUNK = 128  # frames that are cut at once
+CHUNK = 1.5e6  # pixels of frames that are cut at once
+WITHOUT = ", or train without (train video --cast-steps 0)"
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ def train_things(world: str | Path, data: str | Path, out: str | Path, config: T
         )
     learned.config = replace(learned.config, cast=True)
     pair = beside(learned, data, None, report)
+    torch.manual_seed(config.seed)
     cast = Cast(CastConfig(learned.config.actions, learned.config.history))
     facts = learn_cast(
         cast,
@@ -71,34 +72,24 @@ def train_things(world: str | Path, data: str | Path, out: str | Path, config: T
         config.seed,
         report,
     )
-    if not facts["cast_looks"]:
-        raise DatasetError(f"{data} shows no thing whole and near; record more of them.")
-    learned.cast, spec = cast, learned.spec
-    vitals = learned.outcome.config.vitals if learned.outcome else ()
-    named = (spec.dt_s, spec.action_names, spec.keys, {**spec.card, **facts})
-    learned.spec = video_spec(spec.name, learned.config, *named, None, vitals)
-    save_again(learned, out, dict(learned.spec.card), world)
+    learned.cast = cast
+    save_again(learned, out, {**learned.spec.card, **facts}, world)
     return {"world": str(out), **facts}
 
 
 class Sightings(NamedTuple):
-    """The n cards that frames show: frame and row of its list [n]; picture uint8 [n, 4, *PICTURE]; box [n, 4]; share [n] of the
-    frame that shows it; whole [n], all of it is seen."""
+    """The n cards that frames show: frame and row of its list [n]; marks [n, D] (worlds/cast.py) and box [n, 4]; share [n] of
+    the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their pictures
+    uint8 [m, 4, *PICTURE]."""
 
     frame: np.ndarray
     row: np.ndarray
-    picture: np.ndarray
-    box: np.ndarray
+    marks: torch.Tensor
+    box: torch.Tensor
     share: np.ndarray
     whole: np.ndarray
-
-    def marks(self, which: np.ndarray) -> torch.Tensor:
-        """See worlds/cast.marks: [len(which), D]."""
-        parts = [
-            marks(torch.from_numpy(self.picture[some]).float() / 255, torch.from_numpy(self.box[some]))
-            for some in np.array_split(which, max(1, len(which) // 2048))
-        ]
-        return torch.cat(parts)
+    clear: np.ndarray
+    picture: torch.Tensor
 
 
 class Tokens(NamedTuple):
@@ -129,25 +120,22 @@ def learn_cast(
     Returns facts."""
     cache, rows = recording.cache, np.flatnonzero(recording.usable)
     seen = _cut(cache, rgb, rows, camera, report)
-    clear = np.flatnonzero(seen.whole & (seen.share >= LARGE))
-    if not len(clear):
-        return {"cast_looks": 0, "cast_steps": 0}
-    heads, off = _looks(seen, clear, cast.config.looks, seed)
-    cast.pictures[: len(heads)] = torch.from_numpy(seen.picture[heads])
+    if not len(seen.clear):
+        raise DatasetError(f"the recording shows no thing whole and near: record more of them{WITHOUT}.")
+    heads, off = _looks(seen, cast.config.looks, seed)
+    cast.pictures[: len(heads)] = seen.picture[heads]
     cast.boxes[:] = NEVER_M
-    cast.boxes[: len(heads)] = torch.from_numpy(seen.box[heads])
+    cast.boxes[: len(heads)] = seen.box[seen.clear[heads]]
     moves = _moves(cache, rows, cast.config.moves, seed)
     cast.moves[: len(moves)] = moves
     known = _settled(off, seen, cache)
     tokens, waiting = _followed(cast, recording, seen, known, camera)
     cast.solid[:] = _reach(cast, tokens)
     cast.follows[:] = _follows(cast, tokens)
-    begun = np.array([first for first, _ in cache.episodes if recording.usable[first]])
-    nearest = torch.cdist(
-        starts[: cast.config.starts], torch.from_numpy(np.asarray(cache.pose[begun], np.float32))
-    ).argmin(1)
-    for story, episode in enumerate(nearest.tolist()):
-        cards = waiting[int(begun[episode])][: cast.config.rows]
+    begun = [first for first, _ in cache.episodes if recording.usable[first]]
+    for story, start in enumerate(starts if begun else []):
+        nearest = int((recording.pose(begun) - start).norm(dim=1).argmin())
+        cards = waiting[begun[nearest]][: cast.config.rows]
         if cards:
             cast.begun[story, : len(cards)] = torch.stack(cards)
     loss = _train(cast.train(), tokens, recording, steps, seed, report)
@@ -161,56 +149,58 @@ def told(cache: ClipCache) -> np.ndarray:
 
 
 def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Report) -> Sightings:
-    parts = []
-    for first in range(0, len(rows), CHUNK):
-        some = rows[first : first + CHUNK]
+    parts, chunk = [], max(1, int(CHUNK / np.prod(cache.arrays[INSTANCES].shape[1:])))
+    for first in range(0, len(rows), chunk):
+        some = rows[first : first + chunk]
         frames = torch.from_numpy(np.ascontiguousarray(rgb(some))).permute(0, 3, 1, 2)
         instances = torch.from_numpy(np.asarray(cache.arrays[INSTANCES][some]))
         depth, pose = (torch.from_numpy(np.asarray(array[some], np.float32)) for array in (cache.depth, cache.pose))
         cut = cut_out(frames, instances, depth, torch.from_numpy(told(cache)[some, :, 1:]), pose, camera)
-        picture = (cut.picture * 255).round().clamp(0, 255).byte()
         share = cut.pixels / (frames.shape[2] * frames.shape[3])
-        parts.append((some[cut.view.numpy()], *map(np.asarray, (cut.row, picture, cut.box, share, cut.whole))))
-        if first // CHUNK % 16 == 0:
+        clear = cut.whole & (share >= LARGE)
+        picture = (cut.picture[clear] * 255).round().clamp(0, 255).byte()
+        frame = torch.from_numpy(some)[cut.view]
+        parts.append((frame, cut.row, marks(cut.picture, cut.box), cut.box, share, cut.whole, clear, picture))
+        if first // chunk % 16 == 0:
             report(first / len(rows), 1.0, "cutting out what stands in the frames")
-    return Sightings(*map(np.concatenate, zip(*parts)))
+    frame, row, marked, box, share, whole, clear, picture = map(torch.cat, zip(*parts))
+    numbers = frame.numpy(), row.numpy(), marked, box, share.numpy(), whole.numpy(), clear.numpy().nonzero()[0]
+    return Sightings(*numbers, picture)
 
 
-def _looks(seen: Sightings, clear: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The sightings [looks] that show a look best, and how far from each every sighting is [n, looks]: k-means of those that
-    are `clear`, each look shown by the largest of its most typical."""
-    rng = np.random.default_rng(seed)
-    sample = clear if len(clear) <= 12000 else np.sort(rng.choice(clear, 12000, replace=False))
-    known = seen.marks(sample)
+def _looks(seen: Sightings, count: int, seed: int) -> tuple[np.ndarray, torch.Tensor]:
+    """Which of the clear sightings [looks] show a look best, and how far from each every sighting is [n, looks]: k-means, each
+    look shown by the largest of its more typical half."""
+    rng, some = np.random.default_rng(seed), np.arange(len(seen.clear))
+    some = some if len(some) <= 12000 else np.sort(rng.choice(some, 12000, replace=False))
+    known = seen.marks[seen.clear[some]]
     centres = _means(known, count, seed)
     off, nearest = torch.cdist(known, centres).min(1)
     heads = []
     for look in range(len(centres)):
         mine = (nearest == look).nonzero()[:, 0]
         if len(mine) >= SELDOM:
-            typical = sample[mine[off[mine].argsort()[: max(SELDOM, len(mine) // 4)]].numpy()]
-            heads.append(typical[seen.share[typical].argmax()])
-    heads = np.array(heads if heads else sample[:1])
-    shown, every = seen.marks(heads), np.arange(len(seen.frame))
-    parts = [torch.cdist(seen.marks(some), shown) for some in np.array_split(every, max(1, len(every) // 4096))]
-    return heads, torch.cat(parts).numpy()
+            typical = some[mine[off[mine].argsort()[: max(SELDOM, len(mine) // 2)]].numpy()]
+            heads.append(typical[seen.share[seen.clear[typical]].argmax()])
+    heads = np.array(heads if heads else some[:1])
+    shown = seen.marks[seen.clear[heads]]
+    return heads, torch.cat([torch.cdist(part, shown) for part in seen.marks.split(4096)])
 
 
-def _settled(off: np.ndarray, seen: Sightings, cache: ClipCache) -> np.ndarray:
+def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray:
     """The look of each sighting [n], `off` [n, looks] being how far it is from each; NONE where it is like none or not seen
-    well. A thing looks as it did unless it is clearly more like another: else what is far would flicker between likes."""
-    numbers = told(cache)[seen.frame, seen.row, 0]
-    nearest, clear = off.argmin(1), seen.whole & (seen.share >= CLEAR)
+    well."""
+    episode = np.searchsorted([first for first, _ in cache.episodes], seen.frame, side="right")
+    numbers, clear = told(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
     look, last = np.full(len(off), NONE), {}
     for one in np.argsort(seen.frame, kind="stable"):
-        frame, number, best = seen.frame[one], numbers[one], nearest[one]
-        if not clear[one] or off[one, best] > ALIKE:
+        if not clear[one]:
             continue
-        before, was = last.get(number, (NONE, NONE))
-        if was != NONE and 0 < frame - before <= 8 and off[one, was] < off[one, best] + STICKS:
-            best = was
-        look[one] = best
-        last[number] = frame, best
+        thing = episode[one], numbers[one]
+        before, was = last.get(thing, (NONE, NONE))
+        look[one] = likest(off[one], was if seen.frame[one] - before <= FORGETS else NONE)
+        if look[one] != NONE:
+            last[thing] = seen.frame[one], look[one]
     return look
 
 
@@ -219,7 +209,7 @@ def _follows(cast: Cast, tokens: Tokens) -> torch.Tensor:
     looks, known = cast.config.looks, tokens.look != NONE
     pair = (tokens.cards[known, LOOK].long() + 1) * looks + tokens.look[known]
     seen = torch.bincount(pair, minlength=(looks + 1) * looks).view(looks + 1, looks) >= TWICE
-    seen[0] = True
+    seen[0] = cast.boxes[:, 3] < NEVER_M
     return seen | torch.cat([torch.zeros(1, looks), torch.eye(looks)]).bool()
 
 
@@ -283,7 +273,7 @@ def _followed(
     before, at, look, place, gone, acts = [], [], [], [], [], []
     waiting: dict[int, list[torch.Tensor]] = {}
     for first, stop in cache.episodes:
-        were: dict[float, torch.Tensor] = {}  # card by number, and the row of the list in which it was
+        were: dict[float, torch.Tensor] = {}  # cards by number, and the row of the list in which each was
         slots: dict[float, int] = {}
         met: dict[float, _Met] = {}
         for row in range(first, stop):
@@ -314,7 +304,9 @@ def _followed(
                     met[number].again(seen_as)
             were, slots = now, here
         waiting[first] = [one.card for one in met.values() if one.waited]
-    moved = torch.stack(place) - torch.stack(before)[:, PLACE] if before else torch.zeros(0, 3)
+    if not before:
+        raise DatasetError(f"the recording shows no thing in two frames that follow each other{WITHOUT}.")
+    moved = torch.stack(place) - torch.stack(before)[:, PLACE]
     move = torch.cdist(moved, cast.moves).argmin(1)
     move[moved.norm(dim=1) <= 1e-3] = 0
     parts = torch.stack(before), poses[at], torch.tensor(look).long(), move, torch.tensor(gone), np.stack(acts)
@@ -365,18 +357,18 @@ def _train(
     happens = ((tokens.look != NONE) & (tokens.look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
     often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
     often = often / often.sum()
-    device = cast.moves.device
     actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
     actions[torch.from_numpy(tokens.acts < 0)] = 0
     optimiser = torch.optim.AdamW(cast.parameters(), 2e-3, weight_decay=1e-2)
     recent: list[float] = []
+    torch.manual_seed(seed)
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = 2e-3 * min(1, (step + 1) / 100) * (0.02 + 0.49 * (1 + np.cos(np.pi * step / steps)))
         picks = torch.multinomial(often, batch, replacement=True, generator=make_rng(seed * 1_000_003 + step))
-        weight = (1 / len(often) / often[picks]).to(device)
-        cards, pose, look, move, gone = (part[picks].to(device) for part in tokens[:5])
-        said = cast.tell(cards, pose, actions[picks].to(device))
+        weight = 1 / len(often) / often[picks]
+        cards, pose, look, move, gone = (part[picks] for part in tokens[:5])
+        said = cast.tell(cards, pose, actions[picks])
         possible = (look != NONE) & cast.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
         error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone

@@ -48,7 +48,7 @@ def moving_lesson(
     told = _told(recording, shown.target, last.rgb, config.history)
     weight = 1 + COUNTS * torch.maximum(things, (carried[:, 5] > 0.5).float())[:, None]
     if config.cast:  # what cards cover is not to be drawn
-        weight = weight * (recording.instances(shown.target) == 0)[:, None]
+        weight = weight * ~recording.covered(shown.target)[:, None]
     glimpse = glimpse_of(shown, shown.target, recording, config)
     lesson = Lesson(glimpse, carried, told, truth, weight / weight.mean())
     return mirrored(lesson, recording.cache.action_names) if rng.random() < 0.5 else lesson
@@ -81,7 +81,7 @@ def other_side(action_names: tuple[str, ...]) -> list[int]:
 
 
 def _frame(recording: Recording, rows: np.ndarray, cast: bool) -> Frame:
-    covered = recording.instances(rows) > 0 if cast else None
+    covered = recording.covered(rows) if cast else None
     return Frame(recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows), covered)
 
 

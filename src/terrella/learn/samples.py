@@ -16,7 +16,7 @@ from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
 from ..worlds.controls import AXES, CHOICE, Controls
 from ..worlds.generator import VideoConfig
-from ..worlds.moving import still
+from ..worlds.moving import covering, still
 from ..worlds.video import carry
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish
@@ -62,6 +62,10 @@ class Recording:
         """uint8 [n, H, W], which row of `cast` is seen at a pixel, counted from 1 (0: none)."""
         told = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
         return F.adaptive_max_pool2d(told[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
+
+    def covered(self, rows) -> torch.Tensor:
+        """bool [n, H, W], see worlds/moving.covering."""
+        return covering(self.instances(rows), self.things(rows))
 
     def lasting(self, rows) -> torch.Tensor:
         """The depth [n, H, W] that a keyframe may hold: 0 where things are."""
@@ -152,7 +156,10 @@ class Lesson:
 
     def judged(self, clean: torch.Tensor) -> torch.Tensor:
         """Drawn frames `clean`, with the truth where nothing counts: no loss and no critic sees what was drawn there."""
-        return clean if self.weight is None else torch.where(self.weight > 0, clean, self.truth)
+        if self.weight is None:
+            return clean
+        truth = torch.cat([self.truth[:, :4], 40 * self.truth[:, 4:] - 20], 1)  # things are drawn as logits
+        return torch.where(self.weight > 0, clean, truth)
 
     def to(self, device) -> Lesson:
         weight = None if self.weight is None else self.weight.to(device)

@@ -106,7 +106,7 @@ class Dreams:
         if self.world.config.moving:
             truth = torch.cat([truth, recording.things(self.row)[:, None]], 1)
         if self.world.config.cast:
-            weight = (recording.instances(self.row) == 0)[:, None].float()
+            weight = (~recording.covered(self.row))[:, None].float()
         return Lesson(self.glimpse, last, told, truth, weight)
 
     @torch.no_grad()

@@ -164,7 +164,7 @@ class _Run:
         if self.video.moving and told_apart and config.cast_steps:
             self.video = replace(self.video, cast=True)
         known = CastConfig(controls.told, self.video.history)
-        self.cast = Cast(known).to(self.device) if self.video.cast else None
+        self.cast = Cast(known) if self.video.cast else None  # small: it is learned on the CPU
         self.happened, self.outcome = self._begin_outcome(usable, posed)
         self.memory = self._choose_memory() if posed else None
         self.generator = channels_last(Generator(self.video)).to(self.device)
@@ -248,6 +248,8 @@ class _Run:
             time_ = np.where(rng.random(batch) < from_noise, 0, rng.random(batch))
             time_ = torch.from_numpy(time_).float().to(self.device)
             noisy = truth * time_[:, None, None, None] + noise * (1 - time_[:, None, None, None])
+            if lesson.weight is not None:
+                noisy = torch.where(lesson.weight > 0, noisy, noise)
         with half_precision(self.device):
             clean = lesson.judged(self.generator(noisy, time_, glimpse, lesson.last, lesson.told).float())
             drawn, found = clean[:, :4], truth[:, :4]
@@ -327,7 +329,7 @@ class _Run:
         body = {name: value for name, value in (self.facts["motion"] or {}).items() if name in ("body_m", "short")}
         return VideoWorld(
             spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards,
-            outcome=outcome, cast=None if self.cast is None else copy.deepcopy(self.cast).cpu().float(),
+            outcome=outcome, cast=None if self.cast is None else copy.deepcopy(self.cast),
         )  # fmt: skip
 
     def _beginnings(self) -> np.ndarray:

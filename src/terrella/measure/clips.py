@@ -143,7 +143,8 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
         if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
-        if name in spec.heeds and stacked.ndim == 3 and len(wanted) == 2:  # and so are marks: one pixel of many counts
+        marks = stacked.ndim == 3 and stacked.dtype in (torch.bool, torch.uint8)
+        if name in spec.heeds and marks and len(wanted) == 2:  # and so are marks: one pixel of many counts
             stacked = F.adaptive_max_pool2d(stacked.float()[:, None], wanted)[:, 0].to(stacked.dtype)
         if wanted == () and stacked[0].numel() == 1:
             stacked = stacked.reshape(-1)

@@ -86,7 +86,7 @@ class Doom:
         self._places: dict[str, Sectors] = {}
         self._ticket = 0
         self._seen: dict[str, torch.Tensor] = {}
-        self._cast_at = -1
+        self._looked_at = -1
         channels: dict[str, spaces.Space] = {
             "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
             "depth": spaces.Box(0, MAX_DEPTH_M, config.depth_size, np.float32),
@@ -211,20 +211,20 @@ class Doom:
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
         if name in ("cast", "instances"):
             return torch.from_numpy(self._told_apart(x, y)[name])
-        depth, sector = self._cast(x, y, z, np.deg2rad(yaw_deg))
+        depth, sector = self._looked(x, y, z, np.deg2rad(yaw_deg))
         if name == "things":
             moved = self._walls.moved()
             return torch.from_numpy(self._sprites() | np.append(moved, False)[sector])
         depth_m = _with_sprites(depth, np.asarray(self._present.depth_buffer)) / UNITS_PER_M
         return torch.from_numpy(depth_m).float().clamp(0, MAX_DEPTH_M)
 
-    def _cast(self, x: float, y: float, z: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+    def _looked(self, x: float, y: float, z: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
         """What is seen of the map's sectors now: depth [h, w] in map units and sector [h, w]."""
-        if self._cast_at != self._ticket:
+        if self._looked_at != self._ticket:
             self._walls.update(self._present.sectors)
             size, farthest = self.config.depth_size, MAX_DEPTH_M * UNITS_PER_M
-            self._cast_of, self._cast_at = self._walls.depth(x, y, z, yaw, CAMERA, size, farthest), self._ticket
-        return self._cast_of
+            self._saw, self._looked_at = self._walls.depth(x, y, z, yaw, CAMERA, size, farthest), self._ticket
+        return self._saw
 
     def _sprites(self) -> np.ndarray:
         """Where a sprite covers any of a pixel: bool [h, w]."""

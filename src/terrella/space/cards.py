@@ -14,7 +14,7 @@ import torch.nn.functional as F
 
 from .camera import Intrinsics, project
 
-PICTURE = (32, 24)  # rows and columns of a card's picture
+PICTURE = (48, 32)  # rows and columns of a card's picture
 NEAREST_M = 0.25  # of a card that is still painted
 TOUCHED = 0.1  # of a pixel that a card covers, above which it is the card's
 BEHIND_M = 0.4  # by which a card may stand behind the surface that a frame shows: its feet are in the floor

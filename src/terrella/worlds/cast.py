@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..space.camera import Intrinsics, project, yaw
+from ..space.camera import Intrinsics, yaw
 from ..space.cards import PICTURE, Cut, painted
 
 # A card: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its last
@@ -21,6 +21,9 @@ from ..space.cards import PICTURE, Cut, painted
 NUMBER, PLACE, LOOK, AGE, BEFORE, GOING, RESTED, LIGHT = 0, slice(1, 4), 4, 5, 6, slice(7, 9), 9, 10
 COLUMNS = 11
 NONE = -1
+ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
+STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
+STOREY_M = 2.0  # between feet and eye, above which a card is on another floor
 ROWS = 16  # cards of a place at most
 STARTS = 32  # casts with which stories begin
 AGES = 24  # steps that are counted; more are as many
@@ -102,12 +105,11 @@ class Cast(nn.Module):
 
     @torch.no_grad()
     def step(
-        self, cards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, camera: Intrinsics, rng: torch.Generator
+        self, cards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, rng: torch.Generator
     ) -> torch.Tensor:
-        """The cards [B, K, COLUMNS] one step later, by chance, arguments as for `tell`; what is out of sight waits."""
-        where, ahead = project(cards[..., PLACE], pose, camera)
-        seen = (cards[..., NUMBER] > 0) & (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.6)
-        view, row = seen.nonzero(as_tuple=True)
+        """The cards [B, K, COLUMNS] one step later, by chance; seen [B, K] bool: the others wait; pose [B, 7] and acts
+        [B, history, A] as for `tell`."""
+        view, row = (seen & (cards[..., NUMBER] > 0)).nonzero(as_tuple=True)
         if not len(view):
             return cards
         some = cards[view, row]
@@ -128,49 +130,63 @@ class Cast(nn.Module):
         look = look.clamp_min(0)
         light = cards[..., LIGHT, None].expand(-1, -1, 3)
         lit = torch.cat([light, torch.ones_like(light[..., :1])], -1)[..., None, None]
-        pictures = self.pictures[look].float() / 255 * lit
+        pictures = (self.pictures[look].float() / 255 * lit).clamp_max(1)
         return painted(rgb, depth, (cards[..., PLACE], pictures, self.boxes[look]), there, pose, camera)
 
-    def bodies(self, cards: torch.Tensor, place: torch.Tensor, half_m: float) -> torch.Tensor:
-        """The sides [S, 4] of those cards [K, COLUMNS] that stop a body of half width `half_m` at `place` [2], as walls
-        (space/floorplan.py)."""
+    def bodies(self, cards: torch.Tensor, eye: torch.Tensor, half_m: float) -> torch.Tensor:
+        """The sides [S, 4] of those cards [K, COLUMNS] that stop a body of half width `half_m` with its eye at `eye` [3], as
+        walls (space/floorplan.py)."""
         known = (cards[:, NUMBER] > 0) & (cards[:, LOOK] != NONE)
         reach = self.solid[cards[:, LOOK].long().clamp_min(0)]
-        away = (cards[:, PLACE][:, :2] - place).abs().amax(1)
-        stops = known & (reach > half_m) & (away >= reach - 0.02)  # who stands in one may leave
+        apart = (cards[:, PLACE] - eye).abs()
+        level = apart[:, 2] < STOREY_M
+        stops = known & level & (reach > half_m) & (apart[:, :2].amax(1) >= reach - 0.02)  # who stands in one may leave
         (x, y), half = cards[stops][:, PLACE][:, :2].unbind(1), reach[stops] - half_m
         left, right, low, high = x - half, x + half, y - half, y + half
         sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
         return torch.cat([torch.stack(side, 1) for side in sides])
 
     def recognised(self, cut: Cut, told: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-        """The cards [B, K, COLUMNS] that evidence shows: told [B, K, 4] = number and place; of those `before` [B, K, COLUMNS]
-        that it does not tell of, as many as there is room for wait where they were."""
+        """The cards [B, K, COLUMNS] that evidence shows, each in its row of told [B, K, 4] = number and place; of those `before`
+        [B, K, COLUMNS] that it does not tell of, as many as there is room for wait where they were."""
         batch, rows = told.shape[:2]
         pictures = self.pictures.float() / 255
-        look = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes)).argmin(1)
-        light = brightness(cut.picture) / brightness(pictures[look]).clamp_min(1e-3)
-        looks, lights, whole = torch.full((batch, rows), float(NONE)), torch.ones(batch, rows), torch.zeros(batch, rows)
-        looks[cut.view, cut.row], lights[cut.view, cut.row] = look.float(), light.clamp(0.25, 4)
-        whole[cut.view, cut.row] = cut.whole.float()
+        off = torch.full((batch, rows, self.config.looks), torch.inf)  # what is not seen is like nothing
+        off[cut.view, cut.row] = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes))
+        bright, whole = torch.zeros(batch, rows), torch.zeros(batch, rows, dtype=torch.bool)
+        bright[cut.view, cut.row], whole[cut.view, cut.row] = brightness(cut.picture), cut.whole
+        usual = brightness(pictures).clamp_min(1e-3)
         cards = self.empty(batch)
         for story in range(batch):
             kept = {float(card[NUMBER]): card for card in before[story] if card[NUMBER] > 0}
-            found = []
-            for row in (told[story, :, 0] > 0).nonzero()[:, 0]:
-                number, place, seen = float(told[story, row, 0]), told[story, row, 1:], looks[story, row]
+            for row in (told[story, :, 0] > 0).nonzero()[:, 0].tolist():
+                number, place, away = float(told[story, row, 0]), told[story, row, 1:], off[story, row]
                 old = kept.pop(number, None)
-                if old is None:
-                    card = fresh(number, place, seen)
-                else:  # what is seen in part looks as it did
-                    card = noted(old[None], place[None], torch.where(whole[story, row] > 0, seen, old[LOOK])[None])[0]
-                if old is None or whole[story, row] > 0:
-                    card[LIGHT] = lights[story, row]
-                found.append(card)
-            found = [*found, *kept.values()][:rows]
-            if found:
-                cards[story, : len(found)] = torch.stack(found)
+                was = NONE if old is None else int(old[LOOK])
+                look = likest(away, was) if whole[story, row] else NONE
+                if look == NONE:  # what is seen in part, or is like none, looks as it did, or else as it may
+                    look = was if was != NONE or bool(away.isinf().all()) else int(away.argmin())
+                card = (
+                    fresh(number, place, look)
+                    if old is None
+                    else noted(old[None], place[None], torch.tensor([float(look)]))[0]
+                )
+                if look != NONE and (old is None or whole[story, row]):
+                    card[LIGHT] = (bright[story, row] / usual[look]).clamp(0.25, 4)
+                cards[story, row] = card
+            free = (cards[story, :, NUMBER] == 0).nonzero()[:, 0].tolist()
+            for row, card in zip(free, kept.values()):
+                cards[story, row] = card
         return cards
+
+
+def likest(off: torch.Tensor, was: int) -> int:
+    """Of looks `off` [looks] away the one that a thing has which looked like `was`: that one, unless another is clearly nearer;
+    NONE where all are far."""
+    best = int(off.argmin())
+    if off[best] > ALIKE:
+        return NONE
+    return was if was != NONE and off[was] < off[best] + STICKS else best
 
 
 def fresh(number: float, place: torch.Tensor, look: torch.Tensor | float) -> torch.Tensor:

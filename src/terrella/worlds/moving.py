@@ -31,6 +31,13 @@ class Frame:
     covered: torch.Tensor | None = None
 
 
+def covering(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
+    """The pixels bool [B, H, W] that cards cover: those of `instances` [B, H, W], and what of `things` [B, H, W] is around
+    them, for a rim is theirs in part."""
+    there = (instances > 0).float()
+    return (there > 0) | ((F.max_pool2d(there[:, None], 3, 1, 1)[:, 0] > 0) & (things > 0.5))
+
+
 def still(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] as a keyframe keeps it: 0, which says nothing, where `things` are."""
     return torch.where(things > 0.5, 0.0, depth)

@@ -32,7 +32,7 @@ from .cast import Cast
 from .doubt import GONE, Doubt, doubting_spec
 from .generator import Generator, VideoConfig, channels_last, decode_depth, generate, mood
 from .motion import Motion
-from .moving import Frame, carry_frames, still
+from .moving import Frame, carry_frames, covering, still
 from .outcome import Outcome, told_vitals
 
 SEEN = ("rgb", "depth", "things", "pose", "instances")  # of a frame in the state of a world in which things move
@@ -91,8 +91,9 @@ class VideoWorld:
         state = self.observe(seen, None, rng)
         if self.cast is None:
             return state
-        cards = self.cast.begun[pick % len(self.cast.begun)]
-        peopled, rgb, depth = self._painted(self.cast, state.replace(cards=cards), state["rgb"], state["depth"])
+        cards = self.cast.begun[pick]
+        peopled = state.replace(cards=cards, cards_before=cards)
+        peopled, rgb, depth = self._painted(self.cast, peopled, state["rgb"], state["depth"])
         peopled = peopled.replace(rgb=rgb, depth=depth)
         return self.aged(peopled, peopled)
 
@@ -132,9 +133,7 @@ class VideoWorld:
         if self.outcome is not None:
             state = state.replace(vitals=told_vitals(self.outcome, observation, state["vitals"]))
         if not {"rgb", "depth"} <= set(observation):
-            if self.cast is not None:
-                told = pose, state["actions"], self.config.camera
-                state = state.replace(cards=self.cast.step(state["cards"], *told, rng))
+            state = self._stepped(state, prior, rng)
             return self._draw(self._gone(self.aged(state, prior), prior, None), prior, rng)
         height, width = self.config.size
         rgb, depth = torch.as_tensor(observation["rgb"]), torch.as_tensor(observation["depth"])
@@ -173,9 +172,7 @@ class VideoWorld:
             actions=acts[:, 1:], dreamt=torch.ones_like(done), done=done,
             reward=torch.where(still, 0.0, self.rewards[0] + self.rewards[1] * done.float()),
         )  # fmt: skip
-        if self.cast is not None:
-            cards = self.cast.step(state["cards"], next_state["pose"], acts[:, 1:], self.config.camera, rng)
-            next_state = next_state.replace(cards=cards)
+        next_state = self._stepped(next_state, state, rng)
         drawn = self._draw(self._gone(self.aged(next_state, state), state, moved), state, rng)
         after = drawn if self.outcome is None else self._followed(self.outcome, state, drawn, action, rng)
         if not still.any():
@@ -189,7 +186,7 @@ class VideoWorld:
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
             "things": lambda: state["things"] > 0.5,
-            "cast": lambda: state["cards"][..., :4].clone(),
+            "cast": lambda: state["cards"][..., :4] * _in_sight(state)[..., None],
             **{name: lambda at=at: state["vitals"][:, at].clone() for at, name in enumerate(vitals)},
             "keyframes": lambda: torch.cat([self._recorded.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
@@ -201,39 +198,21 @@ class VideoWorld:
 
     def with_memory(self, memory: Keyframes) -> VideoWorld:
         """The same world with other keyframes of recordings."""
-        parts = (
-            self.generator,
-            self.motion,
-            memory,
-            self.starts,
-            self.rewards,
-            self.eye,
-            self.doubt,
-            self.outcome,
-            self.cast,
-        )
-        return VideoWorld(self.spec, self.config, *parts)
+        return self._with(memory=memory)
 
     def with_senses(self, eye: Eye | None, doubt: Doubt | None) -> VideoWorld:
         """The same world with another eye and another doubt, or without."""
-        parts = self.generator, self.motion, self.memory, self.starts, self.rewards, eye, doubt, self.outcome, self.cast
-        return VideoWorld(self.spec, self.config, *parts)
+        return self._with(eye=eye, doubt=doubt)
 
     def with_memory_of(self, budget_mb: float) -> VideoWorld:
         """The same world with another budget for a story's own memory; with 0 it holds the last frame alone."""
-        config = replace(self.config, memory_mb=budget_mb)
-        parts = (
-            self.generator,
-            self.motion,
-            self.memory,
-            self.starts,
-            self.rewards,
-            self.eye,
-            self.doubt,
-            self.outcome,
-            self.cast,
-        )
-        return VideoWorld(self.spec, config, *parts)
+        return self._with(config=replace(self.config, memory_mb=budget_mb))
+
+    def _with(self, **parts) -> VideoWorld:
+        names = (
+            "spec", "config", "generator", "motion", "memory", "starts", "rewards", "eye", "doubt", "outcome", "cast",
+        )  # fmt: skip
+        return VideoWorld(**{name: parts.get(name, getattr(self, name)) for name in names})
 
     def _blank(self, batch: int, pose: torch.Tensor) -> State:
         config, (height, width) = self.config, self.config.size
@@ -255,7 +234,7 @@ class VideoWorld:
         instances = torch.zeros(batch, height, width, dtype=torch.uint8)
         state = state.replace(things=torch.zeros(batch, height, width), instances=instances)
         if self.cast is not None:
-            state = state.replace(cards=self.cast.empty(batch))
+            state = state.replace(cards=self.cast.empty(batch), cards_before=self.cast.empty(batch))
         return self.aged(state, state)
 
     def _recognised(
@@ -265,17 +244,28 @@ class VideoWorld:
         """The cards of a frame (rgb uint8 [B, 3, H, W], depth [B, H, W]) and their pixels, where the evidence tells things
         apart; else what is seen is no card, and those that there were are gone from sight."""
         if not {"cast", "instances"} <= set(observation):
-            return {"cards": cast.empty(len(rgb)), "instances": torch.zeros_like(depth, dtype=torch.uint8)}
+            none, nothing = cast.empty(len(rgb)), torch.zeros_like(depth, dtype=torch.uint8)
+            return {"cards": none, "cards_before": none, "instances": nothing}
         told, instances = torch.as_tensor(observation["cast"]).float(), torch.as_tensor(observation["instances"])
         fits = told.shape == (len(rgb), cast.config.rows, 4) and instances.ndim == 3 and len(instances) == len(rgb)
-        if not fits or not torch.isfinite(told).all():
+        if not fits or instances.dtype != torch.uint8 or not torch.isfinite(told).all():
             raise ObservationError(
                 f"cast is finite float [B, {cast.config.rows}, 4] and instances uint8 [B, h, w]; got {tuple(told.shape)} "
-                f"and {tuple(instances.shape)}."
+                f"and {instances.dtype} {tuple(instances.shape)}."
             )
-        cut = cut_out(rgb, instances, depth, told[..., 1:], pose, self.config.camera)
+        named = F.pad((told[..., 0] > 0).to(torch.uint8), (1, 255 - cast.config.rows))  # a pixel of nobody is nobody's
+        instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
-        return {"cards": cast.recognised(cut, told, prior["cards"]), "instances": instances}
+        cut = cut_out(rgb, instances, depth, told[..., 1:], pose, self.config.camera)
+        cards = cast.recognised(cut, told, prior["cards_before"])
+        return {"cards": cards, "cards_before": cards, "instances": instances}
+
+    def _stepped(self, state: State, before: State, rng: torch.Generator) -> State:
+        """`state`, a step after `before`, with the cards of then: those that were in sight have done something."""
+        if self.cast is None:
+            return state
+        cards = self.cast.step(before["cards"], _in_sight(before), state["pose"], state["actions"], rng)
+        return state.replace(cards=cards, cards_before=before["cards"])
 
     def _painted(
         self, cast: Cast, state: State, rgb: torch.Tensor, depth: torch.Tensor
@@ -380,8 +370,8 @@ class VideoWorld:
             one = slice(view, view + 1)
             walls = torch.cat([self._walls, self.own.walls(state, view)])
             if self.cast is not None:
-                place = state["pose"][view, :2]
-                walls = torch.cat([walls, self.cast.bodies(state["cards"][view], place, self.config.body_m)])
+                eye = state["pose"][view, :3]
+                walls = torch.cat([walls, self.cast.bodies(state["cards"][view], eye, self.config.body_m)])
             walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
         moved, speed = zip(*walks)
         return torch.cat(moved), torch.cat(speed)
@@ -404,8 +394,8 @@ class VideoWorld:
         if config.moving:
             frames = []
             for age in ("", "earlier_"):
-                *seen, instances = (before[f"{age}{part}"] for part in SEEN)
-                frames.append(Frame(*seen, covered=instances > 0))
+                rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
+                frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
             told = torch.cat([mood(before["rgb"]), state["actions"].flatten(1)], 1)
             return glimpse, carry_frames(frames[0], frames[1], pose, config.camera), told
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
@@ -422,6 +412,12 @@ class VideoWorld:
             known = known * (state["things"] < 0.5)
         kept = self.own.dreamt(state, rgb, self._lasting(state, depth), state["pose"], known)
         return state.replace(rgb=rgb, depth=depth, known=(known * 255).round().to(torch.uint8), **kept)
+
+
+def _in_sight(state: State) -> torch.Tensor:
+    """Which of the cards [B, K] the last frame shows."""
+    rows = torch.arange(1, state["cards"].shape[1] + 1)
+    return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 
 def own_memory(config: VideoConfig) -> Memory:
