@@ -155,12 +155,12 @@ class _Walk:
         return view.yaw + float(view.bearing[int(torch.multinomial(likelihood, 1, generator=self.rng))])
 
     def fight(self, view: _View) -> _Moves:
-        """Turns to the nearest thing that stands in sight and shoots at it, standing, strafing or walking; in one fight of five
-        it only aims, so that what a shot does can be told from what aiming does."""
+        """Turns to the nearest thing that stands in sight and shoots at it, standing, strafing or walking, the trigger held or
+        pressed at times; in one fight of five it only aims: what a shot does can be told from what aiming does."""
         along = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][
             _whole(self.rng, 0, 6)
         ]
-        often = 0.8 if _chance(self.rng, 0.8) else 0.0
+        often = (0.0, 0.3, 0.8, 1.0, 1.0)[_whole(self.rng, 0, 4)]
         found, turned = view.thing(target=True), 0.0
         for _ in range(_whole(self.rng, 20, 70)):
             if found is None:

@@ -1,0 +1,71 @@
+"""The bundled world of monsters: they stand where they wait, and who is shot at falls."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import terrella
+from terrella.core import check_world, make_rng
+from terrella.space.camera import planar_pose
+from terrella.worlds.cast import LOOK, NUMBER, PLACE
+from terrella.worlds.video import VideoWorld
+
+STORIES, STEPS, TALL_M, LOW_M = 48, 80, 1.2, 0.75
+
+
+@pytest.fixture(scope="module")
+def world() -> VideoWorld:
+    found = terrella.load("doom-corridor")
+    assert isinstance(found, VideoWorld) and found.cast is not None
+    return found
+
+
+def heights(world: VideoWorld, cards: torch.Tensor) -> torch.Tensor:
+    """How tall cards [..., COLUMNS] are, in metres; nan where there is none."""
+    look = cards[..., LOOK].long()
+    return torch.where((cards[..., NUMBER] > 0) & (look >= 0), world.cast.boxes[look.clamp_min(0), 3], torch.nan)
+
+
+def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
+    assert "observes" in check_world(world) and {"cast", "instances", "health"} <= set(world.spec.channels)
+    state = world.start(8, make_rng(0))
+    assert ((heights(world, state["cards"]) > TALL_M).sum(1) >= 2).all(), "two guards stand at the entrance"
+    assert (state["instances"] > 0).flatten(1).any(1).float().mean() > 0.7
+
+
+def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
+    """Dreams of aiming at each guard of the entrance for two seconds, with ATTACK held and without."""
+    state = world.start(1, make_rng(0))
+    cast, pose = world.cast, state["pose"][0]
+    guards = state["cards"][0][heights(world, state["cards"][0]) > TALL_M]
+    guards = guards[(guards[:, PLACE] - pose[:3])[:, :2].norm(dim=1) < 6.0]
+    assert len(guards) == 2
+    for guard in guards:
+        apart = guard[PLACE] - pose[:3]
+        aimed = planar_pose(*pose[:3, None], torch.atan2(apart[1], apart[0])[None]).expand(STORIES, 7)
+        fell = []
+        for attack in (0.0, 1.0):
+            cards, rng = cast.empty(STORIES), make_rng(1)
+            cards[:, 0] = guard
+            acts = torch.zeros(STORIES, world.config.history, 7)
+            acts[..., world.spec.action_names.index("ATTACK")] = attack
+            low = torch.zeros(STORIES, dtype=torch.bool)
+            for _ in range(STEPS):
+                cards = cast.step(cards, torch.ones(STORIES, cast.config.rows, dtype=torch.bool), aimed, acts, rng)
+                low |= heights(world, cards[:, 0]) < LOW_M
+            fell.append(float(low.float().mean()))
+        assert fell[1] > fell[0] + 0.2, fell
+
+
+def test_a_guard_in_sight_does_something_and_the_place_stays_as_it_is(world):
+    """In a second of standing before them the guards' pixels change in more than one step, and the rest hardly does."""
+    rng, state = make_rng(0), world.start(2, make_rng(0))
+    still, changed = torch.zeros(2, 7, dtype=torch.int8), []
+    for _ in range(30):
+        before, state = state, world.imagine(state, still, rng)
+        off = (state["rgb"].float() - before["rgb"].float()).abs().mean(1)
+        there = (state["instances"] > 0) | (before["instances"] > 0)
+        changed.append((float(off[there].mean()), float(off[~there].mean())))
+    things, rest = torch.tensor(changed).unbind(1)
+    assert (things > 4).sum() >= 2 and rest.mean() < 0.5 * things.mean()
