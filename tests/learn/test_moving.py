@@ -121,7 +121,7 @@ def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     assert world.config.cast and world.cast is not None and world.spec.card["cast_looks"] >= 1
     assert "observes" in check_world(world) and world.spec.heeds == ("things", "instances", "cast", "health")
     state = world.start(2, make_rng(0))
-    assert (state["cards"][:, 0, NUMBER] == 5).all() and (state["cards"][:, 0, LOOK] != NONE).all()
+    assert (state["cards"][:, 0, NUMBER] == 1).all() and (state["cards"][:, 0, LOOK] != NONE).all()
     seen = world.render(state, ("cast", "instances", "things"))
     assert (seen["instances"] == 1).any((1, 2)).all() and (seen["things"] | (seen["instances"] == 0)).all()
     assert torch.equal(seen["cast"][:, 0], state["cards"][:, 0, :4]) and (seen["instances"] <= 1).all()
@@ -163,7 +163,7 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
     told = seen["cast"].clone()
     told[0, 0, 0] = 77.0
     after = world.observe({**seen, "cast": told}, state, rng)
-    assert after["cards"][0, :, NUMBER].tolist()[:2] == [77.0, 5.0]  # the one not told of waits
+    assert after["cards"][0, :, NUMBER].tolist()[:2] == [77.0, 1.0]  # the one not told of waits
     dreamt = world.imagine(state, torch.zeros(1, 6), rng)
     again = world.observe(seen, dreamt, rng)["cards"][0, 0]  # a step after `state`, whatever was dreamt in between
     assert again[RESTED] == min(24, state["cards"][0, 0, RESTED] + 1) and not again[GOING].any()

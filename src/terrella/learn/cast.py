@@ -17,7 +17,7 @@ from ..core.world import make_rng
 from ..data import ClipCache
 from ..space.camera import Intrinsics, project
 from ..space.cards import cut_out
-from ..worlds.cast import LOOK, NONE, PLACE, Cast, CastConfig, fresh, likest, marks, noted
+from ..worlds.cast import LOOK, NONE, NUMBER, PLACE, Cast, CastConfig, fresh, likest, marks, noted
 from ..worlds.folder import load_world, save_again
 from ..worlds.video import VideoWorld
 from .post_training import beside
@@ -32,6 +32,7 @@ UPRIGHT_M = 1.0  # height of what may stand in the way
 BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known to
 NEVER_M = 1e3  # boxes of looks that are not used
 WAITS = 300  # steps from an episode's beginning in which things are found that waited there
+SAME_M, OFTEN = 1.5, 0.08  # metres within which, and share of the episodes in which, it is one that waits there
 LASTS = 15  # steps in which a thing must have been seen to be one that waits
 CHUNK = 1.5e6  # pixels of frames that are cut at once
 WITHOUT = ", or train without (train video --cast-steps 0)"
@@ -116,8 +117,8 @@ def learn_cast(
     report: Report,
 ) -> dict:
     """Teaches `cast` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; a story that
-    begins at one of the poses `starts` [S, 7] begins with the cards that waited in the episode that began nearest to it.
-    Returns facts."""
+    begins at one of the poses `starts` [S, 7] begins with the cards that waited in the episodes that began there. Returns
+    facts."""
     cache, rows = recording.cache, np.flatnonzero(recording.usable)
     seen = _cut(cache, rgb, rows, camera, report)
     if not len(seen.clear):
@@ -134,10 +135,10 @@ def learn_cast(
     cast.follows[:] = _follows(cast, tokens)
     begun = [first for first, _ in cache.episodes if recording.usable[first]]
     for story, start in enumerate(starts if begun else []):
-        nearest = int((recording.pose(begun) - start).norm(dim=1).argmin())
-        cards = waiting[begun[nearest]][: cast.config.rows]
-        if cards:
-            cast.begun[story, : len(cards)] = torch.stack(cards)
+        off = (recording.pose(begun) - start).norm(dim=1)
+        cards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
+        for row, card in enumerate(cards[: cast.config.rows]):
+            cast.begun[story, row] = card
     loss = _train(cast.train(), tokens, recording, steps, seed, report)
     cast.eval()
     return {"cast_looks": len(heads), "cast_moves": len(moves) - 1, "cast_steps": steps, "cast_loss": loss}
@@ -327,6 +328,22 @@ class _Met:
     @property
     def waited(self) -> bool:
         return self.often >= LASTS and not self.born and bool(self.card[LOOK] != NONE)
+
+
+def _gathered(episodes: list[list[torch.Tensor]]) -> list[torch.Tensor]:
+    """The cards [COLUMNS] that waited in episodes which began alike, those of one place as one, the most frequent first: no
+    episode sees all of them."""
+    found: list[tuple[torch.Tensor, int]] = []
+    for card in (card for cards in episodes for card in cards):
+        same = [at for at, (other, _) in enumerate(found) if (other - card)[PLACE].norm() < SAME_M]
+        if same:
+            found[same[0]] = (found[same[0]][0], found[same[0]][1] + 1)
+        else:
+            found.append((card, 1))
+    often = sorted((one for one in found if one[1] >= OFTEN * len(episodes)), key=lambda one: -one[1])
+    for number, (card, _) in enumerate(often):
+        card[NUMBER] = number + 1
+    return [card.clone() for card, _ in often]
 
 
 def _in_sight(numbers: list[float], cards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
