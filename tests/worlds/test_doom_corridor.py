@@ -34,6 +34,13 @@ def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
     assert (state["instances"] > 0).flatten(1).any(1).float().mean() > 0.7
 
 
+def test_the_guards_that_stories_begin_with_are_cards_and_nothing_else(world):
+    """The picture with which a story begins leaves no thing behind that no card covers: it would stand there for ever."""
+    state = world.start(8, make_rng(0))
+    things = state["things"] > 0.5
+    assert things.any() and (things & (state["instances"] == 0)).float().mean() < 0.001
+
+
 def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
     """Dreams of aiming at each guard of the entrance for two seconds, with ATTACK held and without."""
     state = world.start(1, make_rng(0))

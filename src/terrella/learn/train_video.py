@@ -16,7 +16,7 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
 from ..space.keyframes import Keyframes
-from ..worlds.cast import STARTS, Cast, CastConfig
+from ..worlds.cast import ROWS, STARTS, Cast, CastConfig
 from ..worlds.controls import BUTTONS
 from ..worlds.folder import save_world, video_spec
 from ..worlds.generator import Generator, VideoConfig, channels_last, generate
@@ -162,6 +162,11 @@ class _Run:
         self.recording = Recording(cache, start, usable, controls)
         told_apart = {CAST, INSTANCES} <= set(cache.arrays)
         if self.video.moving and told_apart and config.cast_steps:
+            if cache.arrays[CAST].shape[1:] != (ROWS, 4):
+                raise DatasetError(
+                    f"{dataset.root} lists things as {cache.arrays[CAST].shape[1:]}, and {(ROWS, 4)} is read: number and place of "
+                    f"up to {ROWS}. Record it so, or train with --cast-steps 0."
+                )
             self.video = replace(self.video, cast=True)
         known = CastConfig(controls.told, self.video.history)
         self.cast = Cast(known) if self.video.cast else None  # small: it is learned on the CPU

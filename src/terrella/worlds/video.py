@@ -78,6 +78,7 @@ class VideoWorld:
     def _walls(self) -> torch.Tensor:
         return floor_plan(self.memory.walls, self.memory.pose)
 
+    @torch.inference_mode()
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Begins where one of the recordings was, standing still."""
         if batch < 1:
@@ -91,10 +92,11 @@ class VideoWorld:
         state = self.observe(seen, None, rng)
         if self.cast is None:
             return state
-        cards = self.cast.begun[pick]
-        peopled = state.replace(cards=cards, cards_before=cards)
-        peopled, rgb, depth = self._painted(self.cast, peopled, state["rgb"], state["depth"])
-        peopled = peopled.replace(rgb=rgb, depth=depth)
+        cards = self.cast.begun[pick]  # in place of the things that the picture shows, which would stand there for ever
+        shown = state["things"].to(torch.uint8)
+        bare = state.replace(cards=cards, cards_before=cards, instances=shown)
+        bare = self.aged(bare, bare)
+        peopled = self._draw(bare, bare, rng)
         return self.aged(peopled, peopled)
 
     @torch.inference_mode()
