@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -19,7 +20,7 @@ import pytest
 
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset
-from terrella.data.storage.remote import Files, LocalFiles, open_files
+from terrella.data.storage.remote import Files, LocalFiles, _let_go, open_files
 from terrella.data.training.clips import Clips
 from terrella.data.training.windows import _Belt
 
@@ -41,15 +42,21 @@ def name(i: int) -> str:
     return f"data/chunk-000/file-{i:03d}.bin"
 
 
-def held(folder: Path) -> dict[Path, int]:
-    """Bytes of each file in the cache."""
-    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return {path: path.stat().st_size for path in files}
+def held(folder: Path) -> dict[str, int]:
+    """Bytes of each file in a folder that others change meanwhile."""
+    sizes = {}
+    for top, _, names in os.walk(folder):  # which, unlike rglob, passes over a folder that has gone
+        for path in (os.path.join(top, name) for name in names if not name.startswith(".")):
+            with contextlib.suppress(FileNotFoundError):
+                sizes[path] = os.stat(path).st_size
+    return sizes
 
 
 def kept(folder: Path) -> int:
-    """Bytes of all that lies in the cache."""
-    return sum(held(folder).values())
+    """Bytes of all that lies in the cache at one moment: listed until nothing moved, came or went meanwhile."""
+    while (found := held(folder)) != held(folder):
+        pass
+    return sum(found.values())
 
 
 def test_a_folder_and_its_remote_twin_tell_the_same(remote, tmp_path):
@@ -173,6 +180,26 @@ def test_what_a_killed_process_was_fetching_is_cleared_away(remote, tmp_path):
     assert files.local(name(1)).exists() and not left.exists() and kept(tmp_path) == 10_000
 
 
+def test_what_arrives_or_is_cleared_away_while_room_is_made(remote, tmp_path, monkeypatch):
+    files, list_folder = Files(remote, tmp_path, budget_bytes=35_000), os.scandir
+
+    def arrives_between(folder):
+        entries = list(list_folder(folder))
+        if part.exists():
+            os.replace(part, tmp_path / "arrived")
+            room.rmdir()
+        return entries
+
+    with files._room("a", 20_000) as room:
+        part = room / "part-x"
+        part.write_bytes(b"x" * 20_000)
+        with monkeypatch.context() as patch:
+            patch.setattr("terrella.data.storage.remote.os.scandir", arrives_between)
+            assert files._evicted(0) >= 20_000
+    room.mkdir()  # as if its owner, done, removed it once it was found and before it was locked
+    assert _let_go(room, lambda path: [shutil.rmtree(path), shutil.rmtree(path)]) and not room.exists()
+
+
 WORKER = """
 import random, sys
 from terrella.data.storage.remote import Files
@@ -192,12 +219,7 @@ def test_several_processes_share_one_cache(remote, tmp_path):
     running = [subprocess.Popen([*command, str(seed)]) for seed in range(3)]
     most = 0
     while any(process.poll() is None for process in running):
-        try:
-            found, again = held(tmp_path / "cache"), held(tmp_path / "cache")
-        except FileNotFoundError:
-            continue
-        if found == again:  # else a file moved in while they were listed, and may count twice
-            most = max(most, sum(found.values()))
+        most = max(most, kept(tmp_path / "cache"))
         time.sleep(0.002)
     assert [process.returncode for process in running] == [0, 0, 0]
     assert 0 < most <= 45_000

@@ -266,15 +266,17 @@ class Files:
     def _evicted(self, size: int) -> int:
         """Bytes in use after what was used longest ago has made room for `size`, and some more so that this is rare."""
         total, files = 0, []
+        for entry in os.scandir(
+            self._cache / ".coming"
+        ):  # first: one that arrives meanwhile may count twice, never not at all
+            if _let_go(Path(entry.path), shutil.rmtree):  # of a process that was killed
+                continue
+            total += int(entry.name.split("-")[0])
         for entry in os.scandir(self._cache):
             if not entry.name.startswith("."):
                 about = entry.stat()
                 total += about.st_size
                 files.append((about.st_mtime_ns, about.st_size, entry.path))
-        for entry in os.scandir(self._cache / ".coming"):
-            if _let_go(Path(entry.path), shutil.rmtree):  # of a process that was killed
-                continue
-            total += int(entry.name.split("-")[0])
         enough = max(0, self.budget_bytes - self.budget_bytes // 16 - size)
         for _, bytes_, path in sorted(files):
             if total <= enough:
@@ -374,7 +376,7 @@ def _touched(path: Path, size: int) -> bool:
 
 
 def _let_go(path: Path, remove: Callable[[Path], object]) -> bool:
-    """Removes what nobody has locked; whether it did."""
+    """Removes what nobody has locked; whether it is gone."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except FileNotFoundError:
@@ -382,6 +384,8 @@ def _let_go(path: Path, remove: Callable[[Path], object]) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         remove(path)
+        return True
+    except FileNotFoundError:  # removed by its owner since
         return True
     except BlockingIOError:
         return False
