@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 
+from terrella.core.world import make_rng
 from terrella.space.camera import planar_pose
 from terrella.space.keyframes import Keyframes, look, retrieve
-from terrella.worlds.moving import Frame, carry_frames, still
+from terrella.worlds.moving import Frame, _carried, carried_slowly, carry_frames, still
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (24, 32)
 
@@ -22,7 +24,7 @@ def scene(thing_row: slice = slice(10, 16), thing_column: slice = slice(12, 18))
     rgb, depth, things = torch.full((1, 3, *SIZE), 100), torch.full((1, *SIZE), 6.0), torch.zeros(1, *SIZE)
     rgb[:, :, thing_row, thing_column] = torch.tensor([250, 0, 0])[None, :, None, None]
     depth[:, thing_row, thing_column], things[:, thing_row, thing_column] = 3.0, 1.0
-    return Frame(rgb.to(torch.uint8), depth, things, at((0.0, 0.0, 0.0)))
+    return Frame(rgb.to(torch.uint8), depth, things, at((0.0, 0.0, 0.0)), things > 1)
 
 
 def test_a_thing_is_carried_by_its_own_depth():
@@ -70,7 +72,7 @@ def test_a_thing_that_comes_nearer_grows_whole():
     """A step of 1 m towards a thing at 3 m, whose recorded depth is coarse: half as large again, without a hole."""
     frame = scene()
     rough = frame.depth + 0.3 * ((torch.arange(32) % 2) - 0.5) * frame.things  # as an 8-bit depth buffer has it
-    frame = Frame(frame.rgb, rough, frame.things, frame.pose)
+    frame = frame._replace(depth=rough)
     near = carry_frames(frame, frame, at((1.0, 0.0, 0.0)), CAMERA)[0, 5] > 0.5
     rows, columns = near.any(1).nonzero()[:, 0], near.any(0).nonzero()[:, 0]
     assert len(rows) in (9, 10, 11) and len(columns) in (9, 10, 11)
@@ -82,5 +84,20 @@ def test_a_frame_that_stands_still_is_carried_for_ever_as_it_is():
     for _ in range(20):
         carried = carry_frames(frame, frame, at((0.0, 0.0, 0.0)), CAMERA)
         rgb = (carried[:, :3] * 255).round().to(torch.uint8)
-        frame = Frame(rgb, carried[:, 4], carried[:, 5], frame.pose)
+        frame = Frame(rgb, carried[:, 4], carried[:, 5], frame.pose, frame.covered)
     assert torch.equal(frame.rgb, scene().rgb) and torch.equal(frame.things, scene().things)
+
+
+def test_the_kernel_carries_as_the_slow_way_does():
+    """Rough frames of a slanted wall with things before it, some of them covered, seen from near where they were."""
+    rng = make_rng(0)
+    across = torch.linspace(3.0, 8.0, 32).expand(6, 24, 32)
+    depth = across + 0.1 * torch.rand(across.shape, generator=rng)
+    things = (F.avg_pool2d(torch.rand(depth.shape, generator=rng), 5, 1, 2) > 0.52).float()
+    rgb = torch.randint(256, (6, 3, 24, 32), generator=rng, dtype=torch.uint8)
+    pose, aside = at(*[(0.0, 0.0, 0.3)] * 6), at(*[(0.2 * n, -0.1 * n, 0.3 - 0.04 * n) for n in range(6)])
+    covered = torch.rand(depth.shape, generator=rng) < 0.1
+    frame = Frame(rgb, depth - 1.5 * things, things, pose, covered)
+    for seen_from in (pose, aside):
+        quick, slow = _carried(frame, seen_from, CAMERA), carried_slowly(frame, seen_from, CAMERA)
+        assert ((quick - slow).abs() > 1e-3).float().mean() < 1e-3 and slow[:, 3].mean() > 0.4

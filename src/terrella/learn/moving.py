@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -37,9 +35,10 @@ def moving_lesson(
         asked = Lesson(glimpse_of(shown, rows, recording, config), before, told, before)
         clean = dream(asked)  # pyright: ignore[reportOptionalCall]
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        drawn = Frame(rgb, decode_depth(clean[:, 3]), clean[:, 4].sigmoid(), recording.pose(rows))
+        covered = _covered(recording, rows, config.cast)  # in a dream, too, the cards are painted over what is drawn
+        drawn = Frame(rgb, decode_depth(clean[:, 3]), clean[:, 4].sigmoid(), recording.pose(rows), covered)
         last, earlier = drawn, last
-    last = replace(last, rgb=worn(last.rgb, rng))
+    last = last._replace(rgb=worn(last.rgb, rng))
     carried = carry_frames(last, earlier, recording.pose(shown.target), config.camera)
     carried = carried * torch.from_numpy(rng.random(batch) < 0.9)[:, None, None, None]
     things = recording.things(shown.target)
@@ -81,8 +80,12 @@ def other_side(action_names: tuple[str, ...]) -> list[int]:
 
 
 def _frame(recording: Recording, rows: np.ndarray, cast: bool) -> Frame:
-    covered = recording.covered(rows) if cast else None
-    return Frame(recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows), covered)
+    seen = recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows)
+    return Frame(*seen, _covered(recording, rows, cast))
+
+
+def _covered(recording: Recording, rows: np.ndarray, cast: bool) -> torch.Tensor:
+    return recording.covered(rows) if cast else torch.zeros_like(recording.depth(rows), dtype=torch.bool)
 
 
 def _told(recording: Recording, rows: np.ndarray, last: torch.Tensor, history: int) -> torch.Tensor:

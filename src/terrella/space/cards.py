@@ -6,7 +6,6 @@ and its box [4], how far it reaches to the left, the right, below and above of i
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -16,7 +15,6 @@ from .camera import Intrinsics, project
 
 PICTURE = (48, 32)  # rows and columns of a card's picture
 NEAREST_M = 0.25  # of a card that is still painted
-TOUCHED = 0.1  # of a pixel that a card covers, above which it is the card's
 BEHIND_M = 0.4  # by which a card may stand behind the surface that a frame shows: its feet are in the floor
 
 
@@ -102,41 +100,15 @@ def painted(
          where[:, 1] * height - box[:, 3] / ahead * camera[1] * height,
          where[:, 1] * height + box[:, 2] / ahead * camera[1] * height], 1
     )  # fmt: skip
-    rgb, depth, behind = rgb.clone(), depth.clone(), depth
+    from .kernels_numba import paint
+
+    rgb, depth, hides = rgb.clone(), depth.clone(), (depth + BEHIND_M).numpy()
+    onto, pictures = (rgb.numpy(), depth.numpy(), instances.numpy()), pictures.numpy()
     for card in ahead.argsort(descending=True).tolist():  # the nearest is painted last
-        left, right, top, bottom = sides[card].tolist()
-        columns, rows = _pixels(left, right, width), _pixels(top, bottom, height)
-        if not len(columns) or not len(rows):
-            continue
-        at, at_row = int(view[card]), int(row[card])
-        layer = _scaled(pictures[at, at_row], (left, right, top, bottom), columns, rows)
-        spot = at, slice(rows.start, rows.stop), slice(columns.start, columns.stop)
-        seen = (behind[spot] + BEHIND_M > ahead[card]).float()
-        cover = layer[3] * seen
-        colours = rgb[:, :, spot[1], spot[2]][at]
-        rgb[:, :, spot[1], spot[2]][at] = colours * (1 - cover) + layer[:3] * seen
-        depth[spot] = torch.where(cover > 0.5, ahead[card], depth[spot])
-        instances[spot] = torch.where(cover > TOUCHED, at_row + 1, instances[spot]).to(torch.uint8)
+        at, number = int(view[card]), int(row[card]) + 1
+        box, far = tuple(sides[card].tolist()), float(ahead[card])
+        paint(pictures[at, number - 1], box, far, number, hides[at], *(part[at] for part in onto))
     return rgb, depth, instances
-
-
-def _pixels(first: float, last: float, count: int) -> range:
-    """The pixels of `count` that lie between two places, in pixels."""
-    return range(max(0, math.floor(min(first, count))), min(count, math.ceil(max(last, 0))))
-
-
-def _scaled(
-    picture: torch.Tensor, sides: tuple[float, float, float, float], columns: range, rows: range
-) -> torch.Tensor:
-    """A picture [4, *PICTURE] that fills the box `sides` (left, right, top, bottom, in pixels) as the given pixels show it:
-    colours times cover, and cover [4, rows, columns]. It is drawn twice as fine and averaged: edges are as soft as a game's."""
-    left, right, top, bottom = sides
-    u = (columns.start + (torch.arange(2 * len(columns)) + 0.5) / 2 - left) / max(right - left, 1e-6) * 2 - 1
-    v = (rows.start + (torch.arange(2 * len(rows)) + 0.5) / 2 - top) / max(bottom - top, 1e-6) * 2 - 1
-    grid = torch.stack([u.expand(len(v), -1), v[:, None].expand(-1, len(u))], -1)
-    fine = F.grid_sample(picture[None], grid[None], align_corners=False, padding_mode="border")
-    inside = (grid.abs().amax(-1) <= 1) & (fine[:, 3:] > 0.5)
-    return F.avg_pool2d(torch.cat([fine[:, :3] * inside, inside.float()], 1), 2)[0]
 
 
 def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

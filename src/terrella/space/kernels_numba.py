@@ -9,6 +9,7 @@ import numpy as np
 
 NEAR_M = 0.05
 SAME = 0.06  # depths that differ by less than this share are of one surface
+TOUCHED = 0.1  # of a pixel that a card covers, above which it is the card's
 WITHIN_M = 0.005  # as well as walls are known
 
 
@@ -207,6 +208,115 @@ def carry(rgb, depth, turn, eye, known, seen, target_turn, target_eye, camera, c
                 top = rgb[c, j, i] * (1 - a) + rgb[c, j, i + 1] * a
                 bottom = rgb[c, j + 1, i] * (1 - a) + rgb[c, j + 1, i + 1] * a
                 carried[c, v, u] = (top * (1 - b) + bottom * b) / 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def splat(depth, things, turn, eye, target_turn, target_eye, camera, flat, canvas):
+    """The first half of worlds/moving.carried_slowly for one frame: depth and things [H, W] from its turn [3, 3] and eye [3];
+    fills flat [H, W], the depth with that of things averaged over their surroundings, and lowers `canvas` [H, W] to what is seen
+    of it from the target's."""
+    height, width = depth.shape
+    fx, fy, cx, cy = camera
+    sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1))  # of all above and to the left
+    for v in range(height):
+        for u in range(width):
+            here = things[v, u] > 0.5
+            sums[v + 1, u + 1] = sums[v, u + 1] + sums[v + 1, u] - sums[v, u] + (depth[v, u] if here else 0.0)
+            counts[v + 1, u + 1] = counts[v, u + 1] + counts[v + 1, u] - counts[v, u] + (1.0 if here else 0.0)
+    for v in range(height):
+        for u in range(width):
+            far = depth[v, u]
+            if things[v, u] > 0.5:
+                top, bottom, left, right = max(v - 4, 0), min(v + 5, height), max(u - 4, 0), min(u + 5, width)
+                far = (sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]) / (
+                    counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
+                )
+            flat[v, u] = far
+            far, side, up = flat[v, u], -((u + 0.5) / width - cx) / fx, -((v + 0.5) / height - cy) / fy
+            x = far * (turn[0, 0] + side * turn[0, 1] + up * turn[0, 2]) + eye[0] - target_eye[0]
+            y = far * (turn[1, 0] + side * turn[1, 1] + up * turn[1, 2]) + eye[1] - target_eye[1]
+            z = far * (turn[2, 0] + side * turn[2, 1] + up * turn[2, 2]) + eye[2] - target_eye[2]
+            ahead = target_turn[0, 0] * x + target_turn[1, 0] * y + target_turn[2, 0] * z
+            if ahead <= NEAR_M:
+                continue
+            a = (cx - fx * (target_turn[0, 1] * x + target_turn[1, 1] * y + target_turn[2, 1] * z) / ahead) * width
+            b = (cy - fy * (target_turn[0, 2] * x + target_turn[1, 2] * y + target_turn[2, 2] * z) / ahead) * height
+            if 0 <= a < width and 0 <= b < height and ahead < canvas[int(b), int(a)]:
+                canvas[int(b), int(a)] = ahead
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fetch(rgb, flat, things, covered, turn, eye, seen, target_turn, target_eye, camera, found):
+    """The second half of the same: what the frame shows (rgb uint8 [3, H, W], the others [H, W]) of what the target sees [H, W];
+    fills found [6, H, W] = colour, trust, `seen`, things."""
+    height, width = flat.shape
+    fx, fy, cx, cy = camera
+    for v in range(height):
+        for u in range(width):
+            far, side, up = seen[v, u], -((u + 0.5) / width - cx) / fx, -((v + 0.5) / height - cy) / fy
+            found[4, v, u] = far
+            x = far * (target_turn[0, 0] + side * target_turn[0, 1] + up * target_turn[0, 2]) + target_eye[0] - eye[0]
+            y = far * (target_turn[1, 0] + side * target_turn[1, 1] + up * target_turn[1, 2]) + target_eye[1] - eye[1]
+            z = far * (target_turn[2, 0] + side * target_turn[2, 1] + up * target_turn[2, 2]) + target_eye[2] - eye[2]
+            ahead = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
+            if ahead <= NEAR_M:
+                continue
+            a = cx - fx * (turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z) / ahead
+            b = cy - fy * (turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z) / ahead
+            if not (0 <= a <= 1 and 0 <= b <= 1):
+                continue
+            i, j = min(int(a * width), width - 1), min(int(b * height), height - 1)
+            trust = min(max(1.5 - abs(flat[j, i] - ahead) / ahead / SAME, 0.0), 1.0)
+            if covered[j, i] or trust <= 0:
+                continue
+            for c in range(3):
+                found[c, v, u] = rgb[c, j, i] / 255
+            found[3, v, u], found[5, v, u] = trust, things[j, i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def paint(picture, sides, far, number, hides, rgb, depth, instances):
+    """Paints a card's picture [4, h, w] that fills the box `sides` (left, right, top, bottom, in pixels), `far` metres ahead, into
+    rgb [3, H, W], depth [H, W] and instances [H, W] where what `hides` it [H, W] is farther. A pixel is the mean of four places
+    in it: edges are as soft as a game's."""
+    left, right, top, bottom = sides
+    height, width = depth.shape
+    _, rows, columns = picture.shape
+    tall, wide = rows / max(bottom - top, 1e-6), columns / max(right - left, 1e-6)
+    colour = np.zeros(3)
+    for v in range(max(0, math.floor(top)), min(height, math.ceil(bottom))):
+        for u in range(max(0, math.floor(left)), min(width, math.ceil(right))):
+            if hides[v, u] <= far:
+                continue
+            cover = 0.0
+            colour[:] = 0.0
+            for part in range(4):
+                a = (u + 0.25 + 0.5 * (part & 1) - left) * wide
+                b = (v + 0.25 + 0.5 * (part >> 1) - top) * tall
+                if a < 0 or a > columns or b < 0 or b > rows:
+                    continue
+                a, b = min(max(a - 0.5, 0.0), columns - 1.0), min(max(b - 0.5, 0.0), rows - 1.0)
+                i, j = min(int(a), columns - 2), min(int(b), rows - 2)
+                a, b = a - i, b - j
+                if between(picture[3], i, j, a, b) <= 0.5:
+                    continue
+                cover += 0.25
+                for c in range(3):
+                    colour[c] += 0.25 * between(picture[c], i, j, a, b)
+            for c in range(3):
+                rgb[c, v, u] = rgb[c, v, u] * (1 - cover) + colour[c]
+            if cover > 0.5:
+                depth[v, u] = far
+            if cover > TOUCHED:
+                instances[v, u] = number
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def between(plane, i, j, a, b):
+    """The plane [h, w] a share `a` of the way from column i to the next and `b` from row j."""
+    above = plane[j, i] * (1 - a) + plane[j, i + 1] * a
+    below = plane[j + 1, i] * (1 - a) + plane[j + 1, i + 1] * a
+    return above * (1 - b) + below * b
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -24,6 +24,7 @@ from .camera import Intrinsics, planar_pose, rays, yaw
 from .eye import Eye
 from .keyframes import Glimpse, merge
 from .memory import Memory, remembering_spec
+from .reproject import least_around
 
 SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
 _INNER = "world_"  # what the names of the inner world's tensors begin with
@@ -161,7 +162,7 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
     """What memory knows over what was invented, uint8 [B, 3, H, W]: the picture, and the share of memory in each of its
     pixels [B, H, W]. That fades out over three pixels towards what is unknown, and where memory saw the place from much
     farther off; beyond, the invention is brought to the colours that memory has nearby."""
-    inside = -F.max_pool2d(-glimpse.known[:, None], 3, 1, 1)
+    inside = least_around(glimpse.known)[:, None]
     share = F.avg_pool2d(inside, 5, 1, 2, count_include_pad=False) * glimpse.known[:, None]
     share = share * (3 * glimpse.trust[:, :1]).clamp(0, 1)
     recalled, guess = merge(glimpse), invented.float() / 255

@@ -26,12 +26,19 @@ def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, si
     return canvas[:, :-1].view(-1, height, width)
 
 
+def least_around(plane: torch.Tensor) -> torch.Tensor:
+    """The least of each pixel of [B, H, W] and its eight neighbours (a max_pool2d takes fifteen times as long)."""
+    padded = F.pad(plane, (1, 1, 1, 1), value=torch.inf)
+    lines = torch.minimum(torch.minimum(padded[:, :-2], padded[:, 2:]), padded[:, 1:-1])
+    return torch.minimum(torch.minimum(lines[..., :-2], lines[..., 2:]), lines[..., 1:-1])
+
+
 def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     """Depth [B, H, W] with FAR_M in holes -> the same with holes filled from coarser averages (pull-push) of 1/depth.
 
     Single-pixel leaks (a far surface seen through the gaps of a near, sparsely splatted one) are closed first.
     """
-    near = -F.max_pool2d(-depth[:, None], 3, 1, 1)[:, 0]
+    near = least_around(depth)
     count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
     depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
     inverse, weight = 1 / depth[:, None], (depth[:, None] < FAR_M).float()
