@@ -11,7 +11,7 @@ from terrella.core import make_rng
 from terrella.space.camera import planar_pose, rotation
 from terrella.space.keyframes import Keyframes, pick, pick_slowly
 from terrella.space.patches import FAR_M, cast, cast_slowly, patches
-from terrella.space.reproject import carry_unknown, carry_unknown_slowly, fill_holes
+from terrella.space.reproject import carry_unknown, carry_unknown_slowly, fill_holes, fill_holes_slowly
 
 CAMERA = (0.5, 0.667, 0.5, 0.5)
 
@@ -87,10 +87,21 @@ def test_holes_are_filled_as_from_the_whole_pyramid(monkeypatch):
     rng = make_rng(5)
     depth = 1 + 5 * torch.rand(2, 24, 40, generator=rng)
     depth[0, 5:7, 9:12], depth[1, 3:21, 2:35] = FAR_M, FAR_M
-    found = fill_holes(depth)
+    found = fill_holes_slowly(depth, 5)
     assert (found < FAR_M).all()
     monkeypatch.setattr(torch.Tensor, "all", lambda self, *rest: False)
-    assert torch.equal(fill_holes(depth), found)
+    assert torch.equal(fill_holes_slowly(depth, 5), found)
+
+
+@pytest.mark.parametrize("size", [(96, 128), (17, 23), (1, 1)])
+def test_holes_are_filled_as_the_slow_way_does(size):
+    rng = make_rng(1)
+    depth = 1 + 8 * torch.rand(5, *size, generator=rng)
+    depth[1:][torch.rand(4, *size, generator=rng) < 0.3] = FAR_M
+    depth[2, size[0] // 3 :, size[1] // 4 :] = FAR_M
+    depth[3] = FAR_M
+    depth[4] = torch.where(torch.rand(size, generator=rng) < 0.2, 50.0, 2.0)  # leaks
+    assert torch.allclose(fill_holes(depth), fill_holes_slowly(depth, 5), rtol=1e-5)
 
 
 def test_keyframes_are_taken_by_a_list_as_by_a_mask():

@@ -38,6 +38,18 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
     Single-pixel leaks (a far surface seen through the gaps of a near, sparsely splatted one) are closed first.
     """
+    if depth.device.type != "cpu" or depth.requires_grad:
+        return fill_holes_slowly(depth, levels)
+    from .kernels_numba import fill as kernel
+
+    filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    for holed, near, whole in zip(depth.contiguous().numpy(), least_around(depth).numpy(), filled.numpy()):
+        kernel(holed, near, FAR_M, levels, whole)
+    return filled
+
+
+def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
+    """The same as `fill_holes`, in plain tensor algebra; the way on a GPU and for gradients."""
     near = least_around(depth)
     count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
     depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
