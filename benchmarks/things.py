@@ -19,7 +19,7 @@ from terrella.data import ClipCache
 from terrella.learn.samples import Recording, controls_of
 from terrella.space.camera import project
 from terrella.space.cards import cut_out
-from terrella.worlds.cast import LOOK, NONE, NUMBER, PLACE
+from terrella.worlds.cast import LOOK, NONE, NUMBER, PLACE, WIDE_M
 from terrella.worlds.video import VideoWorld
 
 CONTEXT = 10
@@ -63,7 +63,15 @@ def main(
         places = torch.stack([place for _, place in found])
     fell = fell[standing]
     print(f"{int(standing.sum())} standing things in {len(rows)} stories of {steps} steps, {dreams} dreams of each")
-    for who, some in (("all", fell | True), ("those who fell", fell), ("the others", ~fell)):
+    shot = shot_at(learned, cards, recording, rows, steps)[standing]
+    groups = {
+        "all": fell | True,
+        "those who fell": fell,
+        "the others": ~fell,
+        "those shot at": shot,
+        "those not": ~shot,
+    }
+    for who, some in groups.items():
         share = [float(part[some].float().mean()) for part in (fell, chance[True], chance[False])]
         print(
             f"falls of {who} ({int(some.sum())}): game {share[0]:.1%}, dreams {share[1]:.1%}, without ATTACK {share[2]:.1%}"
@@ -101,6 +109,18 @@ def happened(numbers: torch.Tensor, recording: Recording, rows: np.ndarray, step
         known.append(same.any(-1))
         places.append(torch.einsum("bkj,bjc->bkc", same.float(), told[..., 1:]))
     return fell, torch.stack(known), torch.stack(places)
+
+
+def shot_at(world: VideoWorld, cards: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int) -> torch.Tensor:
+    """Which of the cards [B, K, COLUMNS] the recorded player looked straight at (worlds/cast.WIDE_M) with ATTACK pressed."""
+    shot, button = torch.zeros(cards.shape[:2], dtype=torch.bool), world.spec.action_names.index("ATTACK")
+    for step in range(steps):
+        pose = recording.pose(rows + step)
+        where, ahead = project(cards[..., PLACE], pose, world.config.camera)
+        aside = (where[..., 0] - 0.5).abs() * ahead / world.config.camera[0]
+        pressed = recording.action(rows + step)[:, button] > 0
+        shot |= (ahead > 0.2) & (aside < WIDE_M) & pressed[:, None]
+    return shot
 
 
 def dreamt(

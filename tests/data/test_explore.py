@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from terrella.core import Spec, make_rng
 from terrella.data import Explorer
+from terrella.space.camera import planar_pose
 
 
 def _walk(seed: int, steps: int):
@@ -44,6 +45,27 @@ def test_the_same_seed_walks_the_same_way():
     one, two, other = _walk(1, 200), _walk(1, 200), _walk(2, 200)
     assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
     assert not np.array_equal(one[1], other[1])
+
+
+def test_it_fights_what_stands_in_sight_and_at_times_beside_the_mark():
+    """A thing 3 m off, which the player may turn to and away from: where it is when the trigger is pressed."""
+    legs = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "ATTACK")
+    seen = {name: spaces.Box(0, 100, (24, 64)) for name in ("depth", "things")} | {"pose": spaces.Box(-9, 9, (7,))}
+    spec = Spec("range", spaces.MultiBinary(7), seen, (), 0.03, action_names=legs, camera=(0.5, 0.8, 0.5, 0.5))
+    bearing = -torch.atan(((torch.arange(64) + 0.5) / 64 - 0.5) / 0.5)
+    explorer, rng, yaw, off = Explorer(spec), make_rng(0), torch.zeros(1), []
+    for step in range(4000):
+        there = (bearing + yaw).abs() < 0.1  # it stands along x
+        depth = torch.where(there, 3.0, 8.0).expand(1, 24, 64)
+        nothing = torch.zeros(1)
+        pose = planar_pose(nothing, nothing, nothing, yaw)
+        action = explorer({"depth": depth, "things": there.expand(1, 24, 64), "pose": pose}, {"step": step}, rng)[0]
+        if action[6]:
+            off.append(float(yaw))
+        yaw = torch.atan2((yaw + 0.05 * (action[4] - action[5])).sin(), (yaw + 0.05 * (action[4] - action[5])).cos())
+    off = np.abs(off)
+    assert len(off) > 200 and off.max() < 0.7  # in sight, always
+    assert 0.4 < (off < 0.2).mean() < 0.9 and (off > 0.2).mean() > 0.1
 
 
 def test_a_world_without_depth_gets_held_random_actions():

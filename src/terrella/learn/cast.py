@@ -141,7 +141,8 @@ def learn_cast(
             cast.begun[story, row] = card
     loss = _train(cast.train(), tokens, recording, steps, seed, report)
     cast.eval()
-    return {"cast_looks": len(heads), "cast_moves": len(moves) - 1, "cast_steps": steps, "cast_loss": loss}
+    facts = {"cast_frames": len(rows), "cast_looks": len(heads), "cast_moves": len(moves) - 1}
+    return {**facts, "cast_steps": steps, "cast_loss": loss}
 
 
 def told(cache: ClipCache) -> np.ndarray:

@@ -27,6 +27,7 @@ STOREY_M = 2.0  # between feet and eye, above which a card is on another floor
 ROWS = 16  # cards of a place at most
 STARTS = 32  # casts with which stories begin
 AGES = 24  # steps that are counted; more are as many
+WIDE_M = 0.65  # from the middle of a thing, how far beside it one still aims at it
 FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
 
 
@@ -73,7 +74,7 @@ class Cast(nn.Module):
         self.register_buffer("begun", torch.zeros(config.starts, config.rows, COLUMNS))
         self.look, self.before = nn.Embedding(config.looks + 1, 32), nn.Embedding(config.looks + 1, 16)
         self.age, self.rested = nn.Embedding(AGES + 1, 16), nn.Embedding(AGES + 1, 16)
-        inputs = 32 + 3 * 16 + 12 + config.actions * config.history
+        inputs = 32 + 3 * 16 + 13 + 2 * config.actions * config.history
         hidden = config.hidden
         layers = [nn.Linear(inputs, hidden), nn.SiLU(), nn.Dropout(0.1), nn.Linear(hidden, hidden), nn.SiLU()]
         self.think = nn.Sequential(*layers, nn.Dropout(0.1))
@@ -98,8 +99,9 @@ class Cast(nn.Module):
         ]  # fmt: skip
         look, before = ((cards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
         age, rested = (cards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        parts = [self.look(look), self.before(before), self.age(age), self.rested(rested)]
-        known = self.think(torch.cat([*parts, torch.stack(where, 1), acts.flatten(1)], 1))
+        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # what is done to it, not near it
+        parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
+        known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
         return Told(next_look, self.next_move(known), self.goes(known)[:, 0])
 
