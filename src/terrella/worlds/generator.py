@@ -118,6 +118,7 @@ class Generator(nn.Module):
             parts += [carried * (last_trust > 0), last[:, 5:]]
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
+        x = x.contiguous(memory_format=torch.channels_last)  # as the weights are
         kept = []
         for level, block in enumerate(self.before):
             x = block(x, told)
