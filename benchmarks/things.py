@@ -63,7 +63,7 @@ def main(
         places = torch.stack([place for _, place in found])
     fell = fell[standing]
     print(f"{int(standing.sum())} standing things in {len(rows)} stories of {steps} steps, {dreams} dreams of each")
-    shot = shot_at(learned, cards, recording, rows, steps)[standing]
+    shot = shot_at(learned, known, truth, recording, rows)[standing]
     groups = {
         "all": fell | True,
         "those who fell": fell,
@@ -72,6 +72,8 @@ def main(
         "those not": ~shot,
     }
     for who, some in groups.items():
+        if not some.any():
+            continue
         share = [float(part[some].float().mean()) for part in (fell, chance[True], chance[False])]
         print(
             f"falls of {who} ({int(some.sum())}): game {share[0]:.1%}, dreams {share[1]:.1%}, without ATTACK {share[2]:.1%}"
@@ -111,15 +113,17 @@ def happened(numbers: torch.Tensor, recording: Recording, rows: np.ndarray, step
     return fell, torch.stack(known), torch.stack(places)
 
 
-def shot_at(world: VideoWorld, cards: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int) -> torch.Tensor:
-    """Which of the cards [B, K, COLUMNS] the recorded player looked straight at (worlds/cast.WIDE_M) with ATTACK pressed."""
-    shot, button = torch.zeros(cards.shape[:2], dtype=torch.bool), world.spec.action_names.index("ATTACK")
-    for step in range(steps):
-        pose = recording.pose(rows + step)
-        where, ahead = project(cards[..., PLACE], pose, world.config.camera)
-        aside = (where[..., 0] - 0.5).abs() * ahead / world.config.camera[0]
-        pressed = recording.action(rows + step)[:, button] > 0
-        shot |= (ahead > 0.2) & (aside < WIDE_M) & pressed[:, None]
+def shot_at(
+    world: VideoWorld, known: torch.Tensor, truth: torch.Tensor, recording: Recording, rows: np.ndarray
+) -> torch.Tensor:
+    """Who was looked at with ATTACK pressed [B, K], less than worlds/cast.WIDE_M beside its middle, of those in sight (`known`
+    [steps, B, K], at `truth` [steps, B, K, 3] after each step)."""
+    shot, button = torch.zeros_like(known[0]), world.spec.action_names.index("ATTACK")
+    focal, _, centre, _ = world.config.camera
+    for step, (seen, places) in enumerate(zip(known, truth)):
+        where, ahead = project(places, recording.pose(rows + step + 1), world.config.camera)
+        aside = (where[..., 0] - centre).abs() * ahead / focal
+        shot |= seen & (ahead > 0.2) & (aside < WIDE_M) & (recording.action(rows + step)[:, button] > 0)[:, None]
     return shot
 
 

@@ -65,7 +65,7 @@ def test_it_fights_what_stands_in_sight_and_at_times_beside_the_mark():
         yaw = torch.atan2((yaw + 0.05 * (action[4] - action[5])).sin(), (yaw + 0.05 * (action[4] - action[5])).cos())
     off = np.abs(off)
     assert len(off) > 200 and off.max() < 0.7  # in sight, always
-    assert 0.4 < (off < 0.2).mean() < 0.9 and (off > 0.2).mean() > 0.1
+    assert 0.4 < (off < 0.2).mean() < 0.8
 
 
 def test_a_world_without_depth_gets_held_random_actions():

@@ -14,6 +14,7 @@ from tests.data.corridor import DEPTH, Corridor
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.data import ClipCache, Explorer, record
+from terrella.learn import moving
 from terrella.learn.cast import ThingsConfig, train_things
 from terrella.learn.moving import mirrored, moving_lesson, other_side
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
@@ -182,7 +183,7 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
             world.observe({**seen, **bad}, state, rng)
 
 
-def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled):
+def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled, monkeypatch):
     world, folder = peopled
     cache = ClipCache.open(folder / "set", CONFIG.size)
     marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "cast"))
@@ -198,6 +199,12 @@ def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(people
     covered = lesson.truth[:, 4] > 0.5  # nothing else moves here
     assert covered.any() and (lesson.weight[:, 0][covered] == 0).all() and (lesson.weight[:, 0][~covered] > 0).all()
     assert (lesson.last[:, 3][covered] == 0).float().mean() > 0.6 and not (lesson.last[:, 5] > 0.5).any()
+    monkeypatch.setattr(moving, "OFTEN", (0, 0, 0, 1))  # the same where the frames shown are dreamt
+    dreamt = moving_lesson(
+        rows, world.memory, world.config, 8, np.random.default_rng(1), lambda asked: 0 * asked.last[:, :5]
+    )
+    assert (dreamt.last[:, 3] > 0).float().mean() > 0.2
+    assert (dreamt.last[:, 3][dreamt.truth[:, 4] > 0.5] == 0).float().mean() > 0.6
     drawn = torch.zeros_like(lesson.truth)
     judged = lesson.judged(drawn)
     assert torch.equal(judged[:, :3].movedim(1, -1)[covered], lesson.truth[:, :3].movedim(1, -1)[covered])

@@ -24,7 +24,7 @@ def scene(thing_row: slice = slice(10, 16), thing_column: slice = slice(12, 18))
     rgb, depth, things = torch.full((1, 3, *SIZE), 100), torch.full((1, *SIZE), 6.0), torch.zeros(1, *SIZE)
     rgb[:, :, thing_row, thing_column] = torch.tensor([250, 0, 0])[None, :, None, None]
     depth[:, thing_row, thing_column], things[:, thing_row, thing_column] = 3.0, 1.0
-    return Frame(rgb.to(torch.uint8), depth, things, at((0.0, 0.0, 0.0)), things > 1)
+    return Frame(rgb.to(torch.uint8), depth, things, at((0.0, 0.0, 0.0)), torch.zeros_like(things, dtype=torch.bool))
 
 
 def test_a_thing_is_carried_by_its_own_depth():

@@ -156,8 +156,8 @@ class _Walk:
 
     def fight(self, view: _View) -> _Moves:
         """Turns to the nearest thing that stands in sight and shoots at it, standing, strafing or walking, the trigger held or
-        pressed at times; in one fight of five it only aims, and in one of three it aims beside the thing: what a shot does can
-        be told from what aiming does, and what a hit from what a shot."""
+        pressed at times; in one fight of five it only aims, and in one of three it aims beside the thing, at times so little that
+        it grazes it: what a shot does can be told from what aiming does, and what a hit from what a shot."""
         along = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][
             _whole(self.rng, 0, 6)
         ]

@@ -35,7 +35,7 @@ def moving_lesson(
         asked = Lesson(glimpse_of(shown, rows, recording, config), before, told, before)
         clean = dream(asked)  # pyright: ignore[reportOptionalCall]
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        covered = _covered(recording, rows, config.cast)  # in a dream, too, the cards are painted over what is drawn
+        covered = _covered(recording, rows, config.cast)  # in a dream, too, cards cover what is drawn
         drawn = Frame(rgb, decode_depth(clean[:, 3]), clean[:, 4].sigmoid(), recording.pose(rows), covered)
         last, earlier = drawn, last
     last = last._replace(rgb=worn(last.rgb, rng))

@@ -7,8 +7,9 @@ import math
 import numba
 import numpy as np
 
+from .patches import SAME
+
 NEAR_M = 0.05
-SAME = 0.06  # depths that differ by less than this share are of one surface
 TOUCHED = 0.1  # of a pixel that a card covers, above which it is the card's
 WITHIN_M = 0.005  # as well as walls are known
 
@@ -377,13 +378,9 @@ def halved(plane):
     small = np.empty(((height + 1) // 2, (width + 1) // 2), np.float32)
     for v in range(small.shape[0]):
         for u in range(small.shape[1]):
-            below, right = (
-                min(2 * v + 1, height - 1),
-                min(2 * u + 1, width - 1),
-            )  # a lone one counts twice, in its own mean
-            small[v, u] = (
-                plane[2 * v, 2 * u] + plane[2 * v, right] + plane[below, 2 * u] + plane[below, right]
-            ) * np.float32(0.25)
+            below, right = min(2 * v + 1, height - 1), min(2 * u + 1, width - 1)  # at an odd edge one counts twice
+            above = plane[2 * v, 2 * u] + plane[2 * v, right]
+            small[v, u] = np.float32(0.25) * (above + plane[below, 2 * u] + plane[below, right])
     return small
 
 

@@ -15,7 +15,7 @@ import torch
 
 from .camera import Intrinsics, project, rays, rotation
 from .floorplan import wall_segments
-from .patches import FAR_M, cast_all, patches
+from .patches import FAR_M, SAME, cast_all, patches
 from .reproject import fill_holes, warp
 
 COARSE, FINE = 8, 2  # strides of the patches for finding keyframes and for the view's depth
@@ -192,7 +192,7 @@ def vote_slowly(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor,
         (where[..., 1] * height).long().clamp(0, height - 1),
     )
     held = memory.depth.flatten(1).gather(1, row * width + column)
-    same = inside & ((held - depth).abs() < 0.06 * depth)
+    same = inside & ((held - depth).abs() < SAME * depth)
     ratio = distance / depth.clamp_min(0.05)
     return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
 

@@ -15,6 +15,7 @@ import torch
 from .camera import Intrinsics, rays, rotation, unproject
 
 FAR_M = 100.0  # deeper than any depth: "nothing is known there"
+SAME = 0.06  # depths that differ by less than this share are of one surface
 NEAR_M = 0.05
 SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall seen head-on is no surface
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from .camera import Intrinsics, project, rotation, unproject
-from .patches import FAR_M
+from .patches import FAR_M, SAME
 
 
 def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
@@ -27,7 +27,7 @@ def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, si
 
 
 def least_around(plane: torch.Tensor) -> torch.Tensor:
-    """The least of each pixel of [B, H, W] and its eight neighbours (a max_pool2d takes fifteen times as long)."""
+    """The least of each pixel of [B, H, W] and its eight neighbours (a max_pool2d takes many times as long)."""
     padded = F.pad(plane, (1, 1, 1, 1), value=torch.inf)
     lines = torch.minimum(torch.minimum(padded[:, :-2], padded[:, 2:]), padded[:, 1:-1])
     return torch.minimum(torch.minimum(lines[..., :-2], lines[..., 2:]), lines[..., 1:-1])
@@ -38,7 +38,7 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
     Single-pixel leaks (a far surface seen through the gaps of a near, sparsely splatted one) are closed first.
     """
-    if depth.device.type != "cpu" or depth.requires_grad:
+    if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
     from .kernels_numba import fill as kernel
 
@@ -94,7 +94,7 @@ def warp(
     held = held.view(batch, keys, height, width)
     inside = (grid.abs().amax(-1) <= 1).view(batch, keys, height, width) & (seen_depth > 0.05)
     error = (held - seen_depth).abs() / seen_depth.clamp_min(0.05)
-    agreement = torch.where(inside, (1.5 - error / 0.06).clamp(0, 1), 0.0)
+    agreement = torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
     closeness = target_depth[:, None] / seen_depth.clamp_min(0.05)
     return colour.view(batch, keys, -1, height, width), agreement, closeness
 

@@ -27,7 +27,7 @@ STOREY_M = 2.0  # between feet and eye, above which a card is on another floor
 ROWS = 16  # cards of a place at most
 STARTS = 32  # casts with which stories begin
 AGES = 24  # steps that are counted; more are as many
-WIDE_M = 0.65  # from the middle of a thing, how far beside it one still aims at it
+WIDE_M = 0.65  # beside its middle, where a thing counts as looked at by 1/e
 FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
 
 
@@ -99,7 +99,9 @@ class Cast(nn.Module):
         ]  # fmt: skip
         look, before = ((cards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
         age, rested = (cards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # what is done to it, not near it
+        aimed = (
+            torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]
+        )  # how straight the eye looks at it now
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance

@@ -178,7 +178,10 @@ def _cast(about: dict, weights: dict[str, torch.Tensor]) -> Cast | None:
     if told is None:
         return None
     cast = Cast(CastConfig(**told))
-    cast.load_state_dict({k[5:]: v for k, v in weights.items() if k.startswith("cast.")})
+    try:
+        cast.load_state_dict({k[5:]: v for k, v in weights.items() if k.startswith("cast.")})
+    except RuntimeError as error:
+        raise ValueError("its things are of another make of Terrella, or lost") from error
     return cast
 
 

@@ -12,10 +12,9 @@ import torch
 import torch.nn.functional as F
 
 from ..space.camera import Intrinsics, project, rotation, unproject
-from ..space.patches import FAR_M
+from ..space.patches import FAR_M, SAME
 from ..space.reproject import fill_holes, least_around, splat_depth
 
-SAME = 0.06  # depths that differ by less than this share are of one surface
 PLANES = 6  # that `carry_frames` adds to the last frame's colour and trust
 
 
@@ -56,7 +55,8 @@ def _carried(frame: Frame, pose: torch.Tensor, camera: Intrinsics) -> torch.Tens
 
     Pixels are moved whole: what is carried again at every step stays sharp.
     """
-    if frame.depth.device.type != "cpu" or frame.rgb.dtype != torch.uint8 or frame.depth.requires_grad:
+    learns = any(part.requires_grad for part in (*frame, pose))
+    if frame.depth.device.type != "cpu" or frame.rgb.dtype != torch.uint8 or learns:
         return carried_slowly(frame, pose, camera)
     from ..space.kernels_numba import fetch, splat
 

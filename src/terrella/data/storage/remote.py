@@ -266,9 +266,8 @@ class Files:
     def _evicted(self, size: int) -> int:
         """Bytes in use after what was used longest ago has made room for `size`, and some more so that this is rare."""
         total, files = 0, []
-        for entry in os.scandir(
-            self._cache / ".coming"
-        ):  # first: one that arrives meanwhile may count twice, never not at all
+        # What comes is counted first: if it arrives meanwhile it counts twice until the next look, never not at all.
+        for entry in os.scandir(self._cache / ".coming"):
             if _let_go(Path(entry.path), shutil.rmtree):  # of a process that was killed
                 continue
             total += int(entry.name.split("-")[0])
