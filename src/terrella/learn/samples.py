@@ -14,6 +14,7 @@ from ..data import ClipCache
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
+from ..space.reproject import least_around
 from ..worlds.controls import AXES, CHOICE, Controls
 from ..worlds.generator import VideoConfig
 from ..worlds.moving import covering, still
@@ -68,8 +69,9 @@ class Recording:
         return covering(self.instances(rows), self.things(rows))
 
     def lasting(self, rows) -> torch.Tensor:
-        """The depth [n, H, W] that a keyframe may hold: 0 where things are."""
-        return still(self.depth(rows), self.things(rows))
+        """The depth [n, H, W] that a keyframe may hold: 0 where things are and right beside them, where a film bleeds."""
+        kept = still(self.depth(rows), self.things(rows))
+        return torch.where(least_around(kept) > 0, kept, 0.0)
 
     def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:
         """What a world of this make observes of `rows`."""

@@ -28,6 +28,7 @@ ROWS = 16  # cards of a place at most
 STARTS = 32  # casts with which stories begin
 AGES = 24  # steps that are counted; more are as many
 WIDE_M = 0.65  # beside its middle, where a thing counts as looked at by 1/e
+UNLIKELY = 0.01  # a look less likely than that in a step does not come: so many of them would fell a man now and then
 FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
 
 
@@ -118,7 +119,9 @@ class Cast(nn.Module):
             return cards
         some = cards[view, row]
         told = self.tell(some, pose[view], acts[view])
-        look = torch.multinomial(told.look.softmax(1), 1, generator=rng)[:, 0]
+        chance = told.look.softmax(1)
+        chance = torch.where(chance < chance.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0, chance)
+        look = torch.multinomial(chance, 1, generator=rng)[:, 0]
         move = torch.multinomial(told.move.softmax(1), 1, generator=rng)[:, 0]
         gone = torch.rand(len(some), generator=rng) < told.gone.sigmoid()
         after = noted(some, some[:, PLACE] + self.moves[move], look.float())
