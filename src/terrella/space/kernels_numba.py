@@ -169,9 +169,23 @@ def recall(rgb, depth, turns, eyes, seen, turn, eye, camera, colours, trust):
                 i, j = min(int(a), width - 2), min(int(b), height - 2)
                 a, b = a - i, b - j
                 for c in range(3):
-                    top = rgb[best, c, j, i] * (1 - a) + rgb[best, c, j, i + 1] * a
-                    bottom = rgb[best, c, j + 1, i] * (1 - a) + rgb[best, c, j + 1, i + 1] * a
-                    colours[slot, c, v, u] = (top * (1 - b) + bottom * b) / 255
+                    colours[slot, c, v, u] = between(rgb[best, c], i, j, a, b) / 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def moved(u, v, depth, turn, eye, new_turn, new_eye, camera):
+    """Where the surface that is depth[v, u] deep in the view from turn [3, 3] and eye [3] lies in that from the new ones: how far
+    ahead, and its image coordinates (in [0, 1] where it is seen; meaningless behind the eye)."""
+    rows, columns = depth.shape
+    fx, fy, cx, cy = camera
+    side, up, far = -((u + 0.5) / columns - cx) / fx, -((v + 0.5) / rows - cy) / fy, depth[v, u]
+    x = far * (turn[0, 0] + side * turn[0, 1] + up * turn[0, 2]) + eye[0] - new_eye[0]
+    y = far * (turn[1, 0] + side * turn[1, 1] + up * turn[1, 2]) + eye[1] - new_eye[1]
+    z = far * (turn[2, 0] + side * turn[2, 1] + up * turn[2, 2]) + eye[2] - new_eye[2]
+    ahead = new_turn[0, 0] * x + new_turn[1, 0] * y + new_turn[2, 0] * z
+    a = cx - fx * (new_turn[0, 1] * x + new_turn[1, 1] * y + new_turn[2, 1] * z) / ahead
+    b = cy - fy * (new_turn[0, 2] * x + new_turn[1, 2] * y + new_turn[2, 2] * z) / ahead
+    return ahead, a, b
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -180,22 +194,13 @@ def carry(rgb, depth, turn, eye, known, seen, target_turn, target_eye, camera, c
     [3, 3] and eye [3]; what the view knows [V, U] and sees [V, U] from its own; fills `carried` [4, V, U], which is 0."""
     _, height, width = rgb.shape
     rows, columns = seen.shape
-    fx, fy, cx, cy = camera
     for v in range(rows):
         for u in range(columns):
             wanted = 1 - known[v, u]
             if wanted <= 0:
                 continue
-            side, up, far = -((u + 0.5) / columns - cx) / fx, -((v + 0.5) / rows - cy) / fy, seen[v, u]
-            x = far * (target_turn[0, 0] + side * target_turn[0, 1] + up * target_turn[0, 2]) + target_eye[0] - eye[0]
-            y = far * (target_turn[1, 0] + side * target_turn[1, 1] + up * target_turn[1, 2]) + target_eye[1] - eye[1]
-            z = far * (target_turn[2, 0] + side * target_turn[2, 1] + up * target_turn[2, 2]) + target_eye[2] - eye[2]
-            ahead = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
-            if ahead <= NEAR_M:
-                continue
-            a = cx - fx * (turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z) / ahead
-            b = cy - fy * (turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z) / ahead
-            if a < 0 or a > 1 or b < 0 or b > 1:
+            ahead, a, b = moved(u, v, seen, target_turn, target_eye, turn, eye, camera)
+            if ahead <= NEAR_M or a < 0 or a > 1 or b < 0 or b > 1:
                 continue
             i, j = min(int(a * depth.shape[1]), depth.shape[1] - 1), min(int(b * depth.shape[0]), depth.shape[0] - 1)
             trust = wanted * min(max(1.5 - abs(depth[j, i] - ahead) / ahead / SAME, 0.0), 1.0)
@@ -206,9 +211,7 @@ def carry(rgb, depth, turn, eye, known, seen, target_turn, target_eye, camera, c
             i, j = min(int(a), width - 2), min(int(b), height - 2)
             a, b = a - i, b - j
             for c in range(3):
-                top = rgb[c, j, i] * (1 - a) + rgb[c, j, i + 1] * a
-                bottom = rgb[c, j + 1, i] * (1 - a) + rgb[c, j + 1, i + 1] * a
-                carried[c, v, u] = (top * (1 - b) + bottom * b) / 255
+                carried[c, v, u] = between(rgb[c], i, j, a, b) / 255
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -217,7 +220,6 @@ def splat(depth, things, turn, eye, target_turn, target_eye, camera, flat, canva
     fills flat [H, W], the depth with that of things averaged over their surroundings, and lowers `canvas` [H, W] to what is seen
     of it from the target's."""
     height, width = depth.shape
-    fx, fy, cx, cy = camera
     sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1))  # of all above and to the left
     for v in range(height):
         for u in range(width):
@@ -233,16 +235,9 @@ def splat(depth, things, turn, eye, target_turn, target_eye, camera, flat, canva
                     counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
                 )
             flat[v, u] = far
-            far, side, up = flat[v, u], -((u + 0.5) / width - cx) / fx, -((v + 0.5) / height - cy) / fy
-            x = far * (turn[0, 0] + side * turn[0, 1] + up * turn[0, 2]) + eye[0] - target_eye[0]
-            y = far * (turn[1, 0] + side * turn[1, 1] + up * turn[1, 2]) + eye[1] - target_eye[1]
-            z = far * (turn[2, 0] + side * turn[2, 1] + up * turn[2, 2]) + eye[2] - target_eye[2]
-            ahead = target_turn[0, 0] * x + target_turn[1, 0] * y + target_turn[2, 0] * z
-            if ahead <= NEAR_M:
-                continue
-            a = (cx - fx * (target_turn[0, 1] * x + target_turn[1, 1] * y + target_turn[2, 1] * z) / ahead) * width
-            b = (cy - fy * (target_turn[0, 2] * x + target_turn[1, 2] * y + target_turn[2, 2] * z) / ahead) * height
-            if 0 <= a < width and 0 <= b < height and ahead < canvas[int(b), int(a)]:
+            ahead, a, b = moved(u, v, flat, turn, eye, target_turn, target_eye, camera)
+            a, b = a * width, b * height
+            if ahead > NEAR_M and 0 <= a < width and 0 <= b < height and ahead < canvas[int(b), int(a)]:
                 canvas[int(b), int(a)] = ahead
 
 
@@ -251,20 +246,11 @@ def fetch(rgb, flat, things, covered, turn, eye, seen, target_turn, target_eye, 
     """The second half of the same: what the frame shows (rgb uint8 [3, H, W], the others [H, W]) of what the target sees [H, W];
     fills found [6, H, W] = colour, trust, `seen`, things."""
     height, width = flat.shape
-    fx, fy, cx, cy = camera
     for v in range(height):
         for u in range(width):
-            far, side, up = seen[v, u], -((u + 0.5) / width - cx) / fx, -((v + 0.5) / height - cy) / fy
-            found[4, v, u] = far
-            x = far * (target_turn[0, 0] + side * target_turn[0, 1] + up * target_turn[0, 2]) + target_eye[0] - eye[0]
-            y = far * (target_turn[1, 0] + side * target_turn[1, 1] + up * target_turn[1, 2]) + target_eye[1] - eye[1]
-            z = far * (target_turn[2, 0] + side * target_turn[2, 1] + up * target_turn[2, 2]) + target_eye[2] - eye[2]
-            ahead = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
-            if ahead <= NEAR_M:
-                continue
-            a = cx - fx * (turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z) / ahead
-            b = cy - fy * (turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z) / ahead
-            if not (0 <= a <= 1 and 0 <= b <= 1):
+            found[4, v, u] = seen[v, u]
+            ahead, a, b = moved(u, v, seen, target_turn, target_eye, turn, eye, camera)
+            if ahead <= NEAR_M or a < 0 or a > 1 or b < 0 or b > 1:
                 continue
             i, j = min(int(a * width), width - 1), min(int(b * height), height - 1)
             trust = min(max(1.5 - abs(flat[j, i] - ahead) / ahead / SAME, 0.0), 1.0)
