@@ -162,9 +162,10 @@ class _Walk:
             _whole(self.rng, 0, 6)
         ]
         often = (0.0, 0.3, 0.8, 1.0, 1.0)[_whole(self.rng, 0, 4)]
-        beside = (
-            (-1 if _chance(self.rng, 0.5) else 1) * _whole(self.rng, 8, 45) / 100 if _chance(self.rng, 1 / 3) else 0.0
-        )
+        beside = 0.0  # radians
+        if _chance(self.rng, 1 / 3):
+            side = -1 if _chance(self.rng, 0.5) else 1
+            beside = side * _whole(self.rng, 8, 45) / 100
         found, turned = view.thing(target=True), 0.0
         for _ in range(_whole(self.rng, 20, 70)):
             if found is None:
