@@ -56,7 +56,7 @@ $(VENV)/.ready-play: pyproject.toml constraints.txt | $(BIN)/python
 	@$(PIP) -q torch
 	@$(PIP) -q -e '.[sim]'
 	@echo "compiling the geometry, so that the first play need not"
-	@$(BIN)/python -c "import terrella as t; w = t.load('doom-maze'); r = t.make_rng(0); w.imagine(w.start(1, r), w.spec.sample_action(1, r), r)"
+	@$(BIN)/python -c "import terrella as t; r = t.make_rng(0); [w.imagine(w.start(1, r), w.spec.sample_action(1, r), r) for w in map(t.load, ('doom-maze', 'doom-corridor'))]"
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready-play
