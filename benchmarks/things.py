@@ -17,9 +17,9 @@ import tyro
 import terrella
 from terrella.data import ClipCache
 from terrella.learn.samples import Recording, controls_of
+from terrella.space.billboards import cut_out
 from terrella.space.camera import project
-from terrella.space.cards import cut_out
-from terrella.worlds.cast import LOOK, NONE, NUMBER, PLACE, WIDE_M
+from terrella.worlds.objects import LOOK, NONE, NUMBER, PLACE, WIDE_M
 from terrella.worlds.video import VideoWorld
 
 CONTEXT = 10
@@ -52,7 +52,7 @@ def main(
     for back in range(CONTEXT - 1, -1, -1):
         seen = recording.evidence(learned.config, rows - back)
         state = learned.observe(seen, state, terrella.make_rng(0))
-    cards = state["cards"]
+    cards = state["billboards"]
     tall = learned.cast.boxes[cards[..., LOOK].long().clamp_min(0), 3]
     standing = (cards[..., NUMBER] > 0) & (cards[..., LOOK] != NONE) & (tall >= TALL_M)
     fell, known, truth = happened(cards[..., NUMBER], recording, rows, steps, learned.config.camera)
@@ -101,7 +101,7 @@ def happened(numbers: torch.Tensor, recording: Recording, rows: np.ndarray, step
     fell, known, places = torch.zeros(numbers.shape, dtype=torch.bool), [], []
     for step in range(1, steps + 1):
         at = rows + step
-        told = torch.from_numpy(np.array(recording.cache.arrays["observation.cast"][at], np.float32))
+        told = torch.from_numpy(np.array(recording.cache.arrays["observation.objects"][at], np.float32))
         frames = recording.rgb(at), recording.instances(at), recording.depth(at)
         cut = cut_out(*frames, told[..., 1:], recording.pose(at), camera)
         low = torch.zeros(told.shape[:2], dtype=torch.bool)

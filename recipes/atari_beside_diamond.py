@@ -153,7 +153,7 @@ def train_ours(out: Path, minutes: float, **settings) -> None:
         (folder / "cpu.json").write_text(json.dumps({"cpu_s": before + time.process_time()}))
         print(f"{before + time.process_time():.0f} s", f"{done / total:.3f}", words, flush=True)
 
-    config = TrainConfig(name=out.name, size=SIZE, hours=minutes / 60, doubt_frames=0, **settings)
+    config = TrainConfig(name=out.name, size=SIZE, hours=minutes / 60, uncertainty_frames=0, **settings)
     facts = train_video(out / "rec", folder, config, report)
     (folder / "cpu.json").write_text(json.dumps({"cpu_s": before + time.process_time(), "steps": facts["step"]}))
 

@@ -11,7 +11,7 @@ terrella record doom --scenario deadly_corridor --skill 3 --frames 4000 --seed 1
 terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 80000 --seed 2 --out recordings/fights
 terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 16000 --seed 7 --out recordings/fights-test
 terrella train video recordings/monsters --out runs/monsters --name doom-corridor --steps 3500 --motion-steps 4000 \
-    --keyframes 200 --critic-from 900 --eye-steps 0 --doubt-frames 2000
+    --keyframes 200 --critic-from 900 --estimator-steps 0 --uncertainty-frames 2000
 terrella train things runs/monsters/world --data recordings/fights --out runs/monsters/things
 terrella score runs/monsters/things --data recordings/monsters-test --fresh --out scores/monsters --horizons 1 8 32 \
     --clips 24 --drift 0 --long-steps 0
@@ -20,5 +20,5 @@ python benchmarks/things.py runs/monsters/things recordings/fights-test
 terrella record doom --height 96 --scenario freedoom2/MAP01,MAP02,MAP05 --frames 18000 --seed 0 --out recordings/maps
 terrella record doom --height 96 --scenario freedoom2/MAP03 --frames 3000 --seed 1 --out recordings/map03
 terrella train video recordings/maps --out runs/maps --name doom-maps --size 48 64 --steps 3000 \
-    --motion-steps 2500 --outcome-steps 700 --keyframes 420 --critic-from 900 --eye-steps 0 --doubt-frames 0
+    --motion-steps 2500 --outcome-steps 700 --keyframes 420 --critic-from 900 --estimator-steps 0 --uncertainty-frames 0
 terrella score runs/maps --data recordings/maps --new recordings/map03 --out scores/maps --horizons 1 8 32

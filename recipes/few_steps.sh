@@ -9,7 +9,7 @@ export OMP_NUM_THREADS=1
 data=recordings/doom-maze
 [ -d $data ] || terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out $data
 terrella train video $data --out runs/few-teacher --name teacher --no-geometry --size 48 64 \
-    --channels 24 48 96 128 --flow-steps 8 --batch 16 --steps 8000 --doubt-frames 0
+    --channels 24 48 96 128 --flow-steps 8 --batch 16 --steps 8000 --uncertainty-frames 0
 terrella train distil runs/few-teacher --data $data --out runs/few-25 --steps 1400 --batch 12
 terrella train distil runs/few-teacher --data $data --out runs/few-40 --steps 1400 --batch 12 --truth-weight 0.4
 terrella train distil runs/few-teacher --data $data --out runs/few-60 --steps 1000 --batch 12 --truth-weight 0.6

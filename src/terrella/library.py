@@ -11,7 +11,7 @@ from typing import Any
 
 from .core.errors import CheckpointError, TerrellaError
 from .core.world import World
-from .space.eye import Eye
+from .space.estimator import Estimator
 
 BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
@@ -33,7 +33,7 @@ def load(
     name: str | Path,
     *,
     remember: bool = False,
-    eye: str | Path | None = None,
+    estimator: str | Path | None = None,
     memory_mb: float | None = None,
     **options: Any,
 ) -> World:
@@ -50,11 +50,11 @@ def load(
     memory_mb: the budget in MiB of what a story remembers; as its world was saved, or 16.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
-    if remember or eye is not None:
+    if remember or estimator is not None:
         from .space import remembering
 
         inner = load(name, memory_mb=None if is_truth(name) else memory_mb, **options)
-        seeing = None if eye is None else open_eye(eye)
+        seeing = None if estimator is None else open_estimator(estimator)
         return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, seeing)
     text = str(name)
     if memory_mb is not None and is_truth(name):
@@ -147,16 +147,16 @@ def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
 
 
-def open_eye(source: str | Path) -> Eye:
+def open_estimator(source: str | Path) -> Estimator:
     """The eye in a file that `terrella train eye` wrote, or of a world that has one."""
-    from .space.eye import Eye, load_eye
+    from .space.estimator import Estimator, load_estimator
 
     if Path(source).is_file():
-        return load_eye(source)
-    eye = getattr(load(source), "eye", None)
-    if not isinstance(eye, Eye):
+        return load_estimator(source)
+    estimator = getattr(load(source), "estimator", None)
+    if not isinstance(estimator, Estimator):
         raise TerrellaError(f"{source} has no eye; give a file that `terrella train eye` wrote.")
-    return eye
+    return estimator
 
 
 def _open_atari(game: str, options: Mapping[str, Any]) -> World:

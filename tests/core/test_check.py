@@ -153,19 +153,19 @@ class BrokenCamera(Walk):
     spec = replace(SPEC, camera=(0.0, 1.0, 0.5, 0.5))
 
 
-@broken("spec.heeds names ['sonar']")
+@broken("spec.may_observe names ['sonar']")
 class HeedsTheUnseen(Walk):
-    spec = replace(SPEC, heeds=("sonar",))
+    spec = replace(SPEC, may_observe=("sonar",))
 
 
-@broken("spec.heeds names ['at']")
+@broken("spec.may_observe names ['at']")
 class HeedsTwice(Walk):
-    spec = replace(SPEC, heeds=("at",))
+    spec = replace(SPEC, may_observe=("at",))
 
 
 @broken("the prior that it was given unchanged")
 class LearnsFromWhatItHeeds(Walk):
-    spec = replace(SPEC, heeds=("reward",))
+    spec = replace(SPEC, may_observe=("reward",))
 
     def observe(self, observation, prior, rng):
         if prior is not None and "reward" in observation:

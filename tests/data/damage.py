@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from terrella.care.doctor import examine
+from terrella.care.repair import repair
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
-from terrella.data.care.doctor import examine
-from terrella.data.care.repair import repair
 from terrella.data.source import Sensor
 
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from corridor import BUTTONS, Corridor, keys
 
+from terrella.care import doctor
+from terrella.care.alignment import Run, judge
 from terrella.core import make_rng
-from terrella.data import Layout, Recorder, doctor
-from terrella.data.care.alignment import Run, judge
+from terrella.data import Layout, Recorder
 
 FPS, ROWS = 20, 140
 Body = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]

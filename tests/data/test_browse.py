@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrella.core.errors import DatasetError
-from terrella.data.browse import MARKS, Browse, Entry, pose_columns
 from terrella.data.source import Lazy, Readings, Sensor, Source, Take
+from terrella.exchange.browse import MARKS, Browse, Entry, pose_columns
 
 CAMERA, STATE = "observation.images.front", "observation.state"
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Readings, Sensor, Source, Take, open_source, write_source
-from terrella.data.formats.lerobot import Rows
+from terrella.data import Dataset, Readings, Sensor, Source, Take
+from terrella.exchange import open_source, write_source
+from terrella.exchange.formats.lerobot import Rows
 
 FRONT, DEPTH = "observation.images.front", "observation.depth"
 SENSORS = [

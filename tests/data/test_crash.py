@@ -15,9 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 from corridor import Corridor, keys
 
+from terrella.care import doctor
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Dataset, Layout, Recorder, doctor, record
+from terrella.data import ClipCache, Dataset, Layout, Recorder, record
 from terrella.data.storage import durable
 
 LAYOUT = Layout.of_channels(10, ("go",), rgb=(16, 16), pose=True)

@@ -12,9 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from terrella.care import doctor
+from terrella.care.doctor import being_written, examine
 from terrella.core.errors import DatasetError
-from terrella.data import Layout, Recorder, doctor
-from terrella.data.care.doctor import being_written, examine
+from terrella.data import Layout, Recorder
 from terrella.data.source import Sensor
 from terrella.data.storage import durable
 from terrella.data.storage.mp4 import Mp4Writer

@@ -7,8 +7,8 @@ import torch
 from corridor import CELL_M, WALLS, Corridor
 from gymnasium import spaces
 
+from terrella.act import Explorer
 from terrella.core import Spec, make_rng
-from terrella.data import Explorer
 from terrella.space.camera import planar_pose
 
 

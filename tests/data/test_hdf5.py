@@ -17,7 +17,7 @@ from terrella.data.source import Readings, Sensor, Source, Take
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'terrella[hdf5]'")
 
-from terrella.data.formats import counter_strike, hdf5, robomimic, rows  # noqa: E402
+from terrella.exchange.formats import counter_strike, hdf5, robomimic, rows  # noqa: E402
 
 
 def stacked(readings: Readings) -> np.ndarray:
@@ -416,9 +416,9 @@ def test_flipped_bytes_are_an_error_or_the_right_shape(tmp_path):
 
 def test_without_h5py_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    monkeypatch.delitem(sys.modules, "terrella.data.formats.hdf5")
+    monkeypatch.delitem(sys.modules, "terrella.exchange.formats.hdf5")
     with pytest.raises(DatasetError, match=r"pip install 'terrella\[hdf5\]'"):
-        importlib.import_module("terrella.data.formats.hdf5")
+        importlib.import_module("terrella.exchange.formats.hdf5")
 
 
 def test_a_reward_that_is_one_number_is_robomimics_flat_array(tmp_path):

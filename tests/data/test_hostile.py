@@ -17,8 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from terrella.care import doctor
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder, doctor
+from terrella.data import Dataset, Layout, Recorder
 from terrella.data.format import contained, fill
 from terrella.data.source import Sensor
 from terrella.data.storage import thrift
@@ -29,7 +30,8 @@ WORKER = """
 import json, sys, time
 from pathlib import Path
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, doctor, repair
+from terrella.care import doctor, repair
+from terrella.data import Dataset
 def memory(name):
     status = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) // 1024 for line in status if line.startswith(name))

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrella.care import repair
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder, repair
+from terrella.data import Dataset, Layout, Recorder
 from terrella.data.format import RGB, STATE
 from terrella.data.source import Sensor
 

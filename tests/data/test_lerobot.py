@@ -13,11 +13,12 @@ import subprocess
 import numpy as np
 import pytest
 
-from terrella.data import ClipCache, Dataset, doctor
-from terrella.data.convert import open_source, write_source
-from terrella.data.formats.lerobot import Rows
-from terrella.data.merging.merge import merge_into
+from terrella.care import doctor
+from terrella.data import ClipCache, Dataset
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.convert import open_source, write_source
+from terrella.exchange.formats.lerobot import Rows
+from terrella.exchange.merging.merge import merge_into
 
 PYTHON = os.environ.get("TERRELLA_LEROBOT_PYTHON")
 pytestmark = pytest.mark.skipif(

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from terrella.core.errors import DatasetError
-from terrella.data.live import Live
 from terrella.data.source import Sensor
+from terrella.exchange.live import Live
 
 pytest.importorskip("mcap")
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -24,7 +24,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from terrella.data.formats import mcap
+from terrella.exchange.formats import mcap
 
 CALIBRATION = {"width": 24, "height": 16, "distortion_model": "", "K": [9.0, 0, 12, 0, 9, 8, 0, 0, 1]}
 SENSORS = {
@@ -105,7 +105,7 @@ def _readable(count) -> int:
 SCRIPT = """
 import sys, time
 import numpy as np
-from terrella.data.live import Live
+from terrella.exchange.live import Live
 from terrella.data.source import Sensor
 live = Live(sys.argv[1], {"action": Sensor("action", "vector", (1,))}, "run")
 i = 0
@@ -180,7 +180,7 @@ def test_logging_never_waits_for_a_slow_disk(tmp_path, monkeypatch):
         add(*args)
 
     monkeypatch.setattr(mcap.Recording, "add", slow)
-    monkeypatch.setattr("terrella.data.live._WAITING_COUNT", 8)
+    monkeypatch.setattr("terrella.exchange.live._WAITING_COUNT", 8)
     with Live(tmp_path / "slow.mcap", SENSORS, "run") as live:
         begun = time.perf_counter()
         for i in range(200):
@@ -294,7 +294,7 @@ def test_only_foxglove_and_this_machine_may_watch():
 
 
 def test_a_slow_watcher_loses_frames_and_holds_up_nobody(monkeypatch):
-    monkeypatch.setattr("terrella.data.live_server._BEHIND_BYTES", 2**18)
+    monkeypatch.setattr("terrella.exchange.live_server._BEHIND_BYTES", 2**18)
     sensor = Sensor("observation.images.big", "image", (256, 256, 3), "uint8")
     noise = np.random.default_rng(0).integers(0, 255, sensor.shape, np.uint8)
     with Live("0", {sensor.name: sensor}, "run", image="raw") as live:

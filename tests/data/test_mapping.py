@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from robots import arm, robot, rover
 
 from terrella.core.errors import DatasetError
-from terrella.data.merging.mapping import (
+from terrella.data.source import Sensor
+from terrella.exchange.merging.mapping import (
     Camera,
     Dimension,
     MergeMapping,
@@ -25,9 +26,8 @@ from terrella.data.merging.mapping import (
     to_toml,
     write_mapping,
 )
-from terrella.data.merging.propose import propose
-from terrella.data.merging.units import basic, convert, quantity
-from terrella.data.source import Sensor
+from terrella.exchange.merging.propose import propose
+from terrella.exchange.merging.units import basic, convert, quantity
 
 
 def vector(name, names, units=None, frame="", size=None, rate=None):
@@ -245,7 +245,7 @@ mappings = st.builds(
 def test_any_mapping_is_read_as_it_was_written(mapping):
     import tomllib
 
-    from terrella.data.merging.mapping import _mapping
+    from terrella.exchange.merging.mapping import _mapping
 
     assert _mapping(tomllib.loads(to_toml(mapping))) == mapping
 

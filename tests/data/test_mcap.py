@@ -33,7 +33,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
-from terrella.data.formats import foxglove, mcap, mcap_index
+from terrella.exchange.formats import foxglove, mcap, mcap_index
 
 START_NS = 1_700_000_000_000_000_123
 CALIBRATION = {"width": 24, "height": 16, "distortion_model": "plumb_bob", "K": [9.0, 0, 12, 0, 9, 8, 0, 0, 1]}
@@ -690,7 +690,7 @@ def test_paths_and_options_that_cannot_be_are_refused(tmp_path):
     ],
 )
 def test_a_missing_package_is_named_with_its_extra(monkeypatch, leaf, missing):
-    monkeypatch.delitem(sys.modules, f"terrella.data.formats.{leaf}")
+    monkeypatch.delitem(sys.modules, f"terrella.exchange.formats.{leaf}")
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(DatasetError, match=r"pip install 'terrella\[mcap\]'"):
-        importlib.import_module(f"terrella.data.formats.{leaf}")
+        importlib.import_module(f"terrella.exchange.formats.{leaf}")

@@ -13,12 +13,12 @@ from PIL import Image
 from robots import arm, robot, rover
 
 from terrella.core.errors import DatasetError
-from terrella.data.merging.mapping import Number, Rows, Vector, affine, read_mapping, write_mapping
-from terrella.data.merging.merge import letterbox, merge, merge_into
-from terrella.data.merging.propose import propose
-from terrella.data.merging.report import Report, Running
 from terrella.data.resample import resample
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.merging.mapping import Number, Rows, Vector, affine, read_mapping, write_mapping
+from terrella.exchange.merging.merge import letterbox, merge, merge_into
+from terrella.exchange.merging.propose import propose
+from terrella.exchange.merging.report import Report, Running
 
 VECTORS = {"action", "observation.state", "next.reward", "next.done"}
 
@@ -282,7 +282,7 @@ def test_running_statistics_need_not_see_all_at_once(sizes, seed):
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=20))
 def test_quantiles_of_much_come_from_every_nth_value(sizes):
-    import terrella.data.merging.report as module
+    import terrella.exchange.merging.report as module
 
     running, at, before = Running(["a"]), 0, module._SAMPLE
     module._SAMPLE = 16

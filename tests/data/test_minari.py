@@ -15,9 +15,9 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from terrella.core.errors import DatasetError
-from terrella.data.formats import minari as ours
-from terrella.data.formats import rollouts
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.formats import minari as ours
+from terrella.exchange.formats import rollouts
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'terrella[hdf5]'")
 minari = pytest.importorskip("minari", reason="minari is not installed: pip install 'minari[hdf5,arrow]'")

@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from terrella.core.errors import DatasetError
-from terrella.data.formats import pictures, rows
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.formats import pictures, rows
 
 RGB = "observation.images.rgb"
 

@@ -19,8 +19,9 @@ from strangers import killed, shared
 from test_doctor import DATA, VIDEO, change, cut, put, small_video, twin
 from test_interrupted import LAYOUT, LIDAR, SIDE, drive
 
+from terrella.care import doctor, repair
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder, doctor, repair
+from terrella.data import Dataset, Layout, Recorder
 from terrella.data.storage.films import reel
 
 COUNTERS = ("index", "frame_index", "episode_index", "timestamp", "task_index")

@@ -67,7 +67,7 @@ def columns(file, entity: str) -> dict[str, list]:
 
 
 def test_every_reading_is_there_at_its_time(tmp_path):
-    from terrella.data.formats import rerun
+    from terrella.exchange.formats import rerun
 
     notes = rerun.write(source_of(2), tmp_path / "small")
     assert notes == [f"units, frames and calibration of {POSE} have no place in Rerun"]
@@ -95,7 +95,7 @@ def test_every_reading_is_there_at_its_time(tmp_path):
 
 
 def test_one_take_is_one_file_and_nothing_is_overwritten(tmp_path):
-    from terrella.data.formats import rerun
+    from terrella.exchange.formats import rerun
 
     rerun.write(source_of(1), tmp_path / "one.rrd")
     assert len(columns(tmp_path / "one.rrd", "/next/done")["time"]) == 31
@@ -106,14 +106,14 @@ def test_one_take_is_one_file_and_nothing_is_overwritten(tmp_path):
 
 
 def test_a_viewer_that_cannot_be_reached_is_a_sentence():
-    from terrella.data.formats import rerun
+    from terrella.exchange.formats import rerun
 
     with pytest.raises(DatasetError, match="nowhere cannot be reached"):
         rerun.show(source_of(1), "nowhere")
 
 
 def test_a_broken_reading_leaves_nothing_behind(tmp_path):
-    from terrella.data.formats import rerun
+    from terrella.exchange.formats import rerun
 
     def torn(index):
         raise DatasetError("the video is torn.")

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from terrella.core.errors import DatasetError
-from terrella.data.formats import rollouts, rows
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.formats import rollouts, rows
 
 
 class Arm(gymnasium.Env):

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from terrella.core.errors import DatasetError
-from terrella.learn.cast import learn_cast
+from terrella.learn.objects import learn_objects
+from terrella.space.billboards import PICTURE, painted
 from terrella.space.camera import planar_pose
-from terrella.space.cards import PICTURE, painted
-from terrella.worlds.cast import LOOK, NUMBER, PLACE, Cast, CastConfig
+from terrella.worlds.objects import LOOK, NUMBER, PLACE, Objects, ObjectsConfig
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 EPISODES, LENGTH, STEP_M = 30, 16, 0.1
@@ -23,9 +23,9 @@ def figure(colour) -> torch.Tensor:
 
 
 def toy() -> SimpleNamespace:
-    """A recording of it, as learn_cast reads one, and its pictures."""
+    """A recording of it, as learn_objects reads one, and its pictures."""
     rng, rows = np.random.default_rng(0), EPISODES * LENGTH
-    cast, action = np.zeros((rows, 2, 4), np.float32), (rng.random((rows, 2)) < 0.06).astype(np.float32)
+    objects, action = np.zeros((rows, 2, 4), np.float32), (rng.random((rows, 2)) < 0.06).astype(np.float32)
     pictures, depths, marks = [], [], []
     for episode in range(EPISODES):
         place, shot = np.array([3.5 + rng.random(), rng.random() - 0.8, 0.0], np.float32), False
@@ -34,17 +34,17 @@ def toy() -> SimpleNamespace:
             if step:
                 shot = shot or action[row - 1, 0] > 0
                 place = place + np.array([0, STEP_M * (step % 2 == 0 and not shot), 0], np.float32)
-            cast[row, 0] = (1, *place)
+            objects[row, 0] = (1, *place)
             look = figure((0.1, 0.1, 0.9)) if shot else figure((0.9, 0.1, 0.1))
             box = torch.tensor([0.8, 0.8, 0.0, 0.4] if shot else [0.4, 0.4, 0.0, 1.6])
             behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-            cards = torch.from_numpy(cast[row, None, :1, 1:]), look[None, None], box[None, None]
+            cards = torch.from_numpy(objects[row, None, :1, 1:]), look[None, None], box[None, None]
             rgb, depth, seen = painted(*behind, cards, torch.ones(1, 1).bool(), pose(1), CAMERA)
             pictures.append((rgb[0].permute(1, 2, 0) * 255).byte().numpy())
             depths.append(depth[0].numpy())
             marks.append(seen[0].numpy())
     episodes = [(first, first + LENGTH) for first in range(0, rows, LENGTH)]
-    arrays = {"observation.cast": cast, "observation.instances": np.stack(marks)}
+    arrays = {"observation.objects": objects, "observation.instances": np.stack(marks)}
     cache = SimpleNamespace(
         arrays=arrays, episodes=episodes, length=rows, depth=np.stack(depths), pose=pose(rows).numpy()
     )
@@ -61,56 +61,56 @@ def pose(count: int) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def learned():
     torch.manual_seed(0)
-    cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+    objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     starts = pose(2)
     starts[1, 1] = 1.0  # whichever episode began nearest
-    facts = learn_cast(cast, recording, recording.rgb.__getitem__, starts, CAMERA, 500, 0, lambda *told: None)  # pyright: ignore
-    return cast, facts, recording
+    facts = learn_objects(objects, recording, recording.rgb.__getitem__, starts, CAMERA, 500, 0, lambda *told: None)  # pyright: ignore
+    return objects, facts, recording
 
 
 def test_it_finds_the_two_looks_and_the_one_move(learned):
-    cast, facts, _ = learned
-    shown = cast.pictures[: facts["cast_looks"]].float()
+    objects, facts, _ = learned
+    shown = objects.pictures[: facts["cast_looks"]].float()
     red = shown[:, 0].mean((1, 2)) > shown[:, 2].mean((1, 2))
-    tall = cast.boxes[: facts["cast_looks"], 3] > 1
+    tall = objects.boxes[: facts["cast_looks"], 3] > 1
     assert 2 <= facts["cast_looks"] <= 6 and red.any() and (~red).any() and torch.equal(red, tall)
-    assert torch.allclose(cast.moves[1 : facts["cast_moves"] + 1], torch.tensor([0.0, STEP_M, 0.0]), atol=0.02)
+    assert torch.allclose(objects.moves[1 : facts["cast_moves"] + 1], torch.tensor([0.0, STEP_M, 0.0]), atol=0.02)
 
 
 def test_a_story_begins_with_what_waited(learned):
-    cast, _, recording = learned
-    assert cast.begun[..., NUMBER].tolist() == [[1, 0], [1, 0]]
-    assert np.allclose(cast.begun[0, 0, PLACE].numpy(), recording.cache.arrays["observation.cast"][0, 0, 1:])
+    objects, _, recording = learned
+    assert objects.begun[..., NUMBER].tolist() == [[1, 0], [1, 0]]
+    assert np.allclose(objects.begun[0, 0, PLACE].numpy(), recording.cache.arrays["observation.objects"][0, 0, 1:])
 
 
 def test_who_is_shot_at_falls_and_who_is_not_walks_on(learned):
-    cast, _, _ = learned
-    tall = cast.boxes[:, 3] > 1
-    card, acts = cast.begun[:1, 0].clone(), torch.zeros(1, 3, 2)
+    objects, _, _ = learned
+    tall = objects.boxes[:, 3] > 1
+    card, acts = objects.begun[:1, 0].clone(), torch.zeros(1, 3, 2)
     assert tall[int(card[0, LOOK])]
     with torch.no_grad():
-        calm = cast.tell(card, pose(1), acts)
+        calm = objects.tell(card, pose(1), acts)
         acts[0, -1, 0] = 1
-        shot = cast.tell(card, pose(1), acts)
-    assert not cast.follows[1 + int(card[0, LOOK])].all()
+        shot = objects.tell(card, pose(1), acts)
+    assert not objects.follows[1 + int(card[0, LOOK])].all()
     falls = [float(told.look.softmax(1)[0, ~tall].sum()) for told in (calm, shot)]
     assert falls[0] < 0.1 < 0.7 < falls[1]
     assert float(calm.gone.sigmoid()) < 0.05 and float(calm.move.softmax(1)[0, 1:].sum()) > 0.15
 
 
 def test_a_recording_that_shows_no_thing_whole_teaches_nothing():
-    cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+    objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     recording.cache.arrays["observation.instances"] = np.zeros_like(recording.cache.arrays["observation.instances"])
     with pytest.raises(DatasetError, match="no thing whole and near: record more"):
-        learn_cast(cast, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+        learn_objects(objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
 
 
 def test_the_same_seed_teaches_the_same():
     casts = []
     for _ in range(2):
         torch.manual_seed(0)
-        cast, recording = Cast(CastConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
-        learn_cast(cast, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+        objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+        learn_objects(objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
         torch.rand(3)
-        casts.append(cast.state_dict())
+        casts.append(objects.state_dict())
     assert all(torch.equal(casts[0][name], casts[1][name]) for name in casts[0])

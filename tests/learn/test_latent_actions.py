@@ -10,7 +10,8 @@ import torch
 from safetensors.torch import load_file
 
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.data import ClipCache, Dataset, Layout, Recorder, open_source
+from terrella.data import ClipCache, Dataset, Layout, Recorder
+from terrella.exchange import open_source
 from terrella.learn import latent_actions as module
 from terrella.learn.latent_actions import LatentConfig, load_latent, posterior, train_latent_actions
 from terrella.learn.latent_codes import agreement, examine_latent, label, map_keys, shown_shift

@@ -11,18 +11,19 @@ import torch
 from gymnasium import spaces
 from tests.data.corridor import DEPTH, Corridor
 
+from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError, TrainingError
-from terrella.data import ClipCache, Explorer, record
+from terrella.data import ClipCache, record
 from terrella.learn import moving
-from terrella.learn.cast import ThingsConfig, train_things
 from terrella.learn.moving import mirrored, moving_lesson, other_side
+from terrella.learn.objects import ThingsConfig, train_things
 from terrella.learn.samples import THINGS, Recording, choose_keyframes
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.space.camera import yaw
-from terrella.worlds.cast import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import VideoConfig
+from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
 from terrella.worlds.video import VideoWorld
 
 CONFIG = TrainConfig(
@@ -33,8 +34,8 @@ CONFIG = TrainConfig(
     outcome_steps=5,
     keyframes=8,
     critic_from=1,
-    eye_steps=0,
-    doubt_frames=0,
+    estimator_steps=0,
+    uncertainty_frames=0,
     strip_every_s=1e9,
 )
 
@@ -64,17 +65,17 @@ class Peopled(Haunted):
     def __init__(self):
         super().__init__()
         marks = spaces.Box(0, ROWS, DEPTH, np.uint8)  # pyright: ignore[reportCallIssue, reportArgumentType]
-        more = {"instances": marks, "cast": spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)}
+        more = {"instances": marks, "objects": spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)}
         self.spec = replace(self.spec, channels={**self.spec.channels, **more})
 
     def render(self, state, channels):
-        seen = super().render(state, [*{*channels, "things", "pose"} - {"cast", "instances"}])
+        seen = super().render(state, [*{*channels, "things", "pose"} - {"objects", "instances"}])
         x, y, z, *_ = seen["pose"][0].tolist()
         heading = float(yaw(seen["pose"])[0])
         seen["instances"] = seen["things"].to(torch.uint8)
-        seen["cast"] = torch.zeros(1, ROWS, 4)
+        seen["objects"] = torch.zeros(1, ROWS, 4)
         there = [5.0, x + 1.5 * math.cos(heading), y + 1.5 * math.sin(heading), z - 0.5]
-        seen["cast"][0, 0] = torch.tensor(there)
+        seen["objects"][0, 0] = torch.tensor(there)
         return {name: seen[name] for name in channels}
 
 
@@ -83,7 +84,7 @@ def peopled(tmp_path_factory):
     """A world learned of the same, and its recording."""
     folder, world = tmp_path_factory.mktemp("peopled"), Peopled()
     record(world, Explorer(world.spec), folder / "set", 300, make_rng(0), max_episode_steps=80)
-    train_video(folder / "set", folder / "run", replace(CONFIG, cast_steps=20), lambda *told: None)
+    train_video(folder / "set", folder / "run", replace(CONFIG, objects_steps=20), lambda *told: None)
     return load_world(folder / "run" / "world"), folder
 
 
@@ -110,7 +111,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
         world = load_world(tmp_path / "world", memory=memory)
         assert isinstance(world, VideoWorld) and (world.starts.depth == 0).any(), "what moves is in no keyframe"
         assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
-        assert "observes" in check_world(world) and world.spec.heeds == ("things", "health")
+        assert "observes" in check_world(world) and world.spec.may_observe == ("things", "health")
     state = world.start(2, make_rng(0))
     assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
     still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
@@ -119,21 +120,23 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
 
 def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     world, _ = peopled
-    assert world.config.cast and world.cast is not None and world.spec.card["cast_looks"] >= 1
-    assert "observes" in check_world(world) and world.spec.heeds == ("things", "instances", "cast", "health")
+    assert world.config.objects and world.objects is not None and world.spec.card["cast_looks"] >= 1
+    assert "observes" in check_world(world) and world.spec.may_observe == ("things", "instances", "objects", "health")
     state = world.start(2, make_rng(0))
-    assert (state["cards"][:, 0, NUMBER] == 1).all() and (state["cards"][:, 0, LOOK] != NONE).all()
-    seen = world.render(state, ("cast", "instances", "things"))
+    assert (state["billboards"][:, 0, NUMBER] == 1).all() and (state["billboards"][:, 0, LOOK] != NONE).all()
+    seen = world.render(state, ("objects", "instances", "things"))
     assert (seen["instances"] == 1).any((1, 2)).all() and (seen["things"] | (seen["instances"] == 0)).all()
-    assert torch.equal(seen["cast"][:, 0], state["cards"][:, 0, :4]) and (seen["instances"] <= 1).all()
+    assert torch.equal(seen["objects"][:, 0], state["billboards"][:, 0, :4]) and (seen["instances"] <= 1).all()
     save_world(world, tmp_path / "again", dict(world.spec.card))
     again = load_world(tmp_path / "again")
-    kept, read = world.cast.state_dict(), again.cast.state_dict()
-    assert again.cast.config == world.cast.config and all(torch.equal(kept[name], read[name]) for name in kept)
-    cards = [one.imagine(one.start(2, make_rng(1)), torch.zeros(2, 6), make_rng(1))["cards"] for one in (world, again)]
+    kept, read = world.objects.state_dict(), again.objects.state_dict()
+    assert again.objects.config == world.objects.config and all(torch.equal(kept[name], read[name]) for name in kept)
+    cards = [
+        one.imagine(one.start(2, make_rng(1)), torch.zeros(2, 6), make_rng(1))["billboards"] for one in (world, again)
+    ]
     assert torch.equal(*cards)
     bare = world.without_memory()
-    assert bare.cast is world.cast
+    assert bare.objects is world.objects
 
 
 def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
@@ -142,10 +145,10 @@ def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
         folder / "run" / "world", folder / "set", tmp_path / "new", ThingsConfig(5, seed=1), lambda *told: None
     )
     new = load_world(told["world"])
-    assert torch.equal(new.memory.rgb, world.memory.rgb) and new.spec.heeds == world.spec.heeds
+    assert torch.equal(new.memory.rgb, world.memory.rgb) and new.spec.may_observe == world.spec.may_observe
     assert torch.equal(new.generator.enter.weight, world.generator.enter.weight)
-    assert not torch.equal(new.cast.goes.weight, world.cast.goes.weight) and told["cast_steps"] == 5
-    assert torch.equal(new.cast.begun[..., NUMBER], world.cast.begun[..., NUMBER])
+    assert not torch.equal(new.objects.goes.weight, world.objects.goes.weight) and told["objects_steps"] == 5
+    assert torch.equal(new.objects.begun[..., NUMBER], world.objects.begun[..., NUMBER])
 
 
 def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(peopled, recording, tmp_path):
@@ -160,24 +163,24 @@ def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refuse
 def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
     world, rng = peopled[0], make_rng(0)
     state = world.start(1, rng)
-    seen = world.render(state, ("rgb", "depth", "pose", "things", "instances", "cast"))
-    told = seen["cast"].clone()
+    seen = world.render(state, ("rgb", "depth", "pose", "things", "instances", "objects"))
+    told = seen["objects"].clone()
     told[0, 0, 0] = 77.0
-    after = world.observe({**seen, "cast": told}, state, rng)
-    assert after["cards"][0, :, NUMBER].tolist()[:2] == [77.0, 1.0]  # the one not told of waits
+    after = world.observe({**seen, "objects": told}, state, rng)
+    assert after["billboards"][0, :, NUMBER].tolist()[:2] == [77.0, 1.0]  # the one not told of waits
     dreamt = world.imagine(state, torch.zeros(1, 6), rng)
-    again = world.observe(seen, dreamt, rng)["cards"][0, 0]  # a step after `state`, whatever was dreamt in between
-    assert again[RESTED] == min(24, state["cards"][0, 0, RESTED] + 1) and not again[GOING].any()
+    again = world.observe(seen, dreamt, rng)["billboards"][0, 0]  # a step after `state`, whatever was dreamt in between
+    assert again[RESTED] == min(24, state["billboards"][0, 0, RESTED] + 1) and not again[GOING].any()
     stray = {**seen, "instances": torch.where(seen["instances"] == 0, 200, seen["instances"])}
     assert (world.observe(stray, state, rng)["instances"] <= 1).all()
     blank = world.observe({name: seen[name] for name in ("rgb", "depth", "pose")}, state, rng)
-    assert not blank["cards"].any() and not blank["instances"].any()
+    assert not blank["billboards"].any() and not blank["instances"].any()
     for bad in (
-        {"cast": told[:, :3]},
-        {"cast": told[..., :3]},
+        {"objects": told[:, :3]},
+        {"objects": told[..., :3]},
         {"instances": seen["instances"][0]},
         {"instances": seen["instances"].float()},
-        {"cast": told * torch.nan},
+        {"objects": told * torch.nan},
     ):
         with pytest.raises(ObservationError, match="cast is"):
             world.observe({**seen, **bad}, state, rng)
@@ -186,7 +189,7 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
 def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled, monkeypatch):
     world, folder = peopled
     cache = ClipCache.open(folder / "set", CONFIG.size)
-    marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "cast"))
+    marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "objects"))
     assert (
         marks.dtype == np.uint8
         and marks.shape[1:] == DEPTH

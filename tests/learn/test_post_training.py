@@ -13,9 +13,10 @@ from safetensors.torch import load_file
 from tests.data.corridor import Corridor
 from tests.learn.test_moving import Haunted
 
+from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.data import Explorer, Layout, Recorder, record
+from terrella.data import Layout, Recorder, record
 from terrella.learn.distil import DistilConfig, Matching, distil, drawn
 from terrella.learn.post_training import beside
 from terrella.learn.self_forcing import Dreams, DreamsConfig, beginnings, train_dreams
@@ -32,8 +33,8 @@ TEACHER = TrainConfig(
     flow_steps=4,
     steps=3,
     batch=2,
-    eye_steps=0,
-    doubt_frames=0,
+    estimator_steps=0,
+    uncertainty_frames=0,
     outcome_steps=2,
 )
 PLACES = replace(TEACHER, geometry=True, flow_steps=1, motion_steps=5, keyframes=6, critic_from=9)

@@ -11,22 +11,30 @@ import torch
 from tests.data.corridor import Corridor
 from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 
+from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.data import ClipCache, Dataset, Explorer, Layout, Recorder, record, split
-from terrella.learn.doubt import DoubtTraining, Dreamt, answers, calibrate, dreams, fit, pooled
-from terrella.learn.eye import EyeTraining, learn_eye, recoloured, recording_of, relative, train_eye
+from terrella.data import ClipCache, Dataset, Layout, Recorder, record, split
+from terrella.learn.estimator import EstimatorTraining, learn_estimator, recoloured, recording_of, relative, train_eye
 from terrella.learn.samples import Recording
 from terrella.learn.senses import SensesConfig, train_senses
 from terrella.learn.train_video import TrainConfig, train_video
+from terrella.learn.uncertainty import DoubtTraining, Dreamt, answers, calibrate, dreams, fit, pooled
 from terrella.space.camera import planar_pose
-from terrella.space.eye import load_eye
-from terrella.worlds.doubt import CLUES, KNOTS, SITUATION
+from terrella.space.estimator import load_estimator
 from terrella.worlds.folder import load_world
+from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
 from terrella.worlds.video import VideoWorld
 
 BARE = TrainConfig(
-    size=(24, 32), steps=2, batch=2, motion_steps=20, keyframes=8, strip_every_s=1e9, eye_steps=0, doubt_frames=0
+    size=(24, 32),
+    steps=2,
+    batch=2,
+    motion_steps=20,
+    keyframes=8,
+    strip_every_s=1e9,
+    estimator_steps=0,
+    uncertainty_frames=0,
 )
 
 
@@ -59,16 +67,16 @@ def test_an_eye_learns():
     room = Recording(SimpleNamespace(**parts), np.zeros(70, np.int64), np.ones(70, bool))  # pyright: ignore
     off = []
     for steps in (1, 60):
-        eye = learn_eye(room, EyeTraining(steps=steps, batch=6), quiet)
-        off.append(float((eye.depth(room.rgb(np.arange(70))).log() - depth.log()).abs().mean()))
-        assert eye.config.near_m < depth.min() and eye.config.far_m > 0.9 * depth.max()
+        estimator = learn_estimator(room, EstimatorTraining(steps=steps, batch=6), quiet)
+        off.append(float((estimator.depth(room.rgb(np.arange(70))).log() - depth.log()).abs().mean()))
+        assert estimator.config.near_m < depth.min() and estimator.config.far_m > 0.9 * depth.max()
     assert off[1] < 0.8 * off[0], off
 
 
 def test_the_same_seed_gives_the_same_eye(recording, tmp_path):
-    config = EyeTraining((16, 32), 2, 2)
+    config = EstimatorTraining((16, 32), 2, 2)
     facts = [train_eye(recording, tmp_path / name, config, quiet) for name in ("a", "b")]
-    eyes = [load_eye(tmp_path / name / "eye.safetensors").state_dict() for name in ("a", "b")]
+    eyes = [load_estimator(tmp_path / name / "eye.safetensors").state_dict() for name in ("a", "b")]
     assert all(torch.equal(eyes[0][name], eyes[1][name]) for name in eyes[0])
     assert facts[0]["recorded"] == facts[1]["recorded"]
 
@@ -96,7 +104,7 @@ def test_a_recording_without_poses_is_refused(tmp_path):
         for step in range(60):
             recorder.add({"rgb": np.full((24, 32, 3), step, np.uint8)}, np.array([step % 2]), 0.0, False)
     with pytest.raises(DatasetError, match="lacks"):
-        train_eye(tmp_path / "set", tmp_path / "out", EyeTraining(steps=2), quiet)
+        train_eye(tmp_path / "set", tmp_path / "out", EstimatorTraining(steps=2), quiet)
 
 
 @pytest.fixture(scope="module")
@@ -177,21 +185,21 @@ def made_up(count: int, seed: int) -> Dreamt:
 
 
 def test_a_doubt_learns_the_error_to_expect():
-    doubt = fit(made_up(600, 0), DoubtTraining(steps=150), quiet)
-    calibrate(doubt, made_up(400, 1))
+    uncertainty = fit(made_up(600, 0), DoubtTraining(steps=150), quiet)
+    calibrate(uncertainty, made_up(400, 1))
     others = made_up(400, 2)
-    expected = answers(doubt, others)
+    expected = answers(uncertainty, others)
     truth = 0.01 + 0.2 * others.situation[:, 0] ** 2
     assert float((expected - truth).abs().mean()) < 0.012
-    assert float(doubt.sure) < float(doubt.invents)
-    assert torch.equal(doubt.meant, doubt.meant.sort().values) and len(doubt.meant) == KNOTS
+    assert float(uncertainty.sure) < float(uncertainty.invents)
+    assert torch.equal(uncertainty.meant, uncertainty.meant.sort().values) and len(uncertainty.meant) == KNOTS
 
 
 def test_calibration_never_turns_the_order():
-    doubt = fit(made_up(64, 0), DoubtTraining(steps=2), quiet)
-    calibrate(doubt, made_up(64, 1))
+    uncertainty = fit(made_up(64, 0), DoubtTraining(steps=2), quiet)
+    calibrate(uncertainty, made_up(64, 1))
     answer = torch.linspace(0, 2, 500)
-    meant = doubt.calibrated(answer)
+    meant = uncertainty.calibrated(answer)
     assert (meant.diff() >= 0).all() and 0 <= meant.min() and meant.max() <= 1
 
 
@@ -201,7 +209,7 @@ def test_neighbours_that_fall_are_pooled():
 
 
 def test_a_finished_run_is_not_taught_again(recording, tmp_path, monkeypatch):
-    config = replace(BARE, eye_steps=2, doubt_frames=60)
+    config = replace(BARE, estimator_steps=2, uncertainty_frames=60)
     train_video(recording, tmp_path, config, quiet)
     from terrella.learn import train_video as module
 
@@ -210,4 +218,4 @@ def test_a_finished_run_is_not_taught_again(recording, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "learn_senses", fail)
     facts = train_video(recording, tmp_path, config, quiet)
-    assert "uncertainty" in facts and load_world(tmp_path / "world").doubt is not None
+    assert "uncertainty" in facts and load_world(tmp_path / "world").uncertainty is not None

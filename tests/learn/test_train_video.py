@@ -13,19 +13,20 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from tests.data.corridor import Corridor
 
+from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
-from terrella.data import ClipCache, Dataset, Explorer, Layout, Recorder, record
+from terrella.data import ClipCache, Dataset, Layout, Recorder, record
 from terrella.learn.lessons import varied
 from terrella.learn.samples import Lesson, choose_keyframes, usable_rows
 from terrella.learn.train_video import TrainConfig, train_video
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import mood
+from terrella.worlds.generator import context_thumbnail
 
 CONFIG = TrainConfig(
-    size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, eye_steps=0,
-    doubt_frames=0,
+    size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, estimator_steps=0,
+    uncertainty_frames=0,
 )  # fmt: skip
 
 
@@ -44,7 +45,7 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    return out, train_video(recording, out, replace(CONFIG, eye_steps=4, doubt_frames=60), quiet)
+    return out, train_video(recording, out, replace(CONFIG, estimator_steps=4, uncertainty_frames=60), quiet)
 
 
 def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
@@ -52,7 +53,9 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
     assert facts["step"] == 4
     for memory in (True, False):
         world = load_world(out / "world", memory=memory)
-        assert (len(world.memory) > 0) == memory and world.eye is not None and "uncertainty" in world.spec.channels
+        assert (
+            (len(world.memory) > 0) == memory and world.estimator is not None and "uncertainty" in world.spec.channels
+        )
         assert "observes" in check_world(world)
     assert list(out.glob("strip-*.png"))
 
@@ -230,9 +233,9 @@ def test_a_varied_lesson_is_the_same_lesson_in_another_world():
     pixels = (truth[:, :3] * 255).to(torch.uint8)
     changed = set()
     for seed in range(12):
-        lesson = varied(Lesson(glimpse, truth, mood(pixels), truth), np.random.default_rng(seed))
+        lesson = varied(Lesson(glimpse, truth, context_thumbnail(pixels), truth), np.random.default_rng(seed))
         assert torch.equal(lesson.glimpse.rgb[:, 0], lesson.truth[:, :3]) and torch.equal(lesson.last, lesson.truth)
         assert torch.equal(lesson.glimpse.depth, lesson.truth[:, 3])
-        assert torch.allclose(mood((lesson.truth[:, :3] * 255).to(torch.uint8)), lesson.told, atol=1e-5)
+        assert torch.allclose(context_thumbnail((lesson.truth[:, :3] * 255).to(torch.uint8)), lesson.told, atol=1e-5)
         changed.add(not torch.equal(lesson.truth, truth))
     assert changed == {True, False}

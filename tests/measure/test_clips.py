@@ -118,7 +118,7 @@ def test_what_a_world_heeds_is_shown_to_it_where_it_was_recorded():
     cache.further = {"health": np.arange(count, dtype=np.float32)[:, None], "things": things, "ammo": np.zeros(count)}
     clips = clips_from_cache(cache, range(4), 2, 10, 3, make_rng(0))
     channels = {"health": spaces.Box(-np.inf, np.inf, (), np.float32), "things": spaces.Box(0, 1, (6, 8), np.bool_)}
-    heeding = replace(spec, channels={**spec.channels, **channels}, heeds=("health", "things"))
+    heeding = replace(spec, channels={**spec.channels, **channels}, may_observe=("health", "things"))
     seen = evidence(clips, heeding, 1)
     assert seen["health"].tolist() == [clip.start + 1 for clip in clips] and "ammo" not in seen
     assert seen["things"].dtype == torch.bool and seen["things"].nonzero().tolist() == [[k, 2, 3] for k in range(3)]

@@ -23,7 +23,7 @@ class Game:
     def __init__(self, blind: bool = False):
         self.blind = blind
         channels = {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8), "reward": REWARD, "done": DONE, "health": HEALTH}
-        self.spec = Spec("game", spaces.MultiBinary(1), channels, ("rgb",), 0.1, heeds=("health",))
+        self.spec = Spec("game", spaces.MultiBinary(1), channels, ("rgb",), 0.1, may_observe=("health",))
 
     def start(self, batch, rng) -> State:
         return State({"health": torch.full((batch,), 9.0), "reward": torch.zeros(batch)})

@@ -185,7 +185,7 @@ def test_a_dream_is_told_what_it_heeds():
             return super().observe(observation, prior, rng)
 
     dream = Heeding()
-    object.__setattr__(dream.spec, "heeds", ("reward", "sonar"))
+    object.__setattr__(dream.spec, "may_observe", ("reward", "sonar"))
     Story([Panorama(), dream], seed=5)
     assert told == [{"pose", "reward"}], "and not of what the game does not show"
 

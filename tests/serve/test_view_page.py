@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from terrella.data.browse import Browse
 from terrella.data.source import Lazy, Readings, Source, Take
+from terrella.exchange.browse import Browse
 
 from . import rig
 from .test_page import until

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from terrella.core.errors import DatasetError
-from terrella.data.browse import Browse
 from terrella.data.source import Lazy, Readings, Source, Take
+from terrella.exchange.browse import Browse
 from terrella.serve import readings
 
 from . import rig

@@ -64,16 +64,16 @@ def test_what_moves_is_told_apart_by_number_and_place():
     game, rng = Doom(DoomConfig(scenario="defend_the_line")), make_rng(0)
     state, before, met, kept = game.start(1, rng), {}, 0, 0
     for _ in range(60):
-        seen = game.render(state, ("cast", "instances", "things", "pose"))
-        rows = (seen["cast"][0, :, 0] > 0).nonzero()[:, 0].tolist()
+        seen = game.render(state, ("objects", "instances", "things", "pose"))
+        rows = (seen["objects"][0, :, 0] > 0).nonzero()[:, 0].tolist()
         assert rows == list(range(len(rows))) and not (seen["instances"].bool() & ~seen["things"]).any()
-        where, _ = project(seen["cast"][:, :, 1:], seen["pose"], CAMERA)
+        where, _ = project(seen["objects"][:, :, 1:], seen["pose"], CAMERA)
         for row in rows:
             columns = (seen["instances"][0] == row + 1).any(0).nonzero()[:, 0].float()
             if len(columns) > 2 and 5 < columns.min() and columns.max() < 122:
                 assert abs(float(where[0, row, 0]) * 128 - float(columns.mean()) - 0.5) < max(3, len(columns) / 2)
                 met += 1
-        now = {float(card[0]): card[1:] for card in seen["cast"][0][: len(rows)]}
+        now = {float(card[0]): card[1:] for card in seen["objects"][0][: len(rows)]}
         for number in now.keys() & before.keys():
             assert (now[number] - before[number]).norm() < 1.0
             kept += 1

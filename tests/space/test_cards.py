@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 
 from terrella.core import make_rng
+from terrella.space.billboards import BEHIND_M, PICTURE, cut_out, painted
 from terrella.space.camera import planar_pose, project
-from terrella.space.cards import BEHIND_M, PICTURE, cut_out, painted
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 BOX = torch.tensor([0.4, 0.4, 0.0, 1.6])  # 0.8 m wide, 1.6 m tall, on its feet

@@ -10,7 +10,7 @@ import torch
 from terrella.core import make_rng
 from terrella.core.errors import CheckpointError
 from terrella.space.camera import yaw
-from terrella.space.eye import Eye, EyeConfig, load_eye, normalised, save_eye
+from terrella.space.estimator import Estimator, EstimatorConfig, load_estimator, normalised, save_estimator
 from terrella.space.keyframes import Keyframes
 from terrella.space.recognise import recognise, thumbnails
 
@@ -18,9 +18,9 @@ from .rooms import CAMERA, painted, pose_at, room_depth
 
 
 @pytest.fixture
-def eye():
+def estimator():
     torch.manual_seed(0)
-    return Eye(EyeConfig((48, 64), near_m=0.3, far_m=20.0)).eval().requires_grad_(False)
+    return Estimator(EstimatorConfig((48, 64), near_m=0.3, far_m=20.0)).eval().requires_grad_(False)
 
 
 def pictures(count: int, height: int = 48, width: int = 64, seed: int = 0) -> torch.Tensor:
@@ -28,71 +28,71 @@ def pictures(count: int, height: int = 48, width: int = 64, seed: int = 0) -> to
 
 
 @pytest.mark.parametrize("shape", [(48, 64), (96, 128), (30, 70), (5, 4)])
-def test_pictures_of_any_size_are_answered_at_their_own(eye, shape):
+def test_pictures_of_any_size_are_answered_at_their_own(estimator, shape):
     rgb = pictures(2, *shape)
-    depth = eye.depth(rgb)
+    depth = estimator.depth(rgb)
     assert depth.shape == (2, *shape) and depth.dtype == torch.float32
-    assert eye.motion(rgb, rgb).shape == (2, 3) and eye.strangeness(rgb).shape == (2,)
+    assert estimator.motion(rgb, rgb).shape == (2, 3) and estimator.strangeness(rgb).shape == (2,)
 
 
 @pytest.mark.parametrize("value", [0, 255])
-def test_depth_stays_within_the_range_of_the_recordings_whatever_is_shown(eye, value):
+def test_depth_stays_within_the_range_of_the_recordings_whatever_is_shown(estimator, value):
     with torch.no_grad():
         for bias in (-1000.0, 1000.0):
-            eye.leave.bias.fill_(bias)
-            depth = eye.depth(torch.full((1, 3, 48, 64), value, dtype=torch.uint8))
+            estimator.leave.bias.fill_(bias)
+            depth = estimator.depth(torch.full((1, 3, 48, 64), value, dtype=torch.uint8))
             assert torch.isfinite(depth).all() and depth.min() >= 0.3 and depth.max() <= 20.0
 
 
-def test_exposure_and_white_balance_change_nothing(eye):
+def test_exposure_and_white_balance_change_nothing(estimator):
     rgb = pictures(1).float() / 255
     plain = normalised(rgb)
     tinted = normalised(rgb * torch.tensor([0.9, 0.5, 0.7])[:, None, None] + 0.05)
     assert torch.allclose(plain, tinted, atol=0.12)
 
 
-def test_a_depth_that_is_known_is_taken(eye):
+def test_a_depth_that_is_known_is_taken(estimator):
     first, second = pictures(1), pictures(1, seed=1)
-    seen = eye.motion(first, second)
-    assert torch.allclose(eye.motion(first, second, eye.depth(first)), seen, atol=1e-3)
+    seen = estimator.motion(first, second)
+    assert torch.allclose(estimator.motion(first, second, estimator.depth(first)), seen, atol=1e-3)
 
 
-def test_motion_is_that_between_two_views_of_a_room(eye):
+def test_motion_is_that_between_two_views_of_a_room(estimator):
     before, after = pose_at(0.0, 0.0, 0.5), pose_at(0.15, 0.08, 0.53)
-    eye.pace.copy_(torch.tensor([0.2, 0.1, 0.08]))
+    estimator.pace.copy_(torch.tensor([0.2, 0.1, 0.08]))
     pictures = [painted(pose, room_depth(pose, (96, 128))) for pose in (before, after)]
-    found = eye.motion(*pictures, room_depth(before, (96, 128)))
+    found = estimator.motion(*pictures, room_depth(before, (96, 128)))
     assert torch.allclose(found[0], torch.tensor([0.170, -0.002, 0.03]), atol=0.02), found
 
 
-def test_what_is_usual_is_learned(eye):
+def test_what_is_usual_is_learned(estimator):
     grey = (128 + 10 * torch.randn(300, 3, 48, 64, generator=make_rng(0))).clamp(0, 255).to(torch.uint8)
-    eye.learn_usual(eye.looks(grey))
-    strange = eye.strangeness(grey)
+    estimator.learn_usual(estimator.looks(grey))
+    strange = estimator.strangeness(grey)
     assert float((strange < 1).float().mean()) == pytest.approx(0.99, abs=0.01)
-    assert float(eye.strangeness(pictures(1))) > 1.5
+    assert float(estimator.strangeness(pictures(1))) > 1.5
 
 
-def test_an_eye_is_kept_in_half_precision_and_comes_back(eye, tmp_path):
-    eye.learn_usual(eye.looks(pictures(40)))
-    save_eye(eye, tmp_path / "eye.safetensors")
-    again = load_eye(tmp_path / "eye.safetensors")
+def test_an_eye_is_kept_in_half_precision_and_comes_back(estimator, tmp_path):
+    estimator.learn_usual(estimator.looks(pictures(40)))
+    save_estimator(estimator, tmp_path / "eye.safetensors")
+    again = load_estimator(tmp_path / "eye.safetensors")
     rgb = pictures(1)
-    assert again.config == eye.config
-    assert torch.allclose(again.depth(rgb).log(), eye.depth(rgb).log(), atol=0.02)
-    assert torch.allclose(again.strangeness(rgb), eye.strangeness(rgb), rtol=0.02)
+    assert again.config == estimator.config
+    assert torch.allclose(again.depth(rgb).log(), estimator.depth(rgb).log(), atol=0.02)
+    assert torch.allclose(again.strangeness(rgb), estimator.strangeness(rgb), rtol=0.02)
 
 
 def test_what_is_no_eye_is_refused(tmp_path):
     (tmp_path / "a.safetensors").write_bytes(b"nothing")
     for name in ("a.safetensors", "missing.safetensors"):
         with pytest.raises(CheckpointError, match="no eye"):
-            load_eye(tmp_path / name)
+            load_estimator(tmp_path / name)
     from terrella.core import State
 
     State({"a": torch.ones(1)}).save(tmp_path / "state.safetensors")
     with pytest.raises(CheckpointError, match="no eye"):
-        load_eye(tmp_path / "state.safetensors")
+        load_estimator(tmp_path / "state.safetensors")
 
 
 @pytest.fixture(scope="module")

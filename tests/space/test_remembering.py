@@ -187,9 +187,9 @@ def test_memory_is_part_of_the_state(tmp_path):
 
 
 def test_an_eye_gives_pose_and_depth_to_a_world_that_has_none():
-    eye = Told()
-    eye.moves = [(0.0, 0.0, turn) for turn in [TURN] * 15 + [-TURN] * 15]
-    world = Remembering(Fickle(channels=()), eye=eye)
+    estimator = Told()
+    estimator.moves = [(0.0, 0.0, turn) for turn in [TURN] * 15 + [-TURN] * 15]
+    world = Remembering(Fickle(channels=()), estimator=estimator)
     assert {"pose", "depth"} <= set(world.spec.channels)
     first, far, last = there_and_back(world)
     assert likeness(last, first) > 33 and likeness(far, first) < 20
@@ -248,7 +248,7 @@ def test_the_bundled_world_remembers_by_itself():
     world = terrella.load("doom-maze", remember=True, memory_mb=2)
     assert isinstance(world, VideoWorld) and world.own.nbytes <= 2 * 2**20
     with pytest.raises(TerrellaError, match="There is no world"):
-        terrella.load("doom-maze", eye="no such file")
+        terrella.load("doom-maze", estimator="no such file")
 
 
 def test_the_budget_reaches_the_memory_around_a_world(monkeypatch):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 
 from terrella.core import make_rng
+from terrella.space.billboards import PICTURE, cut_out
 from terrella.space.camera import planar_pose
-from terrella.space.cards import PICTURE, cut_out
 from terrella.space.floorplan import slide
-from terrella.worlds.cast import (
+from terrella.worlds.objects import (
     AGE,
     BEFORE,
     GOING,
@@ -18,8 +18,8 @@ from terrella.worlds.cast import (
     NUMBER,
     PLACE,
     RESTED,
-    Cast,
-    CastConfig,
+    Objects,
+    ObjectsConfig,
     fresh,
     likest,
     noted,
@@ -29,118 +29,118 @@ CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 RED, BLUE = 0, 1
 
 
-def eye(heading: float = 0.0) -> torch.Tensor:
+def estimator(heading: float = 0.0) -> torch.Tensor:
     one = torch.ones(1)
     return planar_pose(0 * one, 0 * one, one, heading * one)
 
 
-def cast_of_two() -> Cast:
+def cast_of_two() -> Objects:
     """A tall red look and a flat blue one; its network is as it was born."""
     torch.manual_seed(0)
-    cast = Cast(CastConfig(actions=3, history=2, looks=4, moves=3, rows=4, starts=1)).eval()
-    cast.boxes[:] = 1e3
+    objects = Objects(ObjectsConfig(actions=3, history=2, looks=4, moves=3, rows=4, starts=1)).eval()
+    objects.boxes[:] = 1e3
     for look, (colour, box) in enumerate([((200, 0, 0), (0.4, 0.4, 0, 1.6)), ((0, 0, 200), (0.8, 0.8, 0, 0.4))]):
-        cast.pictures[look] = torch.tensor([*colour, 255], dtype=torch.uint8)[:, None, None].expand(4, *PICTURE)
-        cast.boxes[look] = torch.tensor(box)
-    cast.moves[1] = torch.tensor([0.25, 0.0, 0.0])
-    return cast
+        objects.pictures[look] = torch.tensor([*colour, 255], dtype=torch.uint8)[:, None, None].expand(4, *PICTURE)
+        objects.boxes[look] = torch.tensor(box)
+    objects.moves[1] = torch.tensor([0.25, 0.0, 0.0])
+    return objects
 
 
-def sure(cast: Cast, look: int, move: int, gone: bool = False) -> Cast:
+def sure(objects: Objects, look: int, move: int, gone: bool = False) -> Objects:
     """The same, which always tells one thing."""
-    for head, wanted in ((cast.next_look, look), (cast.next_move, move), (cast.goes, None)):
+    for head, wanted in ((objects.next_look, look), (objects.next_move, move), (objects.goes, None)):
         head.weight.data.zero_()
         head.bias.data.fill_(-50.0)
         if wanted is not None:
             head.bias.data[wanted] = 50.0
-    cast.goes.bias.data.fill_(50.0 if gone else -50.0)
-    return cast
+    objects.goes.bias.data.fill_(50.0 if gone else -50.0)
+    return objects
 
 
-def cards(cast: Cast, *places: tuple[float, float, float]) -> torch.Tensor:
-    whole = cast.empty(1)
+def cards(objects: Objects, *places: tuple[float, float, float]) -> torch.Tensor:
+    whole = objects.empty(1)
     for row, place in enumerate(places):
         whole[0, row] = fresh(row + 1, torch.tensor(place), RED)
     return whole
 
 
-def step(cast: Cast, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
-    return cast.step(before, torch.tensor([seen]), eye(), torch.zeros(1, 2, 3), make_rng(0))
+def step(objects: Objects, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
+    return objects.step(before, torch.tensor([seen]), estimator(), torch.zeros(1, 2, 3), make_rng(0))
 
 
 def test_a_card_does_what_is_told_of_it_and_its_ages_go_on():
-    cast = sure(cast_of_two(), BLUE, 1)
-    one = step(cast, cards(cast, (4.0, 0.0, 0.0)))
+    objects = sure(cast_of_two(), BLUE, 1)
+    one = step(objects, cards(objects, (4.0, 0.0, 0.0)))
     assert one[0, 0, LOOK] == BLUE and one[0, 0, BEFORE] == RED and one[0, 0, AGE] == 0 and one[0, 0, RESTED] == 0
     assert one[0, 0, PLACE].tolist() == [4.25, 0.0, 0.0] and one[0, 0, GOING].tolist() == [0.25, 0.0]
-    two = step(cast, one)
+    two = step(objects, one)
     assert two[0, 0, AGE] == 1 and two[0, 0, BEFORE] == RED and two[0, 0, PLACE][0] == 4.5
     assert (two[0, 1:, NUMBER] == 0).all()
 
 
 def test_what_is_out_of_sight_waits_and_what_is_gone_is_gone():
-    cast = sure(cast_of_two(), BLUE, 1, gone=True)
-    there = cards(cast, (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
-    after = step(cast, there, (True, False, True, True))
+    objects = sure(cast_of_two(), BLUE, 1, gone=True)
+    there = cards(objects, (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+    after = step(objects, there, (True, False, True, True))
     assert after[0, :, NUMBER].tolist() == [0, 2, 0, 0] and torch.equal(after[0, 1], there[0, 1])
 
 
 def test_by_chance_as_often_as_told():
-    cast = sure(cast_of_two(), BLUE, 0)
-    cast.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
-    many, rng = cards(cast, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
+    objects = sure(cast_of_two(), BLUE, 0)
+    objects.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
+    many, rng = cards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
     seen = torch.ones(800, 4, dtype=torch.bool)
-    looks = cast.step(many, seen, eye().expand(800, 7), torch.zeros(800, 2, 3), rng)[:, 0, LOOK]
+    looks = objects.step(many, seen, estimator().expand(800, 7), torch.zeros(800, 2, 3), rng)[:, 0, LOOK]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = cast.step(many, seen, eye().expand(800, 7), torch.zeros(800, 2, 3), make_rng(1))[:, 0, LOOK]
+    again = objects.step(many, seen, estimator().expand(800, 7), torch.zeros(800, 2, 3), make_rng(1))[:, 0, LOOK]
     assert torch.equal(looks, again)
 
 
-def shown(cast: Cast, there: torch.Tensor):
+def shown(objects: Objects, there: torch.Tensor):
     """What evidence tells of a frame with these cards: its cut, and number and place of each."""
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    rgb, depth, instances = cast.paint(there, *behind, eye(), CAMERA)
+    rgb, depth, instances = objects.paint(there, *behind, estimator(), CAMERA)
     told = there[..., :4]
-    return cut_out((rgb * 255).to(torch.uint8), instances, depth, told[..., PLACE], eye(), CAMERA), told
+    return cut_out((rgb * 255).to(torch.uint8), instances, depth, told[..., PLACE], estimator(), CAMERA), told
 
 
 def test_what_was_painted_is_recognised_by_its_look_and_its_light():
-    cast = cast_of_two()
-    there = cards(cast, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
+    objects = cast_of_two()
+    there = cards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
     there[0, 1, LOOK], there[0, 0, LIGHT] = BLUE, 0.5
-    found = cast.recognised(*shown(cast, there), cast.empty(1))
+    found = objects.recognised(*shown(objects, there), objects.empty(1))
     assert torch.equal(found[..., :5], there[..., :5]) and (found[0, 2:] == 0).all()
     assert 0.35 < found[0, 0, LIGHT] < 0.6 and 0.7 < found[0, 1, LIGHT] < 1.1
 
 
 def test_a_card_keeps_its_own_past_and_what_is_not_told_of_waits():
-    cast = cast_of_two()
-    before = cards(cast, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
+    objects = cast_of_two()
+    before = cards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
     before[0, :2, NUMBER] = torch.tensor([7.0, 9.0])
-    now = cards(cast, (5.0, -1.25, 0.0))
+    now = cards(objects, (5.0, -1.25, 0.0))
     now[0, 0, NUMBER] = 9.0
-    found = cast.recognised(*shown(cast, now), before)
+    found = objects.recognised(*shown(objects, now), before)
     assert found[0, :, NUMBER].tolist() == [9, 7, 0, 0]
     assert found[0, 0, GOING].tolist() == [0.0, 0.25] and torch.equal(found[0, 1], before[0, 0])
 
 
 def test_who_stands_upright_stops_a_body_and_who_is_walked_through_does_not():
-    cast = cast_of_two()
-    cast.solid[RED] = 1.0
-    there = cards(cast, (2.0, 0.0, 0.0))
+    objects = cast_of_two()
+    objects.solid[RED] = 1.0
+    there = cards(objects, (2.0, 0.0, 0.0))
     place, wish = torch.zeros(1, 2), torch.tensor([[3.0, 0.0]])
-    moved, _ = slide(cast.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5), place, wish, 0.5)
+    moved, _ = slide(objects.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5), place, wish, 0.5)
     assert abs(float(moved[0, 0]) - 1.0) < 1e-3
-    assert not len(cast.bodies(there[0], torch.tensor([0.0, 0.0, 4.3]), 0.5))  # a floor below
+    assert not len(objects.bodies(there[0], torch.tensor([0.0, 0.0, 4.3]), 0.5))  # a floor below
     there[0, 0, LOOK] = BLUE
-    assert not len(cast.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5))
+    assert not len(objects.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5))
 
 
 def test_what_is_lit_more_than_its_picture_does_not_turn_dark():
-    cast = cast_of_two()
-    there = cards(cast, (4.0, 0.0, 0.0))
+    objects = cast_of_two()
+    there = cards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LIGHT] = 4.0
-    rgb, _, seen = cast.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), eye(), CAMERA)
+    rgb, _, seen = objects.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), estimator(), CAMERA)
     assert seen.any() and rgb.max() == 1.0
 
 
@@ -151,12 +151,12 @@ def test_a_look_lasts_unless_another_is_clearly_nearer():
 
 
 def test_a_look_that_is_not_known_is_not_painted():
-    cast = cast_of_two()
-    there = cards(cast, (4.0, 0.0, 0.0))
+    objects = cast_of_two()
+    there = cards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LOOK] = NONE
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    assert not cast.paint(there, *behind, eye(), CAMERA)[2].any()
-    assert torch.isfinite(step(cast, there)).all()
+    assert not objects.paint(there, *behind, estimator(), CAMERA)[2].any()
+    assert torch.isfinite(step(objects, there)).all()
 
 
 def test_ages_are_counted_to_a_limit():

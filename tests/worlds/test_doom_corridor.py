@@ -8,7 +8,7 @@ import torch
 import terrella
 from terrella.core import check_world, make_rng
 from terrella.space.camera import planar_pose
-from terrella.worlds.cast import LOOK, NUMBER, PLACE
+from terrella.worlds.objects import LOOK, NUMBER, PLACE
 from terrella.worlds.video import VideoWorld
 
 STORIES, STEPS, TALL_M, LOW_M = 48, 80, 1.2, 0.75
@@ -17,20 +17,20 @@ STORIES, STEPS, TALL_M, LOW_M = 48, 80, 1.2, 0.75
 @pytest.fixture(scope="module")
 def world() -> VideoWorld:
     found = terrella.load("doom-corridor")
-    assert isinstance(found, VideoWorld) and found.cast is not None
+    assert isinstance(found, VideoWorld) and found.objects is not None
     return found
 
 
 def heights(world: VideoWorld, cards: torch.Tensor) -> torch.Tensor:
     """How tall cards [..., COLUMNS] are, in metres; nan where there is none."""
     look = cards[..., LOOK].long()
-    return torch.where((cards[..., NUMBER] > 0) & (look >= 0), world.cast.boxes[look.clamp_min(0), 3], torch.nan)
+    return torch.where((cards[..., NUMBER] > 0) & (look >= 0), world.objects.boxes[look.clamp_min(0), 3], torch.nan)
 
 
 def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
-    assert "observes" in check_world(world) and {"cast", "instances", "health"} <= set(world.spec.channels)
+    assert "observes" in check_world(world) and {"objects", "instances", "health"} <= set(world.spec.channels)
     state = world.start(8, make_rng(0))
-    assert ((heights(world, state["cards"]) > TALL_M).sum(1) >= 2).all(), "two guards stand at the entrance"
+    assert ((heights(world, state["billboards"]) > TALL_M).sum(1) >= 2).all(), "two guards stand at the entrance"
     assert (state["instances"] > 0).flatten(1).any(1).float().mean() > 0.7
 
 
@@ -45,8 +45,8 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
     """Dreams of two seconds before each guard of the entrance: looking straight at it or 0.38 rad beside, with ATTACK held or
     not."""
     state = world.start(1, make_rng(0))
-    cast, pose = world.cast, state["pose"][0]
-    guards = state["cards"][0][heights(world, state["cards"][0]) > TALL_M]
+    objects, pose = world.objects, state["pose"][0]
+    guards = state["billboards"][0][heights(world, state["billboards"][0]) > TALL_M]
     guards = guards[(guards[:, PLACE] - pose[:3])[:, :2].norm(dim=1) < 6.0]
     assert len(guards) == 2
     for guard in guards:
@@ -54,13 +54,15 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
         fell = []
         for attack, beside in ((0.0, 0.0), (1.0, 0.0), (1.0, 0.38), (1.0, -0.38)):
             looks = planar_pose(*pose[:3, None], torch.atan2(apart[1], apart[0])[None] + beside).expand(STORIES, 7)
-            cards, rng = cast.empty(STORIES), make_rng(1)
+            cards, rng = objects.empty(STORIES), make_rng(1)
             cards[:, 0] = guard
             acts = torch.zeros(STORIES, world.config.history, 7)
             acts[..., world.spec.action_names.index("ATTACK")] = attack
             low = torch.zeros(STORIES, dtype=torch.bool)
             for _ in range(STEPS):
-                cards = cast.step(cards, torch.ones(STORIES, cast.config.rows, dtype=torch.bool), looks, acts, rng)
+                cards = objects.step(
+                    cards, torch.ones(STORIES, objects.config.rows, dtype=torch.bool), looks, acts, rng
+                )
                 low |= heights(world, cards[:, 0]) < LOW_M
             fell.append(float(low.float().mean()))
         assert fell[1] > max(fell[0], *fell[2:]) + 0.3, fell

@@ -37,7 +37,7 @@ STEERING = Controls(AXES, (-1.0, 0.0), (1.0, 4.0))
 @pytest.mark.parametrize("controls", [Controls.buttons(3), CHOICES, STEERING])
 def test_every_kind_of_action_keeps_the_contract(controls):
     world = made(controls, ("lives",))
-    assert "states_are_values" in check_world(world, steps=3) and world.spec.heeds == ("lives",)
+    assert "states_are_values" in check_world(world, steps=3) and world.spec.may_observe == ("lives",)
 
 
 def test_what_a_network_is_told_of_an_action():

@@ -75,7 +75,7 @@ def _app(given: Sequence[str]) -> SubcommandApp:
 
         training_commands = {
             "video": train.video,
-            "eye": train.eye,
+            "eye": train.estimator,
             "senses": train.senses,
             "things": train.things,
             "latent-actions": train.latent_actions,
@@ -178,10 +178,10 @@ def _record(
     json: bool,
     pictures: Literal["video", "png"] = "video",
 ) -> None:
+    from ..act.explorer import Explorer
     from ..core.errors import DatasetError
     from ..core.world import make_rng
     from ..data import Dataset, Layout, Recorder, record
-    from ..data.explore import Explorer
 
     layout = replace(Layout.of(world.spec), pictures=pictures)
     facts: dict[str, object] = {"dataset": str(out)}
@@ -214,7 +214,7 @@ def _watched(target: str | None, layout, name: str, facts: dict[str, object]):
     if target is None:
         yield None
         return
-    from ..data.live import Live
+    from ..exchange.live import Live
 
     with Live(target, {**layout.sensors, **layout.streams}, name) as live:
         where = f"ws://127.0.0.1:{live.port} (open it in Foxglove)" if live.port else target
@@ -244,7 +244,7 @@ def play(
     truth: str = "doom:my_way_home",
     memory: bool = True,
     remember: bool = False,
-    eye: str | None = None,
+    estimator: str | None = None,
     memory_mb: float | None = None,
     record: Path | None = None,
     port: Port = 8765,
@@ -272,7 +272,7 @@ def play(
     from ..core.errors import TerrellaError
     from ..serve import serve
 
-    learned = load_named(name, device, memory, fast, remember=remember, eye=eye, memory_mb=memory_mb)
+    learned = load_named(name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb)
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
     if compare and picture is not None:

@@ -26,8 +26,8 @@ def doctor(folder: Positional[Path], repair: bool = False, out: Path | None = No
         repair: Write a mended copy that keeps every whole row; the original is not touched.
         out: Where the mended copy goes; without it FOLDER-mended.
     """
-    from ..data import doctor as examine
-    from ..data import repair as mend
+    from ..care import doctor as examine
+    from ..care import repair as mend
 
     faults = examine(folder)
     facts: dict[str, object] = {
@@ -70,8 +70,8 @@ def convert(
         pictures: How LeRobot rows keep pictures: H.264 video, or PNG, which is exact and larger.
         episodes: Rollouts to draw from "gym:ID".
     """
-    from ..data.convert import open_source, write_source
-    from ..data.formats.lerobot import Rows
+    from ..exchange.convert import open_source, write_source
+    from ..exchange.formats.lerobot import Rows
 
     found = open_source(source, fps, episodes, seed)
     rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, None, pictures)
@@ -98,8 +98,8 @@ def merge(
             to be looked at, edited and given here.
         dry: Write the guessed mapping alone.
     """
-    from ..data.convert import open_source
-    from ..data.merging.merge import merge_into
+    from ..exchange.convert import open_source
+    from ..exchange.merging.merge import merge_into
 
     found = {path: open_source(path) for path in sources}
     with progress.shown("merging") as report:
@@ -123,11 +123,11 @@ def view(
         rerun: Hand it to Rerun instead, where that is installed.
         out: Folder to which the page exports the episodes that are not marked bad; without it FOLDER-good.
     """
-    from ..data.browse import browse
-    from ..data.convert import open_source
+    from ..exchange.browse import browse
+    from ..exchange.convert import open_source
 
     if rerun:
-        from ..data.formats import rerun as viewer
+        from ..exchange.formats import rerun as viewer
 
         viewer.show(open_source(folder))
         return

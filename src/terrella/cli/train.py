@@ -7,10 +7,10 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from .. import progress
-from ..learn.cast import ThingsConfig, train_things
 from ..learn.distil import DistilConfig, distil
-from ..learn.eye import EyeTraining, train_eye
+from ..learn.estimator import EstimatorTraining, train_eye
 from ..learn.latent_actions import LatentConfig, train_latent_actions
+from ..learn.objects import ThingsConfig, train_things
 from ..learn.self_forcing import DreamsConfig, train_dreams
 from ..learn.senses import SensesConfig, train_senses
 from ..learn.train_video import TrainConfig, train_video
@@ -20,7 +20,7 @@ from .say import Json, result
 
 VIDEO, EYE, SENSES, LATENT, DISTIL, DREAMS, THINGS = (
     TrainConfig(),
-    EyeTraining(),
+    EstimatorTraining(),
     SensesConfig(),
     LatentConfig(),
     DistilConfig(),
@@ -41,7 +41,7 @@ def video(data: Positional[Path], out: Path, config: TrainConfig = VIDEO, json: 
     result({"run": str(out), **(facts or {})}, json)
 
 
-def eye(data: Positional[Path], out: Path, config: EyeTraining = EYE, json: Json = False) -> None:
+def estimator(data: Positional[Path], out: Path, config: EstimatorTraining = EYE, json: Json = False) -> None:
     """Train an eye that sees depth in one picture, and motion between two, on any recording with depth and poses.
 
     Args:

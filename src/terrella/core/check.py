@@ -99,11 +99,11 @@ def _spec_is_sound(world: World, seed: int, steps: int) -> None:
         _require(
             fits, f"channel '{name}' must be {np.dtype(dtype)} with {axes} axes after the batch; its space is {space}."
         )
-    for what, names in (("observes", spec.observes), ("heeds", spec.heeds), ("units", spec.units)):
+    for what, names in (("observes", spec.observes), ("may_observe", spec.may_observe), ("units", spec.units)):
         strangers = sorted(set(names) - set(spec.channels))
         _require(not strangers, f"spec.{what} names {strangers}, which are not among spec.channels.")
-    twice = sorted(set(spec.observes) & set(spec.heeds))
-    _require(not twice, f"spec.heeds names {twice}, which spec.observes names already.")
+    twice = sorted(set(spec.observes) & set(spec.may_observe))
+    _require(not twice, f"spec.may_observe names {twice}, which spec.observes names already.")
     _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
     _require(
         spec.camera is None or (len(spec.camera) == 4 and min(spec.camera) > 0), "spec.camera is four positive numbers."
@@ -191,7 +191,7 @@ def _refuses_junk(world: World, seed: int, steps: int) -> None:
 
 def _observes(world: World, seed: int, steps: int) -> None:
     rng, channels = make_rng(seed), tuple(world.spec.channels)
-    for names in dict.fromkeys((world.spec.observes, (*world.spec.observes, *world.spec.heeds))):
+    for names in dict.fromkeys((world.spec.observes, (*world.spec.observes, *world.spec.may_observe))):
         state = world.start(1, rng)
         held = _copy(state)
         seen = _copy(world.render(state, names))

@@ -36,7 +36,7 @@ class Spec:
     action:       space of one action (no batch axis).
     channels:     what `render` can show, name -> space of one observation (no batch axis).
     observes:     the channels that `observe` needs as evidence.
-    heeds:        the channels that it takes beside them where they are at hand (what moves, how the player is).
+    may_observe:        the channels that it takes beside them where they are at hand (what moves, how the player is).
     dt_s:         seconds of world time that one `imagine` advances.
     units:        channel -> unit, for the channels that have one ("m", "reward").
     action_names: one name per button (MultiBinary), choice (Discrete) or axis (Box).
@@ -60,7 +60,7 @@ class Spec:
     forkable: bool = True
     max_batch: int | None = None
     card: Mapping[str, object] = field(default_factory=dict)
-    heeds: tuple[str, ...] = ()
+    may_observe: tuple[str, ...] = ()
 
     def check_channels(self, channels) -> None:
         """Raises ChannelError naming the channels that exist."""

@@ -29,7 +29,7 @@ class World(Protocol):
         ...
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
-        """Evidence into state: all that `spec.observes` names, and of what `spec.heeds` names whatever is at hand.
+        """Evidence into state: all that `spec.observes` names, and of what `spec.may_observe` names whatever is at hand.
         Filtering is `observe(obs, imagine(state, action, rng), rng)`."""
         ...
 

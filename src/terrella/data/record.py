@@ -16,7 +16,7 @@ from .format import Layout
 from .recorder import Recorder
 
 if TYPE_CHECKING:
-    from .live import Live
+    from ..exchange.live import Live
 
 # policy(observation, info, rng) -> action [1, *space.shape]; info = {"step": steps since the episode began}
 Policy = Callable[[Observation, Mapping[str, int], torch.Generator], torch.Tensor]

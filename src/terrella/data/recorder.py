@@ -38,7 +38,7 @@ from .storage.mp4 import Mp4Writer
 from .writer import Writer, fresh
 
 if TYPE_CHECKING:
-    from .live import Live
+    from ..exchange.live import Live
 
 _CHANNELS = {"rgb": RGB, "depth": DEPTH, "pose": STATE}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from ..core.errors import DatasetError
-from ..data import ClipCache, Dataset, Readings, Sensor, Source, Take, split, write_source
+from ..data import ClipCache, Dataset, Readings, Sensor, Source, Take, split
 from ..data.source import is_action
+from ..exchange import write_source
 from ..space.camera import yaw
 from .latent_actions import LatentModel, frames_at, load_latent, pair_rows, pictures
 from .updates import Report
@@ -81,7 +82,7 @@ def label(
 
 def _rows(dataset: Dataset):
     """Pictures as they were kept: exact ones stay exact."""
-    from ..data.formats.lerobot import Rows
+    from ..exchange.formats.lerobot import Rows
 
     exact = dataset.features[dataset.rgb_key or ""]["dtype"] == "image"
     return Rows(pictures="png" if exact else "video")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..space.keyframes import Glimpse, Keyframes
-from ..worlds.generator import MOOD, VideoConfig, decode_depth, encode_depth, mood
+from ..worlds.generator import THUMBNAIL, VideoConfig, context_thumbnail, decode_depth, encode_depth
 from ..worlds.history import past
 from .moving import moving_lesson
 from .samples import Dream, Lesson, Recording, carried, draw, glimpse_of
@@ -48,12 +48,12 @@ def place_lesson(
         glimpse, earlier = glimpse_of(shown, shown.before, recording, config), shown.before - 1
         known = recording.rgb(earlier), recording.depth(earlier)
         last = carried(*known, earlier, shown.before, glimpse, recording, config)
-        clean = dream(Lesson(glimpse, _now_and_then(last, 0.5, rng), mood(known[0]), last))
+        clean = dream(Lesson(glimpse, _now_and_then(last, 0.5, rng), context_thumbnail(known[0]), last))
         rgb, depth = _pixels(clean), decode_depth(clean[:, 3])
     glimpse = glimpse_of(shown, shown.target, recording, config)
     last = carried(rgb, depth, shown.before, shown.target, glimpse, recording, config)
     truth = torch.cat([_coded(recording.rgb(shown.target)), encode_depth(recording.depth(shown.target))[:, None]], 1)
-    return varied(Lesson(glimpse, _now_and_then(last, 0.9, rng), mood(rgb), truth), rng)
+    return varied(Lesson(glimpse, _now_and_then(last, 0.9, rng), context_thumbnail(rgb), truth), rng)
 
 
 def varied(lesson: Lesson, rng: np.random.Generator) -> Lesson:
@@ -63,7 +63,7 @@ def varied(lesson: Lesson, rng: np.random.Generator) -> Lesson:
     if rng.random() < 0.5:
         colours = torch.from_numpy(rng.permutation(3))
     pixels = torch.cat([colours, torch.tensor([3])])
-    thumbnail = lesson.told.unflatten(1, (3, *MOOD))[:, colours]
+    thumbnail = lesson.told.unflatten(1, (3, *THUMBNAIL))[:, colours]
     parts = [glimpse.rgb[:, :, colours], glimpse.trust, glimpse.depth, glimpse.known]
     parts += [lesson.last[:, pixels], thumbnail, lesson.truth[:, pixels]]
     if rng.random() < 0.5:
@@ -125,7 +125,7 @@ def _told(recording: Recording, rows: np.ndarray, frames: torch.Tensor) -> torch
     began = wanted < recording.start[rows][:, None]
     actions = recording.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
     actions = torch.where(torch.from_numpy(began)[..., None], 0.0, actions)
-    return torch.cat([mood(frames[:, 0]), actions.flatten(1)], 1)
+    return torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
 
 
 def _coded(rgb: torch.Tensor) -> torch.Tensor:

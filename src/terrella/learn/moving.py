@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from ..space.keyframes import Glimpse, Keyframes
-from ..worlds.generator import MOOD, VideoConfig, decode_depth, encode_depth, mood
+from ..worlds.generator import THUMBNAIL, VideoConfig, context_thumbnail, decode_depth, encode_depth
 from ..worlds.moving import Frame, carry_frames
 from .samples import Dream, Lesson, Recording, draw, glimpse_of
 
@@ -27,7 +27,7 @@ def moving_lesson(
     `dream`), half of the last are worn, and in one sample of ten they are unknown."""
     dreamt = int(rng.choice(len(OFTEN), p=OFTEN)) if dream else 0
     shown = draw(recording, memory, config, batch, rng, back=len(OFTEN) + 1)
-    last, earlier = (_frame(recording, shown.target - dreamt - age, config.cast) for age in (1, 2))
+    last, earlier = (_frame(recording, shown.target - dreamt - age, config.objects) for age in (1, 2))
     for back in range(dreamt, 0, -1):
         rows = shown.target - back
         before = carry_frames(last, earlier, recording.pose(rows), config.camera)
@@ -35,7 +35,7 @@ def moving_lesson(
         asked = Lesson(glimpse_of(shown, rows, recording, config), before, told, before)
         clean = dream(asked)  # pyright: ignore[reportOptionalCall]
         rgb = ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        covered = _covered(recording, rows, config.cast)  # in a dream, too, cards cover what is drawn
+        covered = _covered(recording, rows, config.objects)  # in a dream, too, cards cover what is drawn
         drawn = Frame(rgb, decode_depth(clean[:, 3]), clean[:, 4].sigmoid(), recording.pose(rows), covered)
         last, earlier = drawn, last
     last = last._replace(rgb=worn(last.rgb, rng))
@@ -46,7 +46,7 @@ def moving_lesson(
     truth = torch.cat([coded, encode_depth(recording.depth(shown.target))[:, None], things[:, None]], 1)
     told = _told(recording, shown.target, last.rgb, config.history)
     weight = 1 + COUNTS * torch.maximum(things, (carried[:, 5] > 0.5).float())[:, None]
-    if config.cast:  # what cards cover is not to be drawn
+    if config.objects:  # what cards cover is not to be drawn
         weight = weight * ~recording.covered(shown.target)[:, None]
     glimpse = glimpse_of(shown, shown.target, recording, config)
     lesson = Lesson(glimpse, carried, told, truth, weight / weight.mean())
@@ -64,8 +64,8 @@ def worn(rgb: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
 
 def mirrored(lesson: Lesson, action_names: tuple[str, ...]) -> Lesson:
     """The same lesson in a mirror: what was done to the left is done to the right."""
-    glimpse, mood_size = lesson.glimpse, 3 * MOOD[0] * MOOD[1]
-    small = lesson.told[:, :mood_size].unflatten(1, (3, *MOOD)).flip(-1).flatten(1)
+    glimpse, mood_size = lesson.glimpse, 3 * THUMBNAIL[0] * THUMBNAIL[1]
+    small = lesson.told[:, :mood_size].unflatten(1, (3, *THUMBNAIL)).flip(-1).flatten(1)
     acts = lesson.told[:, mood_size:].unflatten(1, (-1, len(action_names)))[..., other_side(action_names)].flatten(1)
     parts = [part.flip(-1) for part in (glimpse.rgb, glimpse.trust, glimpse.depth, glimpse.known)]
     weight = None if lesson.weight is None else lesson.weight.flip(-1)
@@ -79,13 +79,13 @@ def other_side(action_names: tuple[str, ...]) -> list[int]:
     return [action_names.index(name) if name in action_names else at for at, name in enumerate(names)]
 
 
-def _frame(recording: Recording, rows: np.ndarray, cast: bool) -> Frame:
+def _frame(recording: Recording, rows: np.ndarray, objects: bool) -> Frame:
     seen = recording.rgb(rows), recording.depth(rows), recording.things(rows), recording.pose(rows)
-    return Frame(*seen, _covered(recording, rows, cast))
+    return Frame(*seen, _covered(recording, rows, objects))
 
 
-def _covered(recording: Recording, rows: np.ndarray, cast: bool) -> torch.Tensor:
-    return recording.covered(rows) if cast else torch.zeros_like(recording.depth(rows), dtype=torch.bool)
+def _covered(recording: Recording, rows: np.ndarray, objects: bool) -> torch.Tensor:
+    return recording.covered(rows) if objects else torch.zeros_like(recording.depth(rows), dtype=torch.bool)
 
 
 def _told(recording: Recording, rows: np.ndarray, last: torch.Tensor, history: int) -> torch.Tensor:
@@ -93,4 +93,4 @@ def _told(recording: Recording, rows: np.ndarray, last: torch.Tensor, history: i
     wanted = rows[:, None] - history + np.arange(history)
     actions = recording.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
     known = torch.from_numpy(wanted >= recording.start[rows][:, None])[..., None]
-    return torch.cat([mood(last), torch.where(known, actions, 0.0).flatten(1)], 1)
+    return torch.cat([context_thumbnail(last), torch.where(known, actions, 0.0).flatten(1)], 1)

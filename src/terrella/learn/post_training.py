@@ -63,7 +63,9 @@ def beside(world: World, data: str | Path, keep_out: Box | None, report: Report)
             f"{data} has actions ({found.kind}, {found.told}) that {world.spec.name} does not know "
             f"({controls.kind}, {controls.told}: {', '.join(world.spec.action_names)}); give a recording of the same game."
         )
-    lacks = [name for name in (THINGS,) * config.moving + (CAST, INSTANCES) * config.cast if name not in cache.arrays]
+    lacks = [
+        name for name in (THINGS,) * config.moving + (CAST, INSTANCES) * config.objects if name not in cache.arrays
+    ]
     if lacks:
         raise DatasetError(
             f"{data} does not tell of {', '.join(lacks)}, which {world.spec.name} is shown; record them."
@@ -89,7 +91,7 @@ def beside(world: World, data: str | Path, keep_out: Box | None, report: Report)
 def with_generator(world: Learned, generator: Generator, steps: int, card: dict) -> Learned:
     """The same world around another generator, which draws a frame in `steps`; `card` is added to its facts. Its doubt is
     left out, for it knew the errors of the old one: `terrella train senses` learns another."""
-    fresh = world.with_senses(world.eye if isinstance(world, VideoWorld) else None, None)
+    fresh = world.with_senses(world.estimator if isinstance(world, VideoWorld) else None, None)
     fresh.generator = channels_last(copy.deepcopy(generator).eval().requires_grad_(False))
     fresh.config = replace(world.config, steps=steps)
     kept = {name: value for name, value in world.spec.card.items() if name != "uncertainty"}

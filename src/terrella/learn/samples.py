@@ -21,7 +21,7 @@ from ..worlds.moving import covering, still
 from ..worlds.video import carry
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish
-CAST, INSTANCES = "observation.cast", "observation.instances"  # those that tell it apart
+CAST, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class Recording:
             seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
         if config.moving:
             seen["things"] = self.things(rows)
-        if config.cast:
+        if config.objects:
             seen["instances"] = self.instances(rows)
-            seen["cast"] = torch.from_numpy(np.array(self.cache.arrays[CAST][rows], np.float32))
+            seen["objects"] = torch.from_numpy(np.array(self.cache.arrays[CAST][rows], np.float32))
         return seen
 
     def played(self, spec: Spec, rows) -> torch.Tensor:

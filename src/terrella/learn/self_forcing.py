@@ -78,12 +78,12 @@ class Dreams:
         self.row = rows - CONTEXT + 1
         seen = pair.recording.evidence(self.world.config, self.row)
         self.state = self.world.observe(seen, None, noise_rng)
-        if self.world.config.cast:  # these dreams are of what stands still
-            self.state = self.state.replace(cards=torch.zeros_like(self.state["cards"]))
+        if self.world.config.objects:  # these dreams are of what stands still
+            self.state = self.state.replace(cards=torch.zeros_like(self.state["billboards"]))
         while (self.row < rows).all():
             truth = self.next_lesson().truth
             self.go_on(torch.cat([truth[:, :4], 40 * truth[:, 4:] - 20], 1))  # things are drawn as logits
-            if self.world.config.cast:
+            if self.world.config.objects:
                 self.state = self.state.replace(instances=pair.recording.instances(self.row))
 
     def next_lesson(self) -> Lesson:
@@ -105,7 +105,7 @@ class Dreams:
         truth = torch.cat([found.float() / 127.5 - 1, encode_depth(depth)[:, None]], 1)
         if self.world.config.moving:
             truth = torch.cat([truth, recording.things(self.row)[:, None]], 1)
-        if self.world.config.cast:
+        if self.world.config.objects:
             weight = (~recording.covered(self.row))[:, None].float()
         return Lesson(self.glimpse, last, told, truth, weight)
 

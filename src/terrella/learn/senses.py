@@ -13,12 +13,12 @@ import numpy as np
 
 from ..core.errors import DatasetError, TrainingError
 from ..data import ClipCache, Dataset, split
-from ..space.eye import load_eye, save_eye
+from ..space.estimator import load_estimator, save_estimator
 from ..worlds.folder import Learned, load_world, save_again
 from ..worlds.video import VideoWorld
-from .doubt import DoubtTraining, learn_doubt
-from .eye import EyeTraining, learn_eye, recording_of, sight
+from .estimator import EstimatorTraining, learn_estimator, recording_of, sight
 from .samples import Recording, controls_of
+from .uncertainty import DoubtTraining, learn_uncertainty
 from .updates import Report
 
 
@@ -27,13 +27,13 @@ class SensesConfig:
     """Settings of the training of a world's senses.
 
     Args:
-        eye_steps: Training steps of the eye; with 0 the world keeps the one it has, if any.
-        doubt_frames: Dreamt frames that the doubt learns from; with 0 the world keeps the one it has, if any.
+        estimator_steps: Training steps of the eye; with 0 the world keeps the one it has, if any.
+        uncertainty_frames: Dreamt frames that the doubt learns from; with 0 the world keeps the one it has, if any.
         seed: Of everything random.
     """
 
-    eye_steps: int = 2500
-    doubt_frames: int = 9000
+    estimator_steps: int = 2500
+    uncertainty_frames: int = 9000
     seed: int = 0
 
 
@@ -51,7 +51,7 @@ def train_senses(world: str | Path, data: str | Path, out: str | Path, config: S
         raise DatasetError(f"{data} lacks depth, poses or a camera, from which {learned.spec.name} was learned.")
     train, held_out = split(len(cache.episodes))
     recording = recording_of(cache, train, tuple(box) if box and posed else None, controls_of(cache))
-    told = json.dumps([config.eye_steps, config.seed, box, cache.length, [list(span) for span in cache.episodes]])
+    told = json.dumps([config.estimator_steps, config.seed, box, cache.length, [list(span) for span in cache.episodes]])
     mark = hashlib.sha256(told.encode() + np.ascontiguousarray(cache.pose).tobytes()) if posed else hashlib.sha256()
     keep = Path(out) / f"eye-{mark.hexdigest()[:12]}.safetensors.partial"  # of these settings and this recording alone
     sensing, facts = learn_senses(learned, recording, held_out, tuple(box) if box else None, config, report, keep)
@@ -72,27 +72,32 @@ def learn_senses(
     """`world` with an eye (where it has geometry) and a doubt, and what its card says of them. The eye is kept in the file
     `keep` as soon as it is learned: a run that is stopped goes on from there."""
     facts: dict[str, Any] = {}
-    eye = world.eye if isinstance(world, VideoWorld) else None
-    if isinstance(world, VideoWorld) and config.eye_steps:
+    estimator = world.estimator if isinstance(world, VideoWorld) else None
+    if isinstance(world, VideoWorld) and config.estimator_steps:
         if keep.exists():
-            eye = load_eye(keep)
+            estimator = load_estimator(keep)
         else:
-            eye = learn_eye(recording, EyeTraining(steps=config.eye_steps, keep_out=keep_out, seed=config.seed), report)
+            estimator = learn_estimator(
+                recording, EstimatorTraining(steps=config.estimator_steps, keep_out=keep_out, seed=config.seed), report
+            )
             keep.parent.mkdir(parents=True, exist_ok=True)
-            save_eye(eye, keep)
+            save_estimator(estimator, keep)
         facts["eye"] = {
             place: {name: round(value, 4) for name, value in errors.items()}
-            for place, errors in sight(eye, recording.cache, held_out, keep_out).items()
+            for place, errors in sight(estimator, recording.cache, held_out, keep_out).items()
             if errors
         }
-    sensing = world.with_senses(eye, world.doubt)
-    if config.doubt_frames:
+    sensing = world.with_senses(estimator, world.uncertainty)
+    if config.uncertainty_frames:
         try:
-            horizon, steps = min(64, max(8, config.doubt_frames // 40)), min(1500, max(20, config.doubt_frames // 6))
-            settings = DoubtTraining(config.doubt_frames, horizon, steps=steps, seed=config.seed)
-            doubt, found = learn_doubt(world.with_senses(eye, None), recording, settings, report)
+            horizon, steps = (
+                min(64, max(8, config.uncertainty_frames // 40)),
+                min(1500, max(20, config.uncertainty_frames // 6)),
+            )
+            settings = DoubtTraining(config.uncertainty_frames, horizon, steps=steps, seed=config.seed)
+            uncertainty, found = learn_uncertainty(world.with_senses(estimator, None), recording, settings, report)
         except DatasetError as error:  # the world is as good without it
             return sensing, {**facts, "uncertainty": f"none: {error}"}
         facts["uncertainty"] = {name: round(value, 4) for name, value in found.items()}
-        sensing = sensing.with_senses(eye, doubt)
+        sensing = sensing.with_senses(estimator, uncertainty)
     return sensing, facts

@@ -16,18 +16,18 @@ from ..core.errors import DatasetError, TrainingError
 from ..core.world import make_rng
 from ..data import ClipCache, Dataset, split
 from ..space.keyframes import Keyframes
-from ..worlds.cast import ROWS, STARTS, Cast, CastConfig
 from ..worlds.controls import BUTTONS
 from ..worlds.folder import save_world, video_spec
 from ..worlds.generator import Generator, VideoConfig, channels_last, generate
 from ..worlds.history import HistoryWorld, Starts
 from ..worlds.motion import Motion
+from ..worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
 from ..worlds.outcome import Outcome
 from ..worlds.video import VideoWorld
-from .cast import learn_cast
 from .lessons import recorded_lesson
 from .losses import Critic, flow_losses, frame_losses, half_precision, sharpened
 from .motion import train_motion
+from .objects import learn_objects
 from .outcome import Happenings, train_outcome
 from .samples import (
     CAST,
@@ -56,7 +56,7 @@ class TrainConfig:
         geometry: Use the depth and poses of a recording that has them; --no-geometry learns from pictures and actions alone.
         channels: Of the generator at 1/2, 1/4, 1/8, ... of the size.
         frames: Last frames that a world without geometry sees.
-        cast_steps: Training steps of what things that the recording tells apart do next (`cast`, `instances`), which makes
+        objects_steps: Training steps of what things that the recording tells apart do next (`cast`, `instances`), which makes
             cards of them that walk and fall; 0 leaves it out, and they are drawn as the rest.
         outcome_steps: Training steps of what reads reward, end and vitals off the frames, which is learned first.
         moving: Learn what moves (monsters, doors, pick-ups), where a recording with depth and poses marks it as `things`.
@@ -71,8 +71,8 @@ class TrainConfig:
         keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees, to score new places.
         critic_from: The step from which a critic judges sharpness.
         critic_weight: How hard it pulls, beside the loss itself.
-        eye_steps: Training steps of the eye that sees depth in a lone picture, which is learned last; 0 leaves it out.
-        doubt_frames: Dreamt frames from which the finished world learns to say when it invents; 0 leaves it out.
+        estimator_steps: Training steps of the eye that sees depth in a lone picture, which is learned last; 0 leaves it out.
+        uncertainty_frames: Dreamt frames from which the finished world learns to say when it invents; 0 leaves it out.
         save_every_s: Seconds between saves.
         strip_every_s: Seconds between pictures of truth against dream.
         seed: Of everything random.
@@ -85,7 +85,7 @@ class TrainConfig:
     channels: tuple[int, ...] = (32, 56, 88, 128)
     frames: int = 4
     outcome_steps: int = 1500
-    cast_steps: int = 2500
+    objects_steps: int = 2500
     moving: bool = True
     flow_steps: int = 1
     steps: int = 8000
@@ -97,8 +97,8 @@ class TrainConfig:
     keep_out: Box | None = None
     critic_from: int = 1500
     critic_weight: float = 0.3
-    eye_steps: int = 2500
-    doubt_frames: int = 9000
+    estimator_steps: int = 2500
+    uncertainty_frames: int = 9000
     save_every_s: float = 120.0
     strip_every_s: float = 300.0
     seed: int = 0
@@ -161,15 +161,15 @@ class _Run:
             )
         self.recording = Recording(cache, start, usable, controls)
         told_apart = {CAST, INSTANCES} <= set(cache.arrays)
-        if self.video.moving and told_apart and config.cast_steps:
+        if self.video.moving and told_apart and config.objects_steps:
             if cache.arrays[CAST].shape[1:] != (ROWS, 4):
                 raise DatasetError(
                     f"{dataset.root} lists things as {cache.arrays[CAST].shape[1:]}, and {(ROWS, 4)} is read: number and place of "
-                    f"up to {ROWS}. Record it so, or train with --cast-steps 0."
+                    f"up to {ROWS}. Record it so, or train with --objects-steps 0."
                 )
-            self.video = replace(self.video, cast=True)
-        known = CastConfig(controls.told, self.video.history)
-        self.cast = Cast(known) if self.video.cast else None  # small: it is learned on the CPU
+            self.video = replace(self.video, objects=True)
+        known = ObjectsConfig(controls.told, self.video.history)
+        self.objects = Objects(known) if self.video.objects else None  # small: it is learned on the CPU
         self.happened, self.outcome = self._begin_outcome(usable, posed)
         self.memory = self._choose_memory() if posed else None
         self.generator = channels_last(Generator(self.video)).to(self.device)
@@ -184,14 +184,16 @@ class _Run:
         }
         if self.outcome is not None:
             modules["outcome"] = self.outcome
-        if self.cast is not None:
-            modules["cast"] = self.cast
+        if self.objects is not None:
+            modules["objects"] = self.objects
         self.optimiser = torch.optim.AdamW(
             self.generator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4
         )
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), 3e-4, (0.0, 0.99))
         optimisers = {"optimiser": self.optimiser, "critic_optimiser": self.critic_optimiser}
-        self.updates = Updates(out, _recipe(config, dataset), modules, optimisers, motion=None, outcome=None, cast=None)
+        self.updates = Updates(
+            out, _recipe(config, dataset), modules, optimisers, motion=None, outcome=None, objects=None
+        )
         self.facts = self.updates.facts
 
     def _begin_outcome(self, usable: np.ndarray, posed: bool) -> tuple[Happenings, Outcome | None]:
@@ -227,11 +229,11 @@ class _Run:
             settings = config.outcome_steps, config.seed, report
             self.facts["outcome"] = train_outcome(self.outcome, self.recording.rgb, self.happened, *settings)
             self.updates.save()
-        if self.cast is not None and self.facts["cast"] is None:
-            settings = self.video.camera, config.cast_steps, config.seed, report
+        if self.objects is not None and self.facts["objects"] is None:
+            settings = self.video.camera, config.objects_steps, config.seed, report
             part = self.recording
-            self.facts["cast"] = learn_cast(
-                self.cast, part, self.dataset.rgb_at, part.pose(self._beginnings()), *settings
+            self.facts["objects"] = learn_objects(
+                self.objects, part, self.dataset.rgb_at, part.pose(self._beginnings()), *settings
             )
             self.updates.save()
         every_s = config.save_every_s, config.strip_every_s
@@ -312,7 +314,7 @@ class _Run:
             "parameters": sum(p.numel() for module in modules for p in module.parameters()),
             **(self.facts["motion"] or {}),
             **(self.facts["outcome"] or {}),
-            **(self.facts["cast"] or {}),
+            **(self.facts["objects"] or {}),
         }
         dt_s = about.get("dt_s", 1 / self.cache.fps)
         outcome = None if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
@@ -334,7 +336,7 @@ class _Run:
         body = {name: value for name, value in (self.facts["motion"] or {}).items() if name in ("body_m", "short")}
         return VideoWorld(
             spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards,
-            outcome=outcome, cast=None if self.cast is None else copy.deepcopy(self.cast),
+            outcome=outcome, objects=None if self.objects is None else copy.deepcopy(self.objects),
         )  # fmt: skip
 
     def _beginnings(self) -> np.ndarray:
@@ -375,7 +377,7 @@ class _Run:
         """The last strip, and the senses of the finished world."""
         self.draw_strip()
         world = self.world()
-        settings = SensesConfig(config.eye_steps, config.doubt_frames, config.seed)
+        settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
         keep = self.out / "eye.safetensors"
         sensing, facts = learn_senses(world, self.recording, self.held_out, config.keep_out, settings, report, keep)
         save_world(sensing, self.out / "world", {**world.spec.card, **facts})

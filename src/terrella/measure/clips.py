@@ -129,13 +129,13 @@ def check_clips(place: str, clips: Sequence[Clip], steps: int) -> None:
 
 
 def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Tensor]:
-    """What `spec` observes, and heeds where it was recorded, of row `row` of each clip: name -> tensor [B, ...];
+    """What `spec` observes, and may_observe where it was recorded, of row `row` of each clip: name -> tensor [B, ...];
     ObservationError where it cannot."""
     seen = {}
-    for name in (*spec.observes, *spec.heeds):
+    for name in (*spec.observes, *spec.may_observe):
         told = [getattr(clip, name, None) if hasattr(clip, name) else clip.further.get(name) for clip in clips]
         arrays = [array for array in told if array is not None]
-        if len(arrays) < len(clips) and name in spec.heeds:
+        if len(arrays) < len(clips) and name in spec.may_observe:
             continue
         if len(arrays) < len(clips):
             raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
@@ -144,12 +144,12 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
         if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
         marks = stacked.ndim == 3 and stacked.dtype in (torch.bool, torch.uint8)
-        if name in spec.heeds and marks and len(wanted) == 2:  # and so are marks: one pixel of many counts
+        if name in spec.may_observe and marks and len(wanted) == 2:  # and so are marks: one pixel of many counts
             stacked = F.adaptive_max_pool2d(stacked.float()[:, None], wanted)[:, 0].to(stacked.dtype)
         if wanted == () and stacked[0].numel() == 1:
             stacked = stacked.reshape(-1)
         fits = tuple(stacked.shape[1:]) == wanted
-        if name in spec.heeds and not (fits and torch.isfinite(stacked.float()).all()):
+        if name in spec.may_observe and not (fits and torch.isfinite(stacked.float()).all()):
             continue
         if not fits:
             raise ObservationError(

@@ -278,7 +278,7 @@ class Story:
             self.notice = f"the dream starts on its own: it cannot look at {self.spec.name}."
             return dream.start(1, rng)
         try:
-            shared = [name for name in dream.spec.heeds if _alike(self.spec, dream.spec, name)]
+            shared = [name for name in dream.spec.may_observe if _alike(self.spec, dream.spec, name)]
             state = dream.observe(self.worlds[0].render(truth, [*dream.spec.observes, *shared]), None, rng)
         except TerrellaError as error:
             self.notice = f"the dream starts on its own: {error}"

@@ -95,7 +95,7 @@ class Doom:
         if alive:
             channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
             channels["instances"] = spaces.Box(0, CAST, config.depth_size, np.uint8)
-            channels["cast"] = spaces.Box(-np.inf, np.inf, (CAST, 4), np.float32)
+            channels["objects"] = spaces.Box(-np.inf, np.inf, (CAST, 4), np.float32)
             channels["health"] = HEALTH
         self.spec = Spec(
             name=f"doom:{config.scenario}",
@@ -209,7 +209,7 @@ class Doom:
             half = np.deg2rad(yaw_deg) / 2
             here = np.array([x, y, z]) / UNITS_PER_M + (*self._origin, 0.0)
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
-        if name in ("cast", "instances"):
+        if name in ("objects", "instances"):
             return torch.from_numpy(self._told_apart(x, y)[name])
         depth, sector = self._looked(x, y, z, np.deg2rad(yaw_deg))
         if name == "things":
@@ -244,7 +244,7 @@ class Doom:
             cast[row] = (label.object_id + 1, *(feet + (*self._origin, 0.0)))
             row_of[label.value] = row + 1
         return {
-            "cast": cast,
+            "objects": cast,
             "instances": row_of[_sampled(np.asarray(self._present.labels_buffer), self.config.depth_size)],
         }
 

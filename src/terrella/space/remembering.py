@@ -21,7 +21,7 @@ from ..core.spec import Spec, shape_of
 from ..core.state import State
 from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
-from .eye import Eye
+from .estimator import Estimator
 from .keyframes import Glimpse, merge
 from .memory import Memory, remembering_spec
 from .reproject import least_around
@@ -32,9 +32,11 @@ _DREAMT = ("gone", "uncertainty")  # what worlds with a doubt note in their stat
 _OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 
 
-def remember(world: World, memory_mb: float = 16.0, eye: Eye | None = None, camera: Intrinsics | None = None) -> World:
+def remember(
+    world: World, memory_mb: float = 16.0, estimator: Estimator | None = None, camera: Intrinsics | None = None
+) -> World:
     """`world` with a spatial memory. One that shows the channel `known` has its own and draws from it: it stays as it is."""
-    return world if "known" in world.spec.channels else Remembering(world, memory_mb, eye, camera)
+    return world if "known" in world.spec.channels else Remembering(world, memory_mb, estimator, camera)
 
 
 class Remembering:
@@ -44,27 +46,33 @@ class Remembering:
     memory_mb: budget of a story's memory; camera: intrinsics, where neither the inner world's spec nor the eye has them.
     """
 
-    def __init__(self, world: World, memory_mb: float = 16.0, eye: Eye | None = None, camera: Intrinsics | None = None):
+    def __init__(
+        self,
+        world: World,
+        memory_mb: float = 16.0,
+        estimator: Estimator | None = None,
+        camera: Intrinsics | None = None,
+    ):
         spec = world.spec
-        camera = camera or spec.camera or (eye.config.camera if eye is not None else None)
+        camera = camera or spec.camera or (estimator.config.camera if estimator is not None else None)
         if "known" in spec.channels:
             raise ContractError(f"{spec.name} remembers by itself: it shows what it knows; use it as it is.")
         if "rgb" not in spec.channels or "rgb" not in spec.observes:
             raise ContractError(f"{spec.name} does not show and observe rgb, so memory cannot draw into its pictures.")
-        if "pose" not in spec.channels and eye is None:
+        if "pose" not in spec.channels and estimator is None:
             raise ContractError(
                 f"{spec.name} shows no pose, so memory cannot know where its pictures belong: give an eye."
             )
         if camera is None:
             raise ContractError(f"{spec.name} has no camera in its spec, nor the eye: give the intrinsics.")
         height, width, _ = shape_of(spec.channels["rgb"])
-        self.world, self.eye = world, eye
+        self.world, self.estimator = world, estimator
         self.memory = Memory(camera, (height, width), memory_mb)
         if not self.memory.capacity:
             least = math.ceil(100 * self.memory.keyframe_bytes / 2**20) / 100
             raise ContractError(f"a budget of {memory_mb} MiB has no room for a keyframe; give {least:.2f} or more.")
         self.spec = remembering_spec(
-            _posed_spec(spec, (height, width), eye, camera), (height, width), self.memory.capacity
+            _posed_spec(spec, (height, width), estimator, camera), (height, width), self.memory.capacity
         )
         self._shown = tuple(name for name in _OWN_CHANNELS if name in spec.channels)
 
@@ -119,7 +127,7 @@ class Remembering:
         glimpse = self.memory.look(before, pose)
         rgb, known = blend(glimpse, rgb)
         depth = torch.where(known > 0.5, glimpse.depth, depth)
-        told = (*self.world.spec.observes, *self.world.spec.heeds)
+        told = (*self.world.spec.observes, *self.world.spec.may_observe)
         evidence = self.world.render(inner, [name for name in told if name != "rgb"])
         blended = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
         # a blend is no evidence: how far the dream has gone from any, and what to expect of it, stay as they were
@@ -136,9 +144,9 @@ class Remembering:
         if "depth" in seen:
             depth = F.interpolate(seen["depth"].float()[:, None], self.memory.size, mode="nearest-exact")[:, 0]
             depth = depth.clamp_min(0.05)
-        elif self.eye is not None:
+        elif self.estimator is not None:
             with torch.inference_mode():
-                depth = self.eye.depth(rgb).clone()
+                depth = self.estimator.depth(rgb).clone()
         else:
             beams = rays(self.memory.camera, *self.memory.size)
             depth = (SHELL_M / beams.norm(dim=-1)).expand(len(rgb), -1, -1)
@@ -146,12 +154,12 @@ class Remembering:
 
     def _felt(self, rgb: torch.Tensor, before: State | None) -> torch.Tensor:
         """Where odometry says that the picture was taken, `before` being the last; the origin for a first one."""
-        assert self.eye is not None
+        assert self.estimator is not None
         zero = torch.zeros(len(rgb))
         if before is None:
             return planar_pose(zero, zero, zero, zero)
         with torch.inference_mode():
-            forward, left, turn = self.eye.motion(before["rgb"], rgb, before["depth"]).clone().unbind(-1)
+            forward, left, turn = self.estimator.motion(before["rgb"], rgb, before["depth"]).clone().unbind(-1)
         pose, heading = before["pose"], yaw(before["pose"])
         x = pose[:, 0] + forward * heading.cos() - left * heading.sin()
         y = pose[:, 1] + forward * heading.sin() + left * heading.cos()
@@ -174,13 +182,13 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
     return (mixed * 255).round().clamp(0, 255).to(torch.uint8), share[:, 0]
 
 
-def _posed_spec(spec: Spec, size: tuple[int, int], eye: Eye | None, camera: Intrinsics) -> Spec:
+def _posed_spec(spec: Spec, size: tuple[int, int], estimator: Estimator | None, camera: Intrinsics) -> Spec:
     """With the pose and the depth that memory goes by."""
     channels, units = dict(spec.channels), dict(spec.units)
     if "pose" not in channels:
         channels["pose"] = spaces.Box(-np.inf, np.inf, (7,), np.float32)
         units["pose"] = "m, quaternion wxyz of T_world_cam"
-    if "depth" in channels or eye is not None:  # of the pictures' size
+    if "depth" in channels or estimator is not None:  # of the pictures' size
         channels["depth"], units["depth"] = spaces.Box(0, np.inf, size, np.float32), "m"
     return replace(spec, channels=channels, units=units, camera=camera)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from ..space.camera import Intrinsics
-from ..space.eye import Eye
+from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes, look, retrieve
 from ..space.recognise import recognise
 
@@ -28,7 +28,7 @@ class Arrival:
 
 def arrive(
     rgb: torch.Tensor,
-    eye: Eye,
+    estimator: Estimator,
     memory: Keyframes,
     small: torch.Tensor,
     starts: Keyframes,
@@ -38,7 +38,7 @@ def arrive(
     """Pictures, uint8 [B, 3, H, W], in the place among `memory` (its `thumbnails` are `small`) where they were taken, or
     else in an empty corner of the world at the height of the `starts`; depth is memory's where it knows it, else the eye's.
     """
-    depth, found, poses = eye.depth(rgb), [], []
+    depth, found, poses = estimator.depth(rgb), [], []
     corner = starts.pose[:1].clone()
     corner[0, 0] = starts.pose[:, 0].max() + AWAY_M
     corner[0, 2] = starts.pose[:, 2].median()

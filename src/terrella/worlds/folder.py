@@ -21,15 +21,15 @@ from safetensors.torch import load_file, save_file
 
 from ..core.errors import CheckpointError
 from ..core.spec import DONE, REWARD, Spec
-from ..space.eye import Eye, eye_of, eye_weights
+from ..space.estimator import Estimator, estimator_of, estimator_weights
 from ..space.keyframes import Keyframes
-from .cast import ROWS, Cast, CastConfig
 from .controls import Controls
-from .doubt import Doubt, doubt_of, doubt_weights
 from .generator import Generator, VideoConfig
 from .history import HistoryWorld, Starts
 from .motion import Motion
+from .objects import ROWS, Objects, ObjectsConfig
 from .outcome import Outcome, OutcomeConfig
+from .uncertainty import Uncertainty, uncertainty_of, uncertainty_weights
 from .video import VideoWorld
 
 KIND, VERSION = "video", 2
@@ -37,6 +37,7 @@ MEMORY_FILE = "memory.safetensors"
 Learned = VideoWorld | HistoryWorld
 VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
 RETIRED = ("own_keyframes",)  # settings of older worlds that mean nothing any more
+RENAMED = {"cast": "objects"}
 
 
 def save_world(world: Learned, path: str | Path, card: dict, quality: int = 92) -> None:
@@ -63,14 +64,14 @@ def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
         rewards, controls, outcome = [world.reward, 0.0], world.controls, world.outcome
     if outcome is not None:
         weights |= {f"outcome.{k}": v for k, v in outcome.state_dict().items()}
-    eye, doubt = world.eye if isinstance(world, VideoWorld) else None, world.doubt
-    cast = world.cast if isinstance(world, VideoWorld) else None
-    if cast is not None:
-        weights |= {f"cast.{k}": v for k, v in cast.state_dict().items()}
-    if eye is not None:
-        weights |= {f"eye.{k}": v for k, v in eye_weights(eye).items()}
-    if doubt is not None:
-        weights |= {f"doubt.{k}": v for k, v in doubt_weights(doubt).items()}
+    estimator, uncertainty = world.estimator if isinstance(world, VideoWorld) else None, world.uncertainty
+    objects = world.objects if isinstance(world, VideoWorld) else None
+    if objects is not None:
+        weights |= {f"cast.{k}": v for k, v in objects.state_dict().items()}
+    if estimator is not None:
+        weights |= {f"eye.{k}": v for k, v in estimator_weights(estimator).items()}
+    if uncertainty is not None:
+        weights |= {f"doubt.{k}": v for k, v in uncertainty_weights(uncertainty).items()}
     about = {
         "kind": KIND,
         "version": VERSION,
@@ -79,9 +80,9 @@ def _save(world: Learned, path: Path, card: dict, quality: int) -> None:
         "rewards": rewards,
         "controls": asdict(controls),
         "outcome": asdict(outcome.config) if outcome is not None else None,
-        "cast": asdict(cast.config) if cast is not None else None,
-        "eye": asdict(eye.config) if eye is not None else None,
-        "doubt": asdict(doubt.config) if doubt is not None else None,
+        "cast": asdict(objects.config) if objects is not None else None,
+        "eye": asdict(estimator.config) if estimator is not None else None,
+        "doubt": asdict(uncertainty.config) if uncertainty is not None else None,
         "dt_s": world.spec.dt_s,
         "action_names": list(world.spec.action_names),
         "keys": dict(world.spec.keys),
@@ -112,7 +113,7 @@ def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memor
     try:
         weights = load_file(path / "weights.safetensors")
         packed = load_file(path / MEMORY_FILE)
-        told = {k: v for k, v in about["config"].items() if k not in RETIRED}
+        told = {RENAMED.get(k) or k: v for k, v in about["config"].items() if k not in RETIRED}
         settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in told.items()}
         config = VideoConfig(**settings)
         if memory_mb is not None:
@@ -130,14 +131,14 @@ def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memor
                 begun = replace(begun, actions=starts["actions"], vitals=starts["vitals"])
             told = None if outcome is None else outcome.to(device)
             usual = float(about["rewards"][0])
-            doubt = _doubt(about, weights)
-            return HistoryWorld(spec, config, generator.to(device), begun, usual, told, controls, doubt)
+            uncertainty = _uncertainty(about, weights)
+            return HistoryWorld(spec, config, generator.to(device), begun, usual, told, controls, uncertainty)
         motion = Motion(config)
         motion.load_state_dict({k[7:]: v for k, v in weights.items() if k.startswith("motion.")})
         kept = _unpack({k[7:]: v for k, v in packed.items() if k.startswith("memory.")}, config)
         rewards = (float(about["rewards"][0]), float(about["rewards"][1]))
-        senses = _eye(about, weights), _doubt(about, weights)
-        parts = generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome, _cast(about, weights)
+        senses = _estimator(about, weights), _uncertainty(about, weights)
+        parts = generator, motion, kept, _unpack(starts, config), rewards, *senses, outcome, _objects(about, weights)
         world = VideoWorld(spec, config, *parts)
     except (
         OSError,
@@ -173,26 +174,28 @@ def _outcome(about: dict, weights: dict[str, torch.Tensor]) -> Outcome | None:
     return outcome
 
 
-def _cast(about: dict, weights: dict[str, torch.Tensor]) -> Cast | None:
+def _objects(about: dict, weights: dict[str, torch.Tensor]) -> Objects | None:
     told = about.get("cast")
     if told is None:
         return None
-    cast = Cast(CastConfig(**told))
+    objects = Objects(ObjectsConfig(**told))
     try:
-        cast.load_state_dict({k[5:]: v for k, v in weights.items() if k.startswith("cast.")})
+        objects.load_state_dict({k[5:]: v for k, v in weights.items() if k.startswith("cast.")})
     except RuntimeError as error:
         raise ValueError("its things are of another make of Terrella, or lost") from error
-    return cast
+    return objects
 
 
-def _eye(about: dict, weights: dict[str, torch.Tensor]) -> Eye | None:
+def _estimator(about: dict, weights: dict[str, torch.Tensor]) -> Estimator | None:
     told = about.get("eye")
-    return None if told is None else eye_of(told, {k[4:]: v for k, v in weights.items() if k.startswith("eye.")})
+    return None if told is None else estimator_of(told, {k[4:]: v for k, v in weights.items() if k.startswith("eye.")})
 
 
-def _doubt(about: dict, weights: dict[str, torch.Tensor]) -> Doubt | None:
+def _uncertainty(about: dict, weights: dict[str, torch.Tensor]) -> Uncertainty | None:
     told = about.get("doubt")
-    return None if told is None else doubt_of(told, {k[6:]: v for k, v in weights.items() if k.startswith("doubt.")})
+    return (
+        None if told is None else uncertainty_of(told, {k[6:]: v for k, v in weights.items() if k.startswith("doubt.")})
+    )
 
 
 def video_spec(
@@ -216,9 +219,9 @@ def video_spec(
     marks: dict[str, spaces.Space] = {}
     if config.moving:
         marks["things"] = spaces.Box(0, 1, (height, width), np.bool_)  # pyright: ignore
-    if config.cast:
+    if config.objects:
         marks["instances"] = spaces.Box(0, ROWS, (height, width), np.uint8)
-        marks["cast"] = spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)
+        marks["objects"] = spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)
     return Spec(
         name=name,
         action=(controls or Controls.buttons(config.actions)).space(),
@@ -230,7 +233,7 @@ def video_spec(
         keys=keys,
         camera=config.camera if config.geometry else None,
         card=card,
-        heeds=(*marks, *vitals),
+        may_observe=(*marks, *vitals),
     )
 
 

@@ -14,7 +14,7 @@ from .moving import PLANES
 
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
 LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
-MOOD = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
+THUMBNAIL = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class VideoConfig:
     steps: int = 1  # flow-matching steps a frame
     vitals: tuple[float, ...] = ()  # with which stories begin (names are its outcome's)
     residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
-    cast: bool = False  # things are cards (worlds/cast.py): the generator neither sees nor draws what they cover
+    objects: bool = False  # things are cards (worlds/cast.py): the generator neither sees nor draws what they cover
     moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
 
 
@@ -73,7 +73,7 @@ class Generator(nn.Module):
         self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
         acts = config.history if config.moving else 0 if config.geometry else config.slots  # actions that it is told
-        told = 1 + 3 * MOOD[0] * MOOD[1] + config.actions * acts
+        told = 1 + 3 * THUMBNAIL[0] * THUMBNAIL[1] + config.actions * acts
         self.before = nn.ModuleList(Block(width, told) for width in widths)
         self.after = nn.ModuleList(Block(width, told) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
@@ -165,10 +165,10 @@ def decode_depth(code: torch.Tensor) -> torch.Tensor:
     return ((code + 0.6) * 2).exp().clamp(NEAR_DEPTH_M, FAR_DEPTH_M)
 
 
-def mood(rgb: torch.Tensor) -> torch.Tensor:
+def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
     """The look of frames (uint8 [B, 3, H, W]) as a tiny picture in [-1, 1]: [B, 36]. Where nothing is known of a view,
     what was just seen says best what the place is like."""
-    return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, MOOD).flatten(1)
+    return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, THUMBNAIL).flatten(1)
 
 
 def generate(

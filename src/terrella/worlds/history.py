@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
-from ..space.eye import Eye
+from ..space.estimator import Estimator
 from ..space.keyframes import Glimpse
 from .controls import Controls
-from .doubt import SITUATION, Doubt, doubting_spec
-from .generator import Generator, VideoConfig, channels_last, generate, mood
+from .generator import Generator, VideoConfig, channels_last, context_thumbnail, generate
 from .outcome import Outcome, told_vitals
+from .uncertainty import SITUATION, Uncertainty, uncertain_spec
 
 TRUST = 0.03  # in a frame, against the one after it: what is merged from all of them is nearly the newest alone
 
@@ -54,10 +54,10 @@ class HistoryWorld:
         reward: float = 0.0,
         outcome: Outcome | None = None,
         controls: Controls | None = None,
-        doubt: Doubt | None = None,
+        uncertainty: Uncertainty | None = None,
     ):
-        self.spec, self.config = doubting_spec(spec, doubt is not None), config
-        self.starts, self.reward, self.doubt = starts, reward, doubt
+        self.spec, self.config = uncertain_spec(spec, uncertainty is not None), config
+        self.starts, self.reward, self.uncertainty = starts, reward, uncertainty
         self.generator = channels_last(generator.eval())
         self.outcome = outcome.eval() if outcome else None
         self.controls = controls or Controls.buttons(config.actions)
@@ -106,23 +106,23 @@ class HistoryWorld:
         glimpse, last, mind = self.shown(asked)
         parts = noise.to(there), glimpse.to(there), last.to(there), mind.to(there)
         clean = generate(self.generator, *parts, self.config.steps).cpu()
-        if self.doubt is not None:
+        if self.uncertainty is not None:
             gone = asked["gone"] + 1
             said = F.pad(gone.clamp_max(128).log1p()[:, None], (0, SITUATION - 1))
-            expected = self.doubt.expected(glimpse, last, clean, said, torch.zeros(state.batch))
+            expected = self.uncertainty.expected(glimpse, last, clean, said, torch.zeros(state.batch))
             asked = asked.replace(gone=gone, uncertainty=expected)
         return self.followed(state, self.drawn(asked, clean))
 
-    def with_senses(self, eye: Eye | None, doubt: Doubt | None) -> HistoryWorld:
+    def with_senses(self, estimator: Estimator | None, uncertainty: Uncertainty | None) -> HistoryWorld:
         """The same world with another doubt, or without; it has no use for an eye."""
-        del eye
-        parts = self.generator, self.starts, self.reward, self.outcome, self.controls, doubt
+        del estimator
+        parts = self.generator, self.starts, self.reward, self.outcome, self.controls, uncertainty
         return HistoryWorld(self.spec, self.config, *parts)
 
     def shown(self, state: State) -> tuple[Glimpse, torch.Tensor, torch.Tensor]:
         """What the generator gets (glimpse, last, told) to draw the frame that follows `state`'s newest action."""
         nothing = torch.zeros(state.batch, 4, *self.config.size)
-        told = torch.cat([mood(state["frames"][:, 0]), state["actions"].flatten(1)], 1)
+        told = torch.cat([context_thumbnail(state["frames"][:, 0]), state["actions"].flatten(1)], 1)
         return past(state["frames"]), nothing, told
 
     def drawn(self, state: State, clean: torch.Tensor) -> State:
@@ -162,7 +162,7 @@ class HistoryWorld:
 
     def _sure(self, batch: int) -> dict[str, torch.Tensor]:
         """What is written of doubt where evidence was just seen."""
-        return {} if self.doubt is None else {"gone": torch.zeros(batch), "uncertainty": torch.zeros(batch)}
+        return {} if self.uncertainty is None else {"gone": torch.zeros(batch), "uncertainty": torch.zeros(batch)}
 
 
 def past(frames: torch.Tensor) -> Glimpse:

@@ -61,14 +61,14 @@ def _carried(frame: Frame, pose: torch.Tensor, camera: Intrinsics) -> torch.Tens
     from ..space.kernels_numba import fetch, splat
 
     rgb, depth, things, covered = _arrays(frame.rgb, frame.depth, frame.things, frame.covered)
-    turn, eye, new_turn, new_eye = _arrays(rotation(frame.pose), frame.pose[:, :3], rotation(pose), pose[:, :3])
+    turn, estimator, new_turn, new_eye = _arrays(rotation(frame.pose), frame.pose[:, :3], rotation(pose), pose[:, :3])
     flat, canvas = np.empty_like(depth), np.full_like(depth, FAR_M)
     for n in range(len(depth)):
-        splat(depth[n], things[n], turn[n], eye[n], new_turn[n], new_eye[n], camera, flat[n], canvas[n])
+        splat(depth[n], things[n], turn[n], estimator[n], new_turn[n], new_eye[n], camera, flat[n], canvas[n])
     (seen,) = _arrays(_filled(torch.from_numpy(canvas)))
     found = np.zeros((len(depth), 6, *depth.shape[1:]), np.float32)
     for n in range(len(depth)):
-        shown = rgb[n], flat[n], things[n], covered[n], turn[n], eye[n]
+        shown = rgb[n], flat[n], things[n], covered[n], turn[n], estimator[n]
         fetch(*shown, seen[n], new_turn[n], new_eye[n], camera, found[n])
     return torch.from_numpy(found)
 

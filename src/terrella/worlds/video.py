@@ -18,9 +18,9 @@ import torch.nn.functional as F
 from ..core.errors import ContractError, ObservationError
 from ..core.spec import Spec
 from ..core.state import State
+from ..space.billboards import cut_out
 from ..space.camera import Intrinsics, planar_pose, yaw
-from ..space.cards import cut_out
-from ..space.eye import Eye
+from ..space.estimator import Estimator
 from ..space.floorplan import floor_plan, slide
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table, remembering_spec
@@ -28,12 +28,12 @@ from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
 from .arrival import AWAY_M, arrive
-from .cast import Cast
-from .doubt import GONE, Doubt, doubting_spec
-from .generator import Generator, VideoConfig, channels_last, decode_depth, generate, mood
+from .generator import Generator, VideoConfig, channels_last, context_thumbnail, decode_depth, generate
 from .motion import Motion
 from .moving import Frame, carry_frames, covering, still
+from .objects import Objects
 from .outcome import Outcome, told_vitals
+from .uncertainty import GONE, Uncertainty, uncertain_spec
 
 SEEN = ("rgb", "depth", "things", "pose", "instances")  # of a frame in the state of a world in which things move
 
@@ -47,15 +47,16 @@ class VideoWorld:
     def __init__(
         self, spec: Spec, config: VideoConfig, generator: Generator, motion: Motion,
         memory: Keyframes, starts: Keyframes, rewards: tuple[float, float],
-        eye: Eye | None = None, doubt: Doubt | None = None, outcome: Outcome | None = None, cast: Cast | None = None,
+        estimator: Estimator | None = None, uncertainty: Uncertainty | None = None, outcome: Outcome | None = None,
+        objects: Objects | None = None,
     ):  # fmt: skip
         self.config, self.memory, self.starts, self.rewards = config, memory, starts, rewards
-        self.eye, self.doubt = eye, doubt
+        self.estimator, self.uncertainty = estimator, uncertainty
         self.outcome = outcome.eval() if outcome else None
-        self.cast = cast.eval() if cast else None
+        self.objects = objects.eval() if objects else None
         self.own = own_memory(config)
-        self.spec = doubting_spec(
-            remembering_spec(spec, config.size, len(memory) + self.own.capacity), doubt is not None
+        self.spec = uncertain_spec(
+            remembering_spec(spec, config.size, len(memory) + self.own.capacity), uncertainty is not None
         )
         self.generator = channels_last(generator.eval())
         self.motion = motion.eval()
@@ -90,11 +91,13 @@ class VideoWorld:
         if self.config.moving:  # of what moves, a keyframe keeps the place only
             seen |= {"things": keys.depth <= 0, "depth": fill_holes(torch.where(keys.depth > 0, keys.depth, FAR_M))}
         state = self.observe(seen, None, rng)
-        if self.cast is None:
+        if self.objects is None:
             return state
-        cards = self.cast.begun[pick]  # in place of the things that the picture shows, which would stand there for ever
+        billboards = self.objects.begun[
+            pick
+        ]  # in place of the things that the picture shows, which would stand there for ever
         shown = state["things"].to(torch.uint8)
-        bare = state.replace(cards=cards, cards_before=cards, instances=shown)
+        bare = state.replace(billboards=billboards, billboards_before=billboards, instances=shown)
         bare = self.aged(bare, bare)
         peopled = self._draw(bare, bare, rng)
         return self.aged(peopled, peopled)
@@ -104,11 +107,11 @@ class VideoWorld:
         """Evidence: rgb, depth and pose together become a keyframe of the state; a pose alone moves the eye there
         (it needs a prior) and the frame is dreamt; a picture alone is seen from the prior's pose, or without a prior from
         the remembered place that it shows, else from an empty corner (arrival.py). Its depth is then the eye's."""
-        if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and self.eye is not None:
-            return self._arrive(observation, self.eye, prior, rng)
+        if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and self.estimator is not None:
+            return self._arrive(observation, self.estimator, prior, rng)
         if "pose" not in observation:
-            alone = ", a picture alone" if self.eye else ""
-            blind = "" if self.eye else " For a picture alone it needs an eye: `terrella train senses`."
+            alone = ", a picture alone" if self.estimator else ""
+            blind = "" if self.estimator else " For a picture alone it needs an eye: `terrella train senses`."
             raise ObservationError(
                 f"{self.spec.name} observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
             )
@@ -149,10 +152,10 @@ class VideoWorld:
             if things.shape != depth.shape:
                 raise ObservationError(f"things is bool [B, {height}, {width}]; got {tuple(things.shape)}.")
             state = state.replace(things=things)
-            if self.cast is not None:
-                state = state.replace(**self._recognised(self.cast, rgb, depth, pose, observation, prior))
+            if self.objects is not None:
+                state = state.replace(**self._recognised(self.objects, rgb, depth, pose, observation, prior))
         kept = self.own.observed(state, rgb, self._lasting(state, depth), pose)
-        if self.doubt is not None:
+        if self.uncertainty is not None:
             kept |= {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}
         seen = state.replace(rgb=rgb, depth=depth, known=torch.full(depth.shape, 255, dtype=torch.uint8), **kept)
         return self.aged(seen, seen) if begins else seen  # a story that begins has stood still
@@ -188,7 +191,7 @@ class VideoWorld:
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
             "things": lambda: state["things"] > 0.5,
-            "cast": lambda: state["cards"][..., :4] * _in_sight(state)[..., None],
+            "objects": lambda: state["billboards"][..., :4] * _in_sight(state)[..., None],
             **{name: lambda at=at: state["vitals"][:, at].clone() for at, name in enumerate(vitals)},
             "keyframes": lambda: torch.cat([self._recorded.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
@@ -202,9 +205,9 @@ class VideoWorld:
         """The same world with other keyframes of recordings."""
         return self._with(memory=memory)
 
-    def with_senses(self, eye: Eye | None, doubt: Doubt | None) -> VideoWorld:
+    def with_senses(self, estimator: Estimator | None, uncertainty: Uncertainty | None) -> VideoWorld:
         """The same world with another eye and another doubt, or without."""
-        return self._with(eye=eye, doubt=doubt)
+        return self._with(estimator=estimator, uncertainty=uncertainty)
 
     def with_memory_of(self, budget_mb: float) -> VideoWorld:
         """The same world with another budget for a story's own memory; with 0 it holds the last frame alone."""
@@ -212,7 +215,8 @@ class VideoWorld:
 
     def _with(self, **parts) -> VideoWorld:
         names = (
-            "spec", "config", "generator", "motion", "memory", "starts", "rewards", "eye", "doubt", "outcome", "cast",
+            "spec", "config", "generator", "motion", "memory", "starts", "rewards",
+            "estimator", "uncertainty", "outcome", "objects",
         )  # fmt: skip
         return VideoWorld(**{name: parts.get(name, getattr(self, name)) for name in names})
 
@@ -225,7 +229,7 @@ class VideoWorld:
                 "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool),
                 "rgb": torch.zeros(batch, 3, height, width, dtype=torch.uint8), "depth": torch.ones(batch, height, width),
                 "known": torch.zeros(batch, height, width, dtype=torch.uint8), **self.own.empty(batch),
-                **({} if self.doubt is None else {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}),
+                **({} if self.uncertainty is None else {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}),
             }
         )  # fmt: skip
         if self.outcome is not None:
@@ -235,52 +239,54 @@ class VideoWorld:
             return state
         instances = torch.zeros(batch, height, width, dtype=torch.uint8)
         state = state.replace(things=torch.zeros(batch, height, width), instances=instances)
-        if self.cast is not None:
-            state = state.replace(cards=self.cast.empty(batch), cards_before=self.cast.empty(batch))
+        if self.objects is not None:
+            state = state.replace(billboards=self.objects.empty(batch), billboards_before=self.objects.empty(batch))
         return self.aged(state, state)
 
     def _recognised(
-        self, cast: Cast, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor,
+        self, objects: Objects, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor,
         observation: Mapping[str, torch.Tensor], prior: State,
     ) -> dict[str, torch.Tensor]:  # fmt: skip
         """The cards of a frame (rgb uint8 [B, 3, H, W], depth [B, H, W]) and their pixels, where the evidence tells things
         apart; else what is seen is no card, and those that there were are gone from sight."""
-        if not {"cast", "instances"} <= set(observation):
-            none, nothing = cast.empty(len(rgb)), torch.zeros_like(depth, dtype=torch.uint8)
-            return {"cards": none, "cards_before": none, "instances": nothing}
-        told, instances = torch.as_tensor(observation["cast"]).float(), torch.as_tensor(observation["instances"])
-        fits = told.shape == (len(rgb), cast.config.rows, 4) and instances.ndim == 3 and len(instances) == len(rgb)
+        if not {"objects", "instances"} <= set(observation):
+            none, nothing = objects.empty(len(rgb)), torch.zeros_like(depth, dtype=torch.uint8)
+            return {"billboards": none, "billboards_before": none, "instances": nothing}
+        told, instances = torch.as_tensor(observation["objects"]).float(), torch.as_tensor(observation["instances"])
+        fits = told.shape == (len(rgb), objects.config.rows, 4) and instances.ndim == 3 and len(instances) == len(rgb)
         if not fits or instances.dtype != torch.uint8 or not torch.isfinite(told).all():
             raise ObservationError(
-                f"cast is finite float [B, {cast.config.rows}, 4] and instances uint8 [B, h, w]; got {tuple(told.shape)} "
+                f"objects is finite float [B, {objects.config.rows}, 4] and instances uint8 [B, h, w]; got {tuple(told.shape)} "
                 f"and {instances.dtype} {tuple(instances.shape)}."
             )
-        named = F.pad((told[..., 0] > 0).to(torch.uint8), (1, 255 - cast.config.rows))  # a pixel of nobody is nobody's
+        named = F.pad(
+            (told[..., 0] > 0).to(torch.uint8), (1, 255 - objects.config.rows)
+        )  # a pixel of nobody is nobody's
         instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
         cut = cut_out(rgb, instances, depth, told[..., 1:], pose, self.config.camera)
-        cards = cast.recognised(cut, told, prior["cards_before"])
-        return {"cards": cards, "cards_before": cards, "instances": instances}
+        billboards = objects.recognised(cut, told, prior["billboards_before"])
+        return {"billboards": billboards, "billboards_before": billboards, "instances": instances}
 
     def _stepped(self, state: State, before: State, rng: torch.Generator) -> State:
         """`state`, a step after `before`, with the cards of then: those that were in sight have done something."""
-        if self.cast is None:
+        if self.objects is None:
             return state
-        cards = self.cast.step(before["cards"], _in_sight(before), state["pose"], state["actions"], rng)
-        return state.replace(cards=cards, cards_before=before["cards"])
+        billboards = self.objects.step(before["billboards"], _in_sight(before), state["pose"], state["actions"], rng)
+        return state.replace(billboards=billboards, billboards_before=before["billboards"])
 
     def _painted(
-        self, cast: Cast, state: State, rgb: torch.Tensor, depth: torch.Tensor
+        self, objects: Objects, state: State, rgb: torch.Tensor, depth: torch.Tensor
     ) -> tuple[State, torch.Tensor, torch.Tensor]:
         """The frame (rgb uint8 [B, 3, H, W], depth [B, H, W]) with the cards of `state` before it, and `state` that knows
         where they are."""
         parts = rgb.float() / 255, depth, state["pose"], self.config.camera
-        painted, depth, instances = cast.paint(state["cards"], *parts)
+        painted, depth, instances = objects.paint(state["billboards"], *parts)
         things = torch.maximum(state["things"], (instances > 0).float())
         return state.replace(things=things, instances=instances), (painted * 255).round().to(torch.uint8), depth
 
     def _arrive(
-        self, observation: Mapping[str, torch.Tensor], eye: Eye, prior: State | None, rng: torch.Generator
+        self, observation: Mapping[str, torch.Tensor], estimator: Estimator, prior: State | None, rng: torch.Generator
     ) -> State:
         rgb, (height, width) = torch.as_tensor(observation["rgb"]), self.config.size
         if rgb.dtype != torch.uint8 or rgb.ndim != 4 or rgb.shape[1:] != (height, width, 3):
@@ -288,15 +294,15 @@ class VideoWorld:
         picture = rgb.permute(0, 3, 1, 2).contiguous()
         if prior is None:
             config = self.config
-            seen = arrive(picture, eye, self.memory, self._small, self.starts, config.camera, config.sources)
+            seen = arrive(picture, estimator, self.memory, self._small, self.starts, config.camera, config.sources)
             pose, depth, lone = seen.pose, seen.depth, ~seen.found
         else:
-            pose, depth = prior["pose"], eye.depth(picture)
-            lone = prior["gone"][:, 3] > 0 if self.doubt is not None else None
+            pose, depth = prior["pose"], estimator.depth(picture)
+            lone = prior["gone"][:, 3] > 0 if self.uncertainty is not None else None
         state = self.observe({**observation, "rgb": rgb, "depth": depth, "pose": pose}, prior, rng)
-        if self.doubt is None or lone is None:
+        if self.uncertainty is None or lone is None:
             return state
-        strange = (10 * (eye.strangeness(picture) - 0.95)).clamp(0, 1) * lone
+        strange = (10 * (estimator.strangeness(picture) - 0.95)).clamp(0, 1) * lone
         gone = torch.cat([torch.zeros(len(rgb), 3), lone[:, None].float(), strange[:, None]], 1)
         state = state.replace(gone=gone)
         glimpse, last, told = self.shown(state, state)  # what the world itself would draw of the picture
@@ -304,12 +310,12 @@ class VideoWorld:
         there = next(self.generator.parameters()).device
         parts = noise.to(there), glimpse.to(there), last.to(there), told.to(there)
         clean = generate(self.generator, *parts, self.config.steps).cpu()
-        return state.replace(uncertainty=self._doubted(state, glimpse, last, clean))
+        return state.replace(uncertainty=self._expected_error(state, glimpse, last, clean))
 
     def _gone(self, state: State, before: State, moved: torch.Tensor | None) -> State:
         """`state`, one step further from its evidence than `before`: after a predicted step `moved` [B, 2], or (None) where
         a pose was given."""
-        if self.doubt is None:
+        if self.uncertainty is None:
             return state
         gone = before["gone"].clone()
         gone[:, 0] += 1
@@ -321,9 +327,9 @@ class VideoWorld:
             gone[:, 2] += torch.atan2(turn.sin(), turn.cos()).abs()
         return state.replace(gone=gone)
 
-    def _doubted(self, state: State, glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
+    def _expected_error(self, state: State, glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
         """The error [B] to expect of a frame `clean` that was drawn for `state` from `glimpse` and `last`."""
-        assert self.doubt is not None
+        assert self.uncertainty is not None
         pose, gone = state["pose"], state["gone"]
         angle = (self._headings - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
         apart = (
@@ -333,7 +339,7 @@ class VideoWorld:
         nearest = apart.min(1).values if len(self.memory) else torch.full((state.batch,), AWAY_M)
         own = self.own.count(state).float() / max(1, self.own.capacity)
         said = [gone[:, :4].clamp_max(128).log1p(), nearest.clamp_max(20)[:, None].log1p(), own[:, None]]
-        return self.doubt.expected(glimpse, last, clean, torch.cat(said, 1), gone[:, 4])
+        return self.uncertainty.expected(glimpse, last, clean, torch.cat(said, 1), gone[:, 4])
 
     def aged(self, state: State, before: State) -> State:
         """`state`, in which the frame of `before` is the one before the last, where things move."""
@@ -371,9 +377,9 @@ class VideoWorld:
         for view in range(state.batch):
             one = slice(view, view + 1)
             walls = torch.cat([self._walls, self.own.walls(state, view)])
-            if self.cast is not None:
-                eye = state["pose"][view, :3]
-                walls = torch.cat([walls, self.cast.bodies(state["cards"][view], eye, self.config.body_m)])
+            if self.objects is not None:
+                position = state["pose"][view, :3]
+                walls = torch.cat([walls, self.objects.bodies(state["billboards"][view], position, self.config.body_m)])
             walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
         moved, speed = zip(*walks)
         return torch.cat(moved), torch.cat(speed)
@@ -385,8 +391,8 @@ class VideoWorld:
         there = next(self.generator.parameters()).device
         parts = noise.to(there), glimpse.to(there), last.to(there), told.to(there)
         clean = generate(self.generator, *parts, self.config.steps).cpu()
-        if self.doubt is not None:
-            state = state.replace(uncertainty=self._doubted(state, glimpse, last, clean))
+        if self.uncertainty is not None:
+            state = state.replace(uncertainty=self._expected_error(state, glimpse, last, clean))
         return self.drawn(state, glimpse, clean)
 
     def shown(self, state: State, before: State) -> tuple[Glimpse, torch.Tensor, torch.Tensor]:
@@ -398,10 +404,10 @@ class VideoWorld:
             for age in ("", "earlier_"):
                 rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
                 frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
-            told = torch.cat([mood(before["rgb"]), state["actions"].flatten(1)], 1)
+            told = torch.cat([context_thumbnail(before["rgb"]), state["actions"].flatten(1)], 1)
             return glimpse, carry_frames(frames[0], frames[1], pose, config.camera), told
         last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
-        return glimpse, last, mood(before["rgb"])
+        return glimpse, last, context_thumbnail(before["rgb"])
 
     def drawn(self, state: State, glimpse: Glimpse, clean: torch.Tensor) -> State:
         """`state` with the frame `clean` [B, 4, H, W] that the generator drew of it from `glimpse`, remembered if new."""
@@ -409,8 +415,8 @@ class VideoWorld:
         depth, known = decode_depth(clean[:, 3]), glimpse.known
         if self.config.moving:
             state = state.replace(things=clean[:, 4].sigmoid())
-            if self.cast is not None:
-                state, rgb, depth = self._painted(self.cast, state, rgb, depth)
+            if self.objects is not None:
+                state, rgb, depth = self._painted(self.objects, state, rgb, depth)
             known = known * (state["things"] < 0.5)
         kept = self.own.dreamt(state, rgb, self._lasting(state, depth), state["pose"], known)
         return state.replace(rgb=rgb, depth=depth, known=(known * 255).round().to(torch.uint8), **kept)
@@ -418,7 +424,7 @@ class VideoWorld:
 
 def _in_sight(state: State) -> torch.Tensor:
     """Which of the cards [B, K] the last frame shows."""
-    rows = torch.arange(1, state["cards"].shape[1] + 1)
+    rows = torch.arange(1, state["billboards"].shape[1] + 1)
     return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 

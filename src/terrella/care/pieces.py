@@ -1,0 +1,295 @@
+"""pieces: which rows of a damaged recording are whole, as runs that follow one another without a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from ..core.errors import DatasetError
+from ..data.dataset import decoded
+from ..data.format import AUTOMATIC, to_numpy
+from ..data.storage.tables import batches, open_parquet
+from .survey import Survey, camera_of, found_features
+
+_MOST_LOST = 10_000_000  # rows that cannot be read at a stretch; more is damage
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rows of one episode that are whole and follow one another.
+
+    number: of the episode, as the rows have it; file: where they lie (`path`, or a rebuilt copy of it); row: the first
+    one's place there; frame: the first one's place in the episode; task: of each row; whole: whether these are all rows
+    that the episode is said to have.
+    """
+
+    number: int
+    file: str
+    path: Path
+    row: int
+    frame: int
+    task: np.ndarray
+    whole: bool = False
+
+    @property
+    def count(self) -> int:
+        return len(self.task)
+
+    def part(self, begin: int, end: int) -> Piece:
+        """Rows begin to end of it."""
+        whole = self.whole and (begin, end) == (0, self.count)
+        return replace(self, row=self.row + begin, frame=self.frame + begin, task=self.task[begin:end], whole=whole)
+
+
+@dataclass
+class Table:
+    """The counters of one data file's rows; good: which of them can be read and are finite numbers."""
+
+    file: str
+    path: Path
+    columns: dict[str, np.ndarray]
+    good: np.ndarray
+    missing: dict[str, np.ndarray] = field(default_factory=dict)  # column -> rows in which it is no finite number
+
+
+def as_found(found: Survey, said: list[str]) -> dict[str, dict]:
+    """The features as the rows have them; what info.json says otherwise is said."""
+    features = {name: dict(feature) for name, feature in found.features.items()}
+    forms = []
+    for file in found.data:
+        try:
+            with open_parquet(found.path(file)) as opened:
+                forms.append(opened.schema_arrow)
+        except (DatasetError, OSError, pa.ArrowException, ValueError):
+            continue
+    _swapped(found, features, forms, said)
+    for name, feature in list(features.items()):
+        if feature["dtype"] == "video":
+            size = found.size(name)
+            if size and list(size) != feature["shape"][:2]:
+                said.append(f"the pictures of {name} are {size[0]}x{size[1]}, and so in info.json now")
+                features[name] = {**feature, "shape": [*size, 3]}
+        if feature["dtype"] in ("video", "image") or name in AUTOMATIC or not forms:
+            continue
+        kinds = list(dict.fromkeys(form.field(name).type for form in forms if name in form.names))
+        if len(kinds) == 1 and (changed := _retyped(feature, kinds[0])) != feature:
+            said.append(f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, and so in info.json now")
+            features[name] = changed
+    for name in AUTOMATIC:
+        features.setdefault(name, {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None})
+    return features
+
+
+def _swapped(found: Survey, features: dict[str, dict], forms: list[pa.Schema], said: list[str]) -> None:
+    """Takes away what no table and no video has; where something is missed, what they have beside it is taken in."""
+    columns = {name for form in forms for name in form.names}
+    cameras = {camera for file in found.films if (camera := camera_of(file, found.video_path))}
+    if not forms and not cameras:
+        return  # there is no episode yet: what is promised may still come
+    lost = [name for name, feature in features.items() if feature["dtype"] == "video" and name not in cameras]
+    if forms:
+        lost += [name for name, feature in features.items() if feature["dtype"] != "video" and name not in columns]
+    lost = [name for name in lost if name not in AUTOMATIC]
+    for name in lost:
+        said.append(f"no file has '{name[:100]}', which info.json promises: it is left out")
+        del features[name]
+    if lost:
+        for name, feature in found_features(found.root, found.data, found.films, found.video_path).items():
+            if name not in features:
+                said.append(f"'{name[:100]}' is in the files, though info.json does not say so, and kept")
+                features[name] = feature
+
+
+def _retyped(feature: dict, kind: pa.DataType) -> dict:
+    """The feature with the type, and for plain lists the length, that the column has."""
+    lengths = []
+    while isinstance(kind, pa.BaseExtensionType):
+        kind = kind.storage_type
+    while pa.types.is_nested(kind) and hasattr(kind, "value_type"):
+        lengths.append(kind.list_size if pa.types.is_fixed_size_list(kind) else None)
+        kind = kind.value_type
+    changed = dict(feature)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        changed["dtype"] = "bool" if pa.types.is_boolean(kind) else str(np.dtype(kind.to_pandas_dtype()))
+    if len(lengths) == 1 and lengths[0] and len(feature["shape"]) == 1:
+        changed["shape"] = [lengths[0]]
+    return changed if changed["shape"] == feature["shape"] else {**changed, "names": None}
+
+
+def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dict]) -> Table:
+    """Reads all columns of a data file, keeps the counters; DatasetError where the file as a whole cannot be read."""
+    with open_parquet(path) as opened:
+        names = opened.schema_arrow.names
+    columns = [name for name, feature in features.items() if name in names and feature["dtype"] != "video"]
+    lacks = sorted(
+        name for name, f in features.items() if name not in names and f["dtype"] != "video" and name not in AUTOMATIC
+    )
+    if lacks:
+        raise DatasetError(f"{file} lacks the column '{lacks[0]}' that other rows have.")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in AUTOMATIC}
+    missing: dict[str, list[np.ndarray]] = {}
+    good: list[np.ndarray] = []
+    for _, count, table in batches(path, features, columns):
+        if isinstance(table, DatasetError) and count > _MOST_LOST:
+            raise table  # who claims so many rows has none
+        whole = np.ones(count, bool)
+        found: dict[str, np.ndarray] = {}
+        if isinstance(table, DatasetError):
+            whole[:] = False
+        else:
+            for name in columns:
+                try:
+                    if features[name]["dtype"] == "image":
+                        whole &= _pictures(table[name], tuple(features[name]["shape"]))
+                    else:
+                        found[name] = to_numpy(table[name], tuple(features[name]["shape"]))
+                except (ValueError, TypeError, NotImplementedError):
+                    whole[:] = False
+        for name in AUTOMATIC:
+            there = found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan)
+            parts[name].append(there)
+        for name, feature in features.items():
+            if feature["dtype"].startswith("float") and name != "timestamp":
+                bad = ~np.isfinite(found[name].reshape(count, -1)).all(1) if name in found else np.zeros(count, bool)
+                missing.setdefault(name, []).append(np.asarray(bad))
+        good.append(whole)
+    joined = {name: np.concatenate(some) if some else np.zeros(0) for name, some in parts.items()}
+    bad = {name: np.concatenate(some) for name, some in missing.items()}
+    return Table(file, path, joined, np.concatenate(good) if good else np.zeros(0, bool), bad)
+
+
+def _pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
+    """bool [n]: which of the pictures can be read."""
+    good = np.zeros(len(column), bool)
+    for i, picture in enumerate(column):
+        with suppress(DatasetError):
+            decoded(picture.as_py(), shape, "the camera")
+            good[i] = True
+    return good
+
+
+def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[Piece]:
+    """The whole pieces of a file's rows, episode after episode as they lie there."""
+    numbers = _numbers(survey, table)
+    for number in dict.fromkeys(numbers[numbers >= 0].tolist()):
+        rows = np.flatnonzero(numbers == number)
+        good = table.good[rows] & ~_unmeasured(table, rows, int(number), notes)
+        told = survey.told.get(int(number))
+        frames = _frames(survey, table, rows, None if told is None else told.start)
+        task = np.nan_to_num(table.columns["task_index"][rows], nan=-1).astype(np.int64)
+        cuts = np.flatnonzero((np.diff(frames) != 1) | (np.diff(rows) != 1) | (np.diff(good.astype(np.int8)) != 0)) + 1
+        length = None if told is None else told.length
+        for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(rows)]):
+            if good[begin] and frames[begin] >= 0:
+                whole = frames[begin] == 0 and end - begin == (len(rows) if length is None else length)
+                yield Piece(
+                    int(number), table.file, table.path, int(rows[begin]), int(frames[begin]), task[begin:end], whole
+                )
+
+
+def _numbers(survey: Survey, table: Table) -> np.ndarray:
+    """int64: the episode of each row; where the column is missing, that to which alone the file belongs; else -1."""
+    found = table.columns["episode_index"]
+    here = [episode.number for episode in survey.told.values() if episode.data == table.file]
+    if np.isnan(found).all() and len(here) == 1:
+        return np.full(len(found), here[0], np.int64)
+    return np.where(np.isfinite(found) & (np.abs(found) < 2**53), found, -1).astype(np.int64)
+
+
+def _frames(survey: Survey, table: Table, rows: np.ndarray, start: int | None) -> np.ndarray:
+    """int64: each row's place in its episode: what most of frame_index, index, timestamp and the order of the rows say."""
+    frame, index = table.columns["frame_index"][rows], table.columns["index"][rows]
+    time = np.round(table.columns["timestamp"][rows] * survey.fps)
+    if start is None:
+        offset = (index - frame)[np.isfinite(index - frame)]
+        values, counts = np.unique(offset, return_counts=True)
+        start = int(values[counts.argmax()]) if len(values) else 0
+    votes = np.stack([frame, index - start, time])
+    votes = np.where(np.isfinite(votes) & (np.abs(votes) < 2**53), votes, -1).astype(np.int64)
+    if (votes == np.arange(len(rows))).sum(0).min(initial=3) >= 2:  # as it should be
+        return np.arange(len(rows))
+    found, due = np.empty(len(rows), np.int64), 0
+    for i, said in enumerate(votes.T):
+        choices = [int(vote) for vote in said if vote >= 0]
+        best = max([*choices, due], key=lambda at: (choices.count(at) + (at == due), at == due))
+        found[i] = best
+        due = best + 1
+    return found
+
+
+def _unmeasured(table: Table, rows: np.ndarray, number: int, notes: list[str]) -> np.ndarray:
+    """Rows with a number that is not finite, where most rows of the episode have one; a column that mostly has none stays."""
+    bad = np.zeros(len(rows), bool)
+    for name, missing in table.missing.items():
+        here = missing[rows]
+        if here.mean() > 0.5:
+            notes.append(
+                f"episode {number}: {name} is no finite number in {int(here.sum())} of {len(rows)} rows, which stay as they are"
+            )
+        else:
+            bad |= here
+    return bad
+
+
+class RowReader:
+    """Rows of data files as columns; going on in order reads each file once."""
+
+    def __init__(self, features: Mapping[str, dict]):
+        self._features = features
+        self._columns = [name for name, feature in features.items() if feature["dtype"] != "video"]
+        self._path: Path | None = None
+
+    def columns(self, piece: Piece) -> Iterator[dict[str, np.ndarray]]:
+        """The piece's columns, some hundred rows at a time; pictures as their bytes."""
+        begin, end = piece.row, piece.row + piece.count
+        if self._path != piece.path or begin < self._at:
+            self._path, self._at = piece.path, 0
+            with open_parquet(piece.path) as opened:
+                there = set(opened.schema_arrow.names)
+            wanted = [name for name in self._columns if name in there]
+            self._run = batches(piece.path, self._features, wanted)
+            self._table: pa.Table | None = None
+        while begin < end:
+            if self._table is None or begin >= self._at + len(self._table):
+                self._at, _, table = next(self._run, (end, 0, None))
+                if table is None:
+                    raise DatasetError(f"{piece.path} has changed while it was read; leave it alone and try again.")
+                self._table = None if isinstance(table, DatasetError) else table
+                continue
+            upto = min(end, self._at + len(self._table), begin + 256)
+            yield self._arrays(self._table.slice(begin - self._at, upto - begin))
+            begin = upto
+
+    def _arrays(self, table: pa.Table) -> dict[str, np.ndarray]:
+        found: dict[str, np.ndarray] = {}
+        for name in table.column_names:
+            feature = self._features[name]
+            if feature["dtype"] == "image":
+                column = np.empty(len(table), object)
+                column[:] = [(value or {}).get("bytes") for value in table[name].to_pylist()]
+                found[name] = column
+            else:
+                found[name] = to_numpy(table[name], tuple(feature["shape"]))
+        return found
+
+
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """(begin, end) of each stretch in which the mask is True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2])]
+
+
+def uncovered(pieces: Sequence[Piece]) -> Iterator[Piece]:
+    """The pieces without rows that one before them has too: a file may have been copied."""
+    taken: dict[int, set[int]] = {}
+    for piece in pieces:
+        seen = taken.setdefault(piece.number, set())
+        mask = np.array([frame not in seen for frame in range(piece.frame, piece.frame + piece.count)], bool)
+        for begin, end in runs(mask):
+            yield piece.part(begin, end)
+        seen.update(range(piece.frame, piece.frame + piece.count))

@@ -1,0 +1,398 @@
+"""Browse: a recording of any format, opened for looking at: its list of episodes, single readings, and marks of bad ones."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import DatasetError
+from ..data.format import INFO
+from ..data.source import Readings, Sensor, Source, Take
+from ..data.storage.durable import write_json
+
+MARKS = ".terrella-marks.json"  # beside the recording, in its folder
+_OPEN = 2  # takes kept open at once
+_MARKS_VERSION = 1
+
+Report = Callable[[int, int], None]  # (episodes done, episodes in all)
+Export = Callable[[Path, Sequence[int], Report], None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the list of episodes.
+
+    rows:    readings of its first camera (where it has none: of its first sensor).
+    seconds: time of its last reading.
+    task:    the instruction, "" where there is none.
+    """
+
+    rows: int
+    seconds: float
+    task: str = ""
+
+    @staticmethod
+    def of(take: Take) -> Entry:
+        cameras = [name for name in take.readings if name.startswith("observation.images")]
+        first = next(iter([*cameras, *take.readings]), None)
+        ends = [float(readings.time_s[-1]) for readings in take.readings.values() if len(readings.time_s)]
+        return Entry(len(take.readings[first].time_s) if first else 0, max(ends, default=0.0), take.task)
+
+
+class Browse:
+    """Looks into a recording: what `terrella.serve.viewer.Viewable` asks for.
+
+    source:  the recording.
+    marks:   JSON file that keeps which episodes are bad; it is made when the first is marked.
+    entries: the list of episodes; without it, every take is opened once to learn its length.
+    take:    opens one episode by its number; without it, `source.takes()[number]` where that is a sequence, else takes
+             are walked from the first on.
+    export:  writes the episodes of the given numbers into a new folder, and calls `report` as it goes along.
+
+    At most two takes are kept open. DatasetError where the marks are unreadable, an episode, sensor or reading does not
+    exist, or one does not decode. Not for several threads at once.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        marks: str | Path,
+        entries: Sequence[Entry] | None = None,
+        take: Callable[[int], Take] | None = None,
+        export: Export | None = None,
+    ):
+        self.source, self._marks_path, self._export = source, Path(marks), export
+        self._open = take or _Walk(source).take
+        self.entries = tuple(entries if entries is not None else map(Entry.of, source.takes()))
+        self._takes: OrderedDict[int, _OpenTake] = OrderedDict()
+        self._bad = _read_marks(self._marks_path)
+
+    # -- what there is ------------------------------------------------------------------------------------------------
+
+    def about(self) -> dict:
+        """The recording as JSON: name, robot, fps, notes, sensors (in the order in which a page shows them)."""
+        source = self.source
+        return {
+            "name": source.name,
+            "robot": source.robot,
+            "fps": source.fps,
+            "notes": list(source.notes),
+            "sensors": [_describe(source.sensors[name]) for name in self._names()],
+            "can_export": self._export is not None,
+        }
+
+    def listing(self) -> list[dict]:
+        """Every episode as JSON: rows, seconds, task."""
+        return [{"rows": entry.rows, "seconds": _finite(entry.seconds), "task": entry.task} for entry in self.entries]
+
+    def episode(self, number: int) -> dict:
+        """One episode as JSON: seconds, task, start_ns (text: it is too long for a JSON number in a browser), language
+        ([[time_s, text], ...], from the take's fact of that name) and per sensor count and fault.
+
+        A fault is a sentence that says why a sensor cannot be shown; "" where it can.
+        """
+        opened = self._take(number)
+        sensors, ends = {}, [0.0]
+        for name in opened.take.readings:
+            try:
+                times = opened.times(name)
+                sensors[name] = {"count": len(times), "fault": ""}
+                ends += times[-1:].tolist()
+            except DatasetError as error:
+                sensors[name] = {"count": 0, "fault": str(error)}
+        start = opened.take.start_ns
+        return {
+            "number": number,
+            "seconds": max(ends),
+            "task": opened.take.task,
+            "start_ns": None if start is None else str(start),
+            "language": _language(opened.take),
+            "sensors": sensors,
+        }
+
+    # -- readings -----------------------------------------------------------------------------------------------------
+
+    def times(self, number: int, sensor: str) -> np.ndarray:
+        """float64 [n], ascending, seconds since the episode began."""
+        return self._take(number).times(sensor)
+
+    def reading(self, number: int, sensor: str, index: int) -> np.ndarray:
+        """One picture uint8 [H, W, 3], depth float32 [h, w] in metres, cloud float32 [n, k], or vector [k]."""
+        return self._take(number).reading(sensor, index)
+
+    def series(self, number: int, sensor: str) -> np.ndarray:
+        """A vector sensor's whole episode, float64 [n, k]."""
+        return self._take(number).series(sensor)
+
+    # -- marks and export ---------------------------------------------------------------------------------------------
+
+    def marks(self) -> list[int]:
+        """Numbers of the episodes marked bad, ascending."""
+        return sorted(number for number in self._bad if number < len(self.entries))
+
+    def mark(self, number: int, bad: bool) -> None:
+        """Marks an episode bad, or good again; it is on the disk when this returns."""
+        self._check(number)
+        marked = self._bad | {number} if bad else self._bad - {number}
+        try:
+            write_json(self._marks_path, {"version": _MARKS_VERSION, "bad": sorted(marked)})
+        except OSError as error:
+            raise DatasetError(
+                f"the mark cannot be kept in {self._marks_path} ({error.strerror}); name another file with --marks."
+            ) from error
+        self._bad = marked
+
+    def export(self, path: Path, keep: Sequence[int], report: Report) -> None:
+        """Writes the episodes `keep` into a new folder `path`; may run beside the other methods, in its own thread."""
+        if self._export is None:
+            raise DatasetError(f"{self.source.name} was opened for looking only; it cannot be exported from here.")
+        for number in keep:
+            self._check(number)
+        self._export(path, list(keep), report)
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _names(self) -> list[str]:
+        kinds, vectors = (
+            ("image", "depth", "points", "vector"),
+            ("action", "observation.state", "next.reward", "next.done"),
+        )
+
+        def place(name: str) -> tuple[int, int]:
+            kind = self.source.sensors[name].kind
+            return kinds.index(kind), vectors.index(name) if name in vectors else len(vectors)
+
+        return sorted(self.source.sensors, key=place)
+
+    def _check(self, number: int) -> None:
+        if not 0 <= number < len(self.entries):
+            raise DatasetError(
+                f"{self.source.name} has no episode {number}; its {len(self.entries)} episodes are numbered from 0."
+            )
+
+    def _take(self, number: int) -> _OpenTake:
+        self._check(number)
+        if number not in self._takes:
+            while len(self._takes) >= _OPEN:
+                self._takes.popitem(last=False)
+            self._takes[number] = _OpenTake(self.source, number, self._open(number))
+        self._takes.move_to_end(number)
+        return self._takes[number]
+
+
+class _OpenTake:
+    """One take, with the checked times and whole vectors that were asked of it so far."""
+
+    def __init__(self, source: Source, number: int, take: Take):
+        self.take, self._source, self._number = take, source, number
+        self._times: dict[str, np.ndarray] = {}
+        self._series: dict[str, np.ndarray] = {}
+
+    def times(self, sensor: str) -> np.ndarray:
+        if sensor not in self._times:
+            self._times[sensor] = self._checked_times(sensor)
+        return self._times[sensor]
+
+    def reading(self, sensor: str, index: int) -> np.ndarray:
+        count = len(self.times(sensor))
+        if not 0 <= index < count:
+            raise DatasetError(f"{self._where(sensor)} has {count} readings, no reading {index}.")
+        try:
+            value = np.asarray(self._readings(sensor).values[index])
+        except DatasetError:
+            raise
+        except Exception as error:  # whatever a decoder makes of a broken file
+            raise DatasetError(
+                f"reading {index} of {self._where(sensor)} does not decode ({type(error).__name__}: {error}); look for "
+                "the cause with `terrella data doctor`."
+            ) from error
+        kind = self._source.sensors[sensor].kind
+        if kind == "image" and (value.dtype != np.uint8 or value.ndim != 3 or value.shape[2] != 3 or not value.size):
+            raise self._foreign(sensor, index, value, "a picture, uint8 [H, W, 3]")
+        if kind == "depth" and (value.ndim != 2 or value.dtype.kind not in "fiu" or not value.size):
+            raise self._foreign(sensor, index, value, "depth in metres, [h, w]")
+        if kind == "points" and (value.ndim != 2 or value.shape[1] < 3 or value.dtype.kind not in "fiu"):
+            raise self._foreign(sensor, index, value, "a cloud, [n, 3 or more]")
+        return value
+
+    def series(self, sensor: str) -> np.ndarray:
+        if sensor not in self._series:
+            if self._source.sensors[sensor].kind != "vector":
+                raise DatasetError(f"{self._where(sensor)} is no vector; it is shown one reading at a time.")
+            times, values = self.times(sensor), self._readings(sensor).values
+            try:
+                whole = np.asarray(values if isinstance(values, np.ndarray) else [np.asarray(v) for v in values])
+                whole = whole.astype(np.float64).reshape(len(times), -1) if len(times) else np.zeros((0, 1))
+            except DatasetError:
+                raise
+            except Exception as error:
+                raise DatasetError(
+                    f"{self._where(sensor)} is not a series of numbers ({error}); look for the cause with "
+                    "`terrella data doctor`."
+                ) from error
+            self._series[sensor] = whole
+        return self._series[sensor]
+
+    def _checked_times(self, sensor: str) -> np.ndarray:
+        readings = self._readings(sensor)
+        times = np.asarray(readings.time_s, dtype=np.float64).reshape(-1)
+        if len(times) != len(readings.values):
+            raise DatasetError(
+                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} readings; see "
+                "`terrella data doctor`."
+            )
+        if not np.isfinite(times).all() or (np.diff(times) < 0).any():
+            raise DatasetError(
+                f"the times of {self._where(sensor)} do not ascend, or are no numbers; see `terrella data doctor`."
+            )
+        return times
+
+    def _readings(self, sensor: str) -> Readings:
+        if sensor not in self._source.sensors:
+            known = ", ".join(self._source.sensors)
+            raise DatasetError(f"{self._source.name} has no sensor {sensor}; it has {known}.")
+        if sensor not in self.take.readings:
+            raise DatasetError(f"episode {self._number} has no readings of {sensor}.")
+        return self.take.readings[sensor]
+
+    def _where(self, sensor: str) -> str:
+        return f"{sensor} in episode {self._number}"
+
+    def _foreign(self, sensor: str, index: int, value: np.ndarray, wanted: str) -> DatasetError:
+        return DatasetError(
+            f"reading {index} of {self._where(sensor)} is {value.dtype} {list(value.shape)} and not {wanted}; see "
+            "`terrella data doctor`."
+        )
+
+
+class _Walk:
+    """Episodes by number of any source; one that only gives them in turn is walked on from the last, or begun anew."""
+
+    def __init__(self, source: Source):
+        self._source = source
+        self._at, self._takes = 0, iter(())
+
+    def take(self, number: int) -> Take:
+        if number < self._at or self._at == 0:
+            found = self._source.takes()
+            if isinstance(found, Sequence) and number < len(found):
+                return found[number]
+            self._at, self._takes = 0, iter(found)
+        for take in self._takes:
+            self._at += 1
+            if self._at == number + 1:
+                return take
+        self._at = 0
+        raise DatasetError(f"{self._source.name} has no episode {number} any more; open it again.")
+
+
+def _describe(sensor: Sensor) -> dict:
+    label = re.sub(r"^(observation|next)\.((images|points)\.)?", "", sensor.name) or sensor.name
+    count = (
+        int(np.prod(sensor.shape)) if sensor.kind == "vector" else sensor.shape[-1] if sensor.kind == "points" else 0
+    )
+    names = list(sensor.names) if len(sensor.names) == count else [str(place) for place in range(count)]
+    return {
+        "name": sensor.name,
+        "label": label,
+        "kind": sensor.kind,
+        "shape": list(sensor.shape),
+        "dtype": sensor.dtype,
+        "names": names,
+        "units": [str(sensor.units.get(name, "")) for name in names],
+        "frame": sensor.frame,
+        "rate_hz": sensor.rate_hz,
+        "pose": None if sensor.kind != "vector" or sensor.name == "action" else pose_columns(sensor),
+    }
+
+
+_PREFIX = "(?:|p|pos|position|translation|pose)"
+_TURN = "(?:q|quat|quaternion|rotation|orientation)"
+
+
+def pose_columns(sensor: Sensor) -> dict | None:
+    """Which numbers of a vector are a pose on the ground, found by their names: {"x", "y", "quaternion": [w, x, y, z] or
+    None, "yaw": column or None, "degrees"}. None where it holds no position in metres.
+
+    The world's z is up, and a body looks along its own x. Quaternions and yaw turn the body's axes into the world's.
+    """
+    if not sensor.dtype.startswith("float"):
+        return None
+    plain = [re.sub(r"[^a-z]", "", re.sub(r"_(m|rad|deg)$", "", name.lower())) for name in sensor.names]
+
+    def place(pattern: str) -> int | None:
+        return next((at for at, name in enumerate(plain) if re.fullmatch(pattern, name)), None)
+
+    x, y = place(f"{_PREFIX}x"), place(f"{_PREFIX}y")
+    if x is None or y is None or any(sensor.units.get(sensor.names[at], "m") != "m" for at in (x, y)):
+        return None
+    turn, yaw = [place(f"{_TURN}{axis}") for axis in "wxyz"], place("yaw|theta|heading")
+    quaternion = None if None in turn else turn
+    named = re.search(r"pose|position|odom|gps|ground", sensor.name.lower())
+    if quaternion is None and yaw is None and not named:
+        return None
+    degrees = yaw is not None and (
+        sensor.names[yaw].endswith("_deg") or sensor.units.get(sensor.names[yaw]) in ("deg", "°")
+    )
+    return {"x": x, "y": y, "quaternion": quaternion, "yaw": yaw, "degrees": degrees}
+
+
+def _language(take: Take) -> list[list]:
+    spoken = take.facts.get("language", ())
+    pairs: Iterator = iter(spoken if isinstance(spoken, (list, tuple)) else ())
+    return [[_finite(pair[0]), str(pair[1])] for pair in pairs if isinstance(pair, (list, tuple)) and len(pair) == 2]
+
+
+def _finite(number: object) -> float:
+    try:
+        value = float(number)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        return 0.0
+    return value if np.isfinite(value) else 0.0
+
+
+def _read_marks(path: Path) -> frozenset[int]:
+    if not path.exists():
+        return frozenset()
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        bad = kept["bad"]
+        if kept["version"] != _MARKS_VERSION or not all(type(number) is int and number >= 0 for number in bad):
+            raise ValueError("its list of bad episodes is not one of whole numbers, or of another version")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DatasetError(f"the marks in {path} cannot be read ({error}); mend the file, or move it away.") from error
+    return frozenset(bad)
+
+
+def browse(path: str | Path) -> Browse:
+    """A recording of any format, to be looked through; what is exported from a LeRobot folder is carried over bit for bit."""
+    from ..care.repair import repair
+    from ..data.dataset import Dataset
+    from .convert import open_source, write_source
+
+    source, where = open_source(path), Path(path)
+    if "://" in str(path):
+        marks = Path(f".{where.name}{MARKS}")  # here: nothing is written to a remote
+    else:
+        marks = where / MARKS if where.is_dir() else where.with_name(f".{where.name}{MARKS}")
+    if not (where / INFO).exists():
+
+        def write(out: Path, keep: Sequence[int], report: Report) -> None:
+            wanted = set(keep)
+            chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
+            write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
+
+        return Browse(source, marks, export=write)
+    dataset = Dataset(path)
+    entries = [Entry(episode.length, episode.length / dataset.fps, episode.task) for episode in dataset.episodes]
+
+    def carry(out: Path, keep: Sequence[int], report: Report) -> None:
+        repair(where, out, keep, report)
+
+    return Browse(source, marks, entries, export=carry)

@@ -1,0 +1,245 @@
+"""HDF5 recordings: robomimic's layout (read and written), the Counter-Strike files DIAMOND learned from, D4RL's flat arrays."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ...data.source import Lazy, Sensor, Source, Take
+from . import rows
+
+try:
+    from h5py import Dataset, File, Group, HardLink, string_dtype
+except ImportError as missing:
+    raise DatasetError("HDF5 files need the package h5py: pip install 'terrella[hdf5]'.") from missing
+
+SUFFIXES = (".hdf5", ".h5", ".hdf")
+OURS = "terrella"  # the attribute under which our description of the sensors is kept
+TEXT = string_dtype("utf-8")
+_UNTOLD_BYTES, _BEST_RATIO = 1 << 26, 1100  # deflate packs at most 1032 to 1: who claims more than that is lying
+DEEPEST = 16  # groups in groups
+_STUMBLES = (OSError, RuntimeError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
+
+
+def read(path: str | Path, fps: float | None = None) -> Source:
+    """An HDF5 file, or a folder of them (takes in the natural order of their names), as a Source; its keys say which layout.
+
+    robomimic:      data/demo_i/{actions, obs/*, …}: see robomimic.py.
+    Counter-Strike: frame_i_x, frame_i_y, …, one file a take: see counter_strike.py.
+    D4RL:           observations, actions, terminals, timeouts, …: see d4rl.py.
+
+    fps: rows a second; by default the file's own (robomimic's control_freq, Counter-Strike's 16), else rows.FPS_UNKNOWN,
+    and a note says so.
+    DatasetError where a file is missing, truncated, of another layout, or links to what lies outside it.
+    """
+    path = Path(path)
+    rows.check_fps(fps, str(path))
+    if path.is_dir():
+        files = sorted((p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()), key=rows.natural)
+        if not files:
+            raise DatasetError(f"{path} has no HDF5 files ({', '.join(SUFFIXES)}); name a folder that has.")
+    else:
+        files = [path]
+    from . import counter_strike, d4rl, robomimic
+
+    layout = _layout_of(files[0])
+    if layout == "counter-strike":
+        return counter_strike.read(path, files, fps)
+    one = robomimic.read if layout == "robomimic" else d4rl.read
+    parts = [one(file, fps) for file in files]
+    return parts[0] if len(parts) == 1 else _chained(path.name, parts, files)
+
+
+def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
+    """Writes a source as one robomimic file: see robomimic.write."""
+    from . import robomimic
+
+    return robomimic.write(source, path, progress)
+
+
+def _layout_of(path: Path) -> str:
+    with opened(path) as file:
+        names = members(file)
+        if "data" in names and isinstance(data := child(file, "data"), Group):
+            if any(re.fullmatch(r"demo_\d+", name) for name in members(data)):
+                return "robomimic"
+        if "frame_0_x" in names and "frame_0_y" in names:
+            return "counter-strike"
+        if "observations" in names and "actions" in names:
+            return "d4rl"
+        found = ", ".join(sorted(names, key=rows.natural)[:12]) or "nothing"
+    raise DatasetError(
+        f"{path} is none of the known layouts (robomimic: data/demo_0; Counter-Strike: frame_0_x, frame_0_y; D4RL: "
+        f"observations, actions); it holds {found}."
+    )
+
+
+# -- HDF5 without trust
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[File]:
+    """The file, for reading; whatever HDF5 stumbles over inside is a DatasetError."""
+    try:
+        with _open(path) as file:
+            yield file
+    except _STUMBLES as error:
+        raise DatasetError(f"{path} is damaged ({_first_line(error)}); restore it from a copy.") from error
+
+
+def _open(path: Path) -> File:
+    try:
+        return File(path, "r")
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} does not exist; name an HDF5 file.") from error
+    except _STUMBLES as error:
+        why = _first_line(error)
+        raise DatasetError(f"{path} is truncated or no HDF5 file ({why}); restore it from a copy.") from error
+
+
+def members(parent: Group) -> list[str]:
+    """The names in a group."""
+    return [str(name) for name in parent]
+
+
+def child(parent: Group, name: str) -> Group | Dataset:
+    """parent[name], of the same file: links elsewhere are refused, as are datasets whose bytes lie elsewhere."""
+    where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
+    try:
+        link = parent.get(name, getlink=True)
+        if link is not None and not isinstance(link, HardLink):
+            raise DatasetError(f"{where} is a link, which may lead out of the file; repack the file without links.")
+        found = parent[name]
+    except _STUMBLES as error:
+        raise DatasetError(f"{where} is missing or damaged ({_first_line(error)}); restore it from a copy.") from error
+    if not isinstance(found, Group | Dataset):
+        raise DatasetError(f"{where} is neither a group nor an array; restore the file from a copy.")
+    if isinstance(found, Dataset) and (found.is_virtual or found.external):
+        raise DatasetError(f"{where} keeps its values in other files; repack the file so that it holds them.")
+    return found
+
+
+def numbers(parent: Group, name: str, count: int | None = None) -> Dataset:
+    """The dataset of numbers `name` with `count` rows; DatasetError where it is another or claims more than it stores."""
+    where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
+    found = child(parent, name)
+    if not isinstance(found, Dataset) or found.dtype.kind not in "biuf" or found.ndim < 1:
+        raise DatasetError(f"{where} is not an array of numbers with a row for each step.")
+    size = found.size * found.dtype.itemsize
+    if size > max(_UNTOLD_BYTES, _BEST_RATIO * found.id.get_storage_size()):
+        raise DatasetError(f"{where} claims {size} bytes but the file does not hold them; restore it from a copy.")
+    if count is not None and len(found) != count:
+        raise DatasetError(
+            f"{where} has {len(found)} rows where {count} are needed; the file is truncated or inconsistent."
+        )
+    return found
+
+
+def taken(dataset: Dataset, sensor: Sensor, start: int = 0, stop: int | None = None) -> np.ndarray:
+    """Rows [start, stop) as the sensor's values."""
+    try:
+        return rows.from_stored(np.asarray(dataset[start:stop], sensor.dtype), sensor)
+    except _STUMBLES as error:
+        raise broken(dataset, error) from error
+
+
+def pictures(path: Path, names: Sequence[str], sensor: Sensor, start: int, count: int) -> Lazy:
+    """Rows start … start + count - 1 of the dataset at `names`, each read when looked at; the file is opened at the first look."""
+    kept: list[Dataset] = []
+
+    def make(i: int) -> np.ndarray:
+        if not kept:
+            item = _open(path)
+            for name in names[:-1]:
+                item = group(item, name)
+            kept.append(numbers(item, names[-1]))
+        if kept[0].shape[1:] != rows.stored_shape(sensor) or start + i >= len(kept[0]):
+            raise DatasetError(f"{path} changed while it was read; read it anew.")
+        return taken(kept[0], sensor, start + i, start + i + 1)[0]
+
+    return Lazy(count, make)
+
+
+def followed_by(first: Lazy, last: Lazy) -> Lazy:
+    """The values of both, one after the other."""
+
+    def make(i: int) -> np.ndarray:
+        return np.asarray(first[i] if i < len(first) else last[i - len(first)])
+
+    return Lazy(len(first) + len(last), make)
+
+
+def broken(dataset: Dataset, error: BaseException) -> DatasetError:
+    """What to raise where a dataset's values cannot be read."""
+    where = f"{dataset.file.filename}{dataset.name}"
+    return DatasetError(f"{where} cannot be read ({_first_line(error)}); restore the file from a copy.")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip('"').splitlines() or [type(error).__name__])[0]
+
+
+def attributes(item: Group, without: Sequence[str] = ()) -> dict[str, object]:
+    """The attributes that JSON can hold."""
+    found = {}
+    for name in item.attrs:
+        if name not in without:
+            try:
+                value = rows.json_or_none(item.attrs[name])
+            except _STUMBLES:
+                continue
+            if value is not None:
+                found[name] = value
+    return found
+
+
+def json_attribute(item: Group, name: str) -> object:
+    """The attribute as JSON, None where it is missing or is not."""
+    text = attributes(item).get(name)
+    try:
+        return json.loads(text) if isinstance(text, str) else None
+    except ValueError:
+        return None
+
+
+def group(parent: Group, name: str) -> Group:
+    """parent[name], which must be a group."""
+    found = child(parent, name)
+    if not isinstance(found, Group):
+        raise DatasetError(
+            f"{parent.file.filename}{parent.name.rstrip('/')}/{name} is not a group; the file is inconsistent."
+        )
+    return found
+
+
+def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
+    first = parts[0]
+    for part, file in zip(parts, files):
+        if part.sensors != first.sensors or part.fps != first.fps:
+            raise DatasetError(
+                f"{file} has other sensors than {files[0]}; convert them one by one and merge the results."
+            )
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    facts = {"files": {file.name: part.facts for file, part in zip(files, parts)}}
+
+    def takes() -> Iterator[Take]:
+        for part in parts:
+            yield from part.takes()
+
+    return replace(first, name=name, takes=takes, notes=notes, facts=facts)
+
+
+def check_shape(dataset: Dataset, sensor: Sensor, where: str) -> None:
+    """DatasetError unless the dataset's rows are what the sensor stores."""
+    if dataset.shape[1:] != rows.stored_shape(sensor):
+        shape, want = list(dataset.shape[1:]), list(rows.stored_shape(sensor))
+        raise DatasetError(
+            f"{where} is {shape} a row where the first episode has {want}; drop the episode, or mend it."
+        )

@@ -1,0 +1,223 @@
+"""LeRobot v3.0: a recording read as a Source, and any Source written as one, its rows by a stated clock and policy."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ...data.dataset import Dataset
+from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
+from ...data.recorder import NotFinite, Recorder
+from ...data.resample import SAME_TIME_S, Policy, resample, row_times
+from ...data.source import Readings, Sensor, Source, Take, follows
+from ...data.storage import durable
+
+
+def read(root: str | Path) -> Source:
+    """A LeRobot v3.0 folder, or the address of one."""
+    return Dataset(root).source()
+
+
+@dataclass(frozen=True)
+class Rows:
+    """How a Source becomes rows.
+
+    fps:      rows a second; None for the rows that the source has, or, where each sensor has its own clock, one row for
+              each reading of `lead`.
+    policy:   what a row holds of a sensor that has no reading at its time, as `resample` says; images and depth never
+              mix: "linear" means "nearest" for them.
+    lead:     the sensor whose readings are the rows; None for the fastest camera, else the fastest observation.
+    pictures: "video" (H.264) or "png" (exact).
+    """
+
+    fps: float | None = None
+    policy: Policy = "previous"
+    lead: str | None = None
+    pictures: Literal["video", "png"] = "video"
+
+
+def write(
+    source: Source, root: str | Path, rows: Rows = Rows(), progress: Callable[[int, int], None] | None = None
+) -> list[str]:
+    """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
+
+    Sensors whose clocks are not the rows' are kept twice: resampled in the rows, where every LeRobot reader finds them,
+    and with their true times as streams; points are streams alone. `progress(takes, 0)` is called after each take.
+    """
+    root = Path(os.path.abspath(root))
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise DatasetError(f"{root} is not empty; convert into a new folder.")
+    first = next(iter(source.takes()), None)
+    if first is None:
+        raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
+    lead = _lead(source, first, rows)
+    layout, notes = _layout(source, first, lead, rows)
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        staged = Path(tempfile.mkdtemp(prefix=f".{root.name}.", dir=root.parent))
+        staged.chmod(0o755)
+    except OSError as error:
+        raise DatasetError(f"{root} cannot be written ({error}); choose another place.") from error
+    try:
+        notes += _write(source, layout, staged, lead, rows, progress)
+        if root.exists():
+            root.rmdir()
+        durable.move_into_place(staged, root)
+    except OSError as error:
+        raise DatasetError(f"{root} cannot be written ({error}); choose another place, or free some space.") from error
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+    return [*source.notes, *notes]
+
+
+def _write(source: Source, layout: Layout, root: Path, lead: str, rows: Rows, progress) -> list[str]:
+    left_out, notes = [], dict[str, None]()  # each note once, in order
+    with Recorder(root, layout, interrupted="discard") as recorder:
+        for number, take in enumerate(source.takes()):
+            at = _times(take, layout, lead, rows)
+            if len(at) < 2:
+                left_out.append(f"take {number} was left out: it has {len(at)} row{'s' * (len(at) != 1)}")
+                continue
+            try:
+                notes |= dict.fromkeys(_write_take(recorder, take, at, source.fps is not None, rows))
+            except NotFinite as error:
+                recorder.drop_episode()
+                left_out.append(f"take {number} was left out: {str(error).rstrip('.')}")
+            if progress:
+                progress(number + 1, 0)
+        if not recorder.episodes:
+            raise DatasetError(f"nothing of {source.name} can be kept; {'; '.join(left_out)}.")
+    return [*left_out, *notes]
+
+
+def _lead(source: Source, first: Take, rows: Rows) -> str:
+    if rows.lead is not None:
+        if rows.lead not in source.sensors:
+            raise DatasetError(f"{source.name} has no sensor '{rows.lead}'; it has {', '.join(source.sensors)}.")
+        return rows.lead
+    there = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
+    if not there:
+        raise DatasetError(f"the first take of {source.name} has no readings at all.")
+    seen = [sensor for sensor in there if not follows(sensor.name) and sensor.kind != "points"] or there
+    cameras = [sensor for sensor in seen if sensor.kind == "image"]
+    return max(cameras or seen, key=lambda sensor: len(first.readings[sensor.name].time_s)).name
+
+
+_NONE = Readings(np.zeros(0), [])
+
+
+def _layout(source: Source, first: Take, lead: str, rows: Rows) -> tuple[Layout, list[str]]:
+    at, notes = first.readings[lead].time_s, []
+    rate = rows.fps or source.fps or source.sensors[lead].rate_hz
+    if rate is None:
+        if len(at) < 2 or at[-1] <= at[0]:
+            raise DatasetError(f"{source.name} does not say how many frames a second it has; give --fps.")
+        rate = float(f"{(len(at) - 1) / (at[-1] - at[0]):.6g}")
+    own_clocks = source.fps is None or (rows.fps is not None and rows.fps != source.fps)
+    sensors, streams, pictures = {}, {}, rows.pictures
+    for name, sensor in source.sensors.items():
+        if name in (*AUTOMATIC, ACTION_VALID, TIME):
+            continue
+        reserved = sensor.kind == "points" or (sensor.rate_hz is not None and tidy(sensor.rate_hz) != tidy(rate))
+        if sensor.kind == "image" and (sensor.shape[0] % 2 or sensor.shape[1] % 2) and pictures == "video":
+            pictures = "png"
+            notes.append(
+                f"{name} is {sensor.shape[0]}x{sensor.shape[1]}, odd sizes are none for H.264: pictures are PNG"
+            )
+        if sensor.kind != "points":
+            sensors[name] = sensor
+        if sensor.dtype == "string":
+            continue  # text that has a clock of its own is for the rows alone
+        if sensor.kind == "points" or (own_clocks or reserved) and (name != lead or rows.fps):
+            streams[name] = sensor
+    if not sensors:
+        raise DatasetError(f"{source.name} has nothing but points, which no row can hold; add a camera or a pose.")
+    facts = dict(source.facts)
+    world = facts.pop("world", {})
+    layout = Layout(
+        tidy(float(rate)),
+        sensors,
+        streams,
+        clock=source.fps is None,
+        pictures=pictures,
+        robot=source.robot or "unknown",
+        world=world if isinstance(world, Mapping) else {},
+        facts={**facts, "rows": {"lead": lead, "policy": rows.policy, "fps_asked": rows.fps}},
+    )
+    films = {name for name, sensor in streams.items() if sensor.kind == "image" and pictures == "png"}
+    if films:
+        notes.append(f"{', '.join(sorted(films))}: kept in the rows alone, since pictures are PNG")
+        layout = replace(layout, streams={name: sensor for name, sensor in streams.items() if name not in films})
+    return layout, notes
+
+
+def _times(take: Take, layout: Layout, lead: str, rows: Rows) -> np.ndarray:
+    """float64 [T]: the times of a take's rows."""
+    return take.readings.get(lead, _NONE).time_s if rows.fps is None else row_times(take, layout.sensors, rows.fps)
+
+
+def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, rows: Rows) -> list[str]:
+    layout, notes = recorder.layout, []
+    recorder.task = take.task
+    columns, exact = {}, set()
+    for name, sensor in layout.sensors.items():
+        readings = take.readings.get(name, _NONE)
+        place = _places(readings.time_s, at)
+        apart = len(readings.time_s) < len(at) - 1  # fewer than rows: only where the source has rows are they gaps
+        if len(readings.time_s) and place is not None and (not apart or (follows(name) and has_rows)):
+            columns[name], _ = (readings.values, place), exact.add(name)
+            continue
+        columns[name] = _resampled(readings, sensor, at, rows.policy)
+        if len(readings.time_s) and not follows(name) and columns[name][1][0] < 0:
+            notes.append(f"rows before the first reading of {name} hold that first reading")
+    said = [(float(when), str(words)) for when, words in take.facts.get("language", ())]  # type: ignore[misc]
+    for i, time_s in enumerate(at):
+        while said and said[0][0] <= time_s + SAME_TIME_S:
+            recorder.say(said.pop(0)[1])
+        row = {}
+        for name, (values, place) in columns.items():
+            if place[i] >= 0:
+                row[name] = values[int(place[i])]
+            elif not follows(name):
+                first = int((place >= 0).argmax())
+                row[name] = values[int(place[first])] if place[first] >= 0 else None
+        recorder.add_row(row, float(time_s))
+    for name in layout.streams:
+        if name not in exact:
+            readings = take.readings.get(name, _NONE)
+            for time_s, value in zip(readings.time_s, readings.values):
+                recorder.log(name, value, float(time_s))
+    recorder.end_episode(take.start_ns)
+    dropped = sorted(set(take.facts) - {"language"})
+    return notes + ([f"facts of single takes were not kept: {', '.join(dropped)}"] if dropped else [])
+
+
+def _places(time_s: np.ndarray, at: np.ndarray) -> np.ndarray | None:
+    """int64 [T]: which reading is at each row's time, -1 for none; None where a reading is at no row's time."""
+    row = np.abs(np.searchsorted(at, time_s - SAME_TIME_S)).clip(max=len(at) - 1)
+    if len(np.unique(row)) != len(time_s) or (np.abs(at[row] - time_s) > SAME_TIME_S).any():
+        return None
+    place = np.full(len(at), -1)
+    place[row] = np.arange(len(time_s))
+    return place
+
+
+def _resampled(
+    readings: Readings, sensor: Sensor, at: np.ndarray, policy: Policy
+) -> tuple[Sequence | np.ndarray, np.ndarray]:
+    """(values of T rows, int64 [T]: the row itself, or -1 where there is no value)."""
+    mixes = sensor.kind == "vector" and not follows(sensor.name)
+    held: Policy = "nearest" if policy == "linear" and not mixes else policy
+    values, valid = resample(readings, sensor, at, held)
+    if follows(sensor.name) and len(readings.time_s):  # an action lasts until the next; after the last there is none
+        period = np.median(np.diff(readings.time_s)) if len(readings.time_s) > 1 else 0.0
+        valid = valid & (at < readings.time_s[-1] + max(period, SAME_TIME_S))
+    return values, np.where(valid, np.arange(len(at)), -1)

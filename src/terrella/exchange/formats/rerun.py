@@ -1,0 +1,157 @@
+"""Hands a recording to Rerun (https://rerun.io), whose viewer shows it, or writes the .rrd files that it opens."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import simplejpeg
+
+from ...core.errors import DatasetError
+from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage.durable import move_into_place, sync_file
+from ..browse import pose_columns
+
+try:
+    import rerun as rr  # pyright: ignore[reportMissingImports]
+except ImportError as error:
+    raise DatasetError("Rerun needs a package that is not installed: pip install 'terrella[rerun]'.") from error
+
+_QUALITY = 90  # of JPEG pictures
+_PATIENCE_S = 60.0  # for the viewer to take in one episode
+
+
+def write(source: Source, path: str | Path) -> list[str]:
+    """Writes a folder with one .rrd file for each take, or the file `path` where its name ends in .rrd and the source has
+    a single take; gives back sentences about what Rerun has no place for.
+
+    Pictures become JPEG, depth has 0 where nothing was hit; each sensor keeps its own times (timeline "time", seconds
+    since the take began; "wall_time" where that is known). Units and frames of coordinates are left out.
+    DatasetError where `path` exists, or a single file is asked for and there is no take or more than one.
+    """
+    path = Path(path)
+    if path.exists():
+        raise DatasetError(f"{path} exists already; move it away, or choose another name.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        files = []
+        for number, take in enumerate(source.takes()):
+            if path.suffix == ".rrd" and number == 1:
+                raise DatasetError(f"{source.name} has more than one episode; name a folder for Rerun's files.")
+            files.append(Path(folder) / f"episode-{number:06d}.rrd")
+            stream = _stream(source, number)
+            stream.save(files[-1])
+            _log(stream, source, take)
+            stream.disconnect()
+            sync_file(files[-1])
+        if path.suffix != ".rrd":
+            (Path(folder) / "whole").mkdir()
+            for file in files:
+                move_into_place(file, Path(folder) / "whole" / file.name)
+            move_into_place(Path(folder) / "whole", path)
+        elif files:
+            move_into_place(files[0], path)
+        else:
+            raise DatasetError(f"{source.name} has no episode to write.")
+    return _left_out(source)
+
+
+def show(source: Source, address: str | None = None) -> list[str]:
+    """Sends all takes to Rerun's viewer: the one at `address` ("rerun+http://127.0.0.1:9876/proxy"), or one that is
+    opened on this machine; gives back what Rerun has no place for. DatasetError where there is none."""
+    for number, take in enumerate(source.takes()):
+        stream = _stream(source, number)
+        try:
+            with _reached(address):
+                if address is None:
+                    stream.spawn()  # joins the viewer that is already open, if any
+                else:
+                    stream.connect_grpc(address)
+            _log(stream, source, take)
+            with _reached(address):
+                stream.flush(timeout_sec=_PATIENCE_S)
+        finally:
+            stream.disconnect()
+    return _left_out(source)
+
+
+@contextlib.contextmanager
+def _reached(address: str | None) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError, OSError) as error:
+        where = f"Rerun's viewer at {address}" if address else "a viewer of Rerun"
+        raise DatasetError(
+            f"{where} cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`, or write .rrd files."
+        ) from error
+
+
+def _stream(source: Source, number: int) -> rr.RecordingStream:
+    stream = rr.RecordingStream("terrella")
+    stream.send_recording_name(f"{source.name}, episode {number}")
+    return stream
+
+
+def _left_out(source: Source) -> list[str]:
+    kept = (sensor for sensor in source.sensors.values() if sensor.units or sensor.frame or sensor.facts)
+    names = ", ".join(sensor.name for sensor in kept)
+    return [f"units, frames and calibration of {names} have no place in Rerun"] if names else []
+
+
+def _log(stream: rr.RecordingStream, source: Source, take: Take) -> None:
+    if take.task:
+        stream.log("task", rr.TextDocument(take.task), static=True)
+    for name, readings in take.readings.items():
+        sensor = source.sensors[name]
+        path = rr.new_entity_path(name.split("."))
+        if sensor.kind == "vector":
+            _log_vector(stream, path, sensor, readings, take.start_ns)
+            continue
+        for time_s, value in zip(np.asarray(readings.time_s, np.float64), readings.values, strict=True):
+            stream.reset_time()
+            stream.set_time("time", duration=float(time_s))
+            if take.start_ns is not None:
+                stream.set_time("wall_time", timestamp=np.datetime64(take.start_ns + round(time_s * 1e9), "ns"))
+            stream.log(path, _shown(sensor, np.asarray(value)))
+
+
+def _shown(sensor: Sensor, value: np.ndarray) -> rr.AsComponents:
+    if sensor.kind == "image":
+        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(value), quality=_QUALITY, colorspace="RGB")
+        return rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
+    if sensor.kind == "depth":
+        return rr.DepthImage(np.where(np.isfinite(value), value, 0).astype(np.float32), meter=1.0)
+    return rr.Points3D(value[:, :3])
+
+
+def _log_vector(
+    stream: rr.RecordingStream, path: str, sensor: Sensor, readings: Readings, start_ns: int | None
+) -> None:
+    count = len(readings.time_s)
+    if not count:
+        return
+    times = np.asarray(readings.time_s, np.float64)
+    values = np.asarray(list(readings.values)).astype(np.float64).reshape(count, -1)
+    indexes = [rr.TimeColumn("time", duration=times)]
+    if start_ns is not None:
+        wall = start_ns + np.round(times * 1e9).astype(np.int64)
+        indexes.append(rr.TimeColumn("wall_time", timestamp=wall.astype("datetime64[ns]")))
+    width = values.shape[1]
+    if len(sensor.names) == width:
+        stream.log(path, rr.SeriesLines(names=list(sensor.names)), static=True)
+    stream.send_columns(path, indexes, rr.Scalars.columns(scalars=values.reshape(-1)).partition([width] * count))
+    pose = pose_columns(sensor) if sensor.name != "action" else None
+    if pose is None:
+        return
+    height = next((at for at, name in enumerate(sensor.names) if name in ("z", "z_m")), None)
+    place = values[:, [pose["x"], pose["y"]]]
+    place = np.column_stack([place, values[:, height] if height is not None else np.zeros(count)])
+    turn = {}
+    if pose["quaternion"]:
+        w, *rest = pose["quaternion"]
+        turn = {"quaternion": values[:, [*rest, w]]}
+    stream.log("world/path", rr.LineStrips3D([place]), static=True)
+    stream.send_columns("world/body", indexes, rr.Transform3D.columns(translation=place, **turn))

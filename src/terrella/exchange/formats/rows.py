@@ -1,0 +1,319 @@
+"""Arrays of rows (episodes as reinforcement learning keeps them) as sensors and back, shared by the formats that have rows."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage.durable import move_into_place
+
+OBSERVATION, ACTION, INFO = "observation", "action", "info"
+REWARD, DONE, TRUNCATED = "next.reward", "next.done", "next.truncated"
+IMAGES, DEPTH = "observation.images.", "observation.depth"
+CAMERA = "rgb"  # the name of a camera that its format does not name
+LEAST_PICTURE_SIDE = 32  # Minari's rule too: smaller arrays of bytes are codes (MiniGrid's 7 x 7 x 3), not pictures
+MAX_SIDE, MAX_PIXELS = 16_384, 1 << 26
+FPS_UNKNOWN = 10.0  # where neither the recording nor the caller says how long a row lasts
+MOST_BYTES = 1 << 33  # of one episode's array: more is a damaged or hostile file
+_TIMES_AGREE = 0.5  # of a row: how far the clocks of one row's sensors may lie apart
+_STORED = "stored_shape"
+
+
+# -- arrays as sensors
+
+
+def picture_layout(shape: Sequence[int], dtype: np.dtype | str, least: int = LEAST_PICTURE_SIDE) -> str | None:
+    """ "hwc", "chw", "hw1" or "hw" where bytes of that shape are a picture, else None."""
+    if np.dtype(dtype) != np.uint8 or len(shape) not in (2, 3):
+        return None
+    if len(shape) == 2:
+        return "hw" if min(shape) >= least else None
+    if shape[2] in (1, 3) and min(shape[:2]) >= least:
+        return "hwc" if shape[2] == 3 else "hw1"
+    if shape[0] in (1, 3) and min(shape[1:]) >= least:
+        return "chw"
+    return None
+
+
+def sensor_for(role: str, key: str, shape: Sequence[int], dtype, *, least: int = LEAST_PICTURE_SIDE, **more) -> Sensor:
+    """The sensor of an array [n, *shape]: a picture where its bytes look like one (observations only), else a vector.
+
+    role, key: "observation", "agent.pos" -> "observation.agent.pos", or "observation.images.agent.pos" for a picture;
+    an empty key is "observation.state" ("observation.images.rgb") or the role itself. A shape that a vector or an RGB
+    picture has not is kept in facts["stored_shape"]; `to_stored` gives it back. DatasetError for what is not numbers.
+    """
+    shape, dtype = tuple(int(n) for n in shape), np.dtype(dtype)
+    if dtype.kind not in "biuf" or dtype.itemsize > 8:
+        raise DatasetError(f"'{key or role}' holds {dtype}, not numbers: leave it out of the recording.")
+    if min(shape, default=0) < 0:
+        raise DatasetError(f"'{key or role}' has the shape {list(shape)}, which no array has.")
+    layout = picture_layout(shape, dtype, least) if role == OBSERVATION else None
+    facts = dict(more.pop("facts", {}))
+    if layout is None:
+        size = math.prod(shape)
+        if shape != (size,):
+            facts[_STORED] = list(shape)
+        name = f"{role}.{key}" if key else ("observation.state" if role == OBSERVATION else role)
+        return Sensor(name, "vector", (size,), dtype.name, facts=facts, **more)
+    height, width = shape[1:] if layout == "chw" else shape[:2]
+    check_size(height, width, f"a picture of '{key or role}'")
+    if layout != "hwc":
+        facts[_STORED] = list(shape)
+    return Sensor(f"{IMAGES}{key or CAMERA}", "image", (height, width, 3), "uint8", facts=facts, **more)
+
+
+def stored_shape(sensor: Sensor) -> tuple[int, ...]:
+    """The shape of one reading as its format keeps it."""
+    given = sensor.facts.get(_STORED)
+    if isinstance(given, list | tuple) and all(isinstance(n, int) and n >= 0 for n in given):
+        if sensor.kind == "vector" and math.prod(given) == sensor.shape[0]:
+            return tuple(given)
+        if sensor.kind == "depth" and tuple(given) == (*sensor.shape, 1):
+            return tuple(given)
+        height, width = sensor.shape[:2] if sensor.kind == "image" else (0, 0)
+        if tuple(given) in {(height, width), (height, width, 1), (1, height, width), (3, height, width)}:
+            return tuple(given)
+    return sensor.shape
+
+
+def from_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """[n, *stored_shape] -> [n, *sensor.shape]."""
+    if sensor.kind != "image" or values.shape[1:] == sensor.shape:
+        return np.ascontiguousarray(values.reshape(len(values), *sensor.shape))
+    height, width, _ = sensor.shape
+    if values.ndim == 4 and values.shape[1] == 3:
+        return np.ascontiguousarray(values.transpose(0, 2, 3, 1))
+    return np.repeat(values.reshape(len(values), height, width, 1), 3, axis=3)
+
+
+def to_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """[n, *sensor.shape] -> [n, *stored_shape], with the sensor's dtype; grey is the mean of red, green and blue."""
+    shape = stored_shape(sensor)
+    values = np.asarray(values, sensor.dtype)
+    if sensor.kind != "image" or shape == sensor.shape:
+        return values.reshape(len(values), *shape)
+    if shape[0] == 3:
+        return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
+    grey = np.rint(values.mean(axis=3, dtype=np.float64)).astype(np.uint8)
+    return grey.reshape(len(values), *shape)
+
+
+def check_size(height: int, width: int, what: str) -> None:
+    """DatasetError for a picture that no camera takes (a damaged or hostile file)."""
+    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
+        raise DatasetError(
+            f"{what} is {width} x {height}; pictures are read up to {MAX_PIXELS >> 20} megapixels: remove it, or scale it down."
+        )
+
+
+# -- names
+
+
+def clean(part: str) -> str:
+    """A part of a sensor's name: letters, digits, _ and -."""
+    return re.sub(r"[^\w-]+", "_", part, flags=re.ASCII).strip("_") or "unnamed"
+
+
+def unique(name: str, taken: Mapping[str, object]) -> str:
+    """`name`, or name_2, name_3 … where it is taken."""
+    number, found = 1, name
+    while found in taken:
+        number += 1
+        found = f"{name}_{number}"
+    return found
+
+
+def natural(name: str | Path) -> list[tuple[int, int, str]]:
+    """Sorting key under which frame2 comes before frame10."""
+    parts = re.split(r"(\d+)", str(name), flags=re.ASCII)
+    return [(0, int(part), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
+
+
+def role_of(name: str) -> str:
+    """Of a sensor's name: "observation", "action", "info", "next.reward", "next.done", "next.truncated", or "" for others."""
+    if name in (REWARD, DONE, TRUNCATED):
+        return name
+    head = name.split(".", 1)[0]
+    return head if head in (OBSERVATION, ACTION, INFO) else ""
+
+
+# -- rows of a take
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A take whose sensors agree row by row: `observations` rows, `steps` actions (one less, or as many)."""
+
+    observations: int
+    steps: int
+    time_s: np.ndarray  # of the observations
+
+
+def rows_of(take: Take, where: str) -> Rows:
+    """How many rows a take has; DatasetError where its sensors do not march in step."""
+    seen = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) == OBSERVATION}
+    done = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) not in (OBSERVATION, INFO, "")}
+    for name, readings in take.readings.items():
+        check_times(readings, f"'{name}' in {where}")
+    if len(set(seen.values())) > 1 or len(set(done.values())) > 1:
+        counts = ", ".join(f"{name} {count}" for name, count in {**seen, **done}.items())
+        raise DatasetError(
+            f"{where} has sensors of different rates ({counts} readings); resample it to one rate first."
+        )
+    steps = next(iter(done.values()), 0)
+    count = next(iter(seen.values()), steps)
+    if not count or (done and steps not in (count, count - 1)):
+        raise DatasetError(
+            f"{where} has {count} observations and {steps} actions; it must have as many actions, or one less."
+        )
+    first = next(iter(seen or done))
+    time_s = np.asarray(take.readings[first].time_s, np.float64)
+    row_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.inf
+    for name in (*seen, *done):
+        other = take.readings[name].time_s
+        if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
+            raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; resample it to one rate first.")
+    return Rows(count, steps, time_s)
+
+
+def check_times(readings: Readings, what: str) -> None:
+    """DatasetError unless there is one finite time, not before the last one, for each value."""
+    time_s = np.asarray(readings.time_s)
+    if time_s.ndim != 1 or len(time_s) != len(readings.values):
+        raise DatasetError(f"{what} has {len(readings.values)} values and {time_s.size} times; it must have as many.")
+    if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
+        raise DatasetError(f"{what} has times that are not numbers or run backwards; repair its clock first.")
+
+
+def even(time_s: np.ndarray, fps: float | None) -> bool:
+    """Whether the times are row / fps."""
+    return fps is not None and bool(np.allclose(time_s, np.arange(len(time_s)) / fps, rtol=0, atol=0.01 / fps))
+
+
+def batches(
+    values: Sequence[np.ndarray] | np.ndarray, sensor: Sensor, where: str, count: int | None = None, size: int = 64
+) -> Iterator[np.ndarray]:
+    """The (first `count`) values, `size` at a time, [m, *sensor.shape]; DatasetError where one has another shape."""
+    count = len(values) if count is None else count
+    for start in range(0, count, size):
+        part = values[start : min(start + size, count)]
+        for i, value in enumerate(part):
+            if np.shape(value) != sensor.shape:
+                shape = list(np.shape(value))
+                raise DatasetError(
+                    f"'{sensor.name}' in {where} is {shape} at reading {start + i}, not {list(sensor.shape)}."
+                )
+        yield np.asarray(part).reshape(len(part), *sensor.shape)
+
+
+def whole(readings: Readings, sensor: Sensor, where: str) -> np.ndarray:
+    """All values of a sensor as one array [n, *stored_shape]."""
+    parts = [to_stored(part, sensor) for part in batches(readings.values, sensor, where)]
+    return np.concatenate(parts) if parts else np.empty((0, *stored_shape(sensor)), sensor.dtype)
+
+
+def check_fps(fps: float | None, what: str) -> None:
+    """DatasetError for a rate that is no rate."""
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise DatasetError(f"{what} has {fps} rows a second; give an fps above 0.")
+
+
+def rate_of(given: float | None, known: object, what: str) -> tuple[float, tuple[str, ...]]:
+    """Rows a second: the caller's word, else the file's, else FPS_UNKNOWN and a note that says so."""
+    if given is not None:
+        return float(given), ()
+    if isinstance(known, int | float) and not isinstance(known, bool) and np.isfinite(known) and known > 0:
+        return float(known), ()
+    return FPS_UNKNOWN, (
+        f"{what} keeps no times: rows are taken to be 1/{FPS_UNKNOWN:g} s apart; give fps to say better.",
+    )
+
+
+# -- descriptions kept beside the arrays, so that what we wrote comes back with its names, units and frames
+
+
+def describe(source: Source) -> dict:
+    """JSON of everything about a source that its arrays do not say."""
+    return {
+        "sensors": [asdict(sensor) for sensor in source.sensors.values()],
+        "fps": source.fps,
+        "robot": source.robot,
+        "name": source.name,
+        "facts": dict(source.facts),
+    }
+
+
+def sensors_described(text: object, where: str) -> dict[str, Sensor]:
+    """The sensors of a description; DatasetError where it is not one of ours."""
+    try:
+        found = [_sensor(item) for item in text["sensors"]]  # type: ignore[index]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(
+            f"the description of sensors in {where} is damaged ({error}); delete it to read without."
+        ) from error
+    return {sensor.name: sensor for sensor in found}
+
+
+def _sensor(item: dict) -> Sensor:
+    known = {field.name for field in fields(Sensor)}
+    sensor = Sensor(**{key: value for key, value in item.items() if key in known})
+    shape = tuple(int(n) for n in sensor.shape)
+    np.dtype(sensor.dtype)
+    if (
+        sensor.kind not in ("image", "depth", "points", "vector")
+        or not isinstance(sensor.name, str)
+        or min(shape, default=0) < 0
+    ):
+        raise ValueError(f"'{sensor.name}' is no sensor")
+    return replace(sensor, shape=shape, names=tuple(sensor.names), units=dict(sensor.units), facts=dict(sensor.facts))
+
+
+def json_or_none(value: object) -> object:
+    """The value if JSON can hold it, numpy's numbers and arrays as plain ones; else None."""
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return None
+    return value
+
+
+# -- files that are either whole or not there
+
+
+@contextmanager
+def fresh(path: str | Path) -> Iterator[Path]:
+    """A hidden neighbour of `path` (a folder to be made, or a file), renamed to `path` when all went well."""
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise DatasetError(f"{path} exists already; write to another path, or remove it first.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    staged = path.with_name(f".{path.name}.new")
+    _remove(staged)
+    try:
+        yield staged
+        if path.is_dir():
+            path.rmdir()
+        move_into_place(staged, path)
+    finally:
+        _remove(staged)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,150 @@
+"""Gymnasium spaces as JSON (in Minari's spelling) and as the named sensors that they flatten into."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from gymnasium import spaces
+
+from ...core.errors import DatasetError
+from ...data.source import Sensor
+from .rows import clean, sensor_for, stored_shape, unique
+
+INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # texts that are a take's task
+_DEEPEST = 32
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array (or text) of a space: where it lies (keys of Dicts, indices of Tuples) and its sensor (None for texts)."""
+
+    path: tuple[str | int, ...]
+    sensor: Sensor | None
+    space: Mapping = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return ".".join(clean(str(part)) for part in self.path)
+
+    @property
+    def is_instruction(self) -> bool:
+        return self.sensor is None and (not self.path or str(self.path[-1]).lower() in INSTRUCTIONS)
+
+
+def leaves(role: str, space: object, where: str) -> tuple[Leaf, ...]:
+    """The arrays of a space as JSON, with one sensor each: "observation.NAME", "action", "action.NAME", …"""
+    found: dict[str, Leaf] = {}
+    try:
+        _walk(role, space, (), found, 0)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"the {role} space of {where} cannot be read ({error}).") from error
+    return tuple(found.values())
+
+
+def _walk(role: str, space, path: tuple, found: dict[str, Leaf], depth: int) -> None:
+    kind = space["type"]
+    if depth > _DEEPEST:
+        raise ValueError("it nests too deep")
+    if kind == "Dict":
+        for key, part in space["subspaces"].items():
+            _walk(role, part, (*path, str(key)), found, depth + 1)
+        return
+    if kind == "Tuple":
+        for i, part in enumerate(space["subspaces"]):
+            _walk(role, part, (*path, i), found, depth + 1)
+        return
+    key = ".".join(clean(str(part)) for part in path)
+    if kind == "Text":
+        found[unique(f"text {key}", found)] = Leaf(path, None, space)
+        return
+    shape, dtype = _shape_of(kind, space)
+    sensor = sensor_for(role, key, shape, dtype)
+    if sensor.name in found:
+        sensor = sensor_for(role, unique(sensor.name, found).removeprefix(f"{role}."), shape, dtype)
+    found[sensor.name] = Leaf(path, sensor, space)
+
+
+def _shape_of(kind: str, space) -> tuple[tuple[int, ...], str]:
+    if kind == "Box":
+        return tuple(int(n) for n in space["shape"]), space["dtype"]
+    if kind == "Discrete":
+        return (), "int64"
+    if kind == "MultiDiscrete":
+        return np.shape(space["nvec"]), space.get("dtype", "int64")
+    if kind == "MultiBinary":
+        return tuple(np.atleast_1d(space["n"]).tolist()), "int8"
+    raise ValueError(f"spaces of type {kind} are not known")
+
+
+def to_json(space: spaces.Space) -> dict:
+    """The space as Minari writes it, but for bounds that are one number everywhere, which are that number."""
+    if isinstance(space, spaces.Dict):
+        return {"type": "Dict", "subspaces": {str(key): to_json(part) for key, part in space.spaces.items()}}
+    if isinstance(space, spaces.Tuple):
+        return {"type": "Tuple", "subspaces": [to_json(part) for part in space.spaces]}
+    if isinstance(space, spaces.Box):
+        bounds = {"low": _bound(space.low), "high": _bound(space.high)}
+        return {"type": "Box", "dtype": str(space.dtype), "shape": list(space.shape), **bounds}
+    if isinstance(space, spaces.Discrete):
+        return {"type": "Discrete", "dtype": "int64", "start": int(space.start), "n": int(space.n)}
+    if isinstance(space, spaces.MultiDiscrete):
+        start = np.asarray(space.start).tolist()
+        return {"type": "MultiDiscrete", "dtype": str(space.dtype), "nvec": space.nvec.tolist(), "start": start}
+    if isinstance(space, spaces.MultiBinary):
+        return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
+    if isinstance(space, spaces.Text):
+        low, high = space.min_length, space.max_length
+        return {"type": "Text", "max_length": high, "min_length": low, "charset": space.characters}
+    raise DatasetError(f"spaces like {space} have no place in a recording; wrap the environment so that it has arrays.")
+
+
+def compact(space):
+    """A space as JSON with each bound that is one number everywhere as that number; JSON holds infinities as text."""
+    if isinstance(space, dict):
+        if space.get("type") == "Box":
+            lists = {key: space[key] for key in ("low", "high") if isinstance(space.get(key), list)}
+            return {**space, **{key: _bound(np.asarray(value)) for key, value in lists.items()}}
+        return {key: compact(value) for key, value in space.items()}
+    return [compact(part) for part in space] if isinstance(space, list) else space
+
+
+def expanded(space):
+    """The inverse of `compact`: bounds as nested lists, as Minari reads them."""
+    if isinstance(space, dict):
+        if space.get("type") == "Box":
+            shape = tuple(space["shape"])
+            bounds = {key: _spread(space[key], shape, space["dtype"]) for key in ("low", "high")}
+            return {**space, **bounds}
+        return {key: expanded(value) for key, value in space.items()}
+    return [expanded(part) for part in space] if isinstance(space, list) else space
+
+
+def _spread(bound, shape: tuple[int, ...], dtype: str) -> list:
+    whole = np.dtype(dtype).kind in "iub"  # float64 would lose the last digits of an int64
+    array = np.array(bound, dtype=object if whole else np.float64)
+    return np.broadcast_to(array, shape).tolist()
+
+
+def _bound(values: np.ndarray):
+    first = values.flat[0] if values.size else 0
+    same = values.size and bool((values == first).all())
+    found = (first.item() if isinstance(first, np.generic) else first) if same else values.tolist()
+    return _no_infinity(found)
+
+
+def _no_infinity(value):
+    if isinstance(value, list):
+        return [_no_infinity(part) for part in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def box(sensor: Sensor) -> dict:
+    """The space of a sensor of which nothing else is known: everything that its dtype can hold."""
+    dtype = np.dtype(sensor.dtype)
+    if dtype.kind == "f":
+        low, high = "-inf", "inf"
+    else:
+        low, high = (0, 1) if dtype.kind == "b" else (int(np.iinfo(dtype).min), int(np.iinfo(dtype).max))
+    return {"type": "Box", "dtype": dtype.name, "shape": list(stored_shape(sensor)), "low": low, "high": high}

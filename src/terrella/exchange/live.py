@@ -1,0 +1,175 @@
+"""Logs a recording while it is made, so that a running robot or game can be watched: to a file, or to Foxglove."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import DatasetError
+from ..data.source import Sensor, Source, Take
+
+_FLUSH_S = 0.25  # the most that a file is behind, and that kill -9 may lose
+_WAITING_BYTES, _WAITING_COUNT = 2**26, 2**14  # readings that may wait to be encoded
+_MOST_NOTES = 20
+
+
+class Live:
+    """Takes readings at once and encodes them in a thread of its own; what it cannot keep up with is dropped and counted.
+
+    target:  a new file ending in .mcap, never more than half a second behind; or a port number as text, at which a
+             WebSocket server on 127.0.0.1 is found by Foxglove ("0" chooses a free port, see `port`).
+    sensors: name -> Sensor, all that will be logged.
+    image:   how pictures are sent: "jpeg", "png" or "raw".
+
+    `log` never raises and never waits: errors are told in `notes`, readings that nobody got are counted in `dropped`
+    (one that two slow watchers missed counts twice). DatasetError, from the constructor alone, where the target cannot
+    be used.
+    """
+
+    def __init__(
+        self,
+        target: str | Path,
+        sensors: Mapping[str, Sensor],
+        name: str,
+        *,
+        image: str = "jpeg",
+        task: str = "",
+        start_ns: int | None = None,
+    ):
+        self.start_ns = time.time_ns() if start_ns is None else start_ns
+        self._sensors = dict(sensors)
+        self._notes: list[str] = []
+        self._lost = 0  # by this object; a server has its own
+        self._waiting: deque[tuple[str, int, np.ndarray]] = deque()
+        self._bytes, self._closing, self._broken = 0, False, False
+        self._wake = threading.Condition()
+        if image not in ("jpeg", "png", "raw"):
+            raise DatasetError(f"Live pictures are sent as jpeg, png or raw, not as '{image}'.")
+        self._out = _open(str(target), self._sensors, name, image, task, self.start_ns)
+        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Readings lost so far, to slow watchers, a full disk or too slow a machine."""
+        return self._lost + getattr(self._out, "dropped", 0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what went wrong, each once."""
+        return tuple(self._notes)
+
+    @property
+    def port(self) -> int | None:
+        """Where the server listens; None for a file."""
+        return getattr(self._out, "port", None)
+
+    def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None:
+        """A reading at `time_s` seconds since `start_ns`; the value is copied, and may be changed afterwards.
+
+        A vector may come as any numbers that its sensor's dtype holds; of pictures, depth and points the dtype counts.
+        """
+        sensor = self._sensors.get(sensor_name)
+        if sensor is None:
+            return self._lose(f"'{sensor_name}' is no declared sensor; declare it, or do not log it.")
+        try:
+            value = np.array(value)
+            if sensor.kind == "vector":
+                value = value.astype(sensor.dtype, casting="same_kind").reshape(sensor.shape)
+            time_ns = self.start_ns + round(float(time_s) * 1e9)
+            if not 0 <= time_ns < 2**63:
+                raise OverflowError(f"{time_s} s is out of range")
+        except Exception as error:  # whatever the value is, the recording goes on
+            return self._lose(f"A reading of '{sensor_name}' cannot be logged ({error}); mend what logs it.")
+        with self._wake:
+            if self._closing or self._broken:
+                self._lost += 1
+            elif self._bytes + value.nbytes > _WAITING_BYTES or len(self._waiting) >= _WAITING_COUNT:
+                self._lose("Live logging does not keep up; readings are dropped. Log less often, or smaller pictures.")
+            else:
+                self._bytes += value.nbytes
+                self._waiting.append((sensor_name, time_ns, value))
+                self._wake.notify()
+
+    def close(self) -> None:
+        """Writes what waits and ends the file or the server; to be called once more does nothing."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        self._thread.join()
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _lose(self, note: str) -> None:
+        with self._wake:
+            self._lost += 1
+            self._tell(note)
+
+    def _tell(self, note: str) -> None:
+        if note and note not in self._notes and len(self._notes) < _MOST_NOTES:
+            self._notes.append(note)
+
+    def _run(self) -> None:
+        flush_at = time.monotonic() + _FLUSH_S
+        while (item := self._next(flush_at)) is not None:
+            if item and self._broken:
+                self._lose("")
+            elif item:
+                self._try(self._out.add, *item)
+            if time.monotonic() >= flush_at:
+                if not self._broken:
+                    self._try(self._out.flush)
+                flush_at = time.monotonic() + _FLUSH_S
+        self._try(self._out.abandon if self._broken else self._out.close)
+
+    def _next(self, flush_at: float) -> tuple[str, int, np.ndarray] | tuple[()] | None:
+        """The next reading; () when it is time to flush; None when all is done."""
+        with self._wake:
+            if not self._waiting and not self._closing:
+                self._wake.wait(max(0.0, flush_at - time.monotonic()))
+            if self._waiting:
+                item = self._waiting.popleft()
+                self._bytes -= item[2].nbytes
+                return item
+            return None if self._closing else ()
+
+    def _try(self, do, *item) -> None:
+        try:
+            do(*item)
+        except DatasetError as error:  # of this one reading
+            self._lose(str(error))
+        except Exception as error:  # of the disk or a library: nothing of it may reach the recording
+            self._broken = True
+            self._tell(f"Live logging has stopped ({type(error).__name__}: {error}); the recording goes on.")
+            if item:
+                self._lose("")
+
+
+def _open(target: str, sensors: Mapping[str, Sensor], name: str, image: str, task: str, start_ns: int):
+    """Something with add(name, time_ns, value), flush(), close() and abandon()."""
+    if target.isascii() and target.isdigit():
+        from .live_server import LiveServer
+
+        return LiveServer(int(target), sensors, name, image)
+    if not target.endswith(".mcap"):
+        raise DatasetError(f"'{target}' is neither a port nor a file ending in .mcap; name one of these.")
+    from .formats.mcap import Recording
+
+    source = Source(name, sensors, lambda: iter(()))
+    about = Take({}, task, start_ns)
+    if Path(target).exists():
+        raise DatasetError(f"'{target}' exists already; choose another name for the live log.")
+    try:
+        Path(target).parent.mkdir(parents=True, exist_ok=True)
+        return Recording(Path(target), sensors, source, about, start_ns, image=image)
+    except OSError as error:
+        raise DatasetError(f"'{target}' cannot be written ({error.strerror}); choose another place.") from error

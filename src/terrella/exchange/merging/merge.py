@@ -1,0 +1,466 @@
+"""merge: several robots' recordings as one source of common named numbers and cameras, padded, with masks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ...core.errors import DatasetError
+from ...data.format import WORLD
+from ...data.resample import SAME_TIME_S, blank, clock_of, pick, resample, row_times, stacked
+from ...data.source import Lazy, Readings, Sensor, Source, Take
+from ...data.storage import durable
+from .mapping import (
+    ACTION,
+    CAMERAS_MASK,
+    EMBODIMENT,
+    FOLLOWS,
+    STATE,
+    Camera,
+    MergeMapping,
+    SourceMapping,
+    affine,
+    check_mapping,
+    mask_of,
+    read_mapping,
+    write_mapping,
+)
+from .propose import propose
+from .report import Report, SensorCount, SourceCount
+
+
+def merge(
+    sources: Mapping[str, Source],
+    mapping: MergeMapping,
+    report: Report | None = None,
+    name: str = "merged",
+    terminal: bool = True,
+) -> Source:
+    """One source of all takes of the mapping's sources (path -> Source), in the mapping's order, made as they are read.
+
+    A take of T rows, `mapping.rows.fps` a second, has
+      action                  float32 [D], the named numbers of `mapping.action`; 0 where the robot has none. Its readings
+                              end with the last row in which anything was done: T - 1 of T rows where the original kept
+                              a terminal observation, none in a take without actions.
+      action_mask             bool [T, D], True where this robot did that number in this row.
+      observation.state       float32 [T, S], of `mapping.state`; 0 where it has none.
+      observation.state_mask  bool [T, S], True where it has that number here and now.
+      every merged camera     uint8 [H, W, 3], fitted with its aspect kept, black around and where there is none;
+                              depth float32 [H, W] metres, nearest pixels, inf around and where there is none.
+      observation.cameras_mask  bool [T, cameras], True where a camera (in the order of `names`) shows something.
+      embodiment              int64 [T, 1], the robot's place in `facts["embodiments"]`.
+      what is kept whole      with `NAME_mask`, bool [T, 1]: whether there was any in this row. Points keep their own
+                              clock (what was newest at the first row is dated there); vectors are zero where not
+                              there. What followed: next.reward float32 [1], the sum of all rewards from this row until the next
+                              (so that a return is kept at any fps); bools: whether any was true; others: the newest.
+                              Like actions, they end with their last valid row.
+    The instruction and the facts of a take are kept; start_ns moves to the first row. Numbers are resampled by the policies
+    of `mapping.rows` (`resample`), by which a value is absent in gaps; an action lasts, at the end, for one row of its own
+    clock. Numbers that are not finite, also as float32, are absent. A take of fewer than two rows is skipped.
+
+    terminal: False to give the last rows an action (zeros, masked) too, for formats in which all takes end alike.
+    report:   filled while the takes are read. DatasetError where the mapping does not suit the sources.
+    """
+    check_mapping(mapping, sources)
+    report = report if report is not None else Report()
+    sensors = _sensors(mapping, sources)
+
+    def takes() -> Iterator[Take]:
+        robots = {
+            robot: {
+                "sources": [it.path for it in mapping.sources if it.embodiment == robot],
+                "cameras": _views(mapping, sources, robot),
+            }
+            for robot in mapping.embodiments
+        }
+        counts = [_count(source, sources[source.path], mapping) for source in mapping.sources]
+        report.begin(counts, robots, {ACTION: tuple(mapping.action), STATE: tuple(mapping.state)})
+        for source, count in zip(mapping.sources, counts):
+            for number, take in enumerate(sources[source.path].takes()):
+                try:
+                    merged = _take(take, source, sources[source.path], mapping, sensors, count, report, terminal)
+                except DatasetError as error:
+                    raise DatasetError(f"take {number} of {source.path}: {error}") from error
+                if merged is None:
+                    count.skipped.append(f"take {number}: what is mapped of it makes fewer than two rows")
+                else:
+                    facts = {**take.facts, "embodiment": source.embodiment, "source": source.path, "take": number}
+                    yield replace(merged, facts=facts)
+        report.complete = True
+
+    robots = set(mapping.embodiments)
+    return Source(
+        name=name,
+        sensors=sensors,
+        takes=takes,
+        fps=mapping.rows.fps,
+        robot=robots.pop() if len(robots) == 1 else "several",
+        notes=tuple(
+            f"{source.embodiment}: {what} was left out: {why}"
+            for source in mapping.sources
+            for what, why in _left_out(source, sources[source.path]).items()
+        ),
+        facts={"embodiments": [{"id": number, "name": robot} for number, robot in enumerate(mapping.embodiments)]},
+    )
+
+
+def letterbox(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Fits an image (uint8 [H, W, 3]) or depth (float32 [H, W]) into height x width, aspect kept, in the middle.
+
+    Images are made smaller by the mean of the area (Pillow's box filter), larger by bilinear interpolation, on black; of
+    depth the nearest pixels are taken, on inf.
+    """
+    if picture.shape[:2] == (height, width):
+        return picture
+    down, across, top, left = fit(picture.shape[0], picture.shape[1], height, width)
+    if picture.ndim == 2:
+        fitted = np.full((height, width), np.inf, np.float32)
+        rows = (np.arange(down) + 0.5) * picture.shape[0] / down
+        columns = (np.arange(across) + 0.5) * picture.shape[1] / across
+        inner = picture[rows.astype(int)[:, None], columns.astype(int)]
+    else:
+        fitted = np.zeros((height, width, 3), np.uint8)
+        smaller = down <= picture.shape[0]
+        filter = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
+        inner = np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize((across, down), filter))
+    fitted[top : top + down, left : left + across] = inner
+    return fitted
+
+
+def fit(height: int, width: int, to_height: int, to_width: int) -> tuple[int, int, int, int]:
+    """(height, width, top, left) of a picture of height x width within to_height x to_width, aspect kept, in pixels."""
+    scale = min(to_height / height, to_width / width)
+    down = min(max(round(height * scale), 1), to_height)
+    across = min(max(round(width * scale), 1), to_width)
+    return down, across, (to_height - down) // 2, (to_width - across) // 2
+
+
+def _sensors(mapping: MergeMapping, sources: Mapping[str, Source]) -> dict[str, Sensor]:
+    rate = mapping.rows.fps
+    found: dict[str, Sensor] = {}
+
+    def vector(name: str, dtype: str, names: tuple[str, ...], **more) -> None:
+        found[name] = Sensor(name, "vector", (len(names),), dtype, names, rate_hz=rate, **more)
+
+    for key, dimensions in ((ACTION, mapping.action), (STATE, mapping.state)):
+        if dimensions:
+            names, frames = tuple(dimensions), {name: it.frame for name, it in dimensions.items() if it.frame}
+            units = {name: it.unit for name, it in dimensions.items() if it.unit}
+            common = {it.frame for it in dimensions.values()}
+            frame = common.pop() if len(common) == 1 else ""
+            vector(key, "float32", names, units=units, frame=frame, facts={"frames": frames} if frames else {})
+            vector(mask_of(key), "bool", names)
+    for name, camera in mapping.cameras.items():
+        shape = (camera.height, camera.width, 3) if camera.kind == "image" else (camera.height, camera.width)
+        found[name] = Sensor(name, camera.kind, shape, "uint8" if camera.kind == "image" else "float32", rate_hz=rate)
+    if mapping.cameras:
+        vector(CAMERAS_MASK, "bool", tuple(mapping.cameras))
+    vector(EMBODIMENT, "int64", (EMBODIMENT,), facts={"embodiments": list(mapping.embodiments)})
+    for source in mapping.sources:
+        for name, to in source.keep.items():
+            sensor = sources[source.path].sensors[name]
+            dtype = sensor.dtype if to not in found else np.result_type(found[to].dtype, sensor.dtype).name
+            dtype = "float32" if to == f"{FOLLOWS}reward" else dtype
+            own = sensor.rate_hz if sensor.kind == "points" else rate
+            found[to] = replace(found.get(to, sensor), name=to, dtype=dtype, rate_hz=own)
+            vector(mask_of(to), "bool", (to,))
+    return found
+
+
+def _take(
+    take: Take,
+    source: SourceMapping,
+    origin: Source,
+    mapping: MergeMapping,
+    sensors: Mapping[str, Sensor],
+    count: SourceCount,
+    report: Report,
+    terminal: bool,
+) -> Take | None:
+    used = [name for name, vector in source.vectors.items() if any(number.to for number in vector.numbers)]
+    used += [*source.cameras, *source.keep]
+    at_s = row_times(take, used, mapping.rows.fps)
+    if len(at_s) < 2:
+        return None
+    count.takes, count.rows = count.takes + 1, count.rows + len(at_s)
+    count.late_s += float(at_s[0] - min(take.readings[n].time_s[0] for n in used if _has(take, n)))
+    for name in used:
+        if name in take.readings:
+            _tally(count.sensors.setdefault(name, SensorCount()), take.readings[name], len(at_s))
+        if not _has(take, name):
+            count.sensors.setdefault(name, SensorCount()).rows_without += len(at_s)
+
+    merged: dict[str, np.ndarray | Lazy] = {}
+    for key, dimensions in ((ACTION, mapping.action), (STATE, mapping.state)):
+        if dimensions:
+            values, mask = _numbers(key, take, at_s, source, origin, mapping, count)
+            report.add(source.embodiment, key, values, mask)
+            merged[key] = _until_last(values, mask) if key == ACTION and terminal else values
+            merged[mask_of(key)] = mask
+    if mapping.cameras:
+        merged |= _pictures(take, at_s, source, origin, mapping, count)
+    merged[EMBODIMENT] = np.full((len(at_s), 1), mapping.embodiments.index(source.embodiment))
+    merged |= _kept(take, at_s, source, origin, mapping, sensors, count)
+    time_s = np.arange(len(at_s)) / mapping.rows.fps
+    readings = {name: Readings(time_s[: len(it)], it) for name, it in merged.items()}
+    readings |= _scans(take, at_s, source, mapping, sensors)
+    start_ns = None if take.start_ns is None else take.start_ns + round(at_s[0] * 1e9)
+    said: Any = take.facts.get("language", ())
+    facts = {"language": [[when - at_s[0], words] for when, words in said]} if said else {}
+    return Take({name: readings[name] for name in sensors}, take.task, start_ns, facts)
+
+
+def _has(take: Take, name: str) -> bool:
+    return name in take.readings and len(take.readings[name].time_s) > 0
+
+
+def _tally(count: SensorCount, readings: Readings, rows: int) -> None:
+    count.readings, count.rows = count.readings + len(readings.time_s), count.rows + rows
+    count.longest_gap_s = max(count.longest_gap_s, float(np.diff(np.asarray(readings.time_s)).max(initial=0)))
+
+
+def _numbers(key, take, at_s, source, origin, mapping, count) -> tuple[np.ndarray, np.ndarray]:
+    """(float32 [T, D], bool [T, D]): the merged action or state of one take, and where there is any."""
+    dimensions = mapping.action if key == ACTION else mapping.state
+    places = {name: place for place, name in enumerate(dimensions)}
+    values = np.zeros((len(at_s), len(places)), np.float32)
+    mask = np.zeros(values.shape, bool)
+    policy = mapping.rows.actions if key == ACTION else mapping.rows.continuous
+    for name, vector in source.vectors.items():
+        wanted = [i for i, number in enumerate(vector.numbers) if number.to]
+        if (name == ACTION) != (key == ACTION) or not wanted or not _has(take, name):
+            continue
+        sensor = origin.sensors[name]
+        if not sensor.names:
+            labels = tuple(number.name for number in vector.numbers)
+            sensor = replace(sensor, names=labels if all(labels) else ())
+        units = {label: number.unit for label, number in zip(sensor.names, vector.numbers)}
+        found, valid = resample(take.readings[name], replace(sensor, units=units), at_s, policy, mapping.rows.max_gap_s)
+        if name == ACTION:
+            valid &= _lasts(take.readings[name], at_s, sensor, source, mapping)
+        sensor_count = count.sensors[name]
+        sensor_count.rows_without += int((~valid).sum())
+        for i in wanted:
+            number = vector.numbers[i]
+            scale, offset = affine(number, dimensions[number.to])
+            column = np.asarray(found)[:, i]
+            with np.errstate(over="ignore", invalid="ignore"):
+                if (scale, offset) != (1.0, 0.0):
+                    column = column * scale + offset
+                column = column.astype(np.float32)
+            finite = np.isfinite(column)
+            sensor_count.not_finite += int((valid & ~finite).sum())
+            there = valid & finite
+            values[there, places[number.to]], mask[there, places[number.to]] = column[there], True
+    return values, mask
+
+
+def _lasts(readings: Readings, at_s: np.ndarray, sensor: Sensor, source: SourceMapping, mapping: MergeMapping):
+    """bool [T]: not later than one row of its own clock after the last reading: no action is known to go on after it."""
+    time_s = clock_of(readings, sensor.name)
+    rate = sensor.rate_hz or source.fps or mapping.rows.fps
+    period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1 / rate
+    return at_s < time_s[-1] + max(period - SAME_TIME_S, SAME_TIME_S)
+
+
+def _until_last(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    rows = np.flatnonzero(mask.any(1))
+    return values[: rows[-1] + 1 if len(rows) else 0]
+
+
+def _pictures(take, at_s, source, origin, mapping, count) -> dict[str, np.ndarray | Lazy]:
+    found: dict[str, np.ndarray | Lazy] = {}
+    mask = np.zeros((len(at_s), len(mapping.cameras)), bool)
+    filled = {to: name for name, to in source.cameras.items()}
+    for place, (to, camera) in enumerate(mapping.cameras.items()):
+        name = filled.get(to, "")
+        if name and _has(take, name):
+            sensor, policy = origin.sensors[name], mapping.rows.images
+            seen, mask[:, place] = resample(take.readings[name], sensor, at_s, policy, mapping.rows.max_gap_s)
+            count.sensors[name].rows_without += int((~mask[:, place]).sum())
+            found[to] = _fitted(seen, mask[:, place], camera, name)
+        else:
+            found[to] = _fitted(Lazy(len(at_s), lambda row: np.zeros(0)), mask[:, place], camera, name)
+    return {**found, CAMERAS_MASK: mask}
+
+
+def _fitted(seen, valid: np.ndarray, camera: Camera, name: str) -> Lazy:
+    image = camera.kind == "image"
+    shape = (camera.height, camera.width, 3) if image else (camera.height, camera.width)
+
+    def look(row: int) -> np.ndarray:
+        if not valid[row]:
+            return blank(Sensor("", camera.kind, shape, "uint8" if image else "float32"))
+        picture = np.asarray(seen[row])
+        kind = np.uint8 if image else np.float32
+        if picture.ndim != len(shape) or picture.shape[2:] != shape[2:] or not picture.size or picture.dtype != kind:
+            raise DatasetError(f"row {row} of {name} is {picture.dtype} {picture.shape}, which is no {camera.kind}.")
+        return letterbox(picture, camera.height, camera.width)
+
+    return Lazy(len(valid), look)
+
+
+def _scans(take, at_s, source, mapping, sensors) -> dict[str, Readings]:
+    """Points with a clock of their own, from the newest at the first row on."""
+    found: dict[str, Readings] = {}
+    filled = {to: name for name, to in source.keep.items()}
+    for to in {to: None for it in mapping.sources for to in it.keep.values() if sensors[to].kind == "points"}:
+        name = filled.get(to, "")
+        found[to] = Readings(np.zeros(0), [])
+        if name and _has(take, name):
+            readings = take.readings[name]
+            time_s = clock_of(readings, name)
+            first = max(int(np.searchsorted(time_s, at_s[0] + SAME_TIME_S, side="right")) - 1, 0)
+            scans = Lazy(len(time_s) - first, lambda i, values=readings.values, first=first: values[first + i])
+            found[to] = Readings(np.maximum(time_s[first:] - at_s[0], 0), scans)
+    return found
+
+
+def _kept(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.ndarray]:
+    """What is kept whole, but points, and the masks of all, for every kept sensor of any source."""
+    found: dict[str, np.ndarray] = {}
+    filled = {to: name for name, to in source.keep.items()}
+    for to in {to: None for it in mapping.sources for to in it.keep.values()}:
+        name, sensor = filled.get(to, ""), sensors[to]
+        if not name or not _has(take, name):
+            valid = np.zeros(len(at_s), bool)
+            values = np.zeros((len(at_s), *sensor.shape), sensor.dtype)
+        elif to.startswith(FOLLOWS):
+            values, valid = _followed(take.readings[name], origin.sensors[name], sensor, at_s, source, mapping)
+        elif sensor.kind == "points":
+            index = pick(clock_of(take.readings[name], name), at_s, mapping.rows.images, mapping.rows.max_gap_s)
+            values, valid = np.zeros(0), index >= 0
+        else:
+            policy, gap = mapping.rows.continuous, mapping.rows.max_gap_s
+            values, valid = resample(take.readings[name], origin.sensors[name], at_s, policy, gap)
+            values = np.array(values, sensor.dtype)
+            finite = np.isfinite(values).reshape(len(values), -1).all(1)
+            count.sensors[name].not_finite += int((valid & ~finite).sum())
+            valid = valid & finite
+            values[~valid] = 0
+        if name and _has(take, name):
+            count.sensors[name].rows_without += int((~valid).sum())
+        follows = to.startswith(FOLLOWS)
+        if sensor.kind != "points":
+            found[to] = _until_last(np.asarray(values), valid[:, None]) if follows else np.asarray(values)
+        found[mask_of(to)] = valid[:, None]
+    return found
+
+
+def _followed(readings, sensor: Sensor, merged: Sensor, at_s, source, mapping) -> tuple[np.ndarray, np.ndarray]:
+    """What followed each row until the next: rewards are added up, bools are true where any was, others the newest."""
+    time_s, values = clock_of(readings, sensor.name), stacked(readings, sensor)
+    row = np.searchsorted(at_s, time_s + SAME_TIME_S, side="right") - 1
+    values, row = values[row >= 0], row[row >= 0]
+    covered = (at_s >= time_s[0] - SAME_TIME_S) & _lasts(readings, at_s, sensor, source, mapping)
+    valid = covered | np.isin(np.arange(len(at_s)), row)
+    if merged.name == f"{FOLLOWS}reward":
+        found = np.zeros((len(at_s), 1))
+        np.add.at(found, row, values.astype(np.float64))
+    elif merged.dtype == "bool":
+        found = np.zeros((len(at_s), 1), bool)
+        np.logical_or.at(found, row, values)
+    else:
+        found, _ = resample(readings, sensor, at_s, "previous")
+        found = np.array(found)
+        found[row] = values  # the newest in each row, for readings ascend
+    valid &= np.isfinite(found[:, 0])
+    return np.where(valid[:, None], found, 0).astype(merged.dtype), valid
+
+
+def _views(mapping: MergeMapping, sources: Mapping[str, Source], robot: str) -> dict[str, dict]:
+    """merged camera -> which of the robot's sensors it shows, its size and calibration, and where its picture lies."""
+    found: dict[str, dict] = {}
+    for source in mapping.sources:
+        for name, to in source.cameras.items() if source.embodiment == robot else ():
+            sensor, camera = sources[source.path].sensors[name], mapping.cameras[to]
+            down, across, top, left = fit(sensor.shape[0], sensor.shape[1], camera.height, camera.width)
+            placed = {"height": down, "width": across, "top": top, "left": left}
+            found.setdefault(to, {"sensor": name, "size": list(sensor.shape[:2]), "placed": placed})
+            if "calibration" in sensor.facts:
+                found[to].setdefault("calibration", sensor.facts["calibration"])
+    return found
+
+
+def _left_out(source: SourceMapping, origin: Source) -> dict[str, str]:
+    found = dict(source.out)
+    for name, vector in source.vectors.items():
+        for place, number in enumerate(vector.numbers):
+            if number.out:
+                found[f"{name}[{place}]" + (f" {number.name}" if number.name else "")] = number.out
+    mentioned = {*source.vectors, *source.cameras, *source.keep, *source.out}
+    return found | {name: "the mapping does not mention it" for name in origin.sensors if name not in mentioned}
+
+
+def _count(source: SourceMapping, origin: Source, mapping: MergeMapping) -> SourceCount:
+    notes = [*origin.notes, *source.notes]
+    if ACTION in source.vectors and source.fps and abs(source.fps - mapping.rows.fps) > 1e-6:
+        ratio = source.fps / mapping.rows.fps
+        notes.append(
+            f"{ACTION} at {source.fps:g} rows a second is read at {mapping.rows.fps:g}: numbers that are steps per row "
+            f"(deltas) need their scale multiplied by {ratio:g}; positions and speeds do not."
+        )
+    return SourceCount(source.path, source.embodiment, notes=notes, left_out=_left_out(source, origin))
+
+
+def merge_into(
+    sources: Mapping[str, Source],
+    out: str | Path,
+    mapping: str | Path | None = None,
+    fps: float | None = None,
+    dry: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict, str]:
+    """Merges the sources (path -> Source) into a new LeRobot v3 folder; returns (facts, the same for a person).
+
+    mapping: the file to merge by; None to guess one and write it to OUT.toml, which must not be there yet.
+    fps:     rows a second, before what the mapping says.
+    dry:     stop when the mapping is written.
+
+    Beside the rows lie meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
+    "embodiments", each robot's statistics.
+    """
+    out = Path(out)
+    path = out.parent / f"{out.name}.toml" if mapping is None else Path(mapping)
+    if mapping is None:
+        if path.exists():
+            raise DatasetError(f"{path} is there already: merge by it (--mapping {path}), or move it away.")
+        found = propose(sources, fps)
+        write_mapping(found, path)
+    else:
+        found = read_mapping(path)
+        found = replace(found, rows=replace(found.rows, fps=float(fps))) if fps is not None else found
+    check_mapping(found, sources)
+    if dry:
+        notes = {source.path: list(source.notes) for source in found.sources}
+        said = [f"{source}: {note}" for source, some in notes.items() for note in some]
+        return {"mapping": str(path), "notes": notes}, "\n".join(
+            [*said, f"the mapping is {path}: edit it, then merge by it"]
+        )
+    from ..formats import lerobot
+
+    report = Report()
+    terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
+    merged = merge(sources, found, report, out.name, terminal)
+    notes = lerobot.write(merged, out, progress=progress)
+    about = json.loads((out / WORLD).read_text(encoding="utf-8"))
+    durable.write_json(out / WORLD, {**about, "embodiments": report.embodiments()})
+    durable.write_json(out / "meta" / "merge.json", {**report.to_json(), "notes": notes})
+    write_mapping(found, out / "meta" / "merge.toml")
+    new = [f"note: {note}" for note in notes if note not in merged.notes]
+    text = "\n".join([report.text().rstrip(), *new, f"{len(sources)} recordings are now {out}, merged by {path}"])
+    return {"out": str(out), "mapping": str(path), "notes": notes, **report.to_json()}, text
+
+
+def _ends_without_action(origin: Source, source: SourceMapping, mapping: MergeMapping) -> bool:
+    """Whether nothing was done in the last row of its first take (which stands for all)."""
+    take = next(iter(merge({source.path: origin}, replace(mapping, sources=(source,))).takes()), None)
+    if take is None or ACTION not in take.readings:
+        return True
+    return len(take.readings[ACTION].time_s) < len(take.readings[EMBODIMENT].time_s)

@@ -1,0 +1,125 @@
+"""Cards: what stands in a place, as upright pictures that face the eye: cut out of frames, and painted into them.
+
+A card has a place, its feet (x, y, z in metres, world frame), and a look: a picture [4, *PICTURE] (rgb and cover in [0, 1])
+and its box [4], how far it reaches to the left, the right, below and above of its feet, in metres across the line of sight.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+
+from .camera import Intrinsics, project
+
+PICTURE = (48, 32)  # rows and columns of a card's picture
+NEAREST_M = 0.25  # of a card that is still painted
+BEHIND_M = 0.4  # by which a card may stand behind the surface that a frame shows: its feet are in the floor
+
+
+class Cutout(NamedTuple):
+    """n cards that frames show: view and row [n], which frame and which row of its list; picture [n, 4, *PICTURE]; box
+    [n, 4]; pixels [n], how many show it; whole [n] bool, seen all of it: not cut off by the frame's edge or hidden in part."""
+
+    view: torch.Tensor
+    row: torch.Tensor
+    picture: torch.Tensor
+    box: torch.Tensor
+    pixels: torch.Tensor
+    whole: torch.Tensor
+
+
+def cut_out(
+    rgb: torch.Tensor,
+    instances: torch.Tensor,
+    depth: torch.Tensor,
+    places: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+) -> Cutout:
+    """The cards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], which of the places [B, K, 3] is seen at a pixel,
+    counted from 1 (0: none); depth [B, h, w] metres; pose [B, 7]."""
+    height, width = rgb.shape[-2:]
+    there, depth = (
+        F.interpolate(part[:, None].float(), (height, width), mode="nearest-exact")[:, 0] for part in (instances, depth)
+    )
+    numbers = torch.arange(1, places.shape[1] + 1, device=rgb.device)
+    masks = there[:, None] == numbers[:, None, None]
+    view, row = masks.flatten(2).any(-1).nonzero(as_tuple=True)
+    masks = masks[view, row]
+    if not len(view):
+        nothing = torch.zeros(0)
+        return Cutout(view, row, torch.zeros(0, 4, *PICTURE), torch.zeros(0, 4), nothing.long(), nothing.bool())
+    where, ahead = project(places, pose, camera)
+    where, ahead = where[view, row], ahead[view, row].clamp_min(NEAREST_M)
+    first_column, last_column = _ends(masks.any(1))
+    first_row, last_row = _ends(masks.any(2))
+    left, right = first_column / width, (last_column + 1) / width
+    top, bottom = first_row / height, (last_row + 1) / height
+    across, along = ahead / camera[0], ahead / camera[1]
+    box = torch.stack(
+        [(where[:, 0] - left) * across, (right - where[:, 0]) * across,
+         (bottom - where[:, 1]) * along, (where[:, 1] - top) * along], 1
+    )  # fmt: skip
+    grid = F.affine_grid(_onto(left, right, top, bottom), [len(view), 1, *PICTURE], align_corners=False)
+    frames = torch.cat([rgb.float()[view] / 255 * masks[:, None], masks[:, None].float()], 1)
+    picture = F.grid_sample(frames, grid, align_corners=False)
+    picture[:, :3] = picture[:, :3] / picture[:, 3:].clamp_min(1e-3)
+    around = F.max_pool2d(masks[:, None].float(), 5, 1, 2)[:, 0].bool() & ~masks
+    hidden = (around & (depth[view] < (ahead - 2 * BEHIND_M)[:, None, None])).flatten(1).any(1)
+    cut = (first_column == 0) | (last_column == width - 1) | (first_row == 0) | (last_row == height - 1)
+    return Cutout(view, row, picture, box, masks.flatten(1).sum(1), ~(cut | hidden))
+
+
+def painted(
+    rgb: torch.Tensor,
+    depth: torch.Tensor,
+    billboards: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    there: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Frames with cards in them, each hidden by what is nearer: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
+    which card is seen at a pixel, counted from 1 (uint8 [B, H, W], 0: none).
+
+    rgb and depth are what stands behind; cards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
+    [B, K] bool, which of them there are.
+    """
+    places, pictures, boxes = billboards
+    instances = torch.zeros_like(depth, dtype=torch.uint8)
+    where, ahead = project(places, pose, camera)
+    view, row = (there & (ahead > NEAREST_M)).nonzero(as_tuple=True)
+    if not len(view):
+        return rgb, depth, instances
+    where, ahead, box = where[view, row], ahead[view, row], boxes[view, row]
+    height, width = depth.shape[-2:]
+    sides = torch.stack(
+        [where[:, 0] * width - box[:, 0] / ahead * camera[0] * width,
+         where[:, 0] * width + box[:, 1] / ahead * camera[0] * width,
+         where[:, 1] * height - box[:, 3] / ahead * camera[1] * height,
+         where[:, 1] * height + box[:, 2] / ahead * camera[1] * height], 1
+    )  # fmt: skip
+    from .kernels_numba import paint
+
+    rgb, depth, hides = rgb.clone(), depth.clone(), (depth + BEHIND_M).numpy()
+    onto, pictures = (rgb.numpy(), depth.numpy(), instances.numpy()), pictures.numpy()
+    for billboard in ahead.argsort(descending=True).tolist():  # the nearest is painted last
+        at, number = int(view[billboard]), int(row[billboard]) + 1
+        box, far = tuple(sides[billboard].tolist()), float(ahead[billboard])
+        paint(pictures[at, number - 1], box, far, number, hides[at], *(part[at] for part in onto))
+    return rgb, depth, instances
+
+
+def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The first and the last that is True in each of [n, L]: [n] each."""
+    whole = line.float()
+    return whole.argmax(1), line.shape[1] - 1 - whole.flip(1).argmax(1)
+
+
+def _onto(left, right, top, bottom) -> torch.Tensor:
+    """The affine map [n, 2, 3] from [-1, 1] onto a box of the image, whose sides are given in 0..1."""
+    zero = torch.zeros_like(left)
+    across = torch.stack([right - left, zero, right + left - 1], 1)
+    along = torch.stack([zero, bottom - top, bottom + top - 1], 1)
+    return torch.stack([across, along], 1).float()
