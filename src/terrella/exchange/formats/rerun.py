@@ -13,7 +13,7 @@ import simplejpeg
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
 from ...data.storage.durable import move_into_place, sync_file
-from ..browse import pose_columns
+from ..poses import pose_columns
 
 try:
     import rerun as rr  # pyright: ignore[reportMissingImports]
