@@ -1,4 +1,5 @@
 """Hands a recording to Rerun (https://rerun.io), whose viewer shows it, or writes the .rrd files that it opens."""
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
