@@ -131,6 +131,12 @@ class State(Mapping):
             )
         return self._combined([self], *[lambda tensor: tensor.repeat_interleave(n, dim=0)] * 2)
 
+    def put(self, index: torch.Tensor, fresh: State) -> State:
+        """This state with its entries `index` (int64 [n]) replaced by those of `fresh` (a batch of n)."""
+        if fresh.batch != len(index) or set(fresh) != set(self):
+            raise ValueError(f"put takes {len(index)} fresh entries of the same world; got {fresh}")
+        return State({name: tensor.index_copy(0, index, fresh[name]) for name, tensor in self.items()})
+
     def where(self, which: torch.Tensor, other: State) -> State:
         """This state's entries where `which` (bool [B]), the other's elsewhere."""
         other = other.into(self._arenas)
