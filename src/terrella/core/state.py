@@ -131,12 +131,6 @@ class State(Mapping):
             )
         return self._combined([self], *[lambda tensor: tensor.repeat_interleave(n, dim=0)] * 2)
 
-    def put(self, index: torch.Tensor, fresh: State) -> State:
-        """This state with its entries `index` (int64 [n]) replaced by those of `fresh` (a batch of n)."""
-        if fresh.batch != len(index) or set(fresh) != set(self):
-            raise ValueError(f"put takes {len(index)} fresh entries of the same world; got {fresh}")
-        return State({name: tensor.index_copy(0, index, fresh[name]) for name, tensor in self.items()})
-
     def where(self, which: torch.Tensor, other: State) -> State:
         """This state's entries where `which` (bool [B]), the other's elsewhere."""
         other = other.into(self._arenas)
@@ -147,18 +141,16 @@ class State(Mapping):
         return self._combined([self, other], choose, choose)
 
     def put(self, index, fresh: State) -> State:
-        """The entries `index` [n] (list or int64 tensor, or bool [B]) replaced by those of `fresh`: the batch keeps its size."""
-        fresh = fresh.into(self._arenas)
+        """This state with its entries `index` (int64 [n], or bool [B]) replaced by those of `fresh` (a batch of n)."""
         where = torch.as_tensor(index, device=self.device)
-        if where.dtype != torch.bool:
-            where = where.long()
+        where = where.nonzero()[:, 0] if where.dtype == torch.bool else where.long()
+        if fresh.batch != len(where) or set(fresh) != set(self):
+            raise ValueError(f"put takes {len(where)} fresh entries of the same world; got {fresh}")
 
         def put(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
-            whole = mine.clone(memory_format=torch.contiguous_format)
-            whole[where] = theirs
-            return whole
+            return mine.index_copy(0, where, theirs)
 
-        return self._combined([self, fresh], put, put)
+        return self._combined([self, fresh.into(self._arenas)], put, put)
 
     @staticmethod
     def stack(states: Sequence[State]) -> State:
