@@ -10,11 +10,11 @@ from functools import partial
 import torch
 
 from ..core.errors import ObservationError
-from .policies import Constant, Policy
 from ..core.world import World
 from .clips import Clip
 from .exam import Exam, Found, Probe, batches
 from .fidelity import psnr
+from .policies import Constant, Policy
 from .roll import Results, Tick, fold_context, poses_at
 from .scorecard import PREDICTED, TRUE, Picture, Report, Row
 from .statistics import mean_interval

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from .policies import Replay
 from ..core.world import World
 from .album import Album, look
 from .clips import Clip
 from .exam import Exam, Found, Probe
+from .policies import Replay
 from .roll import Results, Tick, fold_context
 from .scorecard import PREDICTED, Curve, Picture, Report, Row
 from .statistics import Band, Figure, ratio_interval
@@ -121,7 +121,8 @@ def rows_of(
         where = "endurance", "rgb", name, "\u00d7", place, arm, PREDICTED
         found.rows.append(Row(*where, steps, worst, 0, natural, note=note))
         if name in _DRAWN:
-            band = Band(*([getattr(figure, key) for figure in figures] for key in ("value", "low", "high")), len(clips))
+            value, low_, high_ = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
+            band = Band(value, low_, high_, len(clips))
             found.curves.append(Curve(*where, x, band, guides=(0.7, 1.0, 1.3)))
     columns = ["1", *(str(step) for step in x)][: len(gone["frames"])]
     frames = gone["frames"].numpy()[: len(columns)]

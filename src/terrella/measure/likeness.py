@@ -34,6 +34,7 @@ class Series:
         return self.better * (self.values - self.copied)
 
 
+Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
 SeriesOf = Callable[
     [Exam, Found, str, str, Sequence[Clip], Results], list[Series]
 ]  # exam, found, set, place, clips, dreamt
@@ -72,7 +73,7 @@ def drift(exam: Exam, found: Found, series_of: SeriesOf) -> Report:
     """
     whole = Report()
     for place, clips in exam.sets.get(LONG, {}).items():
-        still: dict[str, tuple[tuple, Series]] = {}
+        still: dict[str, tuple[Where, Series]] = {}
         for arm in exam.arms:
             for motion in (PREDICTED, TRUE):
                 dreamt = found.dreamt(LONG, arm, place, motion)
@@ -91,7 +92,7 @@ def _asked(motion: str, made: list[Series]) -> list[Series]:
     return [series for series in made if motion != TRUE or series.channel.partition(".")[0] != "pose"]
 
 
-def _row(exam: Exam, where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]) -> Row:
+def _row(exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]) -> Row:
     at, rng = step - 1, exam.rng
     beside = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
     if motion == PREDICTED:
@@ -101,7 +102,7 @@ def _row(exam: Exam, where, arm: str, motion: str, step: int, series: Series, st
     return Row(*where, arm, motion, step, figure, series.better, beside, gain)
 
 
-def _curve(exam: Exam, where, arm: str, motion: str, values: torch.Tensor) -> Curve:
+def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor) -> Curve:
     return Curve(*where, arm, motion, range(1, values.shape[1] + 1), mean_band(values, exam.rng()))
 
 
@@ -120,7 +121,7 @@ def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) ->
     return rows
 
 
-def _add_usable(exam: Exam, whole: Report, where, arm: str, motion: str, values: torch.Tensor, series: Series) -> None:
+def _add_usable(exam: Exam, whole: Report, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series) -> None:
     steps, mark = values.shape[1], None
     if series.unit == "dB":
         yardsticks = {

@@ -86,7 +86,8 @@ def _report(exam: Exam, found: Found) -> Report:
             parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
             told = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
             if len(told) > 1:
-                told["all"] = tuple(torch.cat([pair[which] for pair in told.values()]) for which in (0, 1))
+                pairs = list(told.values())
+                told["all"] = torch.cat([error for error, _ in pairs]), torch.cat([doubt for _, doubt in pairs])
             for place, (error, uncertainty) in told.items():
                 one = risk(place, arm, motion, error, uncertainty, exam.rng())
                 whole.rows += one.rows

@@ -10,11 +10,11 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import DatasetError, ObservationError
-from .policies import Constant, Policy, Replay
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
 from .clips import Clip, evidence
+from .policies import Constant, Policy, Replay
 from .scorecard import IDLE, OTHERS, TRUE
 
 Tick = Callable[[float], None]  # steps x clips that were done since the last call
