@@ -140,9 +140,20 @@ def some_clips(count: int = 12, horizon: int = 32, context: int = 3, seed: int =
     return clips_from_cache(recording(seed=seed), range(4), context, horizon, count, make_rng(seed))
 
 
+SHORT = {
+    "drop": (8, 32),
+    "batch": 5,
+    "strips": 2,
+    "closure_deg": (),
+    "closure_walk": 0,
+    "long_steps": 0,
+    "speed_steps": 0,
+}
+
+
 def exam_of(arms, places=None, config=None, seed: int = 0, **more) -> Exam:
     """An exam of worlds by name, on clips of the panorama."""
-    config = config or ExamConfig((1, 8, 32), (8, 32), drop=(8, 32), batch=5, strips=2, long_steps=0, speed_steps=0)
+    config = config or ExamConfig((1, 8, 32), (8, 32), **SHORT)
     sets = {CLIPS: places or {"recorded": some_clips()}, **more.pop("sets", {})}
     return Exam(arms, sets, config, seed, **more)
 

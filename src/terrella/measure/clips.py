@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,11 +61,6 @@ def recorded_channels(cache) -> dict[str, np.ndarray]:
     """A clip cache's arrays by the names of the world's channels."""
     named = {name: getattr(cache, name, None) for name in ("rgb", "depth", "pose", "reward", "done")}
     return {**{name: array for name, array in named.items() if array is not None}, **cache.further}
-
-
-def kinds(names: Iterable[str], kind: str) -> list[str]:
-    """Of channels, those of one kind, the main one first: rgb, rgb.wrist."""
-    return sorted((name for name in names if name.partition(".")[0] == kind), key=lambda name: (name != kind, name))
 
 
 def check_recording(cache, spec: Spec) -> None:

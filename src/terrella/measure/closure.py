@@ -6,15 +6,16 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 
 from ..core.errors import ObservationError
+from ..core.policy import Replay
 from ..core.world import World
 from .clips import Clip
 from .exam import Exam, Found, Probe, batches
 from .fidelity import psnr
-from .policies import Constant, Policy
 from .roll import Results, Tick, fold_context, poses_at
 from .scorecard import PREDICTED, TRUE, Picture, Report, Row
 from .statistics import mean_interval
@@ -33,7 +34,7 @@ LEAD = (
 @dataclass(frozen=True)
 class Way:
     """There and back. `steps(clips, pose)`: 2n poses [B, 7] to be observed, that lead away from the first poses (None for a
-    world that shows none) and to them again; or, where `acted`, 2n policies, who act one step each."""
+    world that shows none) and to them again; or, where `acted`, 2n actions [A]."""
 
     name: str
     steps: Callable[[Sequence[Clip], torch.Tensor | None], list]
@@ -63,7 +64,7 @@ def walk_way(steps: int = 100) -> Way:
 def turn_way(there: torch.Tensor, back: torch.Tensor, name: str, steps: int, far_deg: float = 0.0) -> Way:
     """Holds the action `there` for half of the steps, then `back`: for worlds that take no poses."""
     half = steps // 2
-    return Way(name, lambda clips, pose: [*[Constant(there)] * half, *[Constant(back)] * half], far_deg, True)
+    return Way(name, lambda clips, pose: [*[there] * half, *[back] * half], far_deg, True)
 
 
 def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick: Tick = lambda done: None) -> Results:
@@ -83,9 +84,14 @@ def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick
     steps = way.steps(clips, pose)
     count, half = len(steps), len(steps) // 2
     looked = (half // 2, half, count - half // 2, count, count + half)
-    for number, step in enumerate([*steps, *steps[:half]], start=1):
-        if way.acted:
-            state = world.imagine(state, _acts(step, len(clips), rng), rng)
+    twice = [*steps, *steps[:half]]
+    held = [step.expand(len(clips), *step.shape) for step in twice] if way.acted else []
+    policy = Replay(torch.stack(held)) if held else None
+    memory: Any = policy.begin(len(clips), rng) if policy else None
+    for number, step in enumerate(twice, start=1):
+        if policy:
+            action, memory = policy.act({}, memory, rng)
+            state = world.imagine(state, action, rng)
         else:
             state = world.observe({"pose": step}, state, rng)
         frames += [world.render(state, ("rgb",))["rgb"].cpu()] * looked.count(number)
@@ -98,14 +104,10 @@ def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick
     return {**found, "went": went, "frames": torch.stack(frames, 1), "steps": torch.full((len(clips),), count)}
 
 
-def _acts(policy: Policy, batch: int, rng: torch.Generator) -> torch.Tensor:
-    return policy.act({}, policy.begin(batch, rng), rng)[0]
-
-
 def ways_of(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[Way, Sequence[Clip]]]:
     """Along poses where the world takes them, else by actions that undo each other."""
     config, clips = exam.config, clips[: exam.config.closure_clips]
-    if "pose" in world.spec.observes:
+    if exam.follows_poses(world):
         ways = [(yaw_way(far, config.closure_step_deg), clips) for far in config.closure_deg]
         afoot = walkers(clips, config.closure_walk) if config.closure_walk else []
         return ways + ([(walk_way(config.closure_walk), afoot)] if afoot else [])
@@ -194,7 +196,7 @@ def _turns(exam: Exam, world: World):
 def _missing(exam: Exam, world: World) -> str:
     if "rgb" not in exam.shared(world, "rgb") or not world.spec.observes:
         return "needs rgb"
-    if "pose" in world.spec.observes:
+    if exam.follows_poses(world):
         return ""
     return "" if _turns(exam, world) else "needs actions that turn a camera whose pose is shown or recorded"
 

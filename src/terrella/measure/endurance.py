@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..core.policy import Replay
 from ..core.world import World
 from .album import Album, look
 from .clips import Clip
 from .exam import Exam, Found, Probe
-from .policies import Replay
 from .roll import Results, Tick, fold_context
 from .scorecard import PREDICTED, Curve, Picture, Report, Row
 from .statistics import Band, Figure, ratio_interval

@@ -12,8 +12,8 @@ import torch
 
 from ..core.world import World, make_rng
 from .album import Album
-from .clips import Clip, kinds
-from .roll import Results, Watch, dream, idle_action, true_motion_works
+from .clips import Clip
+from .roll import Results, Watch, can_idle, dream, true_motion_works
 from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report
 from .work import Unit
 
@@ -90,14 +90,19 @@ class Exam:
     def shared(self, world: World, *names: str) -> list[str]:
         """Channels of these kinds that the world shows and every clip holds at the world's shape, the main one first."""
         clip = next(iter(self.places.values()))[0]
-        both = [name for kind in names for name in kinds(world.spec.channels, kind) if name in clip.channels]
+        both = [name for kind in names for name in world.spec.kinds(kind) if name in clip.channels]
         return [name for name in both if tuple(world.spec.channels[name].shape or ()) == clip.channels[name].shape[1:]]
+
+    def follows_poses(self, world: World) -> bool:
+        """Whether the world draws what is seen from a pose that it is given."""
+        clip = next(iter(self.places.values()))[0]
+        return self.once(f"poses {id(world)}", lambda: true_motion_works(world, clip, self.rng()))
 
     def fingerprint(self, identity: str = "") -> str:
         """What must be the same for kept results to count."""
         drawn = {
             f"{kind} {place}": [
-                (clip.episode, clip.start, clip.context, clip.horizon, _sum(clip.action)) for clip in some
+                (int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action)) for clip in some
             ]
             for kind, places in self.sets.items()
             for place, some in places.items()
@@ -154,14 +159,12 @@ def motions_of(exam: Exam, world: World, of: str, clips: Sequence[Clip]) -> dict
     found = {PREDICTED: steps}
     if of == ENDINGS:
         return found
-    if config.true_motion and exam.once(
-        f"true motion {id(world)}", lambda: true_motion_works(world, clips[0], exam.rng())
-    ):
+    if config.true_motion and exam.follows_poses(world):
         found[TRUE] = steps
     control = [step for step in config.control_horizons if step <= steps]
     if of == CLIPS and control:
         found |= {OTHERS: max(control)} if len(clips) > 1 else {}
-        found |= {IDLE: max(control)} if idle_action(world.spec) is not None else {}
+        found |= {IDLE: max(control)} if can_idle(world.spec) else {}
     return found
 
 

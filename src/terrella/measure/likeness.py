@@ -92,7 +92,9 @@ def _asked(motion: str, made: list[Series]) -> list[Series]:
     return [series for series in made if motion != TRUE or series.channel.partition(".")[0] != "pose"]
 
 
-def _row(exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]) -> Row:
+def _row(
+    exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]
+) -> Row:
     at, rng = step - 1, exam.rng
     beside = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
     if motion == PREDICTED:
@@ -121,7 +123,9 @@ def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) ->
     return rows
 
 
-def _add_usable(exam: Exam, whole: Report, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series) -> None:
+def _add_usable(
+    exam: Exam, whole: Report, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series
+) -> None:
     steps, mark = values.shape[1], None
     if series.unit == "dB":
         yardsticks = {

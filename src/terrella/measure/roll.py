@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from gymnasium import spaces
 
 from ..core.errors import DatasetError, ObservationError
+from ..core.policy import Idle, Policy, Replay, act
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
 from .clips import Clip, evidence
-from .policies import Constant, Policy, Replay
 from .scorecard import IDLE, OTHERS, TRUE
 
 Tick = Callable[[float], None]  # steps x clips that were done since the last call
@@ -47,15 +46,10 @@ def actions_at(world: World, clips: Sequence[Clip], row: int) -> torch.Tensor:
     return actions.reshape(len(clips), *(world.spec.action.shape or ()))
 
 
-def idle_action(spec: Spec) -> torch.Tensor | None:
-    """The action at rest, [*spec.action.shape]: nothing pressed, axes at 0, a choice named so; None where there is none."""
-    if isinstance(spec.action, spaces.Discrete):
-        names = [name.upper() for name in spec.action_names]
-        rest = [place for place, name in enumerate(names) if name in ("NOOP", "NONE", "NO ACTION", "IDLE")]
-        return torch.tensor(int(spec.action.start) + rest[0]) if rest else None
-    low, high = (torch.from_numpy(np.array(limit, np.float32)) for limit in spec.action_limits)
-    rest = torch.zeros(spec.action.shape or ())
-    return rest if bool(((low <= rest) & (rest <= high)).all()) else None
+def can_idle(spec: Spec) -> bool:
+    """Whether there is an action that does nothing; a choice must be named so."""
+    names = {name.lower() for name in spec.action_names}
+    return spec.action_mode != "choice" or bool(names & {"noop", "no-op", "idle", "none", "stay"})
 
 
 def policy_of(
@@ -63,10 +57,7 @@ def policy_of(
 ) -> Policy:
     """Who acts from the context on: the recorded player, that of `others`, or nobody."""
     if motion == IDLE:
-        rest = idle_action(world.spec)
-        if rest is None:
-            raise DatasetError(f"{world.spec.name} has no action at rest.")
-        return Constant(rest)
+        return Idle(world.spec)
     hands, first = (others or clips) if motion == OTHERS else clips, clips[0].context - 1
     return Replay(torch.stack([actions_at(world, hands, first + step) for step in range(steps)]))
 
@@ -107,7 +98,7 @@ def dream(
         if policy is None:
             state = world.observe({"pose": poses_at(clips, row)}, state, rng)
         else:
-            action, memory = policy.act(seen, memory, rng)
+            action, memory = act(policy, seen, memory, len(clips), world.spec, rng)
             state = world.imagine(state, action, rng)
         seen = {name: tensor.cpu() for name, tensor in world.render(state, channels).items()}
         for watch in watches:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import torch
 
+from ..core.policy import Replay
 from ..core.world import World
 from .clips import Clip
 from .endurance import recorded_actions
 from .exam import Exam, Found, Probe
-from .policies import Replay
 from .roll import Results, Tick, fold_context
 from .scorecard import PREDICTED, Report, Row
 from .statistics import Figure
