@@ -1,27 +1,37 @@
-"""The recent past of a session: pictures for the eye and states to go back to, within fixed budgets."""
+"""The recent past of a session: pictures to show and states to go back to, within fixed budgets."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 
 from ..core.state import State
 
 
+class Image(NamedTuple):
+    """A picture as the page gets it: of which world and through which of its cameras (by their places), and its JPEG."""
+
+    world: int
+    camera: int
+    jpeg: bytes
+
+
 @dataclass(frozen=True)
 class Moment:
-    """One step: its JPEGs (one per world) and, where the worlds can fork, all that is needed to go on from it."""
+    """One step: its pictures and, where the worlds can fork, all that is needed to go on from it."""
 
     step: int
-    images: tuple[bytes, ...]
+    images: tuple[Image, ...]
     flags: int = 0
     episode_return: float = 0.0
     states: tuple[State, ...] | None = None
-    rng: torch.Tensor | None = None  # the generator's state after this step
+    rng: torch.Tensor | None = None  # the generators' states after this step
     uncertainty: float = -1.0  # the error to expect of the last image, -1 where its world does not say
     vitals: tuple[float, ...] = ()  # of the first world's player
+    memory: Any = None  # of the policy that drives
 
 
 class History:
@@ -51,7 +61,7 @@ class History:
         """The oldest step that can be returned to; the newest one where no states are kept."""
         return self._stateful[0].step if self._stateful else self.newest.step
 
-    def pictures(self) -> list[tuple[bytes, ...]]:
+    def pictures(self) -> list[tuple[Image, ...]]:
         return [moment.images for moment in self._pictures]
 
     def push(self, moment: Moment) -> None:

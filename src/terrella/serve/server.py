@@ -28,12 +28,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from ..core.errors import ProtocolError, ServeError
 from ..core.world import World
 from . import protocol
-from .chart import mapped, tells_known
+from .chart import mapped, knows_share
 from .clip import make_clip
 from .guard import RateLimit, SafeHeaders, is_loopback, refusal
-from .picture import doubtful
+from .actions import axes_of
+from .picture import uncertainty_levels
+from .recording import SinkFactory
 from .session import Session
-from .story import SinkFactory, Story, StoryConfig, check_playable, vitals
+from .timeline import Timeline, TimelineConfig, check_playable, vitals
 
 _FILES = {
     "/": ("index.html", "text/html"),
@@ -44,7 +46,8 @@ _FILES = {
     "/card.js": ("card.js", "text/javascript"),
     "/keycaps.js": ("keycaps.js", "text/javascript"),
     "/map.js": ("map.js", "text/javascript"),
-    "/doubt.js": ("doubt.js", "text/javascript"),
+    "/uncertainty.js": ("uncertainty.js", "text/javascript"),
+    "/axes.js": ("axes.js", "text/javascript"),
     "/picture.js": ("picture.js", "text/javascript"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
@@ -61,7 +64,7 @@ class ServeConfig:
     per_s: float = 240.0
     burst: float = 480.0
     faults: int = 20
-    story: StoryConfig = StoryConfig()
+    timeline: TimelineConfig = TimelineConfig()
 
 
 class Sessions:
@@ -94,7 +97,7 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self._tell_story, self._worker)
+        session = Session(self._make_timeline, self._worker)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -118,8 +121,8 @@ class Sessions:
         self._ended.add(task)
         task.add_done_callback(self._ended.discard)
 
-    def _tell_story(self) -> Story:
-        return Story(self.worlds, self.seed, self._sink_factory, self.config.story, self.picture)
+    def _make_timeline(self) -> Timeline:
+        return Timeline(self.worlds, self.seed, self._sink_factory, self.config.timeline, self.picture, self.policy)
 
     def hello(self, session: Session, resumed: bool) -> str:
         """All that the page needs to know about the worlds."""
@@ -141,17 +144,20 @@ def _describe(world: World, label: str) -> dict:
     return {
         "name": spec.name,
         "label": label,
-        "size": list(spec.channels["rgb"].shape[:2]),
+        "cameras": [{"channel": name, "name": spec.suffix_of(name) or "main", "size": spec.channels[name].shape[:2]} for name in spec.kinds("rgb")],
         "dt_s": spec.dt_s,
         "forkable": spec.forkable,
         "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
         "action_names": list(spec.action_names),
+        "action_mode": spec.action_mode,
+        "action_frame": spec.action_frame,
+        "axes": axes_of(spec),
         "action_kind": type(spec.action).__name__,
         "scored": "reward" in spec.channels,
         "vitals": vitals(spec),
-        "doubtful": doubtful(spec),
+        "uncertainty": uncertainty_levels(spec),
         "mapped": mapped(spec),
-        "tells_known": tells_known(spec),
+        "knows_share": knows_share(spec),
         "card": protocol.plain(dict(spec.card)),
     }
 
