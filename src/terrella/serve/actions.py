@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from ..core.spec import Spec
+from ..core.spec import Spec, dtype_of, neutral_action
 from ..core.world import Observation
 
 MAX_AXES = 64  # that a page shows; an action's others rest
@@ -23,7 +23,7 @@ def axes_of(spec: Spec) -> list[dict]:
     space = spec.action
     if not isinstance(space, spaces.Box):
         return []
-    rest, axes = _rest(space).ravel(), []
+    rest, axes = neutral_action(spec).ravel(), []
     table = [np.abs(np.asarray(value, np.float64)) for value in spec.keys.values()]
     for at in range(min(rest.size, MAX_AXES)):
         reach = max([float(row[at]) for row in table], default=0.0) or 1.0
@@ -35,7 +35,7 @@ def axes_of(spec: Spec) -> list[dict]:
                 "low": low if abs(low) < _UNLIMITED else -reach,
                 "high": high if abs(high) < _UNLIMITED else reach,
                 "neutral": float(rest[at]),
-                "whole": np.dtype(space.dtype).kind in "iu",
+                "whole": dtype_of(space).kind in "iu",
             }
         )
     return axes
@@ -46,12 +46,12 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
 
     Buttons combine by element-wise maximum. A choice (Discrete) is the key pressed last. An axis (Box) has the value given,
     or that of the held key which is furthest from rest, so that a negative direction is not lost to a zero. Without any:
-    zeros, brought into the space. Keys that the world does not know count as nothing.
+    the neutral action. Keys that the world does not know count as nothing, values beyond its limits as the limit.
     """
     space = spec.action
     rows = [np.asarray(spec.keys[code], np.float64) for code in held if code in spec.keys]
+    flat = neutral_action(spec).ravel().astype(np.float64)
     if isinstance(space, spaces.Box):
-        flat = _rest(space).ravel()
         given = np.asarray(axes, np.float64)[: flat.size]
         flat[: given.size] = given
         if rows:
@@ -60,17 +60,10 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
             pressed = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
             flat = np.where(pressed != 0, pressed, flat)
         flat = np.clip(flat, space.low.ravel(), space.high.ravel())
-        flat = flat.round() if np.dtype(space.dtype).kind in "iu" else flat
-    elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        flat = np.maximum(rows[-1] if rows else 0.0, np.ravel(space.start))
-    else:
-        flat = np.max(rows, axis=0) if rows else np.zeros(int(np.prod(space.shape or ())))
-    return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype=space.dtype))[None]
-
-
-def _rest(space: spaces.Box) -> np.ndarray:
-    """Zeros, brought into the space, float64."""
-    return np.clip(np.zeros(space.shape), space.low, space.high)
+        flat = flat.round() if dtype_of(space).kind in "iu" else flat
+    elif rows:
+        flat = np.max(rows, axis=0) if isinstance(space, spaces.MultiBinary) else rows[-1]
+    return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
 
 
 class Person:

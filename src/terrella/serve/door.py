@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections import OrderedDict
 from typing import Any
 
@@ -11,27 +12,42 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 REQUEST_S = 10.0  # from the first to the last byte of a request
-MOST_WAITING = 128  # connections that have not finished a request; beyond it the oldest of them goes
+MOST_WAITING = 64  # connections that have not finished a request; beyond it the oldest of them goes
+COMPLAIN_EVERY_S = 60.0
 
 
 def settings(app: Any, websockets: bool) -> uvicorn.Config:
     """How our pages are served; `websockets`: the page has one."""
-    config = uvicorn.Config(
+    return uvicorn.Config(
         app, http=Door, ws="websockets-sansio" if websockets else "none", ws_max_size=2**16, ws_max_queue=64,
-        ws_per_message_deflate=False, log_level="warning", access_log=False, timeout_graceful_shutdown=2,
+        ws_per_message_deflate=False, log_level="error", access_log=False, timeout_graceful_shutdown=2,
         server_header=False, proxy_headers=False,
     )  # fmt: skip
-    return config
+
+
+def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:
+    """Where connections cannot be accepted (no file descriptors are left), a line now and then instead of a trace for each."""
+    complained = -COMPLAIN_EVERY_S
+
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        nonlocal complained
+        if not isinstance(context.get("exception"), OSError) or "accept" not in context.get("message", ""):
+            loop.default_exception_handler(context)
+        elif loop.time() - complained >= COMPLAIN_EVERY_S:
+            complained = loop.time()
+            print(f"terrella: no more connections can be taken ({context['exception']}).", file=sys.stderr)
+
+    loop.set_exception_handler(handle)
 
 
 class Door(H11Protocol):
     """uvicorn's connection with a deadline for each request. A request that is whole is answered without one; a
     WebSocket takes the connection over, and is let in or refused by its own handshake."""
 
-    _waiting: OrderedDict[Door, asyncio.TimerHandle] = OrderedDict()  # oldest first
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)  # pyright: ignore[reportArgumentType]
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().connection_made(transport)
+        found = vars(self.server_state).setdefault("waiting", OrderedDict())  # oldest first
+        self._waiting: OrderedDict[Door, asyncio.TimerHandle] = found
         if len(self._waiting) >= MOST_WAITING:
             next(iter(self._waiting)).drop()
         self._await_request()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -28,10 +28,9 @@ class Moment:
     flags: int = 0
     episode_return: float = 0.0
     states: tuple[State, ...] | None = None
-    rng: torch.Tensor | None = None  # the generators' states after this step
+    rngs: tuple[torch.Tensor, ...] | None = None  # the generators' states after this step
     uncertainty: float = -1.0  # the error to expect of the last image, -1 where its world does not say
     vitals: tuple[float, ...] = ()  # of the first world's player
-    memory: Any = None  # of the policy that drives
 
 
 class History:
@@ -102,7 +101,7 @@ class History:
         self._count(gone, -1)
         if self._pictures and self._pictures[0].step <= gone.step:  # the picture stays, without its state
             index = gone.step - self._pictures[0].step
-            self._pictures[index] = replace(gone, states=None, rng=None)
+            self._pictures[index] = replace(gone, states=None, rngs=None)
 
     def _count(self, moment: Moment, sign: int) -> None:
         seen = {}

@@ -89,7 +89,9 @@ def decode_frame(data: bytes) -> Frame:
         raise ProtocolError(f"a frame of {len(data)} bytes is cut short; reload the page.") from error
     if at > len(data):
         raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
-    return Frame(seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, uncertainty, vitals)
+    return Frame(
+        seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, uncertainty, vitals
+    )
 
 
 @dataclass(frozen=True)

@@ -26,30 +26,26 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ..core.errors import ProtocolError, ServeError
+from ..core.policy import Policy
+from ..core.spec import suffix_of
 from ..core.world import World
 from . import protocol
-from .chart import mapped, knows_share
-from .clip import make_clip
-from .guard import RateLimit, SafeHeaders, is_loopback, refusal
 from .actions import axes_of
+from .chart import knows_share, mapped
+from .clip import make_clip
+from .door import quiet_accepting, settings
+from .guard import Guard, RateLimit, is_loopback
 from .picture import uncertainty_levels
 from .recording import SinkFactory
 from .session import Session
 from .timeline import Timeline, TimelineConfig, check_playable, vitals
 
+_SCRIPTS = ("app", "axes", "card", "controls", "keycaps", "link", "map", "picture", "screens", "uncertainty")
 _FILES = {
     "/": ("index.html", "text/html"),
     "/style.css": ("style.css", "text/css"),
-    "/app.js": ("app.js", "text/javascript"),
-    "/link.js": ("link.js", "text/javascript"),
-    "/controls.js": ("controls.js", "text/javascript"),
-    "/card.js": ("card.js", "text/javascript"),
-    "/keycaps.js": ("keycaps.js", "text/javascript"),
-    "/map.js": ("map.js", "text/javascript"),
-    "/uncertainty.js": ("uncertainty.js", "text/javascript"),
-    "/axes.js": ("axes.js", "text/javascript"),
-    "/picture.js": ("picture.js", "text/javascript"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in _SCRIPTS},
 }
 
 
@@ -77,8 +73,10 @@ class Sessions:
         sink_factory: SinkFactory | None,
         config: ServeConfig,
         picture: torch.Tensor | None = None,
+        policy: Policy | None = None,
     ):
-        self.worlds, self.seed, self.config, self.picture = tuple(worlds), seed, config, picture
+        self.worlds, self.seed, self.config = tuple(worlds), seed, config
+        self.picture, self.policy = picture, policy
         self._sink_factory = sink_factory
         self._seats = config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
@@ -135,7 +133,8 @@ class Sessions:
             resumed=resumed,
             worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
             no_rewind=f"{fixed} is a running game: it cannot go back in time." if fixed else "",
-            no_record="" if self._sink_factory else "start the server with a folder to record to: --record DIR",
+            no_record="" if self._sink_factory else "start the server with --record FOLDER.",
+            driver=type(self.policy).__name__ if self.policy else "",
         )
 
 
@@ -144,7 +143,10 @@ def _describe(world: World, label: str) -> dict:
     return {
         "name": spec.name,
         "label": label,
-        "cameras": [{"channel": name, "name": spec.suffix_of(name) or "main", "size": spec.channels[name].shape[:2]} for name in spec.kinds("rgb")],
+        "cameras": [
+            {"channel": name, "name": suffix_of(name) or "main", "size": spec.channels[name].shape[:2]}
+            for name in spec.kinds("rgb")
+        ],
         "dt_s": spec.dt_s,
         "forkable": spec.forkable,
         "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
@@ -171,6 +173,7 @@ def build_app(
     config: ServeConfig | None = None,
     on_ready: Callable[[], None] | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> Starlette:
     """The ASGI application; `host` is the address it is bound to, which decides what Host headers it answers to."""
     check_playable(worlds)
@@ -180,7 +183,8 @@ def build_app(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture)
+        quiet_accepting(asyncio.get_running_loop())
+        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture, policy)
         sweeper = asyncio.create_task(_sweep(sessions))
         if on_ready:
             on_ready()
@@ -195,13 +199,9 @@ def build_app(
         return Response(content, media_type=kind)
 
     def check(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        return PlainTextResponse(why, 403) if why else PlainTextResponse("ok")
+        return PlainTextResponse("ok")
 
     async def clip(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        if why:
-            return PlainTextResponse(why, 403)
         session = request.app.state.sessions.get(request.path_params["session"])
         pictures = await session.pictures() if session else []
         if not pictures:
@@ -213,15 +213,13 @@ def build_app(
         return Response(content, media_type="video/mp4", headers=disposition)
 
     async def play(websocket: WebSocket) -> None:
-        why = refusal(dict(websocket.headers), host, token, websocket.query_params.get("token"))
-        if why:
-            await websocket.send_denial_response(PlainTextResponse(why, 403))
-        else:
-            await _play(websocket, websocket.app.state.sessions)
+        await _play(websocket, websocket.app.state.sessions)
 
     routes = [Route(path, show) for path in files]
     routes += [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
-    return Starlette(routes=routes, lifespan=lifespan, middleware=[Middleware(SafeHeaders, host=host)])
+    return Starlette(
+        routes=routes, lifespan=lifespan, middleware=[Middleware(Guard, host=host, token=token, files=files)]
+    )
 
 
 async def _sweep(sessions: Sessions) -> None:
@@ -309,9 +307,11 @@ def serve(
     seed: int = 0,
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
-    Stories begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given.
+    Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
+    touches the controls.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
@@ -323,7 +323,7 @@ def serve(
         token = secrets.token_urlsafe(16)
     listener = open_port(host, port)
     with contextlib.closing(listener):
-        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture)
+        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture, policy)
         with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
             server.run(sockets=[listener])
 
@@ -351,16 +351,13 @@ def make_server(
     seed: int = 0,
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> uvicorn.Server:
     """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
     ready = (lambda: on_ready(url)) if on_ready else None
-    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture)
-    settings = uvicorn.Config(
-        app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=2**16, ws_max_queue=64,
-        ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False, proxy_headers=False,
-    )  # fmt: skip
-    return uvicorn.Server(settings)
+    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture, policy)
+    return uvicorn.Server(settings(app, websockets=True))
 
 
 def page_address(host: str, port: int, token: str | None) -> str:

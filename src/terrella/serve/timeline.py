@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import ServeError, TerrellaError
-from ..core.policy import Policy
+from ..core.policy import Policy, act
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
@@ -197,6 +197,7 @@ class Timeline:
         self._shown = self._history.at(step)
         return self._shown
 
+    @torch.inference_mode()
     def branch(self) -> Moment:
         """Goes on from the moment shown: what came after it is forgotten, and the same actions lead to the same frames."""
         if self.rewound:
@@ -260,9 +261,9 @@ class Timeline:
     def _action(self) -> torch.Tensor:
         """[1, ...], the person's, or the policy's while it drives and nobody touches the controls."""
         if self._policy is None or not self.driving or self._person.active:
-            return self._person.act({}, None, self._rngs[-1])[0]
+            return act(self._person, {}, None, 1, self.spec, self._rngs[-1])[0]
         seen = self.worlds[0].render(self._states[0], tuple(self.spec.channels))
-        action, self._memory = self._policy.act(seen, self._memory, self._rngs[-1])
+        action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
         return action
 
     def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
@@ -275,8 +276,11 @@ class Timeline:
     def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
         self._recording.end_episode()
         self._states, self._return = states, 0.0
-        self._memory = self._policy.begin(1, self._rngs[-1]) if self._policy is not None else None
+        self._begin_policy()
         return self._show(step, FRESH, None)
+
+    def _begin_policy(self) -> None:
+        self._memory = self._policy.begin(1, self._rngs[-1]) if self._policy is not None else None
 
     def _entered(self, picture: torch.Tensor, rng: torch.Generator) -> State:
         """The played world after it observed `picture`; a notice says so where it is unlike what the world knows."""
@@ -331,10 +335,9 @@ class Timeline:
             flags | DONE * done,
             self._return,
             None if self.no_rewind else self._states,
-            None if self.no_rewind else torch.stack([rng.get_state() for rng in self._rngs]),
+            None if self.no_rewind else tuple(rng.get_state() for rng in self._rngs),
             float(last["uncertainty"][0]) if "uncertainty" in last else -1.0,
             tuple(float(seen[name][0]) for name in vitals(self.spec)),
-            self._memory,
         )
         self._history.push(moment)
         self._shown = moment
@@ -351,10 +354,11 @@ class Timeline:
 
     def _return_to(self, moment: Moment) -> None:
         self._shown = moment
-        if moment.states is not None and moment.rng is not None:
-            self._states, self._return, self._memory = moment.states, moment.episode_return, moment.memory
-            for rng, state in zip(self._rngs, moment.rng, strict=True):
+        if moment.states is not None and moment.rngs is not None:
+            self._states, self._return = moment.states, moment.episode_return
+            for rng, state in zip(self._rngs, moment.rngs, strict=True):
                 rng.set_state(state)
+            self._begin_policy()
 
 
 def encode_jpeg(rgb: torch.Tensor) -> bytes:
