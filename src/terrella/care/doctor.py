@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ..core.errors import DatasetError
@@ -58,6 +58,11 @@ class Findings:
         for fault in self.faults:
             kinds.setdefault((_kind(fault.what), _kind(fault.mend)), []).append(fault)
         return [Group(tuple(faults)) for faults in kinds.values()]
+
+    def facts(self) -> dict[str, object]:
+        """All of it as JSON values; `kinds` are the groups of faults, likely causes first."""
+        kinds = [{**asdict(group.faults[0]), "count": len(group.faults)} for group in self.groups]
+        return {"faults": [asdict(fault) for fault in self.faults], "kinds": kinds, "notes": self.notes}
 
     def report(self, name: str) -> str:
         """The verdict, then the likeliest cause, then the other faults by kind, then the notes."""
