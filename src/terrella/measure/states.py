@@ -47,14 +47,15 @@ class _Vector:
 
     @staticmethod
     def of(clips: Sequence[Clip], name: str) -> _Vector:
-        whole = torch.stack([torch.from_numpy(np.array(clip.channels[name], np.float64)).flatten(1) for clip in clips])
+        whole = torch.stack([torch.from_numpy(np.array(clip.channels[name], np.float64)) for clip in clips])
+        whole = whole.reshape(*whole.shape[:2], -1)
         unit = whole.flatten(0, 1).std(0, correction=0)
         moves = unit > 1e-6 * whole.abs().amax((0, 1)).clamp_min(1e-6)
         return _Vector((whole / unit)[..., moves], unit, moves, clips[0].context)
 
     def away(self, given: torch.Tensor) -> torch.Tensor:
         """Predictions [n, T, ...] less the truth after the context: [n, T, D]."""
-        mine = (given.double().flatten(2) / self.unit)[..., self.moves]
+        mine = (given.double().reshape(*given.shape[:2], -1) / self.unit)[..., self.moves]
         return mine - self.values[:, self.context : self.context + mine.shape[1]]
 
     def stood(self, steps: int) -> torch.Tensor:
