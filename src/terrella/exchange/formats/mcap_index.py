@@ -134,7 +134,8 @@ class Index:
     def _record(self, at: int) -> Any:
         with open(self.path, "rb") as file:
             file.seek(at)
-            return _parsed(*_FRAME.unpack(file.read(_FRAME.size)), file)
+            opcode, length = _FRAME.unpack(file.read(_FRAME.size))
+            return _parsed(opcode, length, file)
 
     def _messages(self, chunk: int) -> list[Message]:
         with self._lock:
