@@ -81,6 +81,12 @@ class State(Mapping):
         """Each batch entry n times in a row: [a, b].fork(2) = [a, a, b, b]."""
         return State({name: tensor.repeat_interleave(n, dim=0) for name, tensor in self.items()})
 
+    def put(self, index: torch.Tensor, fresh: State) -> State:
+        """This state with its entries `index` (int64 [n]) replaced by those of `fresh` (a batch of n)."""
+        if fresh.batch != len(index) or set(fresh) != set(self):
+            raise ValueError(f"put takes {len(index)} fresh entries of the same world; got {fresh}")
+        return State({name: tensor.index_copy(0, index, fresh[name]) for name, tensor in self.items()})
+
     def where(self, which: torch.Tensor, other: State) -> State:
         """This state's entries where `which` (bool [B]), the other's elsewhere."""
         flags = {name: which.view(-1, *[1] * (tensor.ndim - 1)) for name, tensor in other.items()}
