@@ -13,8 +13,8 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.dataset import decoded
 from ..data.episodes import Film
+from ..data.features import decoded, sensors_of
 from ..data.format import (
     ACTION_VALID,
     AUTOMATIC,
@@ -24,7 +24,6 @@ from ..data.format import (
     Layout,
     fill,
     schema,
-    sensors_of,
     tidy,
     where,
 )

@@ -16,8 +16,8 @@ import pyarrow as pa
 from PIL import Image
 
 from ..core.errors import DatasetError
-from ..data.dataset import checked_features
 from ..data.episodes import Film, counts_of
+from ..data.features import checked_features
 from ..data.format import (
     AUTOMATIC,
     DATA_PATH,

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from ..core.errors import DatasetError, TerrellaError
+from ..core.spec import Camera, Spec, dtype_of, kind_of, shape_of
 from .source import Sensor
-
-if TYPE_CHECKING:
-    from gymnasium import spaces
-
-    from ..core.spec import Camera, Spec
 
 RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
 ACTION, REWARD, DONE = "action", "next.reward", "next.done"
 POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 NAME = re.compile(r"\w[\w.-]{0,200}")  # of a feature, and so of a file and a folder
 MOST_AXES = 5
-ESTIMATES = ("uncertainty", "known", "keyframes")  # what a learned world says of itself: recorded, but never learned from
+ESTIMATES = (
+    "uncertainty",
+    "known",
+    "keyframes",
+)  # what a learned world says of itself: recorded, but never learned from
 RENAMED = {"cast": "objects"}  # channel of old recordings -> what it is called now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
 _IMAGES = "observation.images."
@@ -51,6 +52,12 @@ def channel_of(feature: str, names: Iterable[str] = ()) -> str:
     return RENAMED.get(channel, channel)
 
 
+def renamed(feature: str) -> str:
+    """What a feature of an old recording is called now."""
+    channel = feature.removeprefix("observation.")
+    return f"observation.{RENAMED[channel]}" if channel in RENAMED and channel != feature else feature
+
+
 def features_of(channels: Iterable[str]) -> dict[str, str]:
     """channel -> feature of all channels of one world; DatasetError where two would be one, or a name can be none.
 
@@ -66,7 +73,9 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
             )
         for other, taken in found.items():
             if taken.lower() == feature.lower():
-                raise DatasetError(f"the channels '{other}' and '{channel}' would both be {feature}; rename one of them.")
+                raise DatasetError(
+                    f"the channels '{other}' and '{channel}' would both be {feature}; rename one of them."
+                )
         found[channel] = feature
     return found
 
@@ -79,8 +88,8 @@ def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
 
 def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sensor:
     shape, dtype = _form(spec.name, channel, space)
-    kind, unit = channel.partition(".")[0], spec.units.get(channel, "")
-    if kind == "rgb" or channel in spec.cameras:
+    kind, unit = kind_of(channel), spec.units.get(channel, "")
+    if kind == "rgb":
         if len(shape) != 3 or shape[2] != 3 or dtype != np.uint8:
             raise DatasetError(
                 f"the channel '{channel}' of {spec.name} is {dtype} {shape}, and a picture is uint8 [height, width, 3]: "
@@ -98,12 +107,10 @@ def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sens
         return Sensor(feature, "vector", shape, dtype.name, units=units)
     width = int(np.prod(shape))
     names = tuple(f"{channel}_{i}" for i in range(width))
-    return Sensor(feature, "vector", (width,), dtype.name, names, {name: unit for name in names} if unit else {})
+    return Sensor(feature, "vector", (width,), dtype.name, names, dict.fromkeys(names, unit) if unit else {})
 
 
 def _form(world: str, channel: str, space: spaces.Space) -> tuple[tuple[int, ...], np.dtype]:
-    from ..core.spec import dtype_of, shape_of
-
     try:
         shape, dtype = shape_of(space), dtype_of(space)
     except (TerrellaError, TypeError) as error:
@@ -118,31 +125,50 @@ def _form(world: str, channel: str, space: spaces.Space) -> tuple[tuple[int, ...
     return shape, dtype
 
 
-def camera_json(camera: Camera) -> dict[str, object]:
-    """A Camera as meta/terrella.json keeps it."""
+def facts_of(spec: Spec) -> dict[str, object]:
+    """What meta/terrella.json keeps of a world, JSON values: its actions, cameras, units and clock."""
+    low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
+    limits = {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
     return {
-        "intrinsics": list(camera.intrinsics),
-        "size": list(camera.size),
-        "pose": camera.pose,
-        "mount": list(camera.mount),
+        "name": spec.name,
+        "dt_s": spec.dt_s,
+        "camera": list(spec.camera) if spec.camera else None,
+        "cameras": {channel: _camera_json(camera) for channel, camera in spec.cameras.items()},
+        "action_space": str(spec.action),
+        "action_shape": list(shape_of(spec.action)),
+        "action_names": list(spec.action_names),
+        "action_units": list(spec.action_units),
+        "action_mode": spec.action_mode,
+        "action_frame": spec.action_frame,
+        "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
+        "units": dict(spec.units),
+        "discrete": isinstance(spec.action, spaces.Discrete),
+        **limits,
     }
 
 
-def cameras_of(world: Mapping) -> dict[str, Camera]:
-    """channel -> Camera of a recorded world, from the facts that meta/terrella.json keeps; {} where it keeps none.
+def _camera_json(camera: Camera) -> dict[str, object]:
+    return {
+        "intrinsics": [float(number) for number in camera.intrinsics],
+        "size": [int(number) for number in camera.size],
+        "pose": camera.pose,
+        "mount": [float(number) for number in camera.mount],
+    }
 
-    Of recordings that knew one camera alone: the main one, mounted on `pose`. DatasetError where the facts are damaged.
+
+def cameras_of(world: Mapping, size: Sequence[int] = (1, 1)) -> dict[str, Camera]:
+    """channel -> Camera, from the facts of a recorded world; {} where they name none. DatasetError where they are damaged.
+
+    Of an old recording, which knew but one camera: the main one, on the channel `pose`; `size` is that of its pictures.
     """
-    from ..core.spec import Camera
-
     try:
         if "cameras" not in world:
-            main, size = world.get("camera"), world.get("size") or (0, 0)
-            return {"rgb": Camera(_numbers(main, 4), _numbers(size, 2, int))} if main else {}  # pyright: ignore
+            main = world.get("camera")
+            return {"rgb": Camera(_numbers(main, 4), _numbers(size, 2, int))} if main else {}
         return {
             str(channel): Camera(
-                _numbers(about["intrinsics"], 4),  # pyright: ignore[reportArgumentType]
-                _numbers(about["size"], 2, int),  # pyright: ignore[reportArgumentType]
+                _numbers(about["intrinsics"], 4),
+                _numbers(about["size"], 2, int),
                 None if about["pose"] is None else str(about["pose"]),
                 _numbers(about["mount"], 7),
             )
@@ -152,8 +178,8 @@ def cameras_of(world: Mapping) -> dict[str, Camera]:
         raise DatasetError(f"meta/terrella.json tells no cameras ({error}); restore it from a copy.") from error
 
 
-def _numbers(values: object, count: int, kind: type = float) -> tuple:
-    found = tuple(kind(value) for value in values)  # pyright: ignore[reportGeneralTypeIssues]
+def _numbers(values: Any, count: int, kind: type = float) -> Any:
+    found = tuple(kind(value) for value in values)
     if len(found) != count or not np.isfinite(found).all():
         raise ValueError(f"{count} finite numbers were expected, not {values!r}")
     return found
