@@ -15,7 +15,7 @@ from PIL import Image
 from ..core.errors import DatasetError
 from ..data.format import AUTOMATIC, PICTURE, TIME, Layout, contained, sensor_from_json
 from ..data.storage import boxes
-from .tables import open_parquet, read_whole
+from ..data.storage.tables import open_parquet, read_whole
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, AttributeError, DatasetError)
 _UNREADABLE = (*BROKEN, av.FFmpegError, IndexError, Image.DecompressionBombError, Image.DecompressionBombWarning)

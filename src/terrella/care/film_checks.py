@@ -16,8 +16,8 @@ from ..data.source import Sensor
 from ..data.staged import SAMPLE_EVERY
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
+from ..data.storage.tables import read_whole
 from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
-from .tables import read_whole
 
 _SHORTEN = "let --repair keep the rows that the video shows"
 _EXCHANGE = "exchange the two videos, as --repair does"

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..core.errors import DatasetError
+from ..data.storage.tables import open_parquet
 from . import thrift
 from .pages import DATA, DATA_V2, DICTIONARY, Page, page_at
-from .tables import open_parquet
 
 _MAGIC = b"PAR1"
 _TYPES = {

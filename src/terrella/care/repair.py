@@ -31,7 +31,7 @@ from ..data.source import follows, is_action
 from ..data.staged import LOG, SAMPLE_EVERY, Staged
 from ..data.storage import durable, mp4
 from ..data.storage.films import Reel, cut, reel, whole_frames
-from ..data.storage.tables import read_json
+from ..data.storage.tables import open_parquet, read_json
 from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh
 from .features import BROKEN, mended_features
 from .film_checks import Shown, examine_films
@@ -39,7 +39,6 @@ from .footers import rebuild
 from .pieces import Piece, RowReader, Table, pieces_of, read_table, runs, short, uncovered
 from .stream_mending import StreamMender, possible
 from .survey import Survey, survey
-from .tables import open_parquet
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read
