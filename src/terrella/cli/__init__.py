@@ -75,9 +75,9 @@ def _app(given: Sequence[str]) -> SubcommandApp:
 
         training_commands = {
             "video": train.video,
-            "eye": train.estimator,
-            "senses": train.senses,
-            "things": train.things,
+            "estimator": train.estimator,
+            "uncertainty": train.uncertainty,
+            "objects": train.objects,
             "latent-actions": train.latent_actions,
             "distil": train.few_steps,
             "dreams": train.dreams,
