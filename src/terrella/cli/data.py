@@ -1,15 +1,17 @@
-"""The commands that look after recordings: doctor, convert, merge, view."""
+"""The commands that look after recordings: doctor, convert, merge, view, label."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from .. import progress
-from .say import Host, Json, Port, Seed, Token, result
+from .say import Host, Json, Port, Seed, Token, result, say
 
 Fps = Annotated[float | None, arg(help="Rows a second; without it those that the recording has.")]
 Policy = Annotated[
@@ -18,36 +20,37 @@ Policy = Annotated[
 ]
 
 
-def doctor(folder: Positional[Path], repair: bool = False, out: Path | None = None, json: Json = False) -> int:
+def doctor(
+    folder: Positional[Path], repair: bool = False, out: Path | None = None, yes: bool = False, json: Json = False
+) -> int:
     """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
 
     Args:
         folder: Folder of a LeRobot v3 dataset, ours or anybody's.
         repair: Write a mended copy that keeps every whole row; the original is not touched.
         out: Where the mended copy goes; without it FOLDER-mended.
+        yes: Repair without asking even where most rows would be lost.
     """
-    from ..care import doctor as examine
     from ..care import repair as mend
+    from ..care.doctor import examine
 
-    faults = examine(folder)
-    facts: dict[str, object] = {
-        "dataset": str(folder),
-        "sound": not faults,
-        "faults": [asdict(fault) for fault in faults],
-    }
-    lines = [
-        f"{fault.file}{'' if fault.row is None else f', row {fault.row}'}: {fault.what}.\n    mend: {fault.mend}."
-        for fault in faults
-    ]
-    lines.append(f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}")
+    def allowed(sentence: str) -> bool:
+        if sys.stdin.isatty():
+            say(f"{sentence} Go on? [y/N]")
+            return sys.stdin.readline().strip().lower() in ("y", "yes")
+        return False
+
+    found = examine(folder)
+    facts: dict[str, object] = {"dataset": str(folder), "sound": not found.faults, **found.facts()}
+    lines = [found.report(str(folder))]
     if repair:
         target = out or folder.resolve().with_name(f"{folder.resolve().name}-mended")
         with progress.shown("mending") as report:
-            done = mend(folder, target, progress=lambda pieces, of: report(pieces, of))
+            done = mend(folder, target, progress=lambda pieces, of: report(pieces, of), allow_loss=yes or allowed)
         facts |= {"mended": str(target), "done": done}
         lines += [*done, f"the mended copy: {target}"]
     result(facts, json, "\n".join(lines))
-    return 1 if faults and not repair else 0
+    return 1 if found.faults and not repair else 0
 
 
 def convert(
@@ -75,10 +78,22 @@ def convert(
 
     found = open_source(source, fps, episodes, seed)
     rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, None, pictures)
-    with progress.shown(f"converting {found.name}") as report:
-        notes = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
-    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "notes": notes}
-    result(facts, json, "\n".join([*(f"note: {note}" for note in notes), f"{source} is now {target}"]))
+    with _whole_or_nothing(target), progress.shown(f"converting {found.name}") as report:
+        left_out = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
+    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "left_out": left_out}
+    result(
+        facts, json, "\n".join([*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"])
+    )
+
+
+@contextmanager
+def _whole_or_nothing(target: Path) -> Iterator[None]:
+    """Says what Ctrl-C leaves of a command that writes all of `target` or nothing."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"terrella: stopped; nothing was written at {target}, and what was read is untouched.")
+        raise SystemExit(130) from None
 
 
 def merge(
@@ -102,7 +117,7 @@ def merge(
     from ..exchange.merging.merge import merge_into
 
     found = {path: open_source(path) for path in sources}
-    with progress.shown("merging") as report:
+    with _whole_or_nothing(out), progress.shown("merging") as report:
         facts, text = merge_into(found, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
     result(facts, json, text)
 
@@ -123,14 +138,15 @@ def view(
         rerun: Hand it to Rerun instead, where that is installed.
         out: Folder to which the page exports the episodes that are not marked bad; without it FOLDER-good.
     """
-    from ..exchange.browse import browse
-    from ..exchange.convert import open_source
-
     if rerun:
+        from ..exchange.convert import open_source
         from ..exchange.formats import rerun as viewer
 
-        viewer.show(open_source(folder))
+        for what in viewer.show(open_source(folder)):
+            say(f"left out: {what}.")
         return
+    from ..care import repair
+    from ..exchange.browse import browse
     from ..serve.viewer import view as serve
 
     def ready(address: str) -> None:
@@ -138,7 +154,7 @@ def view(
 
     here = Path(folder).resolve() if "://" not in folder else Path.cwd() / folder.rstrip("/").rsplit("/", 1)[-1]
     good = out or here.with_name(f"{here.name}-good")
-    serve(browse(folder), port, host, token, ready, good)
+    serve(browse(folder, carry=repair), port, host, token, ready, good)
 
 
 def label(

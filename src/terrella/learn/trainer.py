@@ -195,7 +195,8 @@ class Trainer:
                 drawn = time.monotonic()
         self.save()
         if stop.is_set():
-            raise KeyboardInterrupt
+            words = f"{facts['step']} steps of '{self.stage}' are saved in {self.out}; the same command goes on from there."
+            raise KeyboardInterrupt(words)
 
     def _step(self, step: int) -> dict[str, float]:
         """One whole step: a batch, and down each of its losses in turn. Returns the means of their parts."""

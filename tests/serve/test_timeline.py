@@ -1,4 +1,4 @@
-"""Laws of a story: keys become actions, the past can be returned to, memory stays flat, recordings are whole."""
+"""Laws of a timeline: what is held becomes actions, the past can be returned to, memory stays flat, recordings are whole."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from gymnasium import spaces
 
 from terrella.core import Spec, State, check_world, make_rng
 from terrella.core.errors import DatasetError, ServeError
-from terrella.serve.actions import action_of_keys
+from terrella.serve.actions import action_of
 from terrella.serve.history import History, Moment
 from terrella.serve.protocol import DONE, FRESH
-from terrella.serve.story import Story, StoryConfig
+from terrella.serve.timeline import Timeline, TimelineConfig
 
 from .conftest import ListSink
 from .panorama import BUTTONS, PIXELS_PER_STEP, Panorama, SlowDream
@@ -31,102 +31,100 @@ def test_the_fake_keeps_the_contract(forkable):
 
 def test_buttons_held_together_are_all_pressed():
     spec = Panorama().spec
-    held = action_of_keys(spec, ("KeyW", "ArrowUp", "ArrowLeft", "F13"))
+    held = action_of(spec, ("KeyW", "ArrowUp", "ArrowLeft", "F13"))
     assert held.tolist() == [[1, 0, 0, 0, 1, 0]] and len(BUTTONS) == 6
     spec.check_action(held, 1)
 
 
 def test_axes_keep_their_negative_side():
     box = spec_of(spaces.Box(-1, 1, (2,), np.float32), {"KeyW": [1.0, 0.0], "KeyA": [0.0, -1.0], "KeyD": [0.0, 1.0]})
-    assert action_of_keys(box, ("KeyW", "KeyA")).tolist() == [[1.0, -1.0]]
-    assert (
-        action_of_keys(box, ("KeyA", "KeyD")).tolist() == action_of_keys(box, ("KeyD", "KeyA")).tolist() == [[0.0, 1.0]]
-    )
-    assert action_of_keys(box, ()).tolist() == [[0.0, 0.0]]
+    assert action_of(box, ("KeyW", "KeyA")).tolist() == [[1.0, -1.0]]
+    assert action_of(box, ("KeyA", "KeyD")).tolist() == action_of(box, ("KeyD", "KeyA")).tolist() == [[0.0, 1.0]]
+    assert action_of(box, ()).tolist() == [[0.0, 0.0]]
 
 
 def test_of_choices_the_last_key_wins():
     choice = spec_of(spaces.Discrete(3, start=1), {"KeyA": [2.0], "KeyD": [3.0]})
-    assert action_of_keys(choice, ("KeyD", "KeyA")).tolist() == [2]
-    assert action_of_keys(choice, ()).tolist() == [1]
+    assert action_of(choice, ("KeyD", "KeyA")).tolist() == [2]
+    assert action_of(choice, ()).tolist() == [1]
 
 
 def test_rewinding_and_branching_tells_the_same_story_again():
-    story = Story([Panorama()], seed=3)
+    timeline = Timeline([Panorama()], seed=3)
     plan = [LEFT] * 5 + [WALK] * 5 + [RIGHT] * 5
-    first = [story.step(held).images for held in plan]
-    story.stand_at(4)
-    assert story.rewound and story.shown.images == first[3]
-    story.branch()
-    assert not story.rewound and story.newest_step == 4
-    again = [story.step(held).images for held in plan[4:]]
+    first = [timeline.step(held).images for held in plan]
+    timeline.stand_at(4)
+    assert timeline.rewound and timeline.shown.images == first[3]
+    timeline.branch()
+    assert not timeline.rewound and timeline.newest_step == 4
+    again = [timeline.step(held).images for held in plan[4:]]
     assert again == first[4:]
     assert again != first[3:-1], "the frames differ from step to step, or this proves nothing"
 
 
 def test_another_branch_is_another_story():
-    story = Story([Panorama()], seed=3)
-    first = [story.step(LEFT).images for _ in range(6)]
-    story.stand_at(2)
-    story.branch()
-    assert [story.step(RIGHT).images for _ in range(4)] != first[2:]
+    timeline = Timeline([Panorama()], seed=3)
+    first = [timeline.step(LEFT).images for _ in range(6)]
+    timeline.stand_at(2)
+    timeline.branch()
+    assert [timeline.step(RIGHT).images for _ in range(4)] != first[2:]
 
 
 def test_going_back_to_now_loses_nothing():
-    story, twin = Story([Panorama()], seed=1), Story([Panorama()], seed=1)
+    timeline, twin = Timeline([Panorama()], seed=1), Timeline([Panorama()], seed=1)
     for _ in range(8):
-        story.step(LEFT), twin.step(LEFT)
-    story.stand_at(2)
-    story.to_newest()
-    assert [story.step(WALK).images for _ in range(3)] == [twin.step(WALK).images for _ in range(3)]
+        timeline.step(LEFT), twin.step(LEFT)
+    timeline.stand_at(2)
+    timeline.to_newest()
+    assert [timeline.step(WALK).images for _ in range(3)] == [twin.step(WALK).images for _ in range(3)]
 
 
 def test_a_seed_is_a_story():
-    story = Story([Panorama()], seed=1)
-    first = story.shown.images
-    story.step(LEFT)
-    assert story.restart(2).images != first and story.restart(1).images == first
+    timeline = Timeline([Panorama()], seed=1)
+    first = timeline.shown.images
+    timeline.step(LEFT)
+    assert timeline.restart(2).images != first and timeline.restart(1).images == first
 
 
 def test_a_restart_that_fails_leaves_the_old_story():
     world = Panorama()
-    story = Story([world], seed=1)
-    shown = story.step(WALK)
+    timeline = Timeline([world], seed=1)
+    shown = timeline.step(WALK)
 
     def broken(batch, rng):
         raise DatasetError("the game is gone")
 
     world.start = broken
     with pytest.raises(DatasetError, match="gone"):
-        story.restart(2)
-    assert story.seed == 1 and story.shown is shown and story.step(WALK).step == shown.step + 1
+        timeline.restart(2)
+    assert timeline.seed == 1 and timeline.shown is shown and timeline.step(WALK).step == shown.step + 1
 
 
 def test_a_running_game_does_not_rewind():
-    story = Story([Panorama(forkable=False)], seed=0)
-    story.step(LEFT)
+    timeline = Timeline([Panorama(forkable=False)], seed=0)
+    timeline.step(LEFT)
     with pytest.raises(ServeError, match="running game"):
-        story.stand_at(0)
-    assert story.oldest_step == story.newest_step == 1 and story.step(LEFT).step == 2
+        timeline.stand_at(0)
+    assert timeline.oldest_step == timeline.newest_step == 1 and timeline.step(LEFT).step == 2
 
 
 def test_done_begins_the_next_episode():
-    story = Story([Panorama(length=3)], seed=0)
-    flags = [story.step(WALK).flags for _ in range(5)]
+    timeline = Timeline([Panorama(length=3)], seed=0)
+    flags = [timeline.step(WALK).flags for _ in range(5)]
     assert flags == [0, 0, DONE, FRESH, 0]
-    assert story.shown.episode_return == 1.0
+    assert timeline.shown.episode_return == 1.0
 
 
 def test_memory_is_bounded():
     world = Panorama()
-    story = Story([world], seed=0, config=StoryConfig(history_s=64 / 50))
+    timeline = Timeline([world], seed=0, config=TimelineConfig(history_s=64 / 50))
     for _ in range(200):
-        story.step(LEFT)
-    assert len(story.pictures()) == 64 and story.newest_step - story.oldest_step == 63
-    full = story.state_bytes
+        timeline.step(LEFT)
+    assert len(timeline.pictures()) == 64 and timeline.newest_step - timeline.oldest_step == 63
+    full = timeline.state_bytes
     for _ in range(100):
-        story.step(LEFT)
-    assert story.state_bytes == full > 0
+        timeline.step(LEFT)
+    assert timeline.state_bytes == full > 0
 
 
 def test_states_keep_to_their_budget_and_pictures_outlive_them():
@@ -153,27 +151,27 @@ def test_turning_left_moves_the_picture_right():
     world, rng = Panorama(), make_rng(0)
     state = world.start(1, rng)
     before = world.render(state, ("rgb",))["rgb"][0].float()
-    state = world.imagine(state, action_of_keys(world.spec, LEFT), rng)
+    state = world.imagine(state, action_of(world.spec, LEFT), rng)
     after = world.render(state, ("rgb",))["rgb"][0].float()
     assert torch.equal(after[6:, PIXELS_PER_STEP:], before[6:, :-PIXELS_PER_STEP])
 
 
 def test_a_dream_begins_where_the_game_is():
-    story = Story([Panorama(forkable=False), SlowDream()], seed=5)
-    game, dream = story.shown.images
-    assert game == dream and not story.notice
+    timeline = Timeline([Panorama(forkable=False), SlowDream()], seed=5)
+    game, dream = timeline.shown.images
+    assert game.jpeg == dream.jpeg and (game.world, dream.world) == (0, 1) and not timeline.notice
     for _ in range(4):
-        story.step(LEFT)
-    assert len(story.shown.images) == 2 and "running game" in story.no_rewind
-    story.sync()
-    assert story.step(LEFT).step == 6
+        timeline.step(LEFT)
+    assert len(timeline.shown.images) == 2 and "running game" in timeline.no_rewind
+    timeline.sync()
+    assert timeline.step(LEFT).step == 6
 
 
 def test_a_dream_that_cannot_look_starts_on_its_own():
     dream = SlowDream()
     object.__setattr__(dream.spec, "observes", ("sonar",))
-    story = Story([Panorama(), dream], seed=5)
-    assert "on its own" in story.notice and story.step(LEFT).step == 1
+    timeline = Timeline([Panorama(), dream], seed=5)
+    assert "on its own" in timeline.notice and timeline.step(LEFT).step == 1
 
 
 def test_a_dream_is_told_what_it_heeds():
@@ -186,17 +184,17 @@ def test_a_dream_is_told_what_it_heeds():
 
     dream = Heeding()
     object.__setattr__(dream.spec, "may_observe", ("reward", "sonar"))
-    Story([Panorama(), dream], seed=5)
+    Timeline([Panorama(), dream], seed=5)
     assert told == [{"pose", "reward"}], "and not of what the game does not show"
 
 
 def test_a_recording_holds_each_observation_with_what_followed():
     sink = ListSink()
-    story = Story([Panorama(length=5)], seed=0, sink_factory=lambda: sink)
-    story.record(True)
+    timeline = Timeline([Panorama(length=5)], seed=0, sink_factory=lambda: sink)
+    timeline.record(True)
     for _ in range(9):
-        story.step(WALK)
-    story.record(False)
+        timeline.step(WALK)
+    timeline.record(False)
     actions = [action is not None for _, action, _, _ in sink.rows]
     # recorded from step 1: steps 2..5 answer, then the terminal row; the next episode begins at step 6
     assert actions == [True] * 4 + [False] + [True] * 3 + [False] and sink.ends == 2 and sink.closed
@@ -208,15 +206,15 @@ def test_a_recording_holds_each_observation_with_what_followed():
 
 def test_branching_ends_the_recorded_episode():
     sink = ListSink()
-    story = Story([Panorama()], seed=0, sink_factory=lambda: sink)
-    story.record(True)
+    timeline = Timeline([Panorama()], seed=0, sink_factory=lambda: sink)
+    timeline.record(True)
     for _ in range(6):
-        story.step(WALK)
-    story.stand_at(3)
-    story.branch()
+        timeline.step(WALK)
+    timeline.stand_at(3)
+    timeline.branch()
     assert sink.ends == 1
-    story.step(LEFT), story.step(LEFT)
-    story.close()
+    timeline.step(LEFT), timeline.step(LEFT)
+    timeline.close()
     assert sink.ends == 2 and sink.closed
 
 
@@ -226,19 +224,19 @@ def test_play_goes_on_where_the_recording_cannot():
             raise DatasetError("the disk is full; make room.")
 
     sink = FullDisk()
-    story = Story([Panorama()], seed=0, sink_factory=lambda: sink)
-    story.record(True)
+    timeline = Timeline([Panorama()], seed=0, sink_factory=lambda: sink)
+    timeline.record(True)
     for _ in range(4):
-        story.step(WALK)
-    assert not story.recording and "disk is full" in story.notice and sink.closed and story.newest_step == 4
+        timeline.step(WALK)
+    assert not timeline.recording and "disk is full" in timeline.notice and sink.closed and timeline.newest_step == 4
 
 
 def test_worlds_without_a_picture_are_refused():
     blind = Panorama()
     object.__setattr__(blind.spec, "channels", {"pose": blind.spec.channels["pose"]})
     with pytest.raises(ServeError, match="no picture"):
-        Story([blind], 0)
+        Timeline([blind], 0)
     other = SlowDream()
     object.__setattr__(other.spec, "action", spaces.Discrete(2))
     with pytest.raises(ServeError, match="different actions"):
-        Story([Panorama(), other], 0)
+        Timeline([Panorama(), other], 0)
