@@ -125,7 +125,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
 
 def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     world, _ = peopled
-    assert world.config.objects and world.objects is not None and world.spec.card["cast_looks"] >= 1
+    assert world.config.objects and world.objects is not None and world.spec.card["objects_looks"] >= 1
     assert "observes" in check_world(world) and world.spec.may_observe == ("things", "instances", "objects", "health")
     state = world.start(2, make_rng(0))
     assert (state["billboards"][:, 0, NUMBER] == 1).all() and (state["billboards"][:, 0, LOOK] != NONE).all()
@@ -187,7 +187,7 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
         {"instances": seen["instances"].float()},
         {"objects": told * torch.nan},
     ):
-        with pytest.raises(ObservationError, match="cast is"):
+        with pytest.raises(ObservationError, match="objects is"):
             world.observe({**seen, **bad}, state, rng)
 
 

@@ -102,7 +102,7 @@ def test_a_recording_without_poses_is_refused(tmp_path):
     with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
         for step in range(60):
             recorder.add({"rgb": np.full((24, 32, 3), step, np.uint8)}, np.array([step % 2]), 0.0, False)
-    with pytest.raises(DatasetError, match="lacks"):
+    with pytest.raises(DatasetError, match="holds no depth"):
         train_estimator(tmp_path / "set", tmp_path / "out", EstimatorTraining(steps=2), quiet)
 
 

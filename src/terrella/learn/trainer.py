@@ -195,7 +195,9 @@ class Trainer:
                 drawn = time.monotonic()
         self.save()
         if stop.is_set():
-            words = f"{facts['step']} steps of '{self.stage}' are saved in {self.out}; the same command goes on from there."
+            words = (
+                f"{facts['step']} steps of '{self.stage}' are saved in {self.out}; the same command goes on from there."
+            )
             raise KeyboardInterrupt(words)
 
     def _step(self, step: int) -> dict[str, float]:
