@@ -114,7 +114,7 @@ def merge(
         dry: Write the guessed mapping alone.
     """
     from ..exchange.convert import open_source
-    from ..exchange.merging.merge import merge_into
+    from ..exchange.merging.write import merge_into
 
     found = {path: open_source(path) for path in sources}
     with _whole_or_nothing(out), progress.shown("merging") as report:
