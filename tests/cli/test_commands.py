@@ -218,6 +218,7 @@ def test_ctrl_c_exits_with_130(capsys, monkeypatch):
 
     monkeypatch.setattr("terrella.library.worlds", interrupted)
     assert main(["list"]) == 130
+    assert capsys.readouterr().err == "terrella: stopped.\n"
 
 
 def test_our_own_faults_keep_their_trace(monkeypatch):
