@@ -24,7 +24,7 @@ _OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
 
 Report = Callable[[int, int], None]  # (episodes done, episodes in all)
-Export = Callable[[Path, Sequence[int], Report], None]
+Export = Callable[[Path, Sequence[int], Report], object]
 
 
 @dataclass(frozen=True)
