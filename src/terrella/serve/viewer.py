@@ -47,8 +47,9 @@ class Viewable(Protocol):
 
     def about(self) -> dict:
         """JSON: name, robot, fps (or None), notes (sentences), can_export, and sensors, a list of: name, label, kind,
-        shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), and pose:
-        None, or the columns of x and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
+        shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), camera
+        (None, or its intrinsics, size, pose and mount as the world declares them), and pose: None, or the columns of x
+        and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
         ...
 
     def listing(self) -> list[dict]:
