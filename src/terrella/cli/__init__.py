@@ -29,7 +29,7 @@ COMMANDS = {
     "data label": ("data:label", "write learned actions into a recording"),
     "data view": ("data:view", "look through a recording in the browser"),
 }
-# what older releases called commands and options
+# other names of commands and options, most of them those of older releases
 RENAMED = {
     "train eye": "train estimator",
     "train things": "train objects",
