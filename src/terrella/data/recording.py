@@ -1,0 +1,79 @@
+"""record: drives any World with a policy and keeps what happens as a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from ..core.errors import DatasetError
+from ..core.policy import Policy, act
+from ..core.world import Observation, World, make_rng
+from .format import Layout
+from .recorder import Recorder, Watch
+
+
+def record(
+    world: World,
+    policy: Policy,
+    root: str | Path,
+    frames: int,
+    rng: torch.Generator,
+    progress: Callable[[int, int], None] | None = None,
+    fps: float | None = None,
+    max_episode_steps: int = 1050,
+    task: str | None = None,
+    live: Watch | None = None,
+    pictures: Literal["video", "png"] = "video",
+) -> Recorder:
+    """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
+
+    An episode ends at `done` or after `max_episode_steps`. Each episode has a generator of its own, drawn from `rng`'s
+    seed and the episode's number, so that a run that was killed and started again with the same seed records the same
+    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to; `pictures` as in Layout.
+    Returns the closed recorder (its rows and episodes can be read). DatasetError as Recorder raises it; what was
+    committed before is safe.
+    """
+    if frames < 2:
+        raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
+    if max_episode_steps < 1:
+        raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
+    layout = replace(Layout.of(world.spec, fps), pictures=pictures)
+    base = int(torch.randint(2**62, (1,), generator=rng).item())
+    task = task or f"explore {world.spec.name}"
+    with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again
+        while recorder.rows < frames - 1:  # an episode has 2 rows or more
+            seed = int(np.random.SeedSequence([base, recorder.episodes]).generate_state(1, np.uint64)[0] >> 2)
+            _episode(world, policy, recorder, frames, make_rng(seed), progress, max_episode_steps)
+            recorder.end_episode()
+    return recorder
+
+
+def _episode(world, policy, recorder, frames, rng, progress, max_steps) -> None:
+    channels = [name for name in world.spec.channels if name not in ("reward", "done")]
+    follow = [name for name in world.spec.channels if name in ("reward", "done")]
+    state, left, done = world.start(1, rng), frames - recorder.rows, False
+    memory = policy.begin(1, rng)
+    for _ in range(min(max_steps, left - 1)):
+        seen = world.render(state, channels)
+        action, memory = act(policy, seen, memory, 1, world.spec, rng)
+        state = world.imagine(state, action, rng)
+        after = world.render(state, follow)
+        done = bool(after["done"][0]) if "done" in after else False
+        reward = float(after["reward"][0]) if "reward" in after else 0.0
+        recorder.add(_first(seen), action[0].cpu().numpy(), reward, done)
+        if progress:
+            progress(recorder.rows + recorder.in_flight, frames)
+        if done:
+            break
+    recorder.add(_first(world.render(state, channels)))
+    if progress:
+        progress(recorder.rows + recorder.in_flight, frames)
+
+
+def _first(observation: Observation) -> dict[str, np.ndarray]:
+    return {name: tensor[0].cpu().numpy() for name, tensor in observation.items()}
