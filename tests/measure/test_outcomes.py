@@ -55,7 +55,7 @@ def recording(lengths=(40, 30, 50)):
     return SimpleNamespace(
         episodes=[(stop - length, stop) for length, stop in zip(lengths, stops)], length=rows, depth=None, pose=None,
         rgb=np.zeros((rows, 8, 8, 3), np.uint8), action=action, reward=reward, done=done,
-        further={"health": health[:, None]},
+        arrays={}, keys={}, further={"health": health[:, None]},
     )  # fmt: skip
 
 

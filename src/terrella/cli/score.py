@@ -152,15 +152,21 @@ def _exam(
 
 def _cache(data: Path, world: World) -> Any:
     """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
-    from ..data import ClipCache
+    from ..data import ClipCache, Dataset
     from ..measure import check_recording
 
-    picture = world.spec.channels.get("rgb")
-    size: dict[str, Any] = {"size": tuple(picture.shape[:2])} if picture is not None and picture.shape else {}
+    dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
+    for channel in world.spec.kinds("rgb"):
+        height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
+        feature = dataset.channels.get(channel)
+        sizes.setdefault((height, width), []).extend([feature] if feature and channel != "rgb" else [])
     with progress.shown(f"reading {data}") as report:
-        cache = ClipCache.open(data, progress=report, **size)
-    check_recording(cache, world.spec)
-    return cache
+        asked = (sizes or {(96, 128): []}).items()
+        caches = [ClipCache.open(dataset, size, report, cameras) for size, cameras in asked]
+    for cache, cameras in zip(caches, sizes.values()):  # cameras of another size have a cache of their own
+        caches[0].arrays.update({feature: cache.arrays[feature] for feature in cameras})
+    check_recording(caches[0], world.spec)
+    return caches[0]
 
 
 def _files_of(name: str) -> str:
