@@ -31,6 +31,7 @@ _READERS = {  # the kinds that a message can be declared as
     messages.VIDEO: ("image",),
     "foxglove.PointCloud": ("points",),
 }
+_LOG = "foxglove.Log"
 _NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 _MOST_FRAMES = 256  # coordinate frames that one topic of transforms is split into
 
@@ -232,6 +233,9 @@ class _File:
                 self._calibrations.append((group.topic, first))
                 if first != last:
                     self._note(group.topic, "the calibration changes on the way; only the first is carried over")
+                return []
+            if group.schema.name == _LOG:
+                self._note(group.topic, f"its {len(group.log_ns)} log texts are left out")
                 return []
             if group.schema.name in (messages.TRANSFORM, messages.TRANSFORMS):
                 return self._transforms(group)

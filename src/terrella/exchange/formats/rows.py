@@ -169,7 +169,7 @@ def rows_of(take: Take, where: str) -> Rows:
     if len(set(seen.values())) > 1 or len(set(done.values())) > 1:
         counts = ", ".join(f"{name} {count}" for name, count in {**seen, **done}.items())
         raise DatasetError(
-            f"{where} has sensors of different rates ({counts} readings); resample it to one rate first."
+            f"{where} has sensors of different rates ({counts} readings); convert it to LeRobot first, which brings it to one rate."
         )
     steps = next(iter(done.values()), 0)
     count = next(iter(seen.values()), steps)
@@ -183,7 +183,9 @@ def rows_of(take: Take, where: str) -> Rows:
     for name in (*seen, *done):
         other = take.readings[name].time_s
         if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
-            raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; resample it to one rate first.")
+            raise DatasetError(
+                f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first, which brings it to one rate."
+            )
     return Rows(count, steps, time_s)
 
 
