@@ -16,7 +16,7 @@ import tyro
 
 import terrella
 from terrella.data import ClipCache
-from terrella.learn.samples import Recording, controls_of
+from terrella.learn.recording import Recording, controls_of
 from terrella.space.billboards import cut_out
 from terrella.space.camera import project
 from terrella.worlds.objects import LOOK, NONE, NUMBER, PLACE, WIDE_M

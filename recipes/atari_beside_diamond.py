@@ -142,7 +142,7 @@ def train_theirs(checkout: Path, out: Path, minutes: float, batch: int = 32) -> 
 def train_ours(out: Path, minutes: float, **settings) -> None:
     """All that `terrella train video` does but for the head that says how far it errs, for `minutes`; the processor time
     that it took in all is what DIAMOND should be given."""
-    from terrella.learn.train_video import TrainConfig, train_video
+    from terrella.learn.recipes.video import TrainConfig, train_video
 
     folder, before = out / "run", 0.0
     folder.mkdir(parents=True, exist_ok=True)

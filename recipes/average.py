@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 
 import terrella
-from terrella.learn.post_training import with_generator
+from terrella.learn.paired import with_generator
 from terrella.worlds.folder import Learned, save_world
 from terrella.worlds.history import HistoryWorld
 from terrella.worlds.video import VideoWorld

@@ -26,7 +26,7 @@ def shown(what: str) -> Iterator[Callable[..., None]]:
             task = bar.add_task(what, total=None, words="", left="")
 
             def report(done: float, total: float, words: str = "", left_s: float | None = None) -> None:
-                if (total or None) != bar.tasks[task].total:  # another stage begins
+                if (total or None) != bar.tasks[task].total or done < bar.tasks[task].completed:  # another stage begins
                     bar.reset(task, total=total or None)
                 bar.update(task, completed=done, words=words)
                 left_s = bar.tasks[task].time_remaining if left_s is None else left_s
@@ -39,13 +39,14 @@ def shown(what: str) -> Iterator[Callable[..., None]]:
 
 def _lines(what: str) -> Callable[..., None]:
     began = said = time.monotonic()
-    first = of = 0.0
+    first = of = last = 0.0
 
     def report(done: float, total: float, words: str = "", left_s: float | None = None) -> None:
-        nonlocal began, said, first, of
+        nonlocal began, said, first, of, last
         now = time.monotonic()
-        if total != of:  # a stage begins; what an earlier run had done says nothing of this one's speed
+        if total != of or done < last:  # a stage begins; what an earlier run had done says nothing of this one's speed
             began, first, of = now, done, total
+        last = done
         if now - said < LINE_EVERY_S and (done < total or not total):  # a total of 0 is not known
             return
         said = now

@@ -16,8 +16,8 @@ COMMANDS = {
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train estimator": ("train:estimator", "learn to estimate depth and camera motion from pictures"),
-    "train senses": ("train:senses", "add the estimator and the uncertainty to a trained world"),
-    "train objects": ("train:things", "learn what moving objects do, from another recording"),
+    "train uncertainty": ("train:uncertainty", "add an estimator and an uncertainty to a trained world"),
+    "train objects": ("train:objects", "learn what moving objects do, from another recording"),
     "train latent-actions": ("train:latent_actions", "learn actions from pictures alone"),
     "train distil": ("train:few_steps", "make a slow world draw a frame in one or two steps"),
     "train dreams": ("train:dreams", "go on training a world on its own rollouts"),
@@ -29,8 +29,14 @@ COMMANDS = {
     "data label": ("data:label", "write learned actions into a recording"),
     "data view": ("data:view", "look through a recording in the browser"),
 }
-# what older releases called commands and options
-RENAMED = {"train eye": "train estimator", "train things": "train objects", "--eye": "--estimator"}
+# other names of commands and options, most of them those of older releases
+RENAMED = {
+    "train eye": "train estimator",
+    "train things": "train objects",
+    "record gym": "record world",
+    "train senses": "train uncertainty",
+    "--eye": "--estimator",
+}
 
 _THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
 _DRAWING = ("mujoco", "glfw", "OpenGL", "EGL", "gladLoadGL", "GLFW")  # in the errors of a renderer without a display
@@ -42,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _run(given)
     except KeyboardInterrupt as stop:
-        print(f"terrella: {stop or 'stopped.'}", file=sys.stderr)
+        print(f"terrella: {str(stop) or 'stopped.'}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # whoever read our output has gone
         sys.stdout = None
@@ -142,6 +148,7 @@ def _sentence(error: Exception) -> str | None:
         return f"{error.strerror}{where}; choose another folder, or free some space."
     source = f"{type(error).__module__} {error}"
     if any(word in source for word in _DRAWING):
-        what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        sys.unraisablehook = lambda _: None  # half-made renderers complain again when they are thrown away
+        what = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
         return f"the simulator cannot draw without a display ({what}); set MUJOCO_GL=egl or MUJOCO_GL=osmesa and try again."
     return None

@@ -36,7 +36,7 @@ class Watch(Protocol):
 
     start_ns: int
 
-    def log(self, name: str, time_s: float, value: np.ndarray) -> None: ...
+    def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None: ...
 
 
 @dataclass(frozen=True)

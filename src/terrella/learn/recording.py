@@ -1,27 +1,30 @@
-"""Training samples of a VideoWorld: which rows may be learned from, which become its memory, and what it is shown."""
+"""Recording: the rows of a recording as tensors on demand, which of them training may see, and which become a memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ..core.errors import DatasetError
 from ..core.spec import Spec
-from ..data import ClipCache
+from ..data import ClipCache, Dataset, split
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
-from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
+from ..space.keyframes import Keyframes, doubled
 from ..space.reproject import least_around
 from ..worlds.controls import AXES, CHOICE, Controls
 from ..worlds.generator import VideoConfig
 from ..worlds.moving import covering, still
-from ..worlds.video import carry
+from .trainer import Report
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish
-CAST, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
+OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
+FEWEST = 64  # frames that can be trained on
 
 
 @dataclass(frozen=True)
@@ -32,15 +35,76 @@ class Recording:
     start: np.ndarray
     usable: np.ndarray  # rows that training may see
     controls: Controls | None = None  # what its actions mean; None: buttons
+    dataset: Dataset | None = None  # where its pictures lie at their full size
+    held_out: tuple[int, ...] = ()  # episodes that training does not see
+
+    @staticmethod
+    def open(
+        data: str | Path,
+        size: tuple[int, int],
+        report: Report,
+        keep_out: Box | None = None,
+        needs: tuple[str, ...] = ("rgb",),
+        why: str = "a world of pictures is learned from them",
+    ) -> Recording:
+        """The recording `data` with pictures at `size` (height, width). Every 20th episode is held out, and so are the rows
+        from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or rows."""
+        dataset = Dataset(data)
+        cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
+        lacks = [name for name in needs if not there(cache, name)]
+        if lacks:
+            raise DatasetError(f"{data} holds no {', '.join(lacks)}; {why}.")
+        if keep_out is not None and not there(cache, "pose"):
+            raise DatasetError(f"{data} has no poses, so no part of its map can be kept out; drop --keep-out.")
+        train, held_out = split(len(cache.episodes))
+        found = Recording.of(cache, train, keep_out)
+        return replace(found, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+
+    @staticmethod
+    def of(cache: ClipCache, episodes: list[int], keep_out: Box | None) -> Recording:
+        """The rows of `episodes` from which nothing in the box `keep_out` is seen."""
+        start = np.zeros(cache.length, np.int64)
+        for first, last in cache.episodes:
+            start[first:last] = first
+        fx, fy, cx, cy = cache.world.get("camera") or (1.0, 1.0, 0.5, 0.5)
+        return Recording(cache, start, usable_rows(cache, episodes, keep_out, (fx, fy, cx, cy)))
+
+    def enough(self) -> Recording:
+        """The same; DatasetError where too little of it may be trained on."""
+        if self.usable.sum() < FEWEST:
+            raise DatasetError(
+                f"{self.name} leaves {self.usable.sum()} frames to train on; record more, or a smaller keep_out."
+            )
+        return self
+
+    @property
+    def name(self) -> str:
+        return "the recording" if self.dataset is None else str(self.dataset.root)
+
+    @property
+    def seen(self) -> list[int]:
+        """The episodes that training sees."""
+        return [number for number in range(len(self.cache.episodes)) if number not in self.held_out]
+
+    @property
+    def posed(self) -> bool:
+        """Whether it has depth, poses and a camera."""
+        return all(there(self.cache, name) for name in ("depth", "pose", "camera"))
 
     def rgb(self, rows) -> torch.Tensor:
         """uint8 [n, 3, H, W]"""
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
 
     def action(self, rows) -> torch.Tensor:
-        """float32 [n, A], as networks are told it."""
+        """float32 [n, A], as networks are given it."""
         action = torch.from_numpy(np.array(self.cache.action[rows], np.float32))
         return action if self.controls is None else self.controls.tell(action)
+
+    def actions_before(self, rows: np.ndarray, back: np.ndarray) -> torch.Tensor:
+        """float32 [n, len(back), A]: the actions `back` rows before `rows`; zero before an episode's first."""
+        wanted = rows[:, None] - back
+        action = self.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
+        return torch.where(torch.from_numpy(wanted >= self.start[rows][:, None])[..., None], action, 0.0)
 
     def depth(self, rows) -> torch.Tensor:
         """float32 [n, H, W] metres at the size of the frames, whatever size was recorded."""
@@ -60,9 +124,9 @@ class Recording:
         return F.adaptive_max_pool2d(things[:, None], (height, width))[:, 0]
 
     def instances(self, rows) -> torch.Tensor:
-        """uint8 [n, H, W], which row of `cast` is seen at a pixel, counted from 1 (0: none)."""
-        told = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
-        return F.adaptive_max_pool2d(told[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
+        """uint8 [n, H, W], which row of `objects` is seen at a pixel, counted from 1 (0: none)."""
+        recorded = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
+        return F.adaptive_max_pool2d(recorded[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
 
     def covered(self, rows) -> torch.Tensor:
         """bool [n, H, W], see worlds/moving.covering."""
@@ -82,7 +146,7 @@ class Recording:
             seen["things"] = self.things(rows)
         if config.objects:
             seen["instances"] = self.instances(rows)
-            seen["objects"] = torch.from_numpy(np.array(self.cache.arrays[CAST][rows], np.float32))
+            seen["objects"] = torch.from_numpy(np.array(self.cache.arrays[OBJECTS][rows], np.float32))
         return seen
 
     def played(self, spec: Spec, rows) -> torch.Tensor:
@@ -94,9 +158,26 @@ class Recording:
         """As a dream keeps its own."""
         return Keyframes.of(doubled(self.rgb(rows)), self.lasting(rows), self.pose(rows), camera)
 
+    def sharp_keyframes(self, rows: np.ndarray, camera: Intrinsics) -> Keyframes:
+        """Twice the size of the frames, like those of a dream, from the pictures as they were recorded."""
+        rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).float()
+        size = [2 * length for length in self.cache.rgb.shape[1:3]]
+        rgb = F.interpolate(rgb, size, mode="area" if rgb.shape[-1] >= size[1] else "nearest-exact")
+        return Keyframes.of(rgb.round().to(torch.uint8), self.lasting(rows), self.pose(rows), camera)
 
-def controls_of(cache: ClipCache) -> Controls:
-    """What the actions of a recording mean: as its world said, else as they look (buttons where all are 0 or 1)."""
+
+def there(cache: ClipCache, name: str) -> bool:
+    """Whether a recording has a channel, by its name or by its key ("observation.things")."""
+    if name == "camera":
+        return bool(cache.world.get("camera"))
+    return getattr(cache, name, None) is not None or name in cache.arrays
+
+
+def controls_of(cache: ClipCache) -> Controls | None:
+    """What the actions of a recording mean: as its world said, else as they look (buttons where all are 0 or 1); None where
+    it has none."""
+    if cache.action is None:
+        return None
     low, high = cache.world.get("action_low"), cache.world.get("action_high")
     whole = bool(cache.world.get("discrete"))
     if low is None or high is None:
@@ -111,7 +192,7 @@ def controls_of(cache: ClipCache) -> Controls:
 
 
 def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
-    """Rows of `episodes` in which the eye neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
+    """Rows of `episodes` in which the camera neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
     usable = np.zeros(cache.length, bool)
     for episode in episodes:
         usable[slice(*cache.episodes[episode])] = True
@@ -141,90 +222,11 @@ def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_
 
 
 def open_views(memory: Keyframes, count: int) -> Keyframes:
-    """`count` of the keyframes, spread over the map, among the quarter that looks farthest: a good place to begin a story."""
+    """`count` of the keyframes, spread over the map, among the quarter that looks farthest: a good place to begin."""
     far = memory.depth.flatten(1).median(1).values.argsort(descending=True)[: max(count, len(memory) // 4)]
     return memory.at(torch.from_numpy(choose_keyframes(memory.pose.numpy(), far.sort().values.numpy(), count)))
 
 
-@dataclass(frozen=True)
-class Lesson:
-    """One batch for the generator: what it is shown and told, and the true frames it should find, in its own code."""
-
-    glimpse: Glimpse
-    last: torch.Tensor
-    told: torch.Tensor
-    truth: torch.Tensor
-    weight: torch.Tensor | None = None  # [B, 1, H, W], how much each pixel counts; None: all alike
-
-    def judged(self, clean: torch.Tensor) -> torch.Tensor:
-        """Drawn frames `clean`, with the truth where nothing counts: no loss and no critic sees what was drawn there."""
-        if self.weight is None:
-            return clean
-        truth = torch.cat([self.truth[:, :4], 40 * self.truth[:, 4:] - 20], 1)  # things are drawn as logits
-        return torch.where(self.weight > 0, clean, truth)
-
-    def to(self, device) -> Lesson:
-        weight = None if self.weight is None else self.weight.to(device)
-        glimpse, last = self.glimpse.to(device), self.last.to(device)
-        return Lesson(glimpse, last, self.told.to(device), self.truth.to(device), weight)
-
-
-# Dream(lesson without truth) -> clean frames [B, 4, H, W] in the generator's code
-Dream = Callable[[Lesson], torch.Tensor]
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What the generator is shown for B target rows, and the truth."""
-
-    chosen: list[Keyframes]
-    before: np.ndarray  # the row before each target
-    target: np.ndarray
-
-
-def draw(
-    recording: Recording, memory: Keyframes, config: VideoConfig, batch: int, rng: np.random.Generator, back: int = 2
-) -> Shown:
-    """Half of the samples stand in recorded places (memory, thinned at random), half see only their own episode's past.
-
-    Both learn to complete: the first where memory is dense, the second where it is sparse. `back` rows before each target
-    are of its episode and usable.
-    """
-    rows = recording.usable & (np.arange(len(recording.usable)) - recording.start >= back)
-    for age in range(1, back + 1):
-        rows &= np.roll(recording.usable, age)
-    target = rng.choice(np.flatnonzero(rows), batch)
-    chosen = []
-    for index, row in enumerate(target):
-        pose = recording.pose([row])[0]
-        if index % 2 == 0:
-            picks = retrieve([memory], pose, config.camera, config.size, config.sources)[0]
-            if rng.random() < 0.4:
-                picks = [pick for pick in picks if rng.random() < 0.6]
-            chosen.append(memory.at(picks))
-        else:
-            past = _past(recording, int(row), rng)
-            own = recording.keyframes(past, config.camera)
-            chosen.append(own.at(retrieve([own], pose, config.camera, config.size, config.sources)[0]))
-    return Shown(chosen, target - 1, target)
-
-
-def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarray:
-    """A few rows of the same episode's past, the newest some steps ago, as a dream far from its keyframes has them."""
-    newest = row - int(rng.choice([2, 4, 8, 16, 32, 64]))
-    gaps = rng.integers(3, 24, size=int(rng.integers(1, 7))).cumsum() - 3
-    past = np.maximum(newest - gaps, recording.start[row])
-    past = np.unique(np.minimum(past, row - 1))
-    seen = past[recording.usable[past]]  # what training must not see is not shown either
-    return seen if len(seen) else np.array([row - 1])
-
-
-def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: VideoConfig):
-    """What the chosen keyframes know of the views at `rows`."""
-    return look(shown.chosen, recording.pose(rows), config.camera, config.size, config.slots)
-
-
-def carried(rgb, depth, from_rows, to_rows, glimpse, recording: Recording, config: VideoConfig) -> torch.Tensor:
-    """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
-    poses = recording.pose(from_rows), recording.pose(to_rows)
-    return carry(rgb, depth, poses[0], glimpse, poses[1], config.camera)
+def box_of(card: Any) -> Box | None:
+    """The box x0 y0 x1 y1 that a world's card says was kept out of its training."""
+    return (float(card[0]), float(card[1]), float(card[2]), float(card[3])) if isinstance(card, (list, tuple)) else None

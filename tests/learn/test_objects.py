@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.core.errors import DatasetError
-from terrella.learn.objects import learn_objects
+from terrella.learn.objectives.objects import learn_objects
+from terrella.learn.trainer import Run
 from terrella.space.billboards import PICTURE, painted
 from terrella.space.camera import planar_pose
 from terrella.worlds.objects import LOOK, NUMBER, PLACE, Objects, ObjectsConfig
@@ -59,22 +61,23 @@ def pose(count: int) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def learned():
+def learned(tmp_path_factory):
     torch.manual_seed(0)
     objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     starts = pose(2)
     starts[1, 1] = 1.0  # whichever episode began nearest
-    facts = learn_objects(objects, recording, recording.rgb.__getitem__, starts, CAMERA, 500, 0, lambda *told: None)  # pyright: ignore
+    run = Run(tmp_path_factory.mktemp("objects"), {}, quiet)
+    facts = learn_objects(run, objects, recording, recording.rgb.__getitem__, starts, CAMERA, 500)  # pyright: ignore
     return objects, facts, recording
 
 
 def test_it_finds_the_two_looks_and_the_one_move(learned):
     objects, facts, _ = learned
-    shown = objects.pictures[: facts["cast_looks"]].float()
+    shown = objects.pictures[: facts["objects_looks"]].float()
     red = shown[:, 0].mean((1, 2)) > shown[:, 2].mean((1, 2))
-    tall = objects.boxes[: facts["cast_looks"], 3] > 1
-    assert 2 <= facts["cast_looks"] <= 6 and red.any() and (~red).any() and torch.equal(red, tall)
-    assert torch.allclose(objects.moves[1 : facts["cast_moves"] + 1], torch.tensor([0.0, STEP_M, 0.0]), atol=0.02)
+    tall = objects.boxes[: facts["objects_looks"], 3] > 1
+    assert 2 <= facts["objects_looks"] <= 6 and red.any() and (~red).any() and torch.equal(red, tall)
+    assert torch.allclose(objects.moves[1 : facts["objects_moves"] + 1], torch.tensor([0.0, STEP_M, 0.0]), atol=0.02)
 
 
 def test_a_story_begins_with_what_waited(learned):
@@ -98,19 +101,18 @@ def test_who_is_shot_at_falls_and_who_is_not_walks_on(learned):
     assert float(calm.gone.sigmoid()) < 0.05 and float(calm.move.softmax(1)[0, 1:].sum()) > 0.15
 
 
-def test_a_recording_that_shows_no_thing_whole_teaches_nothing():
+def test_a_recording_that_shows_no_thing_whole_teaches_nothing(tmp_path):
     objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     recording.cache.arrays["observation.instances"] = np.zeros_like(recording.cache.arrays["observation.instances"])
     with pytest.raises(DatasetError, match="no thing whole and near: record more"):
-        learn_objects(objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+        learn_objects(Run(tmp_path, {}, quiet), objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5)  # pyright: ignore
 
 
-def test_the_same_seed_teaches_the_same():
-    casts = []
-    for _ in range(2):
+def test_a_stopped_run_goes_on_exactly(tmp_path):
+    def train(out):
         torch.manual_seed(0)
         objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
-        learn_objects(objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5, 0, lambda *told: None)  # pyright: ignore
+        learn_objects(Run(out, {}, quiet), objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5)  # pyright: ignore
         torch.rand(3)
-        casts.append(objects.state_dict())
-    assert all(torch.equal(casts[0][name], casts[1][name]) for name in casts[0])
+
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"objects": 2})

@@ -1,28 +1,23 @@
-"""learn_objects: the looks and moves that a recording's things have, and which follow which, into Objects; and train_things,
-which gives such objects to a world that is trained."""
+"""Objects: the looks and moves that a recording's things have, and which follow which."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..core.errors import DatasetError, TrainingError
-from ..core.world import make_rng
-from ..data import ClipCache
-from ..space.billboards import cut_out
-from ..space.camera import Intrinsics, project
-from ..worlds.folder import load_world, save_again
-from ..worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, ObjectsConfig, fresh, likest, marks, noted
-from ..worlds.video import VideoWorld
-from .post_training import beside
-from .samples import CAST, INSTANCES, Recording
-from .updates import Report, descend
+from ...core.errors import DatasetError
+from ...core.world import make_rng
+from ...data import ClipCache
+from ...space.billboards import cut_out
+from ...space.camera import Intrinsics, project
+from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, fresh, likest, marks, noted
+from ..feeds import Drawn
+from ..recording import INSTANCES, OBJECTS, Recording
+from ..trainer import Learner, Loss, Now, Report, Run, cosine
 
 CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
 FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
@@ -36,46 +31,6 @@ SAME_M, OFTEN = 1.5, 0.08  # metres within which, and share of the episodes in w
 LASTS = 15  # steps in which a thing must have been seen to be one that waits
 CHUNK = 1.5e6  # pixels of frames that are cut at once
 WITHOUT = ", or train without (train video --objects-steps 0)"
-
-
-@dataclass(frozen=True)
-class ThingsConfig:
-    """Settings of the training of a world's things.
-
-    Args:
-        steps: Training steps of what they do next.
-        seed: Of everything random.
-    """
-
-    steps: int = 2500
-    seed: int = 0
-
-
-def train_things(world: str | Path, data: str | Path, out: str | Path, config: ThingsConfig, report: Report) -> dict:
-    """Gives the world in the folder `world` the cast of the recording `data`, in place of its own, and writes it to `out`
-    (which may be `world`); returns its facts."""
-    learned = load_world(world)
-    if not isinstance(learned, VideoWorld) or not learned.config.moving:
-        raise TrainingError(
-            f"{learned.spec.name} knows of no things that move; `terrella train video` makes worlds that do."
-        )
-    learned.config = replace(learned.config, objects=True)
-    pair = beside(learned, data, None, report)
-    torch.manual_seed(config.seed)
-    objects = Objects(ObjectsConfig(learned.config.actions, learned.config.history))
-    facts = learn_objects(
-        objects,
-        pair.recording,
-        pair.dataset.rgb_at,
-        learned.starts.pose,
-        learned.config.camera,
-        config.steps,
-        config.seed,
-        report,
-    )
-    learned.objects = objects
-    save_again(learned, out, {**learned.spec.card, **facts}, world)
-    return {"world": str(out), **facts}
 
 
 class Sightings(NamedTuple):
@@ -107,18 +62,18 @@ class Tokens(NamedTuple):
 
 
 def learn_objects(
+    run: Run,
     objects: Objects,
     recording: Recording,
     rgb: Callable[[np.ndarray], np.ndarray],
     starts: torch.Tensor,
     camera: Intrinsics,
     steps: int,
-    seed: int,
-    report: Report,
 ) -> dict:
-    """Teaches `cast` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; a story that
-    begins at one of the poses `starts` [S, 7] begins with the cards that waited in the episodes that began there. Returns
-    facts."""
+    """Trains `objects` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; an episode that
+    begins at one of the poses `starts` [S, 7] begins with the billboards that waited in the episodes that began there.
+    Returns facts."""
+    seed, report = run.seed, run.report
     cache, rows = recording.cache, np.flatnonzero(recording.usable)
     seen = _cut(cache, rgb, rows, camera, report)
     if not len(seen.clear):
@@ -139,15 +94,17 @@ def learn_objects(
         cards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
         for row, card in enumerate(cards[: objects.config.rows]):
             objects.begun[story, row] = card
-    loss = _train(objects.train(), tokens, recording, steps, seed, report)
+    objective = Next(objects, tokens, recording)
+    trainer = run.stage("objects", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
+    trainer.run(report)
     objects.eval()
-    facts = {"cast_frames": len(rows), "cast_looks": len(heads), "cast_moves": len(moves) - 1}
-    return {**facts, "objects_steps": steps, "cast_loss": loss}
+    facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
+    return {**facts, "objects_steps": steps}
 
 
-def told(cache: ClipCache) -> np.ndarray:
-    """float32 [N, K, 4]: number and place of each card of each row."""
-    return np.asarray(cache.arrays[CAST], np.float32).reshape(cache.length, -1, 4)
+def listed(cache: ClipCache) -> np.ndarray:
+    """float32 [N, K, 4]: number and place of each thing of each row."""
+    return np.asarray(cache.arrays[OBJECTS], np.float32).reshape(cache.length, -1, 4)
 
 
 def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Report) -> Sightings:
@@ -157,7 +114,7 @@ def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Re
         frames = torch.from_numpy(np.ascontiguousarray(rgb(some))).permute(0, 3, 1, 2)
         instances = torch.from_numpy(np.asarray(cache.arrays[INSTANCES][some]))
         depth, pose = (torch.from_numpy(np.asarray(array[some], np.float32)) for array in (cache.depth, cache.pose))
-        cut = cut_out(frames, instances, depth, torch.from_numpy(told(cache)[some, :, 1:]), pose, camera)
+        cut = cut_out(frames, instances, depth, torch.from_numpy(listed(cache)[some, :, 1:]), pose, camera)
         share = cut.pixels / (frames.shape[2] * frames.shape[3])
         clear = cut.whole & (share >= LARGE)
         picture = (cut.picture[clear] * 255).round().clamp(0, 255).byte()
@@ -193,7 +150,7 @@ def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray
     """The look of each sighting [n], `off` [n, looks] being how far it is from each; NONE where it is like none or not seen
     well."""
     episode = np.searchsorted([first for first, _ in cache.episodes], seen.frame, side="right")
-    numbers, clear = told(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
+    numbers, clear = listed(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
     look, last = np.full(len(off), NONE), {}
     for one in np.argsort(seen.frame, kind="stable"):
         if not clear[one]:
@@ -229,7 +186,7 @@ def _reach(objects: Objects, tokens: Tokens) -> torch.Tensor:
 
 def _moves(cache: ClipCache, rows: np.ndarray, count: int, seed: int) -> torch.Tensor:
     """The moves [m, 3] that things make in a step, in metres, the first of them none: k-means."""
-    cards = told(cache)
+    cards = listed(cache)
     follows = rows[:-1][np.diff(rows) == 1]
     follows = follows[~np.isin(follows + 1, [first for first, _ in cache.episodes])]
     same = (cards[follows, :, None, 0] == cards[follows + 1, None, :, 0]) & (cards[follows, :, 0] > 0)[:, :, None]
@@ -267,7 +224,7 @@ def _followed(
     """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the cards that waited
     in it. The recording is walked through as a dream is, card by card."""
     cache, back = recording.cache, np.arange(objects.config.history)[::-1]
-    cards = torch.from_numpy(told(cache).copy())
+    cards = torch.from_numpy(listed(cache).copy())
     poses = torch.from_numpy(np.array(cache.pose, np.float32))
     looks, share = torch.full(cards.shape[:2], float(NONE)), np.zeros(cards.shape[:2])
     looks[seen.frame, seen.row] = torch.from_numpy(known).float()
@@ -367,33 +324,36 @@ def _open(card: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) ->
     return float(cache.depth[row, int(v * height), int(u * width)]) > far - 0.5
 
 
-def _train(
-    objects: Objects, tokens: Tokens, recording: Recording, steps: int, seed: int, report: Report, batch: int = 512
-) -> float:
-    """Half of each batch are tokens in which something happens: another look, a move, an end; each counts by how much likelier
-    than evenly it was drawn, so that what is rare stays as rare as it is. Returns the last loss, in nats a token."""
-    happens = ((tokens.look != NONE) & (tokens.look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
-    often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
-    often = often / often.sum()
-    actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
-    actions[torch.from_numpy(tokens.acts < 0)] = 0
-    optimiser = torch.optim.AdamW(objects.parameters(), 2e-3, weight_decay=1e-2)
-    recent: list[float] = []
-    torch.manual_seed(seed)
-    for step in range(steps):
-        for group in optimiser.param_groups:
-            group["lr"] = 2e-3 * min(1, (step + 1) / 100) * (0.02 + 0.49 * (1 + np.cos(np.pi * step / steps)))
-        picks = torch.multinomial(often, batch, replacement=True, generator=make_rng(seed * 1_000_003 + step))
-        weight = 1 / len(often) / often[picks]
-        cards, pose, look, move, gone = (part[picks] for part in tokens[:5])
-        said = objects.tell(cards, pose, actions[picks])
-        possible = (look != NONE) & objects.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
+class Next:
+    """What comes next of a thing: another look, a move, an end. Half of each batch are tokens in which something happens; each
+    counts by how much likelier than evenly it was drawn, so that what is rare stays as rare as it is."""
+
+    def __init__(self, objects: Objects, tokens: Tokens, recording: Recording, batch: int = 512):
+        self.objects, self.tokens, self.size = objects, tokens, batch
+        look = tokens.look
+        happens = ((look != NONE) & (look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
+        often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
+        self.often = often / often.sum()
+        self.actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
+        self.actions[torch.from_numpy(tokens.acts < 0)] = 0
+        optimiser = torch.optim.AdamW(objects.parameters(), 2e-3, weight_decay=1e-2)
+
+        def rate(now: Now) -> float:
+            return 2e-3 * min(1, (now.step + 1) / 100) * cosine(now.share, 0.02)
+
+        self.modules = {"objects": objects}
+        self.learners = {"objects": Learner(optimiser, (objects,), rate)}
+
+    def picked(self, now: Now) -> torch.Tensor:
+        return torch.multinomial(self.often, self.size, replacement=True, generator=now.noise)
+
+    def losses(self, batch: torch.Tensor, now: Now) -> Iterator[Loss]:
+        weight = 1 / len(self.often) / self.often[batch]
+        cards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
+        said = self.objects.tell(cards, pose, self.actions[batch])
+        possible = (look != NONE) & self.objects.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
         error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
         error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")
         loss = (weight * error).mean()
-        descend(optimiser, loss, step, objects)
-        recent.append(float(loss.detach()))
-        if step % 50 == 49:
-            report((step + 1) / steps, 1.0, f"cast {np.mean(recent[-50:]):.4f}")
-    return round(float(np.mean(recent[-200:])), 4)
+        yield Loss("objects", loss, {"objects": loss})

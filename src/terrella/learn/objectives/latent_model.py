@@ -41,9 +41,9 @@ class Inverse(nn.Module):
 
 
 class Forward(nn.Module):
-    """A U-Net at half size that says for each pixel where it comes from and what is added, as the code tells it.
+    """A U-Net at half size that says for each pixel where it comes from and what is added, as the code says.
 
-    It sees one frame alone: whatever moves must be told by the code, so that a code means a motion, not its change. Each
+    It sees one frame alone: whatever moves must be said by the code, so that a code means a motion, not its change. Each
     code has a sweep of its own, a coarse flow that is the same for every frame; the frame only bends it (and training
     holds the bending small), so that a code means the same everywhere. What depends on the code comes last, so that
     the outcomes of all K codes cost little more than that of one.
@@ -57,12 +57,12 @@ class Forward(nn.Module):
         self.coarse = nn.Sequential(_layer(two, three, 2), _layer(three, three))
         self.up_middle, self.up_fine = nn.Conv2d(three, two, 1), nn.Conv2d(two, one, 1)
         self.join_middle, self.join_fine = _layer(two, two), _layer(one, one)
-        self.told, self.mix = nn.Linear(codes, 2 * one), nn.Conv2d(one, one, 1)
-        self.leave = nn.Conv2d(one, 2 + 12, 3, padding=1)
+        self.condition, self.mix = nn.Linear(codes, 2 * one), nn.Conv2d(one, one, 1)
+        self.output = nn.Conv2d(one, 2 + 12, 3, padding=1)
         self.sweep = nn.Parameter(0.1 * torch.randn(codes, 2, 1, 1) + 0.01 * torch.randn(codes, 2, *SWEEP))  # 10 pixels
-        nn.init.normal_(self.told.weight, 0, 0.5)  # codes begin unlike each other
-        nn.init.normal_(self.leave.weight, 0, 0.01)
-        self.leave.bias.data = torch.zeros(2 + 12)
+        nn.init.normal_(self.condition.weight, 0, 0.5)  # codes begin unlike each other
+        nn.init.normal_(self.output.weight, 0, 0.01)
+        self.output.bias.data = torch.zeros(2 + 12)
 
     def features(self, before: torch.Tensor) -> torch.Tensor:
         """[B, 3, H, W] in [0, 1] -> what every code's outcome is drawn from."""
@@ -80,8 +80,8 @@ class Forward(nn.Module):
         by which the frame bends the code's own sweep.
 
         half: `before` and the outcome have half the size."""
-        scale, shift = self.told(code)[:, :, None, None].chunk(2, 1)
-        out = self.leave(F.silu(self.mix(features) * (1 + scale) + shift))
+        scale, shift = self.condition(code)[:, :, None, None].chunk(2, 1)
+        out = self.output(F.silu(self.mix(features) * (1 + scale) + shift))
         bend, added = 4 * out[:, :2], out[:, 2:]
         sweep = 10 * torch.einsum("bk,kchw->bchw", code, self.sweep)
         flow = F.interpolate(sweep, bend.shape[-2:], mode="bilinear", align_corners=True) + bend
@@ -95,7 +95,7 @@ class Forward(nn.Module):
 
     def errors(self, features: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
         """[B, K]: how far (mean absolute, at half size) each code's outcome is from what really followed."""
-        codes = self.told.in_features
+        codes = self.condition.in_features
         small, truth = F.avg_pool2d(before, 2), F.avg_pool2d(after, 2)
         every = torch.eye(codes, device=before.device).repeat(len(before), 1)
         each = features.repeat_interleave(codes, 0), small.repeat_interleave(codes, 0)
@@ -114,3 +114,24 @@ def warped(frame: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
 
 def _layer(into: int, out: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(into, out, 3, stride, 1), nn.SiLU())
+
+
+class LatentModel:
+    """What was learned: `inverse` names codes, `forward` carries them out; `stride` rows lie between the two frames."""
+
+    def __init__(self, codes: int, stride: int, size: tuple[int, int], device: torch.device):
+        self.codes, self.stride, self.size, self.device = codes, stride, size, device
+        self.inverse, self.forward = Inverse(codes).to(device), Forward(codes).to(device)
+
+    @torch.inference_mode()
+    def infer(self, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+        """Codes int64 [B] that led from one frame [B, 3, H, W] in [0, 1] to the other."""
+        return self.inverse(before.to(self.device), after.to(self.device)).argmax(1).cpu()
+
+    @torch.inference_mode()
+    def predict(self, before: torch.Tensor, code: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The frame [B, 3, H, W] in [0, 1] that follows under codes int64 [B], and the flow (see Forward.outcome)."""
+        before = before.to(self.device)
+        onehot = F.one_hot(code.to(self.device), self.codes).float()
+        frame, flow, _ = self.forward.outcome(self.forward.features(before), before, onehot)
+        return frame.clamp(0, 1).cpu(), flow.cpu()

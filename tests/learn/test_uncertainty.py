@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 import torch
 from tests.data.corridor import Corridor
+from tests.learn.stopping import goes_on_exactly, quiet
 from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
 from terrella.data import ClipCache, Dataset, Layout, Recorder, record, split
-from terrella.learn.estimator import EstimatorTraining, learn_estimator, recoloured, recording_of, relative, train_eye
-from terrella.learn.samples import Recording
-from terrella.learn.senses import SensesConfig, train_senses
-from terrella.learn.train_video import TrainConfig, train_video
-from terrella.learn.uncertainty import DoubtTraining, Dreamt, answers, calibrate, dreams, fit, pooled
+from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative
+from terrella.learn.objectives.uncertainty import ARMS, Dreamt, Rollout, answers, calibrate, dream, fit, pooled
+from terrella.learn.recipes.estimator import EstimatorTraining, train_estimator
+from terrella.learn.recipes.uncertainty import SensesConfig, train_uncertainty
+from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recording import Recording
+from terrella.learn.trainer import Run
 from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
 from terrella.worlds.folder import load_world
@@ -38,10 +41,6 @@ BARE = TrainConfig(
 )
 
 
-def quiet(done, total, words=""):
-    pass
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("senses") / "set"
@@ -57,7 +56,7 @@ def bare(recording, tmp_path_factory):
     return out / "world"
 
 
-def test_an_eye_learns():
+def test_an_estimator_learns(tmp_path):
     """The room of the geometry tests, from 70 places: where its colours are, so is its depth."""
     places = torch.rand(70, 3, generator=make_rng(0)) * torch.tensor([5.0, 5.0, 6.28]) - torch.tensor([2.5, 2.5, 0.0])
     pose = torch.cat([pose_at(*place) for place in places.tolist()])
@@ -67,18 +66,18 @@ def test_an_eye_learns():
     room = Recording(SimpleNamespace(**parts), np.zeros(70, np.int64), np.ones(70, bool))  # pyright: ignore
     off = []
     for steps in (1, 60):
-        estimator = learn_estimator(room, EstimatorTraining(steps=steps, batch=6), quiet)
+        estimator = learn_estimator(Run(tmp_path / str(steps), {}, quiet), room, steps, batch=6)
         off.append(float((estimator.depth(room.rgb(np.arange(70))).log() - depth.log()).abs().mean()))
         assert estimator.config.near_m < depth.min() and estimator.config.far_m > 0.9 * depth.max()
     assert off[1] < 0.8 * off[0], off
 
 
-def test_the_same_seed_gives_the_same_eye(recording, tmp_path):
-    config = EstimatorTraining((16, 32), 2, 2)
-    facts = [train_eye(recording, tmp_path / name, config, quiet) for name in ("a", "b")]
-    eyes = [load_estimator(tmp_path / name / "eye.safetensors").state_dict() for name in ("a", "b")]
-    assert all(torch.equal(eyes[0][name], eyes[1][name]) for name in eyes[0])
-    assert facts[0]["recorded"] == facts[1]["recorded"]
+def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
+    def train(out):
+        facts = train_estimator(recording, out, EstimatorTraining((16, 32), 3, 2), quiet)
+        assert load_estimator(facts["estimator"]) and facts["recorded"]["frames"]
+
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"estimator": 1})
 
 
 def test_motion_is_in_the_frame_of_the_first_pose():
@@ -103,17 +102,17 @@ def test_a_recording_without_poses_is_refused(tmp_path):
     with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
         for step in range(60):
             recorder.add({"rgb": np.full((24, 32, 3), step, np.uint8)}, np.array([step % 2]), 0.0, False)
-    with pytest.raises(DatasetError, match="lacks"):
-        train_eye(tmp_path / "set", tmp_path / "out", EstimatorTraining(steps=2), quiet)
+    with pytest.raises(DatasetError, match="holds no depth"):
+        train_estimator(tmp_path / "set", tmp_path / "out", EstimatorTraining(steps=2), quiet)
 
 
 @pytest.fixture(scope="module")
 def sensing(recording, bare, tmp_path_factory):
-    out = tmp_path_factory.mktemp("sensing") / "world"
-    return out, train_senses(bare, recording, out, SensesConfig(2, 60), quiet)
+    out = tmp_path_factory.mktemp("sensing")
+    return out / "world", train_uncertainty(bare, recording, out, SensesConfig(2, 60), quiet)
 
 
-def test_a_world_is_given_senses(bare, sensing):
+def test_a_world_is_given_an_estimator_and_an_uncertainty(bare, sensing):
     world = load_world(bare)
     picture = world.render(world.start(1, make_rng(0)), ("rgb",))["rgb"]
     with pytest.raises(ObservationError, match="train senses"):
@@ -161,15 +160,27 @@ def test_a_picture_seen_on_the_way_keeps_the_pose(sensing):
 def test_dreams_are_those_of_the_seed_and_of_all_kinds(recording, bare):
     world = load_world(bare)
     cache = ClipCache.open(Dataset(recording), (24, 32))
-    seen = recording_of(cache, split(len(cache.episodes))[0], None)
-    config = DoubtTraining(horizon=3, batch=2)
-    first, second = (list(dreams(world, seen, config, 3)) for _ in range(2))
-    assert [part.arm[0] for part in first] == ["memory", "holes", "no memory"]
+    seen = Recording.of(cache, split(len(cache.episodes))[0], None)
+    rollout = Rollout(horizon=3, batch=2)
+    first, second = ([dream(world, seen, rollout, number) for number in range(3)] for _ in range(2))
+    assert [ARMS[int(part.arm[0])] for part in first] == ["memory", "holes", "no memory"]
     for one, two in zip(first, second):
         assert torch.equal(one.error, two.error) and torch.equal(one.clues, two.clues)
         assert one.clues.shape == (6, CLUES, 6, 8) and one.situation.shape == (6, SITUATION)
         assert (one.error > 0).all() and torch.allclose(one.cells.mean((1, 2)), one.error, atol=1e-5)
-    assert first[2].story.tolist() == [4, 5] * 3
+    assert first[2].episode.tolist() == [4, 5] * 3
+
+
+def test_a_world_without_geometry_is_given_an_uncertainty_and_a_stopped_run_goes_on(recording, tmp_path):
+    config = replace(BARE, geometry=False, channels=(8, 8, 8), outcome_steps=2)
+    train_video(recording, tmp_path / "flat", config, quiet)
+    settings = SensesConfig(2, 60)
+
+    def train(out):
+        facts = train_uncertainty(tmp_path / "flat" / "world", recording, out, settings, quiet)
+        assert "uncertainty" in load_world(facts["world"]).spec.channels
+
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"uncertainty": 1})
 
 
 def made_up(count: int, seed: int) -> Dreamt:
@@ -180,12 +191,12 @@ def made_up(count: int, seed: int) -> Dreamt:
     situation[:, 0] = level
     error = (0.01 + 0.2 * level**2) * (0.7 + 0.6 * torch.rand(count, generator=rng))
     maps = torch.rand(count, CLUES, 6, 8, generator=rng).half()
-    arms = ["memory" if value < 0.5 else "no memory" for value in level.tolist()]
+    arms = torch.where(level < 0.5, ARMS.index("memory"), ARMS.index("no memory"))
     return Dreamt(maps, situation, error[:, None, None].expand(-1, 3, 4), error, torch.arange(count), arms)
 
 
-def test_a_doubt_learns_the_error_to_expect():
-    uncertainty = fit(made_up(600, 0), DoubtTraining(steps=150), quiet)
+def test_an_uncertainty_learns_the_error_to_expect(tmp_path):
+    uncertainty = fit(Run(tmp_path, {}, quiet), made_up(600, 0), 150)
     calibrate(uncertainty, made_up(400, 1))
     others = made_up(400, 2)
     expected = answers(uncertainty, others)
@@ -195,8 +206,8 @@ def test_a_doubt_learns_the_error_to_expect():
     assert torch.equal(uncertainty.meant, uncertainty.meant.sort().values) and len(uncertainty.meant) == KNOTS
 
 
-def test_calibration_never_turns_the_order():
-    uncertainty = fit(made_up(64, 0), DoubtTraining(steps=2), quiet)
+def test_calibration_never_turns_the_order(tmp_path):
+    uncertainty = fit(Run(tmp_path, {}, quiet), made_up(64, 0), 2)
     calibrate(uncertainty, made_up(64, 1))
     answer = torch.linspace(0, 2, 500)
     meant = uncertainty.calibrated(answer)
@@ -211,7 +222,7 @@ def test_neighbours_that_fall_are_pooled():
 def test_a_finished_run_is_not_taught_again(recording, tmp_path, monkeypatch):
     config = replace(BARE, estimator_steps=2, uncertainty_frames=60)
     train_video(recording, tmp_path, config, quiet)
-    from terrella.learn import train_video as module
+    from terrella.learn.recipes import video as module
 
     def fail(*_):
         raise AssertionError("it was taught again")

@@ -1,89 +1,73 @@
-"""Learning to see: an Estimator (space/eye.py) from recordings with depth, mirrored and in other colours."""
+"""Estimator: depth in one picture (and from it motion between two) from recordings with depth, mirrored and recoloured."""
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..core.errors import DatasetError, TrainingError
-from ..core.world import make_rng
-from ..data import ClipCache, Dataset, split
-from ..space.camera import yaw
-from ..space.estimator import Estimator, EstimatorConfig, normalised, save_estimator
-from ..space.floorplan import Box
-from ..worlds.controls import Controls
-from .samples import Recording, usable_rows
-from .updates import Report
+from ...core.errors import DatasetError
+from ...core.world import make_rng
+from ...data import ClipCache
+from ...space.camera import yaw
+from ...space.estimator import Estimator, EstimatorConfig, normalised
+from ...space.floorplan import Box
+from ..feeds import Drawn
+from ..recording import Recording
+from ..trainer import Learner, Loss, Now, Run, cosine
 
 DRIFT = 64  # steps over which odometry is summed when it is judged
 
 
-@dataclass(frozen=True)
-class EstimatorTraining:
-    """Settings of an eye's training.
+class Depths:
+    """By L1 on the logarithm of depth and on its slopes. (Motion follows from depth, by space/align.py.)"""
 
-    Args:
-        size: Height and width of the pictures; the eye looks at half of them.
-        steps: Training steps.
-        batch: Pictures a step.
-        learning_rate: At its height.
-        keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees.
-        seed: Of everything random.
-    """
+    def __init__(self, recording: Recording, batch: int, learning_rate: float, seed: int):
+        self.recording, self.size, self.rows = recording, batch, _pairs(recording)
+        if len(self.rows) < 64:
+            raise DatasetError(
+                f"the recording leaves {len(self.rows)} pairs of pictures to learn an estimator from; record more."
+            )
+        self.some = np.random.default_rng(seed).choice(self.rows, min(len(self.rows), 2000), replace=False)
+        self.estimator = _fresh(recording, self.some, seed)
+        weights = self.estimator.parameters()
+        optimiser = torch.optim.AdamW(weights, learning_rate, (0.9, 0.99), weight_decay=1e-4)
 
-    size: tuple[int, int] = (96, 128)
-    steps: int = 2500
-    batch: int = 16
-    learning_rate: float = 3e-3
-    keep_out: Box | None = None
-    seed: int = 0
+        def rate(now: Now) -> float:
+            return learning_rate * min(1, (now.step + 1) / 50) * cosine(now.share, 0.02)
 
+        self.modules = {"estimator": self.estimator}
+        self.learners = {"estimator": Learner(optimiser, (self.estimator,), rate)}
 
-def train_eye(data: str | Path, out: str | Path, config: EstimatorTraining, report: Report) -> dict:
-    """Trains an eye on the recording `data` and writes it to `out`/eye.safetensors, its errors on held-out episodes and
-    in the box kept out to `out`/eye.json; these are returned. The same seed gives the same eye."""
-    out, dataset = Path(out), Dataset(data)
-    cache = ClipCache.open(dataset, config.size, lambda done, total: report(done, total, "building the clip cache"))
-    if cache.rgb is None or cache.depth is None or cache.pose is None or not cache.world.get("camera"):
-        raise DatasetError(f"{data} lacks pictures, depth, poses or a camera; an eye is learned from all four.")
-    train, held_out = split(len(cache.episodes))
-    recording = recording_of(cache, train, config.keep_out)
-    estimator = learn_estimator(recording, config, report)
-    facts = sight(estimator, cache, held_out, config.keep_out)
-    out.mkdir(parents=True, exist_ok=True)
-    save_estimator(estimator, out / "eye.safetensors")
-    (out / "eye.json").write_text(json.dumps(facts, indent=1) + "\n")
-    return {"eye": str(out / "eye.safetensors"), **facts}
+    def picked(self, now: Now) -> tuple[torch.Tensor, torch.Tensor]:
+        """Pictures [n, 3, H, W] in 0..1 and their depth: mirrored, and in other colours."""
+        rows = now.rng.choice(self.rows, self.size)
+        recording, size = self.recording, _size(self.recording)
+        pictures, depth = recording.rgb(rows).float() / 255, recording.depth(rows)
+        if tuple(pictures.shape[-2:]) != size:
+            pictures = F.interpolate(pictures, size, mode="bilinear", antialias=True, align_corners=False)
+            depth = _sized(depth, size)
+        if now.rng.random() < 0.5:
+            pictures, depth = pictures.flip(-1), depth.flip(-1)
+        return recoloured(pictures, now.rng), depth
 
-
-def recording_of(
-    cache: ClipCache, episodes: list[int], keep_out: Box | None, controls: Controls | None = None
-) -> Recording:
-    """The rows of `episodes` from which nothing in the box `keep_out` is seen."""
-    start = np.zeros(cache.length, np.int64)
-    for first, last in cache.episodes:
-        start[first:last] = first
-    fx, fy, cx, cy = cache.world.get("camera") or (1.0, 1.0, 0.5, 0.5)
-    return Recording(cache, start, usable_rows(cache, episodes, keep_out, (fx, fy, cx, cy)), controls)
+    def losses(self, batch: tuple[torch.Tensor, torch.Tensor], now: Now) -> Iterator[Loss]:
+        picture, depth = (part.to(now.device) for part in batch)
+        off = self.estimator.depth_code(normalised(picture)) - self.estimator.code(depth)
+        slopes = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
+        reach = math.log(self.estimator.config.far_m / self.estimator.config.near_m)
+        yield Loss("estimator", off.abs().mean() + 0.5 * slopes, {"depth_off": reach * off.abs().mean()})
 
 
-def learn_estimator(recording: Recording, config: EstimatorTraining, report: Report) -> Estimator:
-    """Depth by L1 on its logarithm and its slopes. (Motion follows from it, by space/align.py.)"""
-    rows = _pairs(recording)
-    if len(rows) < 64:
-        raise DatasetError(f"the recording leaves {len(rows)} pairs of pictures to learn an eye from; record more.")
-    rng = np.random.default_rng(config.seed)
-    some = rng.choice(rows, min(len(rows), 2000), replace=False)
+def _fresh(recording: Recording, some: np.ndarray, seed: int) -> Estimator:
+    """One that sees the mean depth of the rows `some` everywhere."""
     near, far = recording.depth(some[:500]).flatten()[::7].quantile(torch.tensor([0.0005, 0.9995])).tolist()
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+        torch.manual_seed(seed)
         fx, fy, cx, cy = recording.cache.world["camera"]
         reach = {"near_m": 0.8 * near, "far_m": max(1.25 * far, 1.6 * near)}
         estimator = Estimator(EstimatorConfig(_size(recording), **reach, camera=(fx, fy, cx, cy)))
@@ -91,28 +75,19 @@ def learn_estimator(recording: Recording, config: EstimatorTraining, report: Rep
     usual = estimator.code(_sized(recording.depth(some[:500]), _size(recording))).mean(0)
     estimator.prior.copy_(((usual + usual.flip(-1)) / 2).clamp(0.02, 0.98).logit())
     estimator.pace.copy_(motion_between(recording, some).abs().mean(0).clamp_min(1e-4) * 2)
-    optimiser = torch.optim.AdamW(estimator.parameters(), config.learning_rate, (0.9, 0.99), weight_decay=1e-4)
-    for step in range(config.steps):
-        rate = min(1, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / config.steps)))
-        for group in optimiser.param_groups:
-            group["lr"] = config.learning_rate * rate
-        picture, depth = _lesson(recording, rng.choice(rows, config.batch), rng)
-        truth, code = estimator.code(depth), estimator.depth_code(normalised(picture))
-        off = code - truth
-        slopes = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
-        loss = off.abs().mean() + 0.5 * slopes
-        if not torch.isfinite(loss):
-            raise TrainingError(f"the eye's loss is not a number at step {step}: lower its learning rate.")
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(estimator.parameters(), 1.0)
-        optimiser.step()
-        if step % 20 == 0:
-            ratio = math.log(estimator.config.far_m / estimator.config.near_m) * float(off.detach().abs().mean())
-            report(step, config.steps, f"eye: depth {100 * ratio:.1f}% off")
-    estimator.eval().requires_grad_(False)
+    return estimator
+
+
+def learn_estimator(
+    run: Run, recording: Recording, steps: int, batch: int = 16, learning_rate: float = 3e-3
+) -> Estimator:
+    """A depth and odometry estimator, learned on the CPU."""
+    objective = Depths(recording, batch, learning_rate, run.seed)
+    trainer = run.stage("estimator", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
+    trainer.run(run.report)
+    estimator = objective.estimator.eval().requires_grad_(False)
     with torch.inference_mode():
-        looks = [estimator.looks(recording.rgb(part)) for part in np.array_split(np.sort(some), 40)]
+        looks = [estimator.looks(recording.rgb(part)) for part in np.array_split(np.sort(objective.some), 40)]
         estimator.learn_usual(torch.cat(looks))
     return estimator
 
@@ -132,16 +107,16 @@ def relative(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
 
 
 def sight(estimator: Estimator, cache: ClipCache, episodes: list[int], keep_out: Box | None, frames: int = 400) -> dict:
-    """What the eye gets wrong on `episodes`, where nothing of the box is seen ("recorded") and inside it ("new").
+    """What the estimator gets wrong on `episodes`, where nothing of the box is seen ("recorded") and inside it ("new").
 
     Depth: abs_rel, the mean of |error| / truth, and delta_125, the share of pixels within a factor of 1.25. Odometry:
     moved_off, the sum of errors over the sum of the way; turned_off_deg a step; drift_off, how far off the place is after
     DRIFT summed steps over the length of the way (mean; way longer than half a metre), drift_deg the heading.
     """
-    places = {"recorded": recording_of(cache, episodes, keep_out)}
+    places = {"recorded": Recording.of(cache, episodes, keep_out)}
     if keep_out is not None:
         x0, y0, x1, y1 = keep_out
-        every = recording_of(cache, list(range(len(cache.episodes))), None)
+        every = Recording.of(cache, list(range(len(cache.episodes))), None)
         x, y = np.asarray(cache.pose)[:, :2].T
         inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
         places["new"] = Recording(cache, every.start, every.usable & inside)
@@ -212,17 +187,6 @@ def _size(recording: Recording) -> tuple[int, int]:
 
 def _sized(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return F.interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]
-
-
-def _lesson(recording: Recording, rows: np.ndarray, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pictures [n, 3, H, W] in 0..1 and their depth: mirrored, and in other colours."""
-    pictures, depth, size = recording.rgb(rows).float() / 255, recording.depth(rows), _size(recording)
-    if tuple(pictures.shape[-2:]) != size:
-        pictures = F.interpolate(pictures, size, mode="bilinear", antialias=True, align_corners=False)
-        depth = _sized(depth, size)
-    if rng.random() < 0.5:
-        pictures, depth = pictures.flip(-1), depth.flip(-1)
-    return recoloured(pictures, rng), depth
 
 
 def recoloured(pictures: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
