@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..space.keyframes import Glimpse, Keyframes, look, retrieve
+from ..space.keyframes import Glimpse, Keyframes, gathered, look, retrieve
 from ..worlds.generator import THUMBNAIL, VideoConfig, context_thumbnail, decode_depth, encode_depth
 from ..worlds.video import carry
 from .recording import Recording
@@ -89,24 +89,31 @@ class Views:
         for index, row in enumerate(target):
             pose = recording.pose([row])[0]
             if index % 2 == 0:
-                picks = retrieve([memory], pose, config.camera, config.size, config.sources)[0]
+                picks = _retrieved(memory, pose, config)
                 if rng.random() < 0.4:
                     picks = [pick for pick in picks if rng.random() < 0.6]
                 chosen.append(memory.at(picks))
             else:
                 own = recording.keyframes(_past(recording, int(row), rng), config.camera)
-                chosen.append(own.at(retrieve([own], pose, config.camera, config.size, config.sources)[0]))
+                chosen.append(own.at(_retrieved(own, pose, config)))
         return Views(chosen, target, recording, config)
 
     def glimpse(self, rows: np.ndarray) -> Glimpse:
         """What the chosen keyframes know of the views at `rows`."""
         config = self.config
-        return look(self.chosen, self.recording.pose(rows), config.camera, config.size, config.slots)
+        memory, picks = gathered(self.chosen, config.size)
+        return look(memory, picks, self.recording.pose(rows), config.camera, config.size, config.slots)
 
     def carried(self, rgb, depth, from_rows: np.ndarray, to_rows: np.ndarray, glimpse: Glimpse) -> torch.Tensor:
         """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
         poses = self.recording.pose(from_rows), self.recording.pose(to_rows)
         return carry(rgb, depth, poses[0], glimpse, poses[1], self.config.camera)
+
+
+def _retrieved(memory: Keyframes, pose: torch.Tensor, config: VideoConfig) -> list[int]:
+    """The keyframes to use for the view from `pose` [7]."""
+    picks = retrieve(memory, pose[None], config.camera, config.size, config.sources)[0]
+    return picks[picks >= 0].tolist()
 
 
 def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarray:

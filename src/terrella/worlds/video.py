@@ -21,7 +21,7 @@ from ..core.state import State
 from ..space.billboards import cut_out
 from ..space.camera import Intrinsics, planar_pose, yaw
 from ..space.estimator import Estimator
-from ..space.floorplan import floor_plan, slide
+from ..space.floorplan import NOWHERE, floor_plan, slide
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table, remembering_spec
 from ..space.patches import FAR_M
@@ -230,7 +230,8 @@ class VideoWorld:
                 "rgb": torch.zeros(batch, 3, height, width, dtype=torch.uint8), "depth": torch.ones(batch, height, width),
                 "known": torch.zeros(batch, height, width, dtype=torch.uint8), **self.own.empty(batch),
                 **({} if self.uncertainty is None else {"gone": torch.zeros(batch, len(GONE)), "uncertainty": torch.zeros(batch)}),
-            }
+            },
+            self.own.arenas,
         )  # fmt: skip
         if self.outcome is not None:
             vitals = torch.tensor(config.vitals).expand(batch, -1)
@@ -373,16 +374,14 @@ class VideoWorld:
     def _walk(self, state: State, wish: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The displacement [B, 2] and the speed left [B, 2] of a body that wishes to move by `wish` [B, 2] among the walls
         that memory and the dream have seen."""
-        walks = []
-        for view in range(state.batch):
-            one = slice(view, view + 1)
-            walls = torch.cat([self._walls, self.own.walls(state, view)])
-            if self.objects is not None:
-                position = state["pose"][view, :3]
-                walls = torch.cat([walls, self.objects.bodies(state["billboards"][view], position, self.config.body_m)])
-            walks.append(slide(walls, state["pose"][one, :2], wish[one], self.config.body_m, self.config.short))
-        moved, speed = zip(*walks)
-        return torch.cat(moved), torch.cat(speed)
+        own = self.own.walls(state)
+        if self.objects is not None:
+            sides = [
+                self.objects.bodies(state["billboards"][view], state["pose"][view, :3], self.config.body_m)
+                for view in range(state.batch)
+            ]
+            own = torch.cat([own, torch.nn.utils.rnn.pad_sequence(sides, batch_first=True, padding_value=NOWHERE)], 1)
+        return slide(self._walls, state["pose"][:, :2], wish, self.config.body_m, self.config.short, own)
 
     def _draw(self, state: State, before: State, rng: torch.Generator) -> State:
         """The frame at `state`'s pose, from memory, `before`'s frame and the generator."""
