@@ -1,4 +1,4 @@
-"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how a network is told it."""
+"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how networks take it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Controls:
         return Controls(BUTTONS, (0.0,) * count, (1.0,) * count)
 
     @property
-    def told(self) -> int:
-        """How many numbers a network is told of an action."""
+    def numbers(self) -> int:
+        """How many numbers networks take of an action."""
         return int(self.high[0] - self.low[0]) + 1 if self.kind == CHOICE else len(self.low)
 
     def space(self) -> spaces.Space:
@@ -34,17 +34,17 @@ class Controls:
         if self.kind == BUTTONS:
             return spaces.MultiBinary(len(self.low))
         if self.kind == CHOICE:
-            return spaces.Discrete(self.told, start=int(self.low[0]))
+            return spaces.Discrete(self.numbers, start=int(self.low[0]))
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
-    def tell(self, action: torch.Tensor) -> torch.Tensor:
-        """[B, ...], as recorded or as `space` has it, to float32 [B, told]: buttons as they are, a choice one-hot (all zero
+    def encode(self, action: torch.Tensor) -> torch.Tensor:
+        """[B, ...], as recorded or as `space` has it, to float32 [B, numbers]: buttons as they are, a choice one-hot (all zero
         would be no choice at all), axes so that their limits are -1 and 1."""
-        numbers = action.reshape(len(action), -1).float()
+        given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
-            picked = (numbers[:, 0].round().long() - int(self.low[0])).clamp(0, self.told - 1)
-            return torch.nn.functional.one_hot(picked, self.told).float()
+            picked = (given[:, 0].round().long() - int(self.low[0])).clamp(0, self.numbers - 1)
+            return torch.nn.functional.one_hot(picked, self.numbers).float()
         if self.kind == AXES:
             low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
-            return (2 * (numbers - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
-        return numbers
+            return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
+        return given
