@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 import terrella
+from terrella.core.policy import Scripted
 from terrella.data import record
 
 
@@ -41,15 +42,15 @@ COURTS = {
 
 
 class BallPlayer:
-    """A policy for `record`: see the top of this file."""
+    """Plays one episode: see the top of this file."""
 
     def __init__(self, court: Court, names: tuple[str, ...]):
         self.court, self.names = court, names
         self.left, self.follows, self.aim = 0, True, 0.0
         self.held, self.hold = 0, 0
 
-    def __call__(self, observation: Mapping, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
-        if info["step"] == 0 or self.left <= 0:
+    def __call__(self, observation: Mapping, step: int, rng: torch.Generator) -> torch.Tensor:
+        if step == 0 or self.left <= 0:
             self.left = _whole(rng, 20, 80)
             self.follows = _unit(rng) < 0.85
             self.aim = 4 * _unit(rng) - 2
@@ -89,7 +90,7 @@ def record_game(name: str, out: Path, frames: int = 100_000, held_out: int = 12_
     court = COURTS[name]
     for folder, seed, rows in (("test", 1, held_out), ("rec", 0, frames)):
         world = terrella.load(court.game, size=(64, 64), forkable=False)  # twice as fast
-        player = BallPlayer(court, world.spec.action_names)
+        player = Scripted(lambda court=court, names=world.spec.action_names: BallPlayer(court, names))
         rng = terrella.make_rng(seed)
         done = record(world, player, out / folder, rows, rng, max_episode_steps=3000, pictures="png")
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)

@@ -17,24 +17,25 @@ from pathlib import Path
 import torch
 
 import terrella
+from terrella.core.policy import Scripted
 from terrella.data import record
 
 
 class Driver:
-    """A policy for `record`: see the top of this file."""
+    """Plays one episode: see the top of this file."""
 
     def __init__(self):
         self.left, self.lapse = 0, False
         self.throttle, self.eagerness, self.wild = 0.0, 1.0, torch.zeros(3)
         self.side, self.lost = 1.0, 0
 
-    def __call__(self, observation: Mapping, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
+    def __call__(self, observation: Mapping, step: int, rng: torch.Generator) -> torch.Tensor:
         def chance() -> float:
             return float(torch.rand(1, generator=rng))
 
-        if info["step"] == 0 or self.left <= 0:
+        if step == 0 or self.left <= 0:
             self.left = 20 + int(60 * chance())
-            self.lapse = info["step"] > 60 and chance() < 1 / 6
+            self.lapse = step > 60 and chance() < 1 / 6
             self.throttle, self.eagerness = 0.05 + 0.25 * chance(), 1.5 + 1.5 * chance()
             self.wild = torch.tensor([2 * chance() - 1, chance() * (chance() < 0.7), 0.8 * chance() * (chance() < 0.3)])
             self.left = min(self.left, 25) if self.lapse else self.left
@@ -65,7 +66,7 @@ def record_driving(out: Path, frames: int = 20_000, held_out: int = 5_000) -> No
     world = terrella.load("gym:CarRacing-v3", size=(64, 64))
     for folder, seed, rows in (("test", 1, held_out), ("rec", 0, frames)):
         rng = terrella.make_rng(seed)
-        done = record(world, Driver(), out / folder, rows, rng, max_episode_steps=900, pictures="png")
+        done = record(world, Scripted(Driver), out / folder, rows, rng, max_episode_steps=900, pictures="png")
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from .core.errors import CheckpointError, TerrellaError
 from .core.world import World
+from .similar import did_you_mean
 from .space.estimator import Estimator
 
 BUNDLED = Path(__file__).parent / "bundled"
@@ -87,10 +88,11 @@ def folder_of(name: str | Path) -> Path:
     if Path(text).exists():
         run = Path(text) / "world"  # where `terrella train` leaves the world of a run
         return run if (run / "world.json").is_file() else Path(text)
-    bundled = ", ".join(sorted(_bundled())) or "none"
+    bundled = sorted(_bundled())
+    likest = did_you_mean(text, [*bundled, GAME]) or "."
     raise TerrellaError(
-        f"There is no world '{text}': bundled are {bundled}; the real game is {GAME}, an environment gym:CartPole-v1; "
-        "or give the path of a checkpoint folder."
+        f"There is no world '{text}'{likest} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
+        "environment gym:CartPole-v1; or give the path of a checkpoint folder."
     )
 
 

@@ -10,13 +10,14 @@ import sys
 
 import pytest
 
-from terrella.cli import main
+import terrella
+from terrella.cli import COMMANDS, main
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--frames --human --json --live-mcap --out --pictures --port --seed --size",
-    "play": "--compare --device --eye --fast --host --image --json --memory-mb --no-memory --port --record --remember --seed "
+    "play": "--compare --device --estimator --fast --host --image --json --memory-mb --no-memory --port --record --remember --seed "
     "--token --truth",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
@@ -29,9 +30,10 @@ OPTIONS = {
 
 
 def help_of(command: str, capsys) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main([*command.split(), "--help"])
-    assert stop.value.code == 0
+    try:
+        assert main([*command.split(), "--help"]) == 0
+    except SystemExit as stop:
+        assert stop.code == 0
     return capsys.readouterr().out
 
 
@@ -49,7 +51,63 @@ def test_train_promises_its_main_options(capsys):
 
 def test_every_command_is_in_the_help(capsys):
     shown = help_of("", capsys)
-    assert re.search(r"\{record,train,play,score,list,data\}", shown)
+    assert set(re.findall(r"^  terrella (.+?)  ", shown, re.MULTILINE)) == set(COMMANDS)
+    assert help_of("data", capsys).count("terrella data ") == 6
+
+
+def test_the_version_is_said(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"terrella {terrella.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "given, meant",
+    [
+        (["paly", "doom-maze"], "'play'"),
+        (["data", "docter", "x"], "'doctor'"),
+        (["train", "vido", "x"], "'video'"),
+        (["--versoin"], "'--version'"),
+        (["play", "doom-mzae"], "'doom-maze'"),
+        (["play", "doom:my_way_hom"], "my_way_home"),
+        (["play", "doom-maze", "--prot", "8"], "--port"),
+    ],
+)
+def test_misspelt_words_are_recognised(given, meant, capsys):
+    try:
+        assert main(given) == 2
+    except SystemExit as stop:
+        assert stop.code == 2
+    said = capsys.readouterr()
+    assert meant in said.err and said.out == "" and "Traceback" not in said.err
+
+
+def test_a_missing_command_shows_what_there_is(capsys):
+    assert main([]) == 2 and main(["data"]) == 2
+    assert "terrella data doctor" in capsys.readouterr().err
+
+
+def test_the_names_of_older_releases_still_work(capsys):
+    assert help_of("train eye", capsys) == help_of("train estimator", capsys)
+    assert main(["play", "no-such-world", "--eye", "x"]) == 2
+    assert "no-such-world" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:banana", "", "cuda:99"])
+def test_a_device_that_is_not_here_is_said(device, capsys):
+    assert "--device" in refusal(["play", "doom-maze", "--device", device], capsys)
+
+
+def test_a_simulator_without_a_display_is_said(capsys, monkeypatch):
+    class FatalError(Exception):
+        pass
+
+    FatalError.__module__ = "mujoco"
+
+    def broken(*_, **__):
+        raise FatalError("an OpenGL platform library has not been loaded into this process")
+
+    monkeypatch.setattr("terrella.library.load", broken)
+    assert "MUJOCO_GL=egl" in refusal(["play", "gym:Ant-v5"], capsys)
 
 
 def test_help_imports_nothing_heavy():

@@ -10,7 +10,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from terrella.core import Spec, State, check_world, make_rng
+from terrella.core import Camera, Spec, State, check_world, make_rng
 from terrella.core.errors import ContractError, ObservationError, StaleStateError, TerrellaError
 
 REWARD, DONE = spaces.Box(-np.inf, np.inf, (), np.float32), spaces.Box(0, 1, (), np.bool_)
@@ -91,8 +91,20 @@ class Ticketed(Walk):
 
 def test_lawful_worlds_pass_and_the_laws_are_named():
     values, tickets = check_world(Walk(), steps=6), check_world(Ticketed(), steps=6)
-    assert {"states_are_values", "states_can_be_saved", "batches"} <= set(values)
+    assert {
+        "states_are_values",
+        "states_can_be_saved",
+        "batches",
+        "a_batch_equals_its_singles",
+        "forks_and_puts",
+    } <= set(values)
     assert "stale_states_are_refused" in tickets and "batches" not in tickets
+
+
+def test_a_world_that_promises_gradients_gives_them():
+    world = Walk()
+    world.spec = replace(SPEC, differentiable=True)
+    assert "gradients_reach_the_action" in check_world(world)
 
 
 def broken(message):
@@ -148,9 +160,68 @@ class NoRoom(Walk):
     spec = replace(SPEC, max_batch=0)
 
 
-@broken("camera")
+PICTURED = {**SPEC.channels, "rgb": spaces.Box(0, 255, (6, 8, 3), np.uint8)}
+LENS = Camera((0.5, 0.7, 0.5, 0.5), (6, 8), None)
+
+
+@broken("four positive numbers")
 class BrokenCamera(Walk):
-    spec = replace(SPEC, camera=(0.0, 1.0, 0.5, 0.5))
+    spec = replace(SPEC, channels=PICTURED, cameras={"rgb": replace(LENS, intrinsics=(0.0, 1.0, 0.5, 0.5))})
+
+
+@broken("no picture channel")
+class CameraOfNothing(Walk):
+    spec = replace(SPEC, cameras={"rgb.wrist": LENS})
+
+
+@broken("has size (8, 6), its pictures have (6, 8)")
+class CameraOfAnotherSize(Walk):
+    spec = replace(SPEC, channels=PICTURED, cameras={"rgb": replace(LENS, size=(8, 6))})
+
+
+@broken("is mounted on 'pose.wrist', which is no pose channel")
+class CameraOnNothing(Walk):
+    spec = replace(SPEC, channels=PICTURED, cameras={"rgb": replace(LENS, pose="pose.wrist")})
+
+
+@broken("quaternion w, x, y, z of length 1")
+class BentMount(Walk):
+    spec = replace(SPEC, channels=PICTURED, cameras={"rgb": replace(LENS, mount=(0, 0, 0, 1, 1, 0, 0))})
+
+
+@broken("'rgb.wrist' must be uint8")
+class FloatPicture(Walk):
+    spec = replace(SPEC, channels={**SPEC.channels, "rgb.wrist": spaces.Box(0, 1, (6, 8, 3), np.float32)})
+
+
+@broken("3 units; the space")
+class UnitsThatDisagree(Walk):
+    spec = replace(SPEC, action_units=("m", "m", "rad"))
+
+
+@broken("which the action space")
+class ModeThatDisagrees(Walk):
+    spec = replace(SPEC, action_mode="buttons")
+
+
+@broken("1 names for 2 actions")
+class NamesThatDisagree(Walk):
+    spec = replace(SPEC, action_names=("x",))
+
+
+@broken("a batch differs from that of single episodes")
+class SharedWind(Walk):
+    def imagine(self, state, action, rng):
+        after = super().imagine(state, action, rng)
+        return after.replace(at=after["at"] + torch.randn(2, generator=rng) * ~state["done"][:, None])
+
+
+@broken("promises gradients")
+class FalsePromise(Walk):
+    spec = replace(SPEC, differentiable=True)
+
+    def imagine(self, state, action, rng):
+        return super().imagine(state, self.spec.check_action(action, state.batch).detach(), rng)
 
 
 @broken("spec.may_observe names ['sonar']")
@@ -270,7 +341,7 @@ class LongQuaternion(Walk):
         return {name: torch.full((state.batch, 7), 2.0) if name == "pose" else state[name] for name in channels}
 
 
-@broken("same story")
+@broken("same episode")
 class HiddenClock(Walk):
     lives = 0
 
@@ -344,7 +415,7 @@ class TakesStrongActions(Walk):
 
 @broken("ActionError")
 class RoundsActions(Walk):
-    spec = replace(SPEC, action=spaces.MultiBinary(2))
+    spec = replace(SPEC, action=spaces.MultiBinary(2), action_mode="")
 
     def imagine(self, state, action, rng):
         whole = action.floor() if isinstance(action, torch.Tensor) and action.is_floating_point() else action

@@ -223,7 +223,7 @@ def test_a_world_that_cannot_fork_is_one_environment():
     env.reset(seed=0)
     ends = sum(int((end := env.step(np.array([step % 2])))[2][0] or end[3][0]) for step in range(100))
     assert ends >= 2
-    with pytest.raises(TerrellaError, match="1 to 1 stories"):
+    with pytest.raises(TerrellaError, match="1 to 1 episodes"):
         as_env(world, num_envs=2)
 
 

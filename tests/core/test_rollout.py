@@ -7,6 +7,7 @@ import torch
 
 from terrella.core import make_rng, rollout
 from terrella.core.errors import ChannelError
+from terrella.core.policy import Idle, Reactive
 from terrella.sim.gymnasium import GymnasiumWorld
 
 CHANNELS = ("observation", "reward", "done")
@@ -38,7 +39,8 @@ def test_a_policy_sees_the_observation_that_it_acts_on(pendulum):
         seen.append(observation["observation"])
         return -observation["observation"][:, 2:].clamp(-1, 1)
 
-    rolled = rollout(pendulum, pendulum.start(3, make_rng(0)), policy, make_rng(1), ("observation",), steps=4)
+    start = pendulum.start(3, make_rng(0))
+    rolled = rollout(pendulum, start, Reactive(policy), make_rng(1), ("observation",), steps=4)
     assert rolled.actions.shape == (4, 3, 1)
     assert torch.equal(torch.stack(seen), rolled.observations["observation"][:-1])
     again = rollout(pendulum, pendulum.start(3, make_rng(0)), rolled.actions, make_rng(1), ("observation",))
@@ -56,6 +58,6 @@ def test_what_cannot_be_rolled_out_is_refused(pendulum):
     with pytest.raises(ChannelError):
         rollout(pendulum, start, torch.zeros(1, 1, 1), make_rng(1), ("depth",))
     with pytest.raises(ValueError, match="steps"):
-        rollout(pendulum, start, lambda seen, rng: torch.zeros(1, 1), make_rng(1), CHANNELS)
+        rollout(pendulum, start, Idle(pendulum.spec), make_rng(1), CHANNELS)
     with pytest.raises(ValueError, match="steps"):
         rollout(pendulum, start, torch.zeros(1, 1, 1), make_rng(1), CHANNELS, steps=1)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from terrella.core import Spec, State
+from terrella.core import Camera, Spec, State
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
 MAP = (
@@ -43,7 +43,7 @@ class Corridor:
             dt_s=1 / 35,
             units={"depth": "m"},
             action_names=BUTTONS,
-            camera=(0.5, 0.8, 0.5, 0.5),
+            cameras={"rgb": Camera((0.5, 0.8, 0.5, 0.5), (HEIGHT, WIDTH))},
             max_batch=1,
         )
 
@@ -86,11 +86,18 @@ class Corridor:
         return seen
 
 
-def keys(observation, info, rng) -> torch.Tensor:
-    """A policy that changes its keys every five steps."""
-    if info["step"] % 5 == 0:
-        keys.held = torch.randint(2, (1, 6), generator=rng, dtype=torch.int8)
-    return keys.held
+class Keys:
+    """A policy that changes its keys every five steps; its memory is the keys held and the step."""
+
+    def begin(self, batch, rng):
+        return [(torch.zeros(1, 6, dtype=torch.int8), 0)] * batch
+
+    def act(self, observation, memory, rng):
+        held = [torch.randint(2, (1, 6), generator=rng, dtype=torch.int8) if n % 5 == 0 else now for now, n in memory]
+        return torch.cat(held), [(now, n + 1) for now, (_, n) in zip(held, memory)]
+
+
+keys = Keys()
 
 
 def _free(x: float, y: float) -> bool:

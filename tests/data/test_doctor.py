@@ -365,7 +365,7 @@ def test_faults_of_streams_are_named(tmp_path, name):
 def test_a_file_of_many_episodes_is_read_once(recording, monkeypatch):
     from strangers import shared
 
-    from terrella.data.storage import tables
+    from terrella.care import tables
 
     root = shared(recording, recording.parent / "shared")
     opened: list[Path] = []

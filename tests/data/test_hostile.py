@@ -17,12 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from terrella.care import doctor
+from terrella.care import doctor, thrift
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
 from terrella.data.format import contained, fill
 from terrella.data.source import Sensor
-from terrella.data.storage import thrift
 
 DATA, EPISODES = "data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-001.parquet"
 VIDEO = "videos/observation.images.rgb/chunk-000/file-001.mp4"

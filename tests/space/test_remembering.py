@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 import terrella
-from terrella.core import Spec, State, check_world, make_rng
+from terrella.core import Camera, Spec, State, check_world, make_rng
 from terrella.core.errors import ContractError, ObservationError, TerrellaError
 from terrella.space.camera import planar_pose, yaw
 from terrella.space.keyframes import Glimpse
@@ -48,7 +48,7 @@ class Fickle:
             observes=("rgb",),
             dt_s=0.1,
             action_names=("FORWARD", "TURN_LEFT", "TURN_RIGHT"),
-            camera=CAMERA,
+            cameras={"rgb": Camera(CAMERA, SIZE)},
         )
 
     def start(self, batch, rng):
@@ -219,7 +219,7 @@ def test_who_cannot_be_given_a_memory_is_told_why():
     with pytest.raises(ContractError, match="give an eye"):
         Remembering(Fickle(channels=("depth",)))
     lens = Fickle()
-    lens.spec = replace(lens.spec, camera=None)
+    lens.spec = replace(lens.spec, cameras={})
     with pytest.raises(ContractError, match="no camera"):
         Remembering(lens)
     assert Remembering(lens, camera=CAMERA).spec.camera == CAMERA

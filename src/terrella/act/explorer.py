@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import torch
 
+from ..core.policy import Random
 from ..core.spec import Spec
 from ..core.world import Observation
 
@@ -56,38 +57,31 @@ class _View:
 
 
 class Explorer:
-    """A policy for `record`: policy(observation, info, rng) -> action [1, ...].
+    """A policy that covers a world.
 
     In worlds with depth, pose and Doom's six movement buttons it goes where it has been least in this episode, by ways
     that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Where there is
     a channel `things` it walks up to them, and shoots at them with ATTACK; USE it tries on what is in its way. Elsewhere it
-    holds random actions for 3 to 40 steps. It knows nothing but the observations since info["step"] was 0.
+    holds random actions for 3 to 40 steps. It knows nothing but the observations of its episode.
     """
 
     def __init__(self, spec: Spec):
         self.spec = spec
         self._walks = set(LEGS) <= set(spec.action_names) and {"depth", "pose"} <= set(spec.channels)
-        self._moves: _Moves | None = None
-        self._held: torch.Tensor | None = None
-        self._hold = 0
+        self._random = Random(spec, (3, 40))
 
-    def __call__(self, observation: Observation, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
+    def begin(self, batch: int, rng: torch.Generator) -> list:
+        """The memory of `batch` episodes: walks that have not begun, which `act` moves on in place."""
+        return [_Walk(rng, self.spec) for _ in range(batch)] if self._walks else self._random.begin(batch, rng)
+
+    def act(self, observation: Observation, memory: list, rng: torch.Generator) -> tuple[torch.Tensor, list]:
         if not self._walks:
-            return self._random(info, rng)
-        view = _look(self.spec, observation)
-        if info["step"] == 0 or self._moves is None:
-            self._moves = _Walk(rng, self.spec).story(view)
-            buttons = next(self._moves)
-        else:
-            buttons = self._moves.send(view)
-        action = [[float(name in buttons) for name in self.spec.action_names]]
-        return torch.tensor(action).to(torch.int8)
-
-    def _random(self, info: Mapping[str, int], rng: torch.Generator) -> torch.Tensor:
-        if info["step"] == 0 or self._hold <= 0 or self._held is None:
-            self._held, self._hold = self.spec.sample_action(1, rng), _whole(rng, 3, 40)
-        self._hold -= 1
-        return self._held
+            return self._random.act(observation, memory, rng)
+        pressed = []
+        for entry, walk in enumerate(memory):
+            buttons = walk.next(_look(self.spec, {name: seen[entry : entry + 1] for name, seen in observation.items()}))
+            pressed.append([float(name in buttons) for name in self.spec.action_names])
+        return torch.tensor(pressed).to(torch.int8), memory
 
 
 class _Walk:
@@ -99,8 +93,16 @@ class _Walk:
         self.meets = "things" in spec.channels
         self.visits: dict[tuple[int, int], int] = {}
         self.boredom = 0.0  # grows while nothing new is found, and lowers what counts as promising
+        self._moves: _Moves | None = None
 
-    def story(self, view: _View) -> _Moves:
+    def next(self, view: _View) -> tuple[str, ...]:
+        """The buttons of the next step."""
+        if self._moves is None:
+            self._moves = self.episode(view)
+            return next(self._moves)
+        return self._moves.send(view)
+
+    def episode(self, view: _View) -> _Moves:
         kinds = [self.seek, self.run, self.turn, self.strafe, self.back, self.stop, self.look_around, self.mash]
         weights = torch.tensor([10.0, 2.0, 1.0, 1.5, 0.6, 0.4, 0.3, 1.0])
         while True:

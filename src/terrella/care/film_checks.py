@@ -13,8 +13,8 @@ from ..data.format import STREAM_PATH, where
 from ..data.source import Sensor
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
-from ..data.storage.tables import read_whole
 from .survey import LEFTOVER, RESTORE, Fault, Survey, Told, listed
+from .tables import read_whole
 
 _SHORTEN = "let --repair keep the rows that the video shows"
 

@@ -32,11 +32,12 @@ from ..data.source import Sensor, follows, is_action
 from ..data.staged import LOG, Staged
 from ..data.storage import durable, mp4
 from ..data.storage.films import Reel, cut, reel, whole_frames
-from ..data.storage.footers import rebuild
-from ..data.storage.tables import open_parquet, read_json, read_whole
+from ..data.storage.tables import read_json
 from ..data.writer import NAME, ROWS_PER_GROUP, Draft, Writer, fresh
+from .footers import rebuild
 from .pieces import Piece, RowReader, Table, as_found, pieces_of, read_table, runs, uncovered
 from .survey import Survey, survey
+from .tables import open_parquet, read_whole
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read

@@ -13,8 +13,9 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.format import ACTION, ACTION_VALID, DONE, STATS, TASKS, contained, names_of, schema, to_numpy
-from ..data.storage.tables import batches, open_parquet, read_json
+from ..data.storage.tables import read_json
 from .survey import LEFTOVER, RESTORE, Fault, Survey
+from .tables import batches, open_parquet
 
 _LEAVE_OUT = "let --repair split the episode around such rows, or leave it out of training"
 _COUNT_ANEW = "let --repair count anew"

@@ -36,7 +36,8 @@ from ..data.format import (
 )
 from ..data.source import Sensor
 from ..data.storage import boxes
-from ..data.storage.tables import open_parquet, read_json, read_whole
+from ..data.storage.tables import read_json
+from .tables import open_parquet, read_whole
 
 RESTORE = "restore the file from a copy, or let --repair make a dataset of what is whole"
 LEFTOVER = "it was being committed when the recorder was killed: record into the folder again, or delete the file"

@@ -11,7 +11,8 @@ from .say import say
 if TYPE_CHECKING:
     from ..core.world import World
 
-Device = Annotated[str, arg(help="cpu, cuda, or auto: a GPU where there is one.")]
+Device = Annotated[str, arg(help="cpu, cuda, mps, or auto: a GPU if there is one.")]
+Fast = Annotated[bool, arg(help="Draw with ONNX Runtime, or with a compiled graph on a GPU, if that is faster here.")]
 
 
 def load_named(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:
@@ -28,12 +29,19 @@ def load_named(name: str, device: str, memory: bool = True, fast: bool = False, 
 
 
 def device_of(name: str) -> str:
+    """A device that this machine has, as torch spells it; TerrellaError where it has none of that name."""
     import torch
 
     from ..core.errors import TerrellaError
 
-    if name != "auto":
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
         if name.startswith("cuda") and not torch.cuda.is_available():
-            raise TerrellaError(f"--device {name}: this PyTorch finds no GPU here; use --device cpu, or auto.")
-        return name
-    return "cuda" if torch.cuda.is_available() else "cpu"
+            raise RuntimeError
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError, ValueError) as error:
+        here = ["cpu", *(["cuda"] if torch.cuda.is_available() else []), *(["mps"] if torch.mps.is_available() else [])]
+        what = "finds no GPU" if name.startswith("cuda") else "has no such device"
+        raise TerrellaError(f"--device {name}: PyTorch {what} here; use {', '.join(here)} or auto.") from error
+    return name

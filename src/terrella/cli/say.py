@@ -11,9 +11,11 @@ from tyro.conf import arg
 
 Json = Annotated[bool, arg(name="json", help="Print one JSON document on stdout instead of text.")]
 Seed = Annotated[int, arg(help="The same seed gives the same result.")]
-Port = Annotated[int, arg(help="Port of the page; 0 takes a free one.")]
-Host = Annotated[str, arg(help="Address to listen on; any other than this machine's own needs a token.")]
-Token = Annotated[str | None, arg(help="Secret that the page's address must carry.")]
+Port = Annotated[int, arg(help="Port of the page; 0 picks a free one.")]
+Host = Annotated[
+    str, arg(help="Address to listen on. Any other than this machine needs a token; one is made if none is given.")
+]
+Token = Annotated[str | None, arg(help="Secret that the address of the page must contain.")]
 
 
 def say(words: str) -> None:

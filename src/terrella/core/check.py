@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from gymnasium import spaces
 
 from .errors import ActionError, ChannelError, ContractError, ObservationError, StaleStateError, TerrellaError
-from .spec import Spec, dtype_of, shape_of
+from .spec import AXES, BUTTONS, MODES, Spec, dtype_of, kind_of, shape_of
 from .state import State
 from .world import Observation, World, make_rng
 
-# The channels whose meaning every tool knows: dtype, and number of axes of one entry.
+# The kinds of channels whose meaning every tool knows: dtype, and number of axes of one entry.
 _WELL_KNOWN = {
     "rgb": (np.uint8, 3),
     "depth": (np.float32, 2),
@@ -24,14 +25,15 @@ _WELL_KNOWN = {
     "done": (np.bool_, 0),
     "known": (np.float32, 2),
     "keyframes": (np.float32, 2),
+    "instruction": (np.float32, 1),
 }
 
 
 def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
     """Runs every law; gives the names of those that held, raises ContractError at the first that does not.
 
-    The laws begin several stories, so a world that cannot fork is left at a place of its own. `steps` is the length
-    of a story; laws about `done` are only proven where a story gets there.
+    The laws begin several episodes, so a world that cannot fork is left at a place of its own. `steps` is the length
+    of an episode; laws about `done` are only proven where a story gets there.
     """
     if not isinstance(world, World) or not isinstance(world.spec, Spec):
         raise ContractError("a World has `spec` (a terrella.Spec) and the verbs start, observe, imagine, render.")
@@ -43,7 +45,12 @@ def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
         _refuses_junk,
         _observes,
     ]
-    laws += [_states_are_values, _states_can_be_saved, _batches] if world.spec.forkable else [_stale_states_are_refused]
+    if world.spec.differentiable:
+        laws.append(_gradients_reach_the_action)
+    if world.spec.forkable:
+        laws += [_states_are_values, _states_can_be_saved, _forks_and_puts, _batches, _a_batch_equals_its_singles]
+    else:
+        laws.append(_stale_states_are_refused)
     for law in laws:
         law(world, seed, steps)
     return [law.__name__.strip("_") for law in laws]
@@ -84,18 +91,19 @@ def _check_observation(world: World, seen: Observation, channels: Sequence[str],
         rows = tensor.cpu().numpy()
         _require(rows.dtype == space.dtype, f"channel '{name}' is {rows.dtype}, its spec says {space.dtype}.")
         _require(all(space.contains(np.asarray(row)) for row in rows), f"channel '{name}' leaves its space {space}.")
-    if "pose" in channels:
-        lengths = seen["pose"][:, 3:].norm(dim=1)
-        _require(bool((lengths - 1).abs().max() < 1e-3), "the quaternion of channel 'pose' must have length 1.")
+    for name in channels:
+        if kind_of(name) == "pose":
+            lengths = seen[name][:, 3:].norm(dim=1)
+            _require(bool((lengths - 1).abs().max() < 1e-3), f"the quaternion of channel '{name}' must have length 1.")
 
 
 def _spec_is_sound(world: World, seed: int, steps: int) -> None:
     spec = world.spec
     _require(0 < spec.dt_s < float("inf"), "spec.dt_s must be positive seconds.")
     _require(bool(spec.channels), "a world renders at least one channel.")
-    for name, (dtype, axes) in _WELL_KNOWN.items():
-        space = spec.channels.get(name)
-        fits = space is None or (dtype_of(space) == dtype and len(shape_of(space)) == axes)
+    for name, space in spec.channels.items():
+        dtype, axes = _WELL_KNOWN.get(kind_of(name), (None, 0))
+        fits = dtype is None or (dtype_of(space) == dtype and len(shape_of(space)) == axes)
         _require(
             fits, f"channel '{name}' must be {np.dtype(dtype)} with {axes} axes after the batch; its space is {space}."
         )
@@ -105,9 +113,39 @@ def _spec_is_sound(world: World, seed: int, steps: int) -> None:
     twice = sorted(set(spec.observes) & set(spec.may_observe))
     _require(not twice, f"spec.may_observe names {twice}, which spec.observes names already.")
     _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
-    _require(
-        spec.camera is None or (len(spec.camera) == 4 and min(spec.camera) > 0), "spec.camera is four positive numbers."
-    )
+    _cameras_are_sound(spec)
+    _actions_have_a_meaning(spec)
+
+
+def _cameras_are_sound(spec: Spec) -> None:
+    for name, camera in spec.cameras.items():
+        pictures = name in spec.channels and kind_of(name) == "rgb"
+        _require(pictures, f"spec.cameras names '{name}', which is no picture channel (rgb, rgb.wrist) of this world.")
+        sound = len(camera.intrinsics) == 4 and min(camera.intrinsics) > 0
+        _require(sound, f"the intrinsics of camera '{name}' are four positive numbers: fx/W, fy/H, cx/W, cy/H.")
+        size = shape_of(spec.channels[name])[:2]
+        _require(tuple(camera.size) == size, f"camera '{name}' has size {camera.size}, its pictures have {size}.")
+        mounted = camera.pose is None or (camera.pose in spec.channels and kind_of(camera.pose) == "pose")
+        _require(mounted, f"camera '{name}' is mounted on '{camera.pose}', which is no pose channel of this world.")
+        unit = len(camera.mount) == 7 and abs(float(np.linalg.norm(camera.mount[3:])) - 1) < 1e-3
+        _require(unit, f"the mount of camera '{name}' is x, y, z and a quaternion w, x, y, z of length 1.")
+
+
+def _actions_have_a_meaning(spec: Spec) -> None:
+    axes, width = isinstance(spec.action, spaces.Box), int(np.prod(shape_of(spec.action)))
+    _require(spec.action_mode in MODES, f"spec.action_mode is '{spec.action_mode}'; it must be one of {MODES}.")
+    fits = spec.action_mode in AXES if axes else spec.action_mode not in AXES
+    fits = fits and (spec.action_mode != BUTTONS or isinstance(spec.action, spaces.MultiBinary))
+    _require(fits, f"spec.action_mode is '{spec.action_mode}', which the action space {spec.action} cannot be.")
+    if spec.action_units:
+        count = len(spec.action_units)
+        _require(axes and count == width, f"spec.action_units has {count} units; the space {spec.action} has {width}.")
+    if spec.action_names:
+        count = int(spec.action.n) if isinstance(spec.action, spaces.Discrete) else width
+        _require(
+            len(spec.action_names) == count,
+            f"spec.action_names has {len(spec.action_names)} names for {count} actions.",
+        )
     for key, flat in spec.keys.items():
         try:
             spec.check_action(torch.tensor(flat).reshape(1, *shape_of(spec.action)), 1)
@@ -142,7 +180,7 @@ def _refuses_other_batches(world: World, seed: int, steps: int) -> None:
         _require_raises(TerrellaError, message, world.start, most + 1, rng)
 
 
-def _story(world: World, seed: int, steps: int) -> list[Observation]:
+def _episode(world: World, seed: int, steps: int) -> list[Observation]:
     rng, channels = make_rng(seed), tuple(world.spec.channels)
     state = world.start(1, rng)
     frames = [_copy(world.render(state, channels))]
@@ -163,14 +201,14 @@ def _global_chance() -> tuple:
 def _acts_deterministically(world: World, seed: int, steps: int) -> None:
     _ = torch.rand(1), np.random.random(), random.random()  # moves them on, so that seeding one again shows
     chance = _global_chance()
-    first, second = _story(world, seed, steps), _story(world, seed, steps)
-    _require(all(_same(a, b) for a, b in zip(first, second, strict=True)), "the same seed must tell the same story.")
+    first, second = _episode(world, seed, steps), _episode(world, seed, steps)
+    _require(all(_same(a, b) for a, b in zip(first, second, strict=True)), "the same seed must give the same episode.")
     _require(chance == _global_chance(), "chance must come from the rng alone, not from global generators.")
     for now, then in zip(first, first[1:]):
         if "done" in now and bool(now["done"]):
             paid = float(then["reward"]) if "reward" in then else 0.0
-            _require(bool(then["done"]), "a story that is done must stay done.")
-            _require(paid == 0, "a story that is done must give no more reward.")
+            _require(bool(then["done"]), "an episode that is done must stay done.")
+            _require(paid == 0, "an episode that is done must give no more reward.")
 
 
 def _refuses_junk(world: World, seed: int, steps: int) -> None:
@@ -252,11 +290,60 @@ def _batches(world: World, seed: int, steps: int) -> None:
     for entry in range(2):
         alone = world.render(states.at(entry), channels)
         for name in channels:
-            slack = 1.01 if alone[name].dtype == torch.uint8 else 1e-3  # a sum in another order may round otherwise
-            alike = torch.allclose(alone[name].double(), seen[name][entry : entry + 1].double(), rtol=1e-3, atol=slack)
+            alike = _close(alone[name], seen[name][entry : entry + 1])
             _require(alike, f"channel '{name}' of a batch entry depends on its neighbour.")
     turned = world.imagine(states.at([1, 0]), world.spec.sample_action(2, rng), rng)
     _check_observation(world, world.render(turned, channels), channels, 2)
+
+
+def _close(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """Equal but for what sums in another order may round otherwise."""
+    slack = 1.01 if one.dtype == torch.uint8 else 1e-3
+    return torch.allclose(one.double(), other.double(), rtol=1e-3, atol=slack)
+
+
+def _a_batch_equals_its_singles(world: World, seed: int, steps: int) -> None:
+    if world.spec.max_batch == 1:
+        return
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    states, actions = world.start(2, rng), world.spec.sample_action(2, rng)
+    together = _copy(world.render(world.imagine(states, actions, make_rng(seed + 1)), channels))
+    one_rng = make_rng(seed + 1)
+    for entry in range(2):
+        after = world.imagine(states.at(entry), actions[entry : entry + 1], one_rng)
+        alone = world.render(after, channels)
+        for name in channels:
+            message = f"channel '{name}' of a batch differs from that of single episodes stepped one after the other."
+            _require(_close(alone[name], together[name][entry : entry + 1]), message)
+
+
+def _forks_and_puts(world: World, seed: int, steps: int) -> None:
+    rng, channels = make_rng(seed), tuple(world.spec.channels)
+    state = world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng)
+    before = _copy(world.render(state, channels))
+    if world.spec.max_batch is not None and world.spec.max_batch < 2:
+        return
+    forked = state.fork(2)
+    _require(forked.batch == 2, "fork(2) of one state has batch 2.")
+    fresh = world.start(1, rng)
+    begun = _copy(world.render(fresh, channels))
+    mixed = forked.put(torch.tensor([1]), fresh)
+    for entry, expected in ((0, before), (1, begun)):
+        seen = world.render(mixed.at(entry), channels)
+        _require(all(_close(seen[name], expected[name]) for name in channels), "put changes the named entries alone.")
+    seen = world.render(forked.at(1), channels)
+    _require(all(_close(seen[name], before[name]) for name in channels), "a fork renders as what it was forked from.")
+
+
+def _gradients_reach_the_action(world: World, seed: int, steps: int) -> None:
+    rng = make_rng(seed)
+    state, action = world.start(1, rng), world.spec.sample_action(1, rng).float().requires_grad_()
+    seen = world.render(world.imagine(state, action, rng), tuple(world.spec.channels))
+    sums = [tensor.sum() for tensor in seen.values() if tensor.requires_grad]
+    message = "spec.differentiable promises gradients from a channel to the action, and none comes."
+    _require(bool(sums), message)
+    (gradient,) = torch.autograd.grad(torch.stack(sums).sum(), action, allow_unused=True)
+    _require(gradient is not None and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).any()), message)
 
 
 def _stale_states_are_refused(world: World, seed: int, steps: int) -> None:

@@ -23,9 +23,9 @@ def as_env(
     seed: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> WorldEnv:
-    """`num_envs` stories of `world` side by side.
+    """`num_envs` episodes of `world` side by side.
 
-    max_steps:      a story is truncated after that many steps.
+    max_steps:      an episode is truncated after that many steps.
     observation:    a channel's name, whose arrays are the observations; or several names, for a dictionary of arrays.
                     By default "observation" where the world has it, else "rgb".
     seed:           of the first `reset()`; later resets go on from there unless they are given one.
@@ -34,7 +34,7 @@ def as_env(
                     DISABLED: call reset(options={"reset_mask": bool [num_envs]}).
 
     Reward is the channel `reward` (0 where the world has none), terminated the channel `done`.
-    Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` stories.
+    Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` episodes.
     """
     return WorldEnv(world, num_envs, max_steps, observation, seed, autoreset_mode)
 
@@ -55,7 +55,7 @@ class WorldEnv(VectorEnv):
         most = spec.max_batch if spec.forkable else 1
         if num_envs < 1 or (most is not None and num_envs > most):
             raise TerrellaError(
-                f"{spec.name} holds 1 to {most or 'any number of'} stories at once; num_envs is {num_envs}."
+                f"{spec.name} holds 1 to {most or 'any number of'} episodes at once; num_envs is {num_envs}."
             )
         if max_steps is not None and max_steps < 1:
             raise TerrellaError(f"max_steps is a number of steps from 1 on, or None for no end; got {max_steps}.")
@@ -93,7 +93,7 @@ class WorldEnv(VectorEnv):
         return self._state
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """New stories in all environments, or in those of options["reset_mask"]; `seed` restarts all chance."""
+        """New episodes in all environments, or in those of options["reset_mask"]; `seed` restarts all chance."""
         super().reset(seed=seed)
         if seed is not None:
             self._rng = make_rng(seed)
@@ -124,11 +124,9 @@ class WorldEnv(VectorEnv):
         self.world.spec.check_action(actions, self.num_envs)
         if fresh.all():
             self._begin(fresh)
-        elif fresh.any():
-            live = torch.from_numpy(np.flatnonzero(~fresh))
-            self._state = self._restarted(state, fresh, self.world.imagine(state.at(live), actions[live], self._rng))
         else:
-            self._state = self.world.imagine(state, actions, self._rng)
+            moved = self.world.imagine(state, actions, self._rng)
+            self._state = self._restarted(moved, fresh) if fresh.any() else moved
         self._steps = np.where(fresh, 0, self._steps + 1)
         seen = self._look()
         rewards = (
@@ -154,14 +152,11 @@ class WorldEnv(VectorEnv):
         self._state = self.world.start(self.num_envs, self._rng)
         self._steps[mask], self._ended[mask] = 0, False
 
-    def _restarted(self, state: State, mask: np.ndarray, live: State | None = None) -> State:
-        """`state` with new starts where `mask`; `live` are the other entries, where they have moved on."""
-        keep, renew = np.flatnonzero(~mask), np.flatnonzero(mask)
-        live = state.at(torch.from_numpy(keep)) if live is None else live
-        started = self.world.start(len(renew), self._rng)
+    def _restarted(self, state: State, mask: np.ndarray) -> State:
+        """`state` with new starts where `mask`."""
+        renew = torch.from_numpy(np.flatnonzero(mask))
         self._steps[mask], self._ended[mask] = 0, False
-        back = torch.from_numpy(np.argsort(np.concatenate([keep, renew])))
-        return State.stack([live, started]).at(back)
+        return state.put(renew, self.world.start(len(renew), self._rng))
 
     def _restart_ended(self):
         ended = self._ended.copy()

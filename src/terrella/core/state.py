@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -12,7 +12,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from .errors import CheckpointError
+from .arena import Arena
+from .deferred import Deferred, Pick
+from .errors import CheckpointError, ContractError
+
+_ARENA = "arena:"  # how the names of an arena's parts begin in a file
 
 
 class State(Mapping):
@@ -20,54 +24,96 @@ class State(Mapping):
 
     `state["pose"]` reads one tensor, `state.at(i)` picks batch entries (int, slice or index tensor; the batch
     axis stays), `state.replace(pose=...)` makes a new value, `state.fork(n)` repeats each entry n times.
+
+    arenas: by the name of a pointer tensor (int64 rows, 0 for none), the arena that it points into. deferred: further
+    tensors, that are computed when they are first read.
     """
 
-    __slots__ = ("_tensors",)
+    __slots__ = ("_tensors", "_arenas", "_deferred", "_names", "__weakref__")
 
-    def __init__(self, tensors: Mapping[str, torch.Tensor]):
-        if not tensors:
-            raise ValueError("a State needs at least one tensor")
+    def __init__(
+        self,
+        tensors: Mapping[str, torch.Tensor],
+        arenas: Mapping[str, Arena] | None = None,
+        deferred: Deferred | None = None,
+    ):
+        late = () if deferred is None else tuple(name for name in deferred.names if name not in tensors)
         sizes = {name: (tensor.shape[0] if tensor.ndim else None) for name, tensor in tensors.items()}
+        sizes |= {name: deferred.batch for name in late if deferred is not None}
+        if not sizes:
+            raise ValueError("a State needs at least one tensor")
         if None in sizes.values() or len(set(sizes.values())) != 1:
             raise ValueError(f"every tensor of a State leads with the same batch axis; got {sizes}")
+        arenas = {name: arena for name, arena in (arenas or {}).items() if name in sizes}
+        for name, arena in arenas.items():
+            if name in tensors:
+                arena.hold(tensors[name])
         object.__setattr__(self, "_tensors", MappingProxyType(dict(tensors)))
+        object.__setattr__(self, "_arenas", MappingProxyType(arenas))
+        object.__setattr__(self, "_deferred", deferred if late else None)
+        object.__setattr__(self, "_names", tuple(sizes))
 
     def __setattr__(self, name, value):
         raise AttributeError("a State is a value: use state.replace(name=tensor)")
 
     def __getitem__(self, name: str) -> torch.Tensor:
-        return self._tensors[name]
+        if name in self._tensors:
+            return self._tensors[name]
+        if name not in self._names:
+            raise KeyError(name)
+        return self._deferred.values()[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._tensors)
+        return iter(self._names)
 
     def __len__(self) -> int:
-        return len(self._tensors)
+        return len(self._names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
 
     def __eq__(self, other) -> bool:
-        """The same names with the same tensors, bit for bit."""
+        """The same names with the same tensors, bit for bit; of an arena, the same rows."""
         return (
             isinstance(other, State)
             and set(self) == set(other)
-            and all(_same(self[name], other[name]) for name in self)
+            and all(_same(self[name], other[name]) for name in self if name not in self._arenas)
+            and all(_same_rows(self, other, name) for name in self._arenas)
         )
 
     __hash__ = None
 
     def __repr__(self) -> str:
-        inside = ", ".join(f"{name}{list(tensor.shape)}" for name, tensor in self.items())
-        return f"State({inside})"
+        shown = [f"{name}{list(tensor.shape)}" for name, tensor in self._tensors.items()]
+        shown += [f"{name}[{self.batch}, not yet computed]" for name in self._names if name not in self._tensors]
+        return f"State({', '.join(shown)})"
 
     @property
     def batch(self) -> int:
-        return next(iter(self._tensors.values())).shape[0]
+        return len(next(iter(self._tensors.values()))) if self._tensors else self._deferred.batch
+
+    @property
+    def device(self) -> torch.device:
+        return next((tensor.device for tensor in self._tensors.values()), torch.device("cpu"))
+
+    @property
+    def arenas(self) -> Mapping[str, Arena]:
+        return self._arenas
+
+    @property
+    def deferred(self) -> Deferred | None:
+        """What computes the tensors that nobody has read yet; None where none wait."""
+        return None if self._deferred is None or self._deferred.done else self._deferred
 
     @property
     def nbytes(self) -> int:
-        return sum(tensor.numel() * tensor.element_size() for tensor in self.values())
+        """Of the tensors that are there, what is repeated (by a fork) counted once; without the arenas."""
+        ready = [self[name] for name in self._names if name in self._tensors or self.deferred is None]
+        sizes = ([n for n, stride in zip(part.shape, part.stride()) if stride or not n] for part in ready)
+        return sum(part.element_size() * int(np.prod(size, dtype=np.int64)) for part, size in zip(ready, sizes))
 
     def replace(self, **tensors: torch.Tensor) -> State:
-        return State({**self._tensors, **tensors})
+        return State({**self._tensors, **tensors}, self._arenas, self._deferred)
 
     def at(self, index) -> State:
         """Batch entries `index` (int, slice, list or index tensor) as a State that still has a batch axis."""
@@ -75,47 +121,142 @@ class State(Mapping):
             index = [int(index)]
         elif isinstance(index, torch.Tensor) and index.ndim == 0:
             index = index.reshape(1)
-        return State({name: tensor[index] for name, tensor in self.items()})
+        return self._combined([self], lambda tensor: tensor[index], lambda rows: rows[index])
 
     def fork(self, n: int) -> State:
-        """Each batch entry n times in a row: [a, b].fork(2) = [a, a, b, b]."""
-        return State({name: tensor.repeat_interleave(n, dim=0) for name, tensor in self.items()})
+        """Each batch entry n times in a row: [a, b].fork(2) = [a, a, b, b]. The copies of a single entry take no room."""
+        if self.batch == 1:
+            return self._combined(
+                [self], lambda tensor: tensor.expand(n, *tensor.shape[1:]), lambda rows: rows.expand(n)
+            )
+        return self._combined([self], *[lambda tensor: tensor.repeat_interleave(n, dim=0)] * 2)
 
     def where(self, which: torch.Tensor, other: State) -> State:
         """This state's entries where `which` (bool [B]), the other's elsewhere."""
-        flags = {name: which.view(-1, *[1] * (tensor.ndim - 1)) for name, tensor in other.items()}
-        return State({name: torch.where(flags[name], self[name], tensor) for name, tensor in other.items()})
+        other = other.into(self._arenas)
+
+        def choose(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
+            return torch.where(which.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+
+        return self._combined([self, other], choose, choose)
+
+    def put(self, index, fresh: State) -> State:
+        """This state with its entries `index` (int64 [n], or bool [B]) replaced by those of `fresh` (a batch of n)."""
+        where = torch.as_tensor(index, device=self.device)
+        where = where.nonzero()[:, 0] if where.dtype == torch.bool else where.long()
+        if fresh.batch != len(where) or set(fresh) != set(self):
+            raise ValueError(f"put takes {len(where)} fresh entries of the same world; got {fresh}")
+
+        def put(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
+            return mine.index_copy(0, where, theirs)
+
+        return self._combined([self, fresh.into(self._arenas)], put, put)
 
     @staticmethod
     def stack(states: Sequence[State]) -> State:
         """States joined along the batch axis."""
         if not states:
             raise ValueError("nothing to stack")
-        names = set(states[0])
-        if any(set(state) != names for state in states):
-            raise ValueError("only states of the same world can be stacked")
-        return State({name: torch.cat([state[name] for state in states]) for name in states[0]})
+        first = states[0]
+        adopted = [first, *(state.into(first.arenas) for state in states[1:])]
+        return first._combined(adopted, *[lambda *tensors: torch.cat(tensors)] * 2)
+
+    def into(self, arenas: Arena | Mapping[str, Arena]) -> State:
+        """The same state with what it points at in the given arenas (one for all, or by pointer): rows of others are copied.
+        ContractError where an arena has another layout."""
+        changed = {}
+        for name, mine in self._arenas.items():
+            arena = arenas if isinstance(arenas, Arena) else arenas.get(name, mine)
+            if arena is not mine:
+                changed[name] = arena, arena.adopt(self[name], mine)
+        if not changed:
+            return self
+        held = {**self._arenas, **{name: arena for name, (arena, _) in changed.items()}}
+        tensors = {**self._tensors, **{name: pointer for name, (_, pointer) in changed.items()}}
+        return State(tensors, held, self._deferred)
 
     def to(self, device) -> State:
-        return State({name: tensor.to(device) for name, tensor in self.items()})
+        there = torch.device(device)
+        state = self.into(
+            {name: Arena(arena.parts, there) for name, arena in self._arenas.items() if arena.device != there}
+        )
+        return State({name: tensor.to(there) for name, tensor in state.items()}, state.arenas)
+
+    def narrowed(self, rows: torch.Tensor) -> State:
+        """`at(rows)`, where what waits is planned for those entries alone."""
+        deferred = self.deferred
+        if deferred is None:
+            return self.at(rows)
+        return State({name: tensor[rows] for name, tensor in self._tensors.items()}, self._arenas, deferred.at(rows))
 
     def save(self, path: str | Path) -> None:
-        """Writes one safetensors file."""
+        """Writes one safetensors file, with the rows that the state points at."""
         tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.items()}
-        save_file(tensors, str(path), metadata={"terrella": json.dumps({"kind": "state"})})
+        for name, arena in self._arenas.items():
+            rows, place = torch.unique(
+                torch.cat([tensors[name].new_zeros(1), tensors[name].flatten()]), return_inverse=True
+            )
+            tensors[name] = place[1:].view(tensors[name].shape)
+            for part in arena.parts:
+                tensors[f"{_ARENA}{name}:{part}"] = arena.read(part)[rows[1:].to(arena.device)].cpu()
+        about = {"kind": "state", "arenas": {name: list(arena.parts) for name, arena in self._arenas.items()}}
+        save_file(tensors, str(path), metadata={"terrella": json.dumps(about)})
 
     @staticmethod
     def load(path: str | Path) -> State:
-        """Reads what `save` wrote; CheckpointError where the file is missing or foreign."""
+        """Reads what `save` wrote, with arenas of its own; CheckpointError where the file is missing or foreign."""
         try:
             with safe_open(str(path), framework="pt") as file:
                 meta = json.loads((file.metadata() or {}).get("terrella", "{}"))
                 if not isinstance(meta, dict) or meta.get("kind") != "state":
                     raise CheckpointError(f"{path} is a safetensors file but holds no Terrella state.")
-                return State({name: file.get_tensor(name) for name in file.keys()})
-        except (OSError, SafetensorError, ValueError) as error:
+                tensors = {name: file.get_tensor(name) for name in file.keys() if not name.startswith(_ARENA)}
+                arenas = {}
+                for name, parts in meta.get("arenas", {}).items():
+                    rows = {part: file.get_tensor(f"{_ARENA}{name}:{part}") for part in parts}
+                    kinds = {part: (value.dtype, tuple(value.shape[1:])) for part, value in rows.items()}
+                    arenas[name] = Arena(kinds, room=1 + max(len(value) for value in rows.values()))
+                    held = arenas[name].keep(rows)  # in an arena without a past they are numbered from 1
+                    if int(tensors[name].max()) > len(held) or int(tensors[name].min()) < 0:
+                        raise CheckpointError(f"{path} points at rows that it does not hold.")
+                    tensors[name] = torch.cat([held.new_zeros(1), held])[tensors[name]]
+                return State(tensors, arenas)
+        except (OSError, SafetensorError, ValueError, KeyError, ContractError) as error:
             raise CheckpointError(f"{path} is not a saved state ({error}); write one with state.save(path).") from error
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _combined(
+        self,
+        states: Sequence[State],
+        combine: Callable[..., torch.Tensor],
+        pick: Callable[..., torch.Tensor],
+    ) -> State:
+        """`combine` of the states' tensors that are there; of what waits in one of them, `pick` of the rows' numbers."""
+        if any(set(state) != set(self) for state in states):
+            raise ValueError("only states of the same world can be stacked, put or mixed")
+        late = {name for state in states if state.deferred is not None for name in state if name not in state._tensors}
+        tensors = {name: combine(*(state[name] for state in states)) for name in self if name not in late}
+        if not late:
+            return State(tensors, self._arenas)
+        ends = np.cumsum([state.batch for state in states]).tolist()
+        numbers = [torch.arange(end - state.batch, end, device=self.device) for state, end in zip(states, ends)]
+        plan = Pick(tuple(states), pick(*numbers))
+        return State(tensors, self._arenas, Deferred([name for name in self if name in late], plan))
 
 
 def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+
+
+def _same_rows(one: State, other: State, name: str) -> bool:
+    """Whether two states' pointers of one name are nothing at the same places, and point at equal rows elsewhere."""
+    if name not in other.arenas or not one.arenas[name].same_layout(other.arenas[name]):
+        return False
+    mine, theirs = one[name], other[name]
+    if mine.shape != theirs.shape or not torch.equal(mine > 0, theirs > 0):
+        return False
+    some = mine > 0
+    pairs = ((one.arenas[name].read(part)[mine[some]], other.arenas[name].read(part)[theirs[some]])
+             for part in one.arenas[name].parts)  # fmt: skip
+    return all(_same(a, b) for a, b in pairs)

@@ -10,22 +10,27 @@ import torch
 from .spec import Spec
 from .state import State
 
-# name -> tensor that leads with the batch axis. rgb: uint8 [B, H, W, 3]; depth: float32 [B, h, w], metres along the
-# optical axis; pose: float32 [B, 7] = x, y, z in metres and quaternion w, x, y, z of T_world_cam, world z up, camera
-# x forward, y left, z up; reward: float32 [B]; done: bool [B]; known: float32 [B, H, W] in 0..1, the share of memory in
-# each pixel of rgb, the rest being invented; keyframes: float32 [B, N, 4] = x, y in metres, heading in radians, kind (0
-# empty, 1 recorded, 2 observed, 3 dreamt).
+# name -> tensor that leads with the batch axis. A name is a kind, or a kind and which one of it ("rgb.wrist"). rgb: uint8
+# [B, H, W, 3]; depth: float32 [B, h, w], metres along the optical axis; pose: float32 [B, 7] = x, y, z in metres and
+# quaternion w, x, y, z of T_world_cam, world z up, camera x forward, y left, z up; reward: float32 [B]; done: bool [B];
+# known: float32 [B, H, W] in 0..1, the share of memory in each pixel of rgb, the rest being invented; keyframes: float32
+# [B, N, 4] = x, y in metres, heading in radians, kind (0 empty, 1 recorded, 2 observed, 3 imagined); instruction: float32
+# [B, D], the embedding of a task's text. A goal is a mapping of channels, too.
 Observation = Mapping[str, torch.Tensor]
 
 
 @runtime_checkable
 class World(Protocol):
-    """Folds observations into a state, moves the state under an action, shows what can be seen from it."""
+    """Folds observations into a state, moves the state under an action, shows what can be seen from it.
+
+    Gradients and inference mode are the caller's choice: no verb forces either. Chance comes from `rng` alone, so that a
+    batch of B steps as B single episodes would that are stepped one after the other.
+    """
 
     spec: Spec
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        """`batch` states in which a story may begin."""
+        """`batch` states in which an episode may begin."""
         ...
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,15 +11,13 @@ import numpy as np
 import torch
 
 from ..core.errors import DatasetError
+from ..core.policy import Policy, act
 from ..core.world import Observation, World, make_rng
 from .format import Layout
 from .recorder import Recorder
 
 if TYPE_CHECKING:
     from ..exchange.live import Live
-
-# policy(observation, info, rng) -> action [1, *space.shape]; info = {"step": steps since the episode began}
-Policy = Callable[[Observation, Mapping[str, int], torch.Generator], torch.Tensor]
 
 
 def record(
@@ -63,9 +61,10 @@ def _episode(world, policy, recorder, frames, rng, progress, max_steps) -> None:
     channels = [name for name in world.spec.channels if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]
     state, left, done = world.start(1, rng), frames - recorder.rows, False
-    for step in range(min(max_steps, left - 1)):
+    memory = policy.begin(1, rng)
+    for _ in range(min(max_steps, left - 1)):
         seen = world.render(state, channels)
-        action = torch.as_tensor(policy(seen, {"step": step}, rng))
+        action, memory = act(policy, seen, memory, 1, world.spec, rng)
         state = world.imagine(state, action, rng)
         after = world.render(state, follow)
         done = bool(after["done"][0]) if "done" in after else False

@@ -21,7 +21,7 @@ import vizdoom
 from gymnasium import spaces
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, REWARD, Spec
+from ..core.spec import DONE, REWARD, Camera, Spec
 from ..core.state import State
 from .doom_map import Sectors, map_names, skies
 
@@ -110,7 +110,7 @@ class Doom:
                 for code, button in KEYS.items()
                 if button in self.buttons
             },
-            camera=CAMERA,
+            cameras={"rgb": Camera(CAMERA, config.size)},
             forkable=False,
             max_batch=1,
             card={"what": f"ViZDoom's {config.scenario} with Freedoom's art: the real game", "kind": "simulator"},

@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import ObservationError, TerrellaError
-from ..core.spec import DONE, Spec, dtype_of, shape_of
+from ..core.spec import DONE, Camera, Spec, dtype_of, shape_of
 from ..core.state import State
 
 
@@ -38,7 +38,7 @@ class Replay:
         name: str = "replay",
         spaces_given: Mapping[str, spaces.Space] | None = None,
         units: Mapping[str, str] | None = None,
-        camera: tuple[float, float, float, float] | None = None,
+        cameras: Mapping[str, Camera] | None = None,
     ):
         lengths = {key: len(array) for key, array in channels.items()}
         if not lengths or set(lengths.values()) != {len(actions) + 1}:
@@ -57,7 +57,7 @@ class Replay:
             observes=(),
             dt_s=dt_s,
             units=units or {},
-            camera=camera,
+            cameras=cameras or {},
             card={"what": f"a recorded episode of {self._last} steps", "kind": "recording"},
         )
 

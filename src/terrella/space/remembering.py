@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core.errors import ContractError, ObservationError
-from ..core.spec import Spec, shape_of
+from ..core.spec import Camera, Spec, shape_of
 from ..core.state import State
 from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
@@ -190,7 +190,7 @@ def _posed_spec(spec: Spec, size: tuple[int, int], estimator: Estimator | None, 
         units["pose"] = "m, quaternion wxyz of T_world_cam"
     if "depth" in channels or estimator is not None:  # of the pictures' size
         channels["depth"], units["depth"] = spaces.Box(0, np.inf, size, np.float32), "m"
-    return replace(spec, channels=channels, units=units, camera=camera)
+    return replace(spec, channels=channels, units=units, cameras={**spec.cameras, "rgb": Camera(camera, size)})
 
 
 def _inner(state: State) -> State:

@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import CheckpointError
-from ..core.spec import DONE, REWARD, Spec
+from ..core.spec import DONE, REWARD, Camera, Spec
 from ..space.estimator import Estimator, estimator_of, estimator_weights
 from ..space.keyframes import Keyframes
 from .controls import Controls
@@ -231,7 +231,7 @@ def video_spec(
         units=units,
         action_names=tuple(action_names),
         keys=keys,
-        camera=config.camera if config.geometry else None,
+        cameras={"rgb": Camera(config.camera, config.size)} if config.geometry else {},
         card=card,
         may_observe=(*marks, *vitals),
     )

@@ -1,10 +1,17 @@
-"""Reading tables and JSON that may be damaged or hostile: nothing is decoded before its size has been found sane."""
+"""Reading tables and JSON with pyarrow; what is damaged, or would fill the memory, is a clear error.
+
+pyarrow reads a damaged file without harm as long as nobody asks for its view of a column's metadata
+(`metadata.row_group(i).column(j)` ends the process), so row groups are chosen by the numbers in their column "index".
+What a file unpacks to is bounded by reading it in batches.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +21,28 @@ import pyarrow.parquet as pq
 
 from ...core.errors import DatasetError
 from ..format import to_numpy
-from .pages import Footer, Group, footer, largest
 
-_SLACK = 1 << 20  # bytes that any column may take beyond its numbers
-_LARGEST = 4 << 30  # bytes that one reading may unpack to
-_REPEATED = 1 << 30  # the same, of texts that repeat one another
+BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, RuntimeError)
+_BATCH = 64 << 20  # bytes that one batch of numbers may take
+_TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
+_TABLE = 64  # the same, of tables whose rows are short
+_LARGEST = 4 << 30  # bytes that one reading of numbers may unpack to
+_REPEATED = 1 << 30  # the same, where texts are among them: a few bytes of a file can repeat one without end
 _LARGEST_JSON = 256 << 20  # bytes; stats.json of many cameras is long, but not so long
-_BATCH = 64 << 20  # bytes that one batch of `batches` may unpack to
 _ROWS_A_BYTE = 64  # more rows than these for each byte of a file are a bomb: at least their counters differ
-_BYTES_A_BYTE = 1000
 _FEW_ROWS = 1_000_000
-_BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, RuntimeError)
 
 
 def read_whole(path: Path, columns: list[str] | None = None, most_rows: int | None = None) -> pa.Table:
     """A parquet file's columns (nested ones by their path); DatasetError where it is missing, damaged or far too large."""
     try:
-        told = footer(path)
-        if most_rows is not None and told.rows > most_rows:
-            raise ValueError(f"it claims {told.rows:,} rows where at most {most_rows:,} can be")
         with open_parquet(path) as file:
-            return _unpacked(path, file, told, range(len(told.groups)), columns)
-    except _BROKEN as error:
-        raise _damaged(path, error) from error
+            rows = file.metadata.num_rows
+            if most_rows is not None and rows > most_rows:
+                raise ValueError(f"it claims {rows:,} rows where at most {most_rows:,} can be")
+            return _bounded(file, range(file.num_row_groups), columns, _table_step(file, columns), _REPEATED)
+    except BROKEN as error:
+        raise damaged(path, error) from error
 
 
 def read_rows(
@@ -44,12 +50,9 @@ def read_rows(
 ) -> dict[str, pa.ChunkedArray]:
     """Columns of the rows `start` to `stop` (by the column "index") of a data file that may hold many episodes."""
     try:
-        told = footer(path)
-        groups = [at for at, group in enumerate(told.groups) if _may_hold(group, start, stop)]
-        for at in groups:
-            _promised(told.groups[at], columns, features)
+        groups = [at for at, group in enumerate(_groups(path)) if group[1] < stop and group[2] >= start]
         with open_parquet(path) as file:
-            table = _unpacked(path, file, told, groups, ["index", *columns])
+            table = _features(file, groups, ["index", *columns], features)
         index = table["index"].to_numpy()
         if len(index) != stop - start or not np.array_equal(index, np.arange(start, stop)):
             inside = (index >= start) & (index < stop)
@@ -59,107 +62,71 @@ def read_rows(
                     f"it has {int(inside.sum())} of the {stop - start} rows from {start} on, or they are moved"
                 )
         return {name: table[name] for name in columns}
-    except _BROKEN as error:
-        raise _damaged(path, error) from error
-
-
-def batches(
-    path: Path, features: Mapping[str, dict], columns: Sequence[str]
-) -> Iterator[tuple[int, int, pa.Table | DatasetError]]:
-    """(first row, rows, table) of a data file piece after piece, the largest of some megabytes; DatasetError where it is broken.
-
-    A piece that cannot be read is given as the error itself, and reading goes on with the next row group.
-    """
-    try:
-        told = footer(path)
-        if told.rows > max(_FEW_ROWS, _ROWS_A_BYTE * path.stat().st_size):
-            raise ValueError(f"it claims {told.rows:,} rows in {path.stat().st_size:,} bytes")
-        file = open_parquet(path)
-    except _BROKEN as error:
-        raise _damaged(path, error) from error
-    with file:
-        at = 0
-        for number, group in enumerate(told.groups):
-            done = 0
-            try:
-                _promised(group, columns, features)
-                size, widest = largest(path, [group], _tops(columns))
-                if size > max(_LARGEST, _BYTES_A_BYTE * path.stat().st_size):
-                    raise ValueError(f"it unpacks to {size:,} bytes")
-                step = group.rows if size <= _BATCH else min(_BATCH * group.rows // size, _BATCH // widest)
-                for batch in file.iter_batches(max(1, step), row_groups=[number], columns=list(columns)):
-                    if batch.num_rows:
-                        yield at + done, batch.num_rows, pa.Table.from_batches([batch])
-                    done += batch.num_rows
-                if done < group.rows:
-                    raise ValueError(f"{group.rows - done} rows are missing")
-            except _BROKEN as error:
-                yield at + done, max(0, group.rows - done), _damaged(path, error)
-            at += group.rows
+    except BROKEN as error:
+        raise damaged(path, error) from error
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """The file, its pages checked against their checksums where it has some; ValueError where its footer is damaged."""
-    footer(path)
-    return pq.ParquetFile(path, page_checksum_verification=True)
+    """The file, its pages checked against their checksums where it has some; ValueError where it claims absurdly many rows."""
+    file = pq.ParquetFile(path, page_checksum_verification=True)
+    if not 0 <= file.metadata.num_rows <= max(_FEW_ROWS, _ROWS_A_BYTE * os.stat(path).st_size):
+        raise ValueError(f"it claims {file.metadata.num_rows:,} rows in {os.stat(path).st_size:,} bytes")
+    return file
 
 
-def _unpacked(
-    path: Path, file: pq.ParquetFile, told: Footer, groups: Sequence[int], columns: list[str] | None
-) -> pa.Table:
-    """Whole row groups; ValueError where they unpack to more than _LARGEST."""
-    size, widest = largest(path, [told.groups[at] for at in groups], None if columns is None else _tops(columns))
-    if size <= _LARGEST:
-        return file.read_row_groups(groups, columns=columns)
+def _groups(path: Path) -> tuple[tuple[int, int, int], ...]:
+    """(rows, least, greatest "index") of each row group."""
+    about = os.stat(path)
+    return _found_groups(str(path), about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(1024)
+def _found_groups(path: str, _size: int, _changed_ns: int) -> tuple[tuple[int, int, int], ...]:
+    found = []
+    with open_parquet(Path(path)) as file:
+        for number in range(file.num_row_groups):
+            try:
+                index = file.read_row_group(number, columns=["index"])["index"].to_numpy()
+                found.append((len(index), int(index.min()), int(index.max())))
+            except BROKEN:  # whoever needs it is told; the rest can be read
+                found.append((0, -1, 1 << 62))
+    return tuple(found)
+
+
+def _features(file: pq.ParquetFile, groups: Sequence[int], columns: list[str], features: Mapping[str, dict]):
+    """Columns of a data file; ValueError where they unpack to more than the features promise."""
+    wide, texts = 8, False
+    for name in columns:
+        dtype = features[name]["dtype"] if name in features else "int64"
+        texts |= dtype in ("image", "string")
+        wide += 16 * math.prod(features[name]["shape"]) if dtype not in ("image", "string", "video") else 0
+    step = _TEXTS if texts else max(1, _BATCH // wide)
+    return _bounded(file, groups, columns, step, _REPEATED if texts else _LARGEST)
+
+
+def _table_step(file: pq.ParquetFile, columns: list[str] | None) -> int:
+    """Rows that are read at once of a table that no feature describes."""
+    numbers = all(
+        pa.types.is_primitive(field.type) for field in file.schema_arrow if columns is None or field.name in columns
+    )
+    return _FEW_ROWS if numbers else _TABLE
+
+
+def _bounded(file: pq.ParquetFile, groups: Iterable[int], columns: list[str] | None, step: int, most: int) -> pa.Table:
+    """Whole row groups, `step` rows at a time; ValueError where they unpack to more than `most` bytes."""
     parts, total = [], 0
-    for batch in file.iter_batches(max(1, _BATCH // widest), row_groups=groups, columns=columns):
+    for batch in file.iter_batches(step, row_groups=list(groups), columns=columns):
         total += batch.nbytes
-        if total > _REPEATED:
-            raise ValueError(f"it unpacks to more than {_REPEATED:,} bytes")
+        if total > most:
+            raise ValueError(f"it unpacks to more than {most:,} bytes")
         parts.append(batch)
-    return pa.Table.from_batches(parts, parts[0].schema if parts else file.schema_arrow)
+    form = parts[0].schema if parts else file.schema_arrow
+    table = pa.Table.from_batches(parts, form)
+    return table if parts or columns is None else table.select([name for name in columns if name in form.names])
 
 
-def _tops(columns: Sequence[str]) -> set[str]:
-    return {name.split(".")[0] for name in columns}
-
-
-def _may_hold(group: Group, start: int, stop: int) -> bool:
-    """Whether the row group may hold those rows, by the statistics of "index"; where they say nothing it may."""
-    for column in group.columns:
-        if column.path == "index" and column.least is not None and column.most is not None:
-            return column.least < stop and column.most >= start
-    return True
-
-
-def _promised(group: Group, columns: Collection[str], features: Mapping[str, dict]) -> None:
-    """ValueError where the group holds another number of values than its rows and the features' shapes give."""
-    for column in group.columns:
-        name = _top(column.path, features)
-        if name not in columns:
-            continue
-        dtype, numbers = features[name]["dtype"], math.prod(features[name]["shape"])
-        if column.values != group.rows * (1 if dtype in ("image", "string") else numbers):
-            raise ValueError(f"column '{name}' holds {column.values:,} numbers in {group.rows:,} rows")
-        if dtype == "image":
-            most = group.rows * (numbers * 2 + 65536)
-        else:
-            most = _LARGEST if dtype == "string" else column.values * 16
-        if column.unpacked > most + _SLACK:
-            raise ValueError(f"column '{name}' claims {column.unpacked:,} bytes")
-
-
-def _top(path: str, features: Mapping[str, dict]) -> str:
-    """The feature that a leaf of the schema belongs to: "action.list.element" is of "action"."""
-    if path in features:
-        return path
-    for part in (".list.", ".bytes", ".path"):
-        if part in path and path.split(part)[0] in features:
-            return path.split(part)[0]
-    return path.rsplit(".list", 1)[0]
-
-
-def _damaged(path: Path, error: BaseException) -> DatasetError:
+def damaged(path: Path, error: BaseException) -> DatasetError:
+    """What is said of a table that cannot be read."""
     short = (str(error).splitlines() or [type(error).__name__])[0][:300]
     return DatasetError(
         f"the table {path} is missing, truncated or not parquet ({short}); restore it from a copy, or remove its episode."
@@ -179,11 +146,15 @@ def read_json(path: Path) -> object:
 class ValuesOf(Sequence):
     """The lists of numbers of one column, each a numpy array, read row group by row group when they are looked at."""
 
-    def __init__(self, path: Path, column: str, count: int, first: int = 0):
-        self._path, self._column, self._count, self._first = path, column, count, first
-        self._starts = np.cumsum([0, *(group.rows for group in _told(path).groups)])
-        self._open = -1
-        self._group: pa.ChunkedArray | None = None
+    def __init__(self, path: Path, column: str, count: int):
+        self._path, self._column, self._count, self._first = path, column, count, 0
+        try:
+            with open_parquet(path) as file:
+                rows = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+        except BROKEN as error:
+            raise damaged(path, error) from error
+        self._starts = np.cumsum([0, *rows])
+        self._open, self._group = -1, None
 
     def __len__(self) -> int:
         return self._count
@@ -193,52 +164,39 @@ class ValuesOf(Sequence):
             raise IndexError(index)
         row = self._first + int(index) % self._count
         group = int(np.searchsorted(self._starts, row, side="right")) - 1
-        if group != self._open:
-            self._group, self._open = self._read(group), group
-        return self._value(row - int(self._starts[group]))
-
-    def _read(self, group: int):
         try:
-            with open_parquet(self._path) as file:
-                return _unpacked(self._path, file, _told(self._path), [group], [self._column])[self._column]
-        except _BROKEN as error:
-            raise _damaged(self._path, error) from error
+            if group != self._open:
+                with open_parquet(self._path) as file:
+                    self._group, self._open = self._read(file, group), group
+            return self._value(row - int(self._starts[group]))
+        except (AttributeError, IndexError, NotImplementedError, *BROKEN) as error:
+            raise damaged(self._path, error) from error
 
-    def _value(self, row: int):
+    def _read(self, file: pq.ParquetFile, group: int) -> Any:
+        return _bounded(file, [group], [self._column], _TABLE, _LARGEST)[self._column]
+
+    def _value(self, row: int) -> Any:
         assert self._group is not None
-        try:
-            return self._group[row].values.to_numpy(zero_copy_only=False)
-        except (AttributeError, IndexError, TypeError) as error:
-            raise _damaged(self._path, error) from error
+        return self._group[row].values.to_numpy(zero_copy_only=False)
 
 
 class RowsOf(ValuesOf):
     """One feature of the rows `start` to `stop` (by the column "index"): arrays of its shape, pictures as they are kept."""
 
     def __init__(self, path: Path, column: str, start: int, stop: int, features: Mapping[str, dict]):
-        index = read_whole(path, ["index"])["index"].to_numpy()
-        first = int(np.argmax(index == start)) if len(index) else 0
-        there = index[first : first + stop - start]
-        if len(there) != stop - start or not np.array_equal(there, np.arange(start, stop)):
-            raise _damaged(path, ValueError(f"it lacks rows of {start} to {stop - 1}, or they are moved"))
+        super().__init__(path, column, stop - start)
         self._features, self._shape = features, tuple(features[column]["shape"])
-        super().__init__(path, column, stop - start, first)
+        index = read_whole(path, ["index"])["index"].to_numpy()
+        self._first = int(np.argmax(index == start)) if len(index) else 0
+        there = index[self._first : self._first + stop - start]
+        if len(there) != stop - start or not np.array_equal(there, np.arange(start, stop)):
+            raise damaged(path, ValueError(f"it lacks rows of {start} to {stop - 1}, or they are moved"))
 
-    def _read(self, group: int):
-        try:
-            _promised(_told(self._path).groups[group], [self._column], self._features)
-            column = super()._read(group)
-            return column if self._features[self._column]["dtype"] == "image" else to_numpy(column, self._shape)
-        except (ValueError, TypeError, NotImplementedError) as error:
-            raise _damaged(self._path, error) from error
+    def _read(self, file: pq.ParquetFile, group: int) -> Any:
+        column = _features(file, [group], [self._column], self._features)[self._column]
+        return column if self._features[self._column]["dtype"] == "image" else to_numpy(column, self._shape)
 
-    def _value(self, row: int):
-        value: Any = self._group
+    def _value(self, row: int) -> Any:
+        value = self._group
+        assert value is not None
         return value[row] if isinstance(value, np.ndarray) else value[row].as_py()
-
-
-def _told(path: Path) -> Footer:
-    try:
-        return footer(path)
-    except _BROKEN as error:
-        raise _damaged(path, error) from error

@@ -8,7 +8,7 @@ from corridor import CELL_M, WALLS, Corridor
 from gymnasium import spaces
 
 from terrella.act import Explorer
-from terrella.core import Spec, make_rng
+from terrella.core import Camera, Spec, make_rng
 from terrella.space.camera import planar_pose
 
 
@@ -16,8 +16,9 @@ def _walk(seed: int, steps: int):
     world, rng = Corridor(), make_rng(seed)
     explorer = Explorer(world.spec)
     state, places, actions = world.start(1, rng), [], []
-    for step in range(steps):
-        action = explorer(world.render(state, ("depth", "pose")), {"step": step}, rng)
+    memory = explorer.begin(1, rng)
+    for _ in range(steps):
+        action, memory = explorer.act(world.render(state, ("depth", "pose")), memory, rng)
         state = world.imagine(state, world.spec.check_action(action, 1), rng)
         places.append(state["where"][0, :2].numpy())
         actions.append(action[0].numpy())
@@ -51,15 +52,25 @@ def test_it_fights_what_stands_in_sight_and_at_times_beside_the_mark():
     """A thing 3 m off, which the player may turn to and away from: where it is when the trigger is pressed."""
     legs = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "ATTACK")
     seen = {name: spaces.Box(0, 100, (24, 64)) for name in ("depth", "things")} | {"pose": spaces.Box(-9, 9, (7,))}
-    spec = Spec("range", spaces.MultiBinary(7), seen, (), 0.03, action_names=legs, camera=(0.5, 0.8, 0.5, 0.5))
+    spec = Spec(
+        "range",
+        spaces.MultiBinary(7),
+        seen,
+        (),
+        0.03,
+        action_names=legs,
+        cameras={"rgb": Camera((0.5, 0.8, 0.5, 0.5), (24, 64))},
+    )
     bearing = -torch.atan(((torch.arange(64) + 0.5) / 64 - 0.5) / 0.5)
     explorer, rng, yaw, off = Explorer(spec), make_rng(0), torch.zeros(1), []
-    for step in range(4000):
+    memory = explorer.begin(1, rng)
+    for _ in range(4000):
         there = (bearing + yaw).abs() < 0.1  # it stands along x
         depth = torch.where(there, 3.0, 8.0).expand(1, 24, 64)
         nothing = torch.zeros(1)
         pose = planar_pose(nothing, nothing, nothing, yaw)
-        action = explorer({"depth": depth, "things": there.expand(1, 24, 64), "pose": pose}, {"step": step}, rng)[0]
+        seen = {"depth": depth, "things": there.expand(1, 24, 64), "pose": pose}
+        (action,), memory = explorer.act(seen, memory, rng)
         if action[6]:
             off.append(float(yaw))
         yaw = torch.atan2((yaw + 0.05 * (action[4] - action[5])).sin(), (yaw + 0.05 * (action[4] - action[5])).cos())
@@ -71,7 +82,11 @@ def test_it_fights_what_stands_in_sight_and_at_times_beside_the_mark():
 def test_a_world_without_depth_gets_held_random_actions():
     spec = Spec("box", spaces.Box(-1, 1, (2,), np.float32), {"reward": spaces.Box(-1, 1, ())}, (), 0.1)
     explorer, rng = Explorer(spec), make_rng(0)
-    actions = torch.cat([explorer({}, {"step": step}, rng) for step in range(300)])
+    memory, taken = explorer.begin(1, rng), []
+    for _ in range(300):
+        action, memory = explorer.act({}, memory, rng)
+        taken.append(action)
+    actions = torch.cat(taken)
     spec.check_action(actions, 300)
     runs = np.diff(np.flatnonzero((actions[1:] != actions[:-1]).any(1).numpy()))
     assert runs.min() >= 3 and runs.max() <= 40 and len(runs) > 5

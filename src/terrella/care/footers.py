@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ...core.errors import DatasetError
+from ..core.errors import DatasetError
 from . import thrift
 from .pages import DATA, DATA_V2, DICTIONARY, Page, page_at
 from .tables import open_parquet

@@ -1,0 +1,92 @@
+"""The command `terrella play`: a world, or a game and a world side by side, on a page in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from .named import Device, Fast, load_named
+from .say import Host, Json, Port, Seed, Token, result
+
+if TYPE_CHECKING:
+    from ..core.world import World
+
+
+def play(
+    name: Positional[str],
+    image: Path | None = None,
+    compare: bool = False,
+    truth: str = "doom:my_way_home",
+    memory: bool = True,
+    remember: bool = False,
+    estimator: str | None = None,
+    memory_mb: float | None = None,
+    record: Path | None = None,
+    port: Port = 8765,
+    host: Host = "127.0.0.1",
+    token: Token = None,
+    device: Device = "auto",
+    fast: Fast = False,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Play a world in the browser: a learned world or a real game.
+
+    Args:
+        name: A name that `terrella list` shows, or the path of a checkpoint.
+        image: Start from this picture (any image file). Pictures can also be dropped on the page.
+        compare: Show the real game beside the learned world, under the same actions.
+        truth: The real game that --compare shows.
+        memory: --no-memory plays a learned world without its keyframes.
+        remember: Add a spatial memory to a world that has none.
+        estimator: Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one.
+        memory_mb: Size limit of the spatial memory in MiB; default: as the world was saved, or 16.
+        record: Folder of a dataset to which the page can record.
+    """
+    from ..core.errors import TerrellaError
+    from ..serve import serve
+
+    learned = load_named(name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb)
+    worlds = [learned]
+    picture = _first_picture(image, learned) if image is not None else None
+    if compare and picture is not None:
+        raise TerrellaError("--image cannot be compared with a game, which cannot go on from it; leave --compare out.")
+    if compare:
+        worlds = [_game_like(learned, truth), learned]
+    sink = None
+    if record is not None:
+        from ..data import Layout, Recorder
+
+        layout, folder = Layout.of(worlds[0].spec), record
+        sink = lambda: Recorder(folder, layout, "play")  # noqa: E731
+    names = [world.spec.name for world in worlds]
+
+    def ready(address: str) -> None:
+        result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
+
+    serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed, picture=picture)
+
+
+def _first_picture(path: Path, world: World) -> Any:
+    """The picture of an image file as the world would see it, after it was seen once: what is refused is refused now."""
+    from ..core.errors import ServeError
+    from ..core.world import make_rng
+    from ..serve import read_picture
+
+    if "rgb" not in world.spec.observes:
+        raise ServeError(f"{world.spec.name} takes no pictures, so it cannot begin with one; leave --image out.")
+    height, width = world.spec.channels["rgb"].shape[:2]
+    picture = read_picture(path, (height, width))
+    world.observe({"rgb": picture[None]}, None, make_rng(0))
+    return picture
+
+
+def _game_like(learned: World, name: str) -> World:
+    """The real game, with pictures of the size that the learned world shows."""
+    from .. import library
+
+    shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
+    like: dict[str, Any] = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
+    return library.load(name, **like)

@@ -1,0 +1,152 @@
+"""The commands `terrella record ...`: a script's or a person's episodes of a world become a dataset."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from .. import progress
+from .say import Json, Port, Seed, result, say
+
+if TYPE_CHECKING:
+    from ..core.world import World
+
+Watch = Annotated[
+    str | None,
+    arg(name="live-mcap", help="Also log to a file NAME.mcap, or to Foxglove at a port of this machine."),
+]
+
+
+def record_doom(
+    out: Path,
+    scenario: str = "my_way_home",
+    skill: int | None = None,
+    frames: int = 100_000,
+    height: int = 192,
+    human: bool = False,
+    live_mcap: Watch = None,
+    seed: Seed = 0,
+    port: Port = 8765,
+    json: Json = False,
+) -> None:
+    """Record the game Doom: pictures, depth, camera pose, actions and rewards.
+
+    Args:
+        out: Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
+        scenario: A ViZDoom scenario, or maps of a game: freedoom2/MAP01,MAP02 (each episode uses one of them).
+        skill: Difficulty, 1 to 5; default: the scenario's own.
+        frames: Frames to record in all. With --human there is no limit.
+        height: Height of the pictures in pixels; the width is 4/3 of it.
+        human: Play in the browser yourself; without it a script explores.
+    """
+    from .. import library
+
+    depth = (min(max(height, 1), 96), min(max(height, 1), 96) * 4 // 3)
+    world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth, skill=skill)
+    _record(world, out, frames, human, live_mcap, seed, port, json)
+
+
+def record_world(
+    name: Positional[str],
+    out: Path,
+    frames: int = 10_000,
+    size: tuple[int, int] | None = None,
+    pictures: Literal["auto", "png", "video"] = "auto",
+    human: bool = False,
+    live_mcap: Watch = None,
+    seed: Seed = 0,
+    port: Port = 8765,
+    json: Json = False,
+) -> None:
+    """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5) or a learned world.
+
+    Args:
+        name: A name that `terrella list` shows, or the path of a checkpoint.
+        out: Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
+        frames: Frames to record in all. With --human there is no limit.
+        size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
+        pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above.
+        human: Play in the browser yourself; without it a script explores.
+    """
+    from .. import library
+    from ..core.errors import TerrellaError
+
+    if size is not None and not name.startswith("gym:"):
+        raise TerrellaError("--size is for Gymnasium environments; other worlds show the size that they show.")
+    options: dict[str, Any] = {"size": size} if size else {}
+    world = library.load(name, **options)
+    if pictures == "auto":
+        drawn = world.spec.channels.get("rgb")
+        pictures = "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
+    _record(world, out, frames, human, live_mcap, seed, port, json, pictures)
+
+
+def _record(
+    world: World,
+    out: Path,
+    frames: int,
+    human: bool,
+    watch: str | None,
+    seed: int,
+    port: int,
+    json: bool,
+    pictures: Literal["video", "png"] = "video",
+) -> None:
+    from ..act.explorer import Explorer
+    from ..core.errors import DatasetError
+    from ..core.world import make_rng
+    from ..data import Dataset, Layout, Recorder, record
+
+    layout = replace(Layout.of(world.spec), pictures=pictures)
+    facts: dict[str, object] = {"dataset": str(out)}
+    with _watched(watch, layout, world.spec.name, facts) as live:
+        if human:
+            from ..serve import serve
+
+            def ready(address: str) -> None:
+                say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
+
+            sink = lambda: Recorder(out, layout, "play", live=live)  # noqa: E731
+            serve([world], port=port, sink_factory=sink, on_ready=ready, seed=seed)
+            if not out.exists():
+                raise DatasetError("nothing was recorded: press the record button on the page before you play.")
+        else:
+            with progress.shown("recording") as report:
+                player, rng = Explorer(world.spec), make_rng(seed)
+                done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
+            facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
+    dataset = Dataset(out)
+    facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
+    if dataset.has("rgb"):
+        facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
+    result(facts, json)
+
+
+@contextmanager
+def _watched(target: str | None, layout, name: str, facts: dict[str, object]):
+    """A Live to log to, None without a target; says where to look, and how much of it was lost."""
+    if target is None:
+        yield None
+        return
+    from ..exchange.live import Live
+
+    with Live(target, {**layout.sensors, **layout.streams}, name) as live:
+        where = f"ws://127.0.0.1:{live.port} (open it in Foxglove)" if live.port else target
+        say(f"Watch at {where}.")
+        yield live
+    facts |= {"watched": where, "watch_dropped": live.dropped, "watch_notes": list(live.notes)}
+
+
+def _contact_sheet(dataset, path: Path) -> Path:
+    """Twelve pictures from the whole recording, to see at a glance what it holds."""
+    from ..measure import strip
+
+    rows = [dataset.length * (2 * place + 1) // 24 for place in range(12)]
+    pictures = dataset.rgb_at(rows).reshape(3, 4, *dataset.rgb_at(rows[:1]).shape[1:])
+    lines = {f"from {rows[4 * line]:,}": pictures[line] for line in range(3)}
+    strip(lines, [""] * 4).convert("RGB").save(path, quality=88)
+    return path

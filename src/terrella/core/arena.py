@@ -1,0 +1,144 @@
+"""Arena: large immutable rows that lie once in shared tensors; states hold row numbers, and rows that none holds are freed.
+
+Row 0 is reserved: all zeros, "nothing". Rows are written once. Before an arena grows, it marks the rows that live pointer
+tensors hold (it keeps weak references to those) and takes the others again.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Mapping
+
+import torch
+
+from .errors import ContractError
+
+Parts = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]  # name -> dtype and shape of one row
+
+
+class Arena:
+    """Rows of several parts, `parts[name]` = (dtype, shape), on one device; safe to share between threads."""
+
+    def __init__(self, parts: Parts, device: torch.device | str = "cpu", room: int = 64):
+        self.parts = {name: (dtype, tuple(shape)) for name, (dtype, shape) in parts.items()}
+        self.device = torch.device(device)
+        self._lock = threading.RLock()
+        self._pointers: dict[int, weakref.ref[torch.Tensor]] = {}
+        self._newest = (
+            threading.local()
+        )  # the rows that each thread kept last, which it may still be building a state of
+        self._crowd = 1000  # pointers noted, above which the dead ones are dropped
+        with torch.inference_mode(False):
+            self._rows = {name: self._blank(name, room) for name in self.parts}
+            self._free = torch.arange(1, room)
+
+    def __repr__(self) -> str:
+        return f"Arena({', '.join(self.parts)}: {self.capacity} rows on {self.device})"
+
+    @property
+    def capacity(self) -> int:
+        """Rows that there is room for before the arena grows."""
+        return len(next(iter(self._rows.values())))
+
+    @property
+    def row_bytes(self) -> int:
+        return sum(dtype.itemsize * torch.Size(shape).numel() for dtype, shape in self.parts.values())
+
+    def same_layout(self, other: Arena) -> bool:
+        return self.parts == other.parts
+
+    def read(self, name: str) -> torch.Tensor:
+        """All rows of one part, [capacity, ...]; to be read only, at rows that a live pointer tensor holds."""
+        return self._rows[name]
+
+    def keep(self, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Writes n new rows, `values[name]` [n, ...] for every part; their numbers, int64 [n].
+
+        They stay while this tensor or a held one (`hold`; a State holds its pointers) lives, and until this thread keeps again.
+        """
+        if set(values) != set(self.parts):
+            raise ContractError(f"this arena keeps {', '.join(self.parts)}; got {', '.join(values)}.")
+        sizes = {len(value) for value in values.values()}
+        fits = all(tuple(value.shape[1:]) == self.parts[name][1] for name, value in values.items())
+        if len(sizes) != 1 or not fits:
+            shapes = {name: tuple(value.shape) for name, value in values.items()}
+            raise ContractError(f"every part needs n rows of its shape, {self.parts}; got {shapes}.")
+        count = sizes.pop()
+        if self.device.type == "meta":
+            return torch.zeros(count, dtype=torch.int64, device=self.device)
+        with self._lock, torch.inference_mode(False), torch.no_grad():
+            if count > len(self._free):
+                self._sweep(count)
+            rows, self._free = self._free[:count].to(self.device), self._free[count:]
+            for name, value in values.items():
+                self._rows[name].index_copy_(0, rows, value.detach().to(self._rows[name]))
+            self._newest.rows = rows
+            return self.hold(rows)
+
+    def hold(self, pointer: torch.Tensor) -> torch.Tensor:
+        """Takes note that `pointer`, int64 rows of any shape, holds its rows for as long as it lives; returns it."""
+        with self._lock:
+            self._pointers[id(pointer)] = weakref.ref(pointer)
+            if len(self._pointers) > self._crowd:
+                self._living()
+        return pointer
+
+    def used(self) -> torch.Tensor:
+        """Which rows live pointer tensors hold: bool [capacity]."""
+        marks = torch.zeros(self.capacity, dtype=torch.bool, device=self.device)
+        with self._lock:
+            for pointer in self._living():
+                marks[_distinct(pointer).reshape(-1)] = True
+        marks[0] = True
+        return marks
+
+    def adopt(self, pointer: torch.Tensor, other: Arena) -> torch.Tensor:
+        """The same rows of `other` copied here: their new numbers, in the shape of `pointer`."""
+        if other is self:
+            return pointer
+        if not self.same_layout(other):
+            raise ContractError(
+                f"a state's memory has another layout ({other.parts}) than this world's ({self.parts})."
+            )
+        rows, where = torch.unique(pointer, return_inverse=True)
+        rows, where = (rows[1:], where) if len(rows) and rows[0] == 0 else (rows, where + 1)
+        new = self.keep({name: other.read(name)[rows].to(self.device) for name in self.parts})
+        return self.hold(torch.cat([new.new_zeros(1), new])[where.to(self.device)])
+
+    def _living(self) -> list[torch.Tensor]:
+        """The pointer tensors that still live; the others are forgotten."""
+        found = [(key, ref, ref()) for key, ref in self._pointers.items()]
+        self._pointers = {key: ref for key, ref, pointer in found if pointer is not None}
+        self._crowd = 1000 + 2 * len(self._pointers)
+        return [pointer for _, _, pointer in found if pointer is not None]
+
+    def _sweep(self, count: int) -> None:
+        """Makes at least `count` rows free: those that no pointer holds; the arena grows where few are."""
+        marks = self.used().cpu()
+        free = (~marks).nonzero()[:, 0]
+        before = self.capacity
+        if len(free) < max(count, before // 4):  # else it would sweep again soon
+            more = max(before, count)
+            for name, old in self._rows.items():
+                grown = self._blank(name, before + more)
+                grown[:before] = old
+                self._rows[name] = grown
+            free = torch.cat([free, torch.arange(before, before + more)])
+        self._free = free
+
+    def _blank(self, name: str, rows: int) -> torch.Tensor:
+        dtype, shape = self.parts[name]
+        blank = torch.empty(
+            (rows, *shape), dtype=dtype, device=self.device
+        )  # the system gives memory when it is written
+        blank[:1] = 0
+        return blank
+
+
+def _distinct(pointer: torch.Tensor) -> torch.Tensor:
+    """The tensor without the repetitions of an expanded axis."""
+    for axis, stride in enumerate(pointer.stride()):
+        if stride == 0 and pointer.shape[axis] > 1:
+            pointer = pointer.narrow(axis, 0, 1)
+    return pointer

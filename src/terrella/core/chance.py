@@ -1,0 +1,73 @@
+"""Chance by counting: one seed per batch entry, from which any tensor of noise follows, on any device and in any batch.
+
+An entry's noise is a hash of (its seed, stream, position): splitmix64 (Steele, Lea & Flood 2014), as in the counter-based
+generators of Salmon et al. 2011. So a batch of B equals B singles, and a frame may be drawn long after its step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+GOLDEN, FIRST, SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15  # of splitmix64, as signed 64 bit
+
+
+def seeds(batch: int, rng: torch.Generator, device: torch.device | str | None = None) -> torch.Tensor:
+    """One draw from `rng` for each entry: int64 [batch]. B at once equal B singles, one after the other."""
+    low, high, there = -(2**63), 2**63 - 1, rng.device
+    if there.type == "cpu":
+        drawn = torch.randint(low, high, (batch,), generator=rng)
+    else:  # there a batch is no sequence of singles
+        ones = [torch.randint(low, high, (1,), generator=rng, device=there) for _ in range(batch)]
+        drawn = torch.cat(ones) if ones else torch.zeros(0, dtype=torch.int64, device=there)
+    return drawn if device is None else drawn.to(device)
+
+
+def uniform(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
+    """float32 [B, *shape] in [0, 1): one of 2**24 steps each; another `stream`, other numbers."""
+    return _halves(seeds, math.prod(shape), stream)[1].view(len(seeds), *shape)
+
+
+def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
+    """float32 [B, *shape], standard normal (Box and Muller 1958)."""
+    count = math.prod(shape)
+    high, low = _halves(seeds, (count + 1) // 2, stream)
+    radius, angle = high.add_(2.0**-25).log_().mul_(-2).sqrt_(), low.mul_(2 * math.pi)
+    both = torch.cat([angle.cos().mul_(radius), angle.sin_().mul_(radius)], 1)
+    return both[:, :count].reshape(len(seeds), *shape)
+
+
+def choice(seeds: torch.Tensor, probabilities: torch.Tensor, stream: int = 0) -> torch.Tensor:
+    """int64 [B, ...] drawn from `probabilities` [B, ..., K], which need not add up to 1; those of 0 are never drawn."""
+    sums = probabilities.double().cumsum(-1)
+    point = uniform(seeds, probabilities.shape[1:-1], stream).double()[..., None] * sums[..., -1:]
+    return (sums <= point).sum(-1).clamp_max(probabilities.shape[-1] - 1)
+
+
+def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The upper and the lower half of `count` hashes of each seed, as float32 [B, count] in [0, 1), multiples of 2**-24."""
+    if seeds.device.type != "cpu":
+        return _halves_slowly(seeds, count, stream)
+    from .kernels_numba import halves  # numba takes half a second to import
+
+    high, low = torch.empty(2, len(seeds), count).unbind(0)
+    halves(seeds.contiguous().numpy(), stream, high.numpy(), low.numpy())
+    return high, low
+
+
+def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same as `_halves`, in plain tensor algebra; the way on a GPU."""
+    key = _hashed(seeds + _hashed(torch.full_like(seeds, stream)))[:, None]
+    mixed = _hashed(key + torch.arange(count, device=seeds.device) * GOLDEN)
+    high, low = (mixed >> 40) & 0xFFFFFF, (mixed >> 8) & 0xFFFFFF
+    return high.float() * 2.0**-24, low.float() * 2.0**-24
+
+
+def _hashed(x: torch.Tensor) -> torch.Tensor:
+    """splitmix64's mixing of int64; a shift to the right brings in zeros."""
+    x = x + GOLDEN
+    x = (x ^ ((x >> 30) & (2**34 - 1))) * FIRST
+    x = (x ^ ((x >> 27) & (2**37 - 1))) * SECOND
+    return x ^ ((x >> 31) & (2**33 - 1))

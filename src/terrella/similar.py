@@ -1,0 +1,13 @@
+"""Says which known name a misspelt one is likest, for messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """ "; did you mean 'play'?" where one of the known names is like it, else an empty string."""
+    names = {one.lower(): one for one in known}
+    close = get_close_matches(name.lower(), list(names), n=1, cutoff=0.6)
+    return f"; did you mean '{names[close[0]]}'?" if close else ""
