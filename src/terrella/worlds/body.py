@@ -6,11 +6,10 @@ import copy
 from collections.abc import Mapping
 from typing import final
 
-import numpy as np
 import torch
-from gymnasium import spaces
 from torch import nn
 
+from ..core.spec import POSE, POSE_UNIT
 from ..core.state import State
 from ..space.camera import planar_pose, yaw
 from ..space.floorplan import slide
@@ -18,7 +17,6 @@ from .config import MotionConfig
 from .parts import Channels, Walls
 
 FASTEST_M = 1.0  # a step; what evidence moves by more has been put there, and has no speed
-POSE = spaces.Box(-np.inf, np.inf, (7,), np.float32)
 
 
 class Motion(nn.Module):
@@ -72,7 +70,7 @@ class MotionBody:
         return MotionBody(copy.deepcopy(self.motion).to(device), self.config)
 
     def channels(self) -> Channels:
-        return Channels({"pose": POSE}, {"pose": "m, quaternion wxyz of T_world_cam"}, ("pose",))
+        return Channels({"pose": POSE}, {"pose": POSE_UNIT}, ("pose",))
 
     def blank(self, batch: int, pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """A body that stands still at `pose` [B, 7]."""

@@ -8,21 +8,37 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-BUTTONS, CHOICE, AXES = "buttons", "choice", "axes"
+from ..core.errors import ContractError
+from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
+
+AXES = "axes"
 
 
 @dataclass(frozen=True)
 class Controls:
     """kind: "buttons", each 0 or 1; "choice", a whole number from low to high; "axes", numbers between low and high.
-    low and high: limits, one for each number of an action."""
+    low and high: limits, one for each number of an action. What axes mean: mode, units and frame, as in Spec."""
 
     kind: str
     low: tuple[float, ...]
     high: tuple[float, ...]
+    mode: str = ""
+    units: tuple[str, ...] = ()
+    frame: str = ""
 
     @staticmethod
     def buttons(count: int) -> Controls:
         return Controls(BUTTONS, (0.0,) * count, (1.0,) * count)
+
+    @staticmethod
+    def of(spec: Spec) -> Controls:
+        """Those of a world with this spec; ContractError for axes without limits and for actions that are no plain list."""
+        low, high = (np.asarray(limit, np.float64).ravel() for limit in spec.action_limits)
+        if len(shape_of(spec.action)) > 1 or not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise ContractError(f"{spec.name} has actions in {spec.action}; buttons, one choice or limited axes can be learned.")
+        kind = spec.action_mode if spec.action_mode in (BUTTONS, CHOICE) else AXES
+        meaning = spec.action_mode if kind == AXES else "", tuple(spec.action_units), spec.action_frame
+        return Controls(kind, tuple(low.tolist()), tuple(high.tolist()), *meaning)
 
     @property
     def numbers(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import torch
 import torch.nn.functional as F
@@ -43,14 +44,17 @@ class Block(nn.Module):
         return F.silu(x + self.second(inner))
 
 
+@final
 class Generator(nn.Module):
     """A U-Net that, from noise and what memory knows, predicts the clean frame (flow matching, x-prediction).
 
     Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what
     is known comes through as sharp as it was seen. It begins with a 2x pixel-unshuffle: a quarter of the cost.
     With `residual` it is the newest frame and what the net changes in it: where hardly a pixel ever changes, a mixture
-    soon copies, and then no gradient tells it otherwise.
+    soon copies, and then no gradient corrects it.
     """
+
+    kind = "unet"
 
     def __init__(self, config: GeneratorConfig):
         super().__init__()

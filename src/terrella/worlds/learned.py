@@ -18,9 +18,9 @@ import torch
 from torch import nn
 
 from ..core import chance
-from ..core.deferred import Deferred
+from ..core.deferred import Deferred, Step
 from ..core.errors import ContractError
-from ..core.spec import Spec
+from ..core.spec import Camera, Spec
 from ..core.state import State
 from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes
@@ -163,7 +163,10 @@ class LearnedWorld:
             units={name: unit for part in said for name, unit in part.units.items()},
             action_names=tuple(about.action_names),
             keys=about.keys,
-            camera=scene.camera,
+            cameras={"rgb": Camera(scene.camera, self.size)} if scene.camera else {},
+            action_units=about.controls.units,
+            action_mode=about.controls.mode,
+            action_frame=about.controls.frame,
             card=card,
             may_observe=tuple(name for part in said for name in part.may_observe),
         )
@@ -270,8 +273,8 @@ class LearnedWorld:
     def _draw(self, asked: State, before: State, seeds: torch.Tensor, still: torch.Tensor) -> State:
         """`asked` with its frame, which is drawn when it is first read; entries that are `still` [B] keep that of `before`."""
         now = {name: asked[name] for name in asked if name not in self._drawn_names}
-        frame = Deferred(self._drawn_names, self._frame, before, {**now, "seeds": seeds, "still": still})
-        return State(now, asked.arenas, frame)
+        frame = Step(self._frame, before, {**now, "seeds": seeds, "still": still})
+        return State(now, asked.arenas, Deferred(self._drawn_names, frame))
 
     def _frame(self, before: State, now: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """The tensors that follow from drawing the frame of the state that `before` and `now` make."""
