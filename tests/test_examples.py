@@ -19,7 +19,12 @@ def example(name: str) -> dict:
 
 
 def test_no_example_is_forgotten_here():
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {"00_hello.py", "01_random_shooting.py", "02_gym_env.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {
+        "00_hello.py",
+        "01_random_shooting.py",
+        "02_gym_env.py",
+        "03_two_cameras.py",
+    }
 
 
 def test_hello(tmp_path):
@@ -40,3 +45,13 @@ def test_one_planner_balances_by_the_truth_and_by_a_learned_world():
 def test_a_world_as_a_gymnasium_environment():
     result = example("02_gym_env.py")["main"]()
     assert result["episodes"] > 10 and 9 < result["mean_return"] < 60
+
+
+def test_a_robot_with_two_cameras_is_recorded(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # a machine without OpenGL
+        pytest.skip(f"MuJoCo cannot draw here ({error}): install libegl1 and set MUJOCO_GL=egl")
+    found = example("03_two_cameras.py")["main"](tmp_path / "robot", 40)
+    assert found["rows"] == 40 and len(found["cameras"]) == 2

@@ -10,9 +10,10 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from terrella.core import State, make_rng
+from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.core.spec import POSE, POSE_UNIT
+from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
 
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
 
@@ -322,8 +323,8 @@ class Painter(gymnasium.Env):
         return picture
 
 
-def test_a_pictured_observation_is_the_picture_made_small_and_info_can_be_told():
-    world, rng = GymnasiumWorld(Painter, size=(4, 6), told=("laps",)), make_rng(0)
+def test_a_pictured_observation_is_the_picture_made_small_and_info_gives_channels():
+    world, rng = GymnasiumWorld(Painter, size=(4, 6), info_channels=("laps",)), make_rng(0)
     assert set(world.spec.channels) == {"rgb", "reward", "done", "laps"} and world.spec.forkable
     state = world.start(2, rng)
     gas, nothing = [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
@@ -340,3 +341,67 @@ def test_arrow_keys_steer_give_gas_and_brake():
     keys = GymnasiumWorld(Painter).spec.keys
     assert keys["ArrowLeft"] == [-1, 0, 0] and keys["ArrowRight"] == [1, 0, 0]
     assert keys["ArrowUp"] == [0, 1, 0] and keys["ArrowDown"] == [0, 0, 1]
+
+
+class Turntable(gymnasium.Env):
+    """A camera that turns by its action, and a second one that looks the other way; an adapter names what they see."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    render_mode = "rgb_array"
+    terrella = Adapter(
+        channels={
+            "depth": Channel(
+                lambda env: np.full((8, 12), 1.0 + env.angle**2), spaces.Box(0, 9e9, (8, 12), np.float32), "m"
+            ),
+            "pose": Channel(lambda env: (0, 0, 0, np.cos(env.angle / 2), 0, 0, np.sin(env.angle / 2)), POSE, POSE_UNIT),
+            "rgb.back": Channel(lambda env: env.picture(env.angle + np.pi), spaces.Box(0, 255, (8, 12, 3), np.uint8)),
+        },
+        cameras={
+            "rgb": Camera((0.5, 0.75, 0.5, 0.5), (8, 12)),
+            "rgb.back": Camera((0.5, 0.75, 0.5, 0.5), (8, 12), mount=(0, 0, 0, 0, 0, 0, 1)),
+        },
+        action_names=("turn",),
+        action_units=("rad/s",),
+        action_mode="velocity",
+    )
+
+    def __init__(self):
+        self.angle = 0.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.angle = float(self.np_random.uniform(-1, 1))
+        return np.array([self.angle]), {}
+
+    def step(self, action):
+        self.angle += 0.1 * float(action[0])
+        return np.array([self.angle]), 0.0, False, False, {}
+
+    def render(self):
+        return self.picture(self.angle)
+
+    def picture(self, angle):
+        return np.full((8, 12, 3), 127 + 100 * np.sin(angle), np.uint8)
+
+
+def test_an_adapter_names_depth_pose_cameras_and_what_actions_mean():
+    world, rng = GymnasiumWorld(Turntable), make_rng(0)
+    assert {"batches", "states_can_be_saved"} <= set(check_world(world))
+    spec = world.spec
+    assert spec.action_units == ("rad/s",) and spec.action_mode == "velocity" and spec.units["depth"] == "m"
+    assert spec.kinds("rgb") == ("rgb", "rgb.back") and spec.camera == (0.5, 0.75, 0.5, 0.5)
+    state = world.start(2, rng)
+    angle = state["observation"][:, 0]
+    seen = world.render(state, ("depth", "pose", "rgb", "rgb.back"))
+    assert torch.allclose(seen["depth"][:, 0, 0], (1 + angle**2).float()) and seen["rgb"].shape == (2, 8, 12, 3)
+    assert torch.allclose(seen["pose"][:, 6], (angle / 2).sin().float())
+    assert (seen["rgb"][0].int() + seen["rgb.back"][0].int() - 253).abs().max() <= 2
+
+
+def test_a_channel_of_another_shape_than_it_declares_is_refused_by_name():
+    wrong = Adapter(channels={"depth": Channel(lambda env: np.zeros(3), spaces.Box(0, 1, (2,), np.float32))})
+    world = GymnasiumWorld(Turntable, adapter=wrong)
+    with pytest.raises(TerrellaError, match="gave 'depth' of shape"):
+        world.render(world.start(1, make_rng(0)), ("depth",))

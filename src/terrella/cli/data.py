@@ -1,7 +1,9 @@
-"""The commands that look after recordings: doctor, convert, merge, view."""
+"""The commands that look after recordings: doctor, convert, merge, view, label."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from .. import progress
-from .say import Host, Json, Port, Seed, Token, result
+from .say import Host, Json, Port, Seed, Token, result, say
 
 Fps = Annotated[float | None, arg(help="Rows a second; without it those that the recording has.")]
 Policy = Annotated[
@@ -75,10 +77,22 @@ def convert(
 
     found = open_source(source, fps, episodes, seed)
     rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, None, pictures)
-    with progress.shown(f"converting {found.name}") as report:
-        notes = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
-    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "notes": notes}
-    result(facts, json, "\n".join([*(f"note: {note}" for note in notes), f"{source} is now {target}"]))
+    with _whole_or_nothing(target), progress.shown(f"converting {found.name}") as report:
+        left_out = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
+    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "left_out": left_out}
+    result(
+        facts, json, "\n".join([*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"])
+    )
+
+
+@contextmanager
+def _whole_or_nothing(target: Path) -> Iterator[None]:
+    """Says what Ctrl-C leaves of a command that writes all of `target` or nothing."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"terrella: stopped; nothing was written at {target}, and what was read is untouched.")
+        raise SystemExit(130) from None
 
 
 def merge(
@@ -102,7 +116,7 @@ def merge(
     from ..exchange.merging.merge import merge_into
 
     found = {path: open_source(path) for path in sources}
-    with progress.shown("merging") as report:
+    with _whole_or_nothing(out), progress.shown("merging") as report:
         facts, text = merge_into(found, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
     result(facts, json, text)
 
@@ -123,14 +137,15 @@ def view(
         rerun: Hand it to Rerun instead, where that is installed.
         out: Folder to which the page exports the episodes that are not marked bad; without it FOLDER-good.
     """
-    from ..exchange.browse import browse
-    from ..exchange.convert import open_source
-
     if rerun:
+        from ..exchange.convert import open_source
         from ..exchange.formats import rerun as viewer
 
-        viewer.show(open_source(folder))
+        for what in viewer.show(open_source(folder)):
+            say(f"left out: {what}.")
         return
+    from ..care import repair
+    from ..exchange.browse import browse
     from ..serve.viewer import view as serve
 
     def ready(address: str) -> None:
@@ -138,7 +153,7 @@ def view(
 
     here = Path(folder).resolve() if "://" not in folder else Path.cwd() / folder.rstrip("/").rsplit("/", 1)[-1]
     good = out or here.with_name(f"{here.name}-good")
-    serve(browse(folder), port, host, token, ready, good)
+    serve(browse(folder, carry=repair), port, host, token, ready, good)
 
 
 def label(

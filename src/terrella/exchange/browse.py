@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DatasetError
+from ..data.dataset import Dataset
 from ..data.format import INFO
 from ..data.source import Readings, Sensor, Source, Take
 from ..data.storage.durable import write_json
+from .convert import open_source, write_source
+from .poses import pose_columns
 
 MARKS = ".terrella-marks.json"  # beside the recording, in its folder
 _OPEN = 2  # takes kept open at once
@@ -69,6 +72,7 @@ class Browse:
     ):
         self.source, self._marks_path, self._export = source, Path(marks), export
         self._open = take or _Walk(source).take
+        self._texts = {name for name, sensor in source.sensors.items() if sensor.dtype == "string"}
         self.entries = tuple(entries if entries is not None else map(Entry.of, source.takes()))
         self._takes: OrderedDict[int, _OpenTake] = OrderedDict()
         self._bad = _read_marks(self._marks_path)
@@ -83,7 +87,7 @@ class Browse:
             "robot": source.robot,
             "fps": source.fps,
             "notes": list(source.notes),
-            "sensors": [_describe(source.sensors[name]) for name in self._names()],
+            "sensors": [_describe(source.sensors[name]) for name in self._names() if name not in self._texts],
             "can_export": self._export is not None,
         }
 
@@ -93,13 +97,17 @@ class Browse:
 
     def episode(self, number: int) -> dict:
         """One episode as JSON: seconds, task, start_ns (text: it is too long for a JSON number in a browser), language
-        ([[time_s, text], ...], from the take's fact of that name) and per sensor count and fault.
+        ([[time_s, text], ...]: the instruction as it changes, and what sensors of text say) and per sensor count and fault.
 
         A fault is a sentence that says why a sensor cannot be shown; "" where it can.
         """
         opened = self._take(number)
         sensors, ends = {}, [0.0]
+        language = _language(opened.take)
         for name in opened.take.readings:
+            if name in self._texts:
+                language += opened.texts(name)
+                continue
             try:
                 times = opened.times(name)
                 sensors[name] = {"count": len(times), "fault": ""}
@@ -112,7 +120,7 @@ class Browse:
             "seconds": max(ends),
             "task": opened.take.task,
             "start_ns": None if start is None else str(start),
-            "language": _language(opened.take),
+            "language": sorted(language, key=lambda pair: pair[0]),
             "sensors": sensors,
         }
 
@@ -239,6 +247,18 @@ class _OpenTake:
             self._series[sensor] = whole
         return self._series[sensor]
 
+    def texts(self, sensor: str) -> list[list]:
+        """[[time_s, "name: text"], ...] of a sensor of text, where it changes; its fault, where it cannot be read."""
+        label, found = sensor.rpartition(".")[2], []
+        try:
+            for time_s, value in zip(self.times(sensor).tolist(), self._readings(sensor).values):
+                text = f"{label}: {np.asarray(value).reshape(-1)[0]}"
+                if not found or found[-1][1] != text:
+                    found.append([time_s, text])
+        except DatasetError as error:
+            found.append([0.0, str(error)])
+        return found
+
     def _checked_times(self, sensor: str) -> np.ndarray:
         readings = self._readings(sensor)
         times = np.asarray(readings.time_s, dtype=np.float64).reshape(-1)
@@ -312,37 +332,6 @@ def _describe(sensor: Sensor) -> dict:
     }
 
 
-_PREFIX = "(?:|p|pos|position|translation|pose)"
-_TURN = "(?:q|quat|quaternion|rotation|orientation)"
-
-
-def pose_columns(sensor: Sensor) -> dict | None:
-    """Which numbers of a vector are a pose on the ground, found by their names: {"x", "y", "quaternion": [w, x, y, z] or
-    None, "yaw": column or None, "degrees"}. None where it holds no position in metres.
-
-    The world's z is up, and a body looks along its own x. Quaternions and yaw turn the body's axes into the world's.
-    """
-    if not sensor.dtype.startswith("float"):
-        return None
-    plain = [re.sub(r"[^a-z]", "", re.sub(r"_(m|rad|deg)$", "", name.lower())) for name in sensor.names]
-
-    def place(pattern: str) -> int | None:
-        return next((at for at, name in enumerate(plain) if re.fullmatch(pattern, name)), None)
-
-    x, y = place(f"{_PREFIX}x"), place(f"{_PREFIX}y")
-    if x is None or y is None or any(sensor.units.get(sensor.names[at], "m") != "m" for at in (x, y)):
-        return None
-    turn, yaw = [place(f"{_TURN}{axis}") for axis in "wxyz"], place("yaw|theta|heading")
-    quaternion = None if None in turn else turn
-    named = re.search(r"pose|position|odom|gps|ground", sensor.name.lower())
-    if quaternion is None and yaw is None and not named:
-        return None
-    degrees = yaw is not None and (
-        sensor.names[yaw].endswith("_deg") or sensor.units.get(sensor.names[yaw]) in ("deg", "°")
-    )
-    return {"x": x, "y": y, "quaternion": quaternion, "yaw": yaw, "degrees": degrees}
-
-
 def _language(take: Take) -> list[list]:
     spoken = take.facts.get("language", ())
     pairs: Iterator = iter(spoken if isinstance(spoken, (list, tuple)) else ())
@@ -370,29 +359,26 @@ def _read_marks(path: Path) -> frozenset[int]:
     return frozenset(bad)
 
 
-def browse(path: str | Path) -> Browse:
-    """A recording of any format, to be looked through; what is exported from a LeRobot folder is carried over bit for bit."""
-    from ..care.repair import repair
-    from ..data.dataset import Dataset
-    from .convert import open_source, write_source
+def browse(path: str | Path, carry: Callable[[Path, Path, Sequence[int], Report], object] | None = None) -> Browse:
+    """A recording of any format, to be looked through.
 
+    carry(from, to, episodes, report): writes episodes of a LeRobot folder into a new one bit for bit, for the export;
+    without it they are written anew, as those of other formats are.
+    """
     source, where = open_source(path), Path(path)
     if "://" in str(path):
         marks = Path(f".{where.name}{MARKS}")  # here: nothing is written to a remote
     else:
         marks = where / MARKS if where.is_dir() else where.with_name(f".{where.name}{MARKS}")
+
+    def write(out: Path, keep: Sequence[int], report: Report) -> None:
+        wanted = set(keep)
+        chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
+        write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
+
     if not (where / INFO).exists():
-
-        def write(out: Path, keep: Sequence[int], report: Report) -> None:
-            wanted = set(keep)
-            chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
-            write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
-
         return Browse(source, marks, export=write)
     dataset = Dataset(path)
     entries = [Entry(episode.length, episode.length / dataset.fps, episode.task) for episode in dataset.episodes]
-
-    def carry(out: Path, keep: Sequence[int], report: Report) -> None:
-        repair(where, out, keep, report)
-
-    return Browse(source, marks, entries, export=carry)
+    export = write if carry is None else lambda out, keep, report: carry(where, out, keep, report)
+    return Browse(source, marks, entries, export=export)

@@ -2,18 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from ..core.errors import DatasetError
 from ..data.format import INFO
-from ..data.source import Source
-from .formats import pictures
+from ..data.source import Sensor, Source, Take
+from .formats.suffixes import IMAGES, VIDEOS
 
 Format = Literal["lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"]
-_HDF5 = (".hdf5", ".h5", ".hdf")
 _DEEPEST = 4  # folders below the one named that are looked into
+_SENSOR_FACTS = ("names", "units", "frame", "facts")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """One format: what people call it, where its code is, and which of a take's and sensors' facts it has a place for.
+
+    leaf:  module of `formats`, imported when it is used.
+    read:  its function read(path, fps) -> Source; write: its function write(source, path, progress) -> sentences.
+    keeps: "text" (string features), "task", "language", "start_ns", "facts" (of takes), "sensors" (their names, units, …).
+    """
+
+    name: str
+    leaf: str
+    suffixes: frozenset[str] = frozenset()
+    keeps: frozenset[str] = frozenset()
+    read: str = "read"
+    write: str = "write"
+
+    def call(self, function: str, *given: Any, **more: Any) -> Any:
+        return getattr(import_module(f".formats.{self.leaf}", __package__), function)(*given, **more)
+
+
+_ALL = frozenset({"text", "task", "language", "start_ns", "facts", "sensors"})
+_KINDS: dict[str, _Kind] = {
+    "lerobot": _Kind("LeRobot v3", "lerobot", keeps=_ALL),  # its writer says itself which facts it leaves out
+    "mcap": _Kind("MCAP", "mcap", frozenset({".mcap"}), _ALL - {"text"}),
+    "minari": _Kind("Minari", "minari", keeps=frozenset({"task", "start_ns", "sensors"})),
+    "robomimic": _Kind("HDF5", "hdf5", frozenset({".hdf5", ".h5", ".hdf"}), frozenset({"task", "sensors"})),
+    "rollouts": _Kind("npz rollouts", "rollouts", frozenset({".npz"}), frozenset({"task", "start_ns", "sensors"})),
+    "videos": _Kind("videos", "pictures", VIDEOS, read="read_videos", write="write_videos"),
+    "images": _Kind("images", "pictures", IMAGES, read="read_images", write="write_images"),
+}
+_READ = ", ".join(kind.name for kind in _KINDS.values())
 
 
 def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, seed: int = 0) -> Source:
@@ -27,38 +63,11 @@ def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, 
     """
     name = str(path)
     if name.startswith("gym:"):
-        from .formats import rollouts
+        from .formats import environments
 
-        return rollouts.from_env(name.removeprefix("gym:"), episodes=episodes, seed=seed, fps=fps)
-    if "://" in name:
-        from .formats import lerobot
-
-        return lerobot.read(name)
-    return _open(Path(path), _kind(Path(path)), fps)
-
-
-def _open(path: Path, kind: str, fps: float | None) -> Source:
-    if kind == "lerobot":
-        from .formats import lerobot
-
-        return lerobot.read(path)
-    if kind == "mcap":
-        from .formats import mcap
-
-        return mcap.read(path, verify=True)
-    if kind == "minari":
-        from .formats import minari
-
-        return minari.read(path, fps)
-    if kind == "hdf5":
-        from .formats import hdf5
-
-        return hdf5.read(path, fps)
-    if kind == "rollouts":
-        from .formats import rollouts
-
-        return rollouts.read(path, fps)
-    return pictures.read_videos(path) if kind == "videos" else pictures.read_images(path, fps or 10.0)
+        return environments.from_env(name.removeprefix("gym:"), episodes=episodes, seed=seed, fps=fps)
+    kind = _KINDS["lerobot" if "://" in name else _kind(Path(path))]
+    return kind.call(kind.read, name if "://" in name else Path(path), fps=fps)
 
 
 def _kind(path: Path) -> str:
@@ -67,7 +76,7 @@ def _kind(path: Path) -> str:
     if path.is_file():
         kind = _by_suffix({path.suffix.lower()})
         if kind is None:
-            raise DatasetError(f"{path} is of no format that is read here ({', '.join(_read())}).")
+            raise DatasetError(f"{path} is of no format that is read here ({_READ}).")
         return kind
     if (path / INFO).exists() or (path / "meta" / "episodes").exists():
         return "lerobot"
@@ -80,28 +89,17 @@ def _kind(path: Path) -> str:
         if kind:
             return kind
         folders = [folder for folder in files if folder.is_dir()]
-    raise DatasetError(f"{path} holds no recording that is read here ({', '.join(_read())}).")
+    raise DatasetError(f"{path} holds no recording that is read here ({_READ}).")
 
 
 def _by_suffix(found: set[str]) -> str | None:
-    kinds = {
-        "mcap": (".mcap",),
-        "hdf5": _HDF5,
-        "rollouts": (".npz",),
-        "videos": pictures.VIDEOS,
-        "images": pictures.IMAGES,
-    }
-    return next((kind for kind, suffixes in kinds.items() if found & set(suffixes)), None)
+    return next((name for name, kind in _KINDS.items() if found & kind.suffixes), None)
 
 
-def _read() -> list[str]:
-    return ["LeRobot v3", "MCAP", "Minari", "HDF5", "npz rollouts", "videos", "images"]
-
-
-def format_of(path: str | Path) -> Format:
+def format_of(path: str | Path) -> str:
     """The format that a new path's name asks for: MCAP for .mcap, robomimic's HDF5 for .hdf5, else LeRobot."""
     suffix = Path(path).suffix.lower()
-    return "mcap" if suffix == ".mcap" else "robomimic" if suffix in _HDF5 else "lerobot"
+    return next((name for name in ("mcap", "robomimic") if suffix in _KINDS[name].suffixes), "lerobot")
 
 
 def write_source(
@@ -111,35 +109,65 @@ def write_source(
     rows=None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Writes a Source at a new path; returns sentences on what could not be carried over.
+    """Writes a Source at a new path, all of it or nothing; returns a sentence on each thing that was left out or changed,
+    in reading it (`source.notes`) and in writing it.
 
     to: None for what the path's name asks for. rows: formats.lerobot.Rows, how it becomes rows, for LeRobot alone.
-    DatasetError where something lies there already.
+    DatasetError where something lies there already, the disk is full, or the takes do not fit the format.
     """
-    to, path = to or format_of(path), Path(path)
-    if to not in get_args(Format):
-        raise DatasetError(f"there is no format '{to}' to write; choose {', '.join(get_args(Format))}.")
-    if to == "lerobot":
-        from .formats import lerobot
-
-        return lerobot.write(source, path, rows or lerobot.Rows(), progress)
-    if path.exists() and (path.is_file() or any(path.iterdir())):
+    chosen, path = to or format_of(path), Path(path)
+    if chosen not in get_args(Format):
+        raise DatasetError(f"there is no format '{chosen}' to write; choose {', '.join(get_args(Format))}.")
+    if chosen != "lerobot" and path.exists() and (path.is_file() or any(path.iterdir())):
         raise DatasetError(f"{path} is there already; convert into a new one.")
-    if to == "mcap":
-        from .formats import mcap
+    more = {"rows": rows} if rows and chosen == "lerobot" else {}
+    kind, said = _KINDS[chosen], dict.fromkeys(source.notes)
+    kept = _without_text(source, said, kind) if "text" not in kind.keeps else source
+    lost: dict[str, None] = {}
+    counted = replace(kept, takes=lambda: _seen(kept, kind, lost))
+    try:
+        notes = kind.call(kind.write, counted, path, progress=progress, **more)
+    except OSError as error:
+        raise DatasetError(f"{path} was not written ({error.strerror}); free some space or choose another.") from error
+    if "sensors" not in kind.keeps:
+        bare = Sensor("", "image", ())
+        for name, sensor in kept.sensors.items():
+            here = [part for part in _SENSOR_FACTS if getattr(sensor, part) != getattr(bare, part)]
+            calibrated = ["calibration"] * ("calibration" in sensor.facts)
+            if here and sensor.kind in ("image", "depth"):
+                lost[f"{', '.join(calibrated or here)} of '{name}'"] = None
+    said |= dict.fromkeys(notes)
+    return [*said, *(f"{what} has no place in {kind.name} and was left out." for what in lost)]
 
-        return mcap.write(source, path, progress=progress)
-    if to == "minari":
-        from .formats import minari
 
-        return minari.write(source, path, progress=progress)
-    if to == "robomimic":
-        from .formats import hdf5
+def _without_text(source: Source, said: dict[str, None], kind: _Kind) -> Source:
+    texts = [name for name, sensor in source.sensors.items() if sensor.dtype == "string"]
+    said |= {f"'{name}' is text, which {kind.name} has no place for, and was left out.": None for name in texts}
+    sensors = {name: sensor for name, sensor in source.sensors.items() if name not in texts}
 
-        return hdf5.write(source, path, progress=progress)
-    if to == "rollouts":
-        from .formats import rollouts
+    def takes() -> Iterator[Take]:
+        for take in source.takes():
+            yield replace(take, readings={name: it for name, it in take.readings.items() if name not in texts})
 
-        return rollouts.write(source, path, progress=progress)
-    write = pictures.write_videos if to == "videos" else pictures.write_images
-    return write(source, path, progress=progress)
+    return replace(source, sensors=sensors, takes=takes) if texts else source
+
+
+def _seen(source: Source, kind: _Kind, lost: dict[str, None]) -> Iterator[Take]:
+    """The takes; what of each the format has no place for is added to `lost` as they go by."""
+    for take in source.takes():
+        language = take.facts.get("language")
+        for what, there in (("task", take.task), ("language", language), ("start_ns", take.start_ns is not None)):
+            if there and what not in kind.keeps:
+                lost[_WORDS[what]] = None
+        if "facts" not in kind.keeps:
+            for name, value in take.facts.items():
+                if name not in ("language", kind.leaf, "robomimic" if kind.leaf == "hdf5" else "texts"):
+                    lost[f"the fact '{name}' of takes ({json.dumps(value, default=str)[:60]})"] = None
+        yield take
+
+
+_WORDS = {  # what of a take may be lost, in words
+    "task": "the instruction of takes",
+    "language": "the course of the instruction within a take",
+    "start_ns": "the wall-clock time of takes",
+}

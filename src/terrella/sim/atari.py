@@ -12,7 +12,7 @@ from gymnasium.utils.seeding import np_random
 from PIL import Image
 
 from ..core.errors import TerrellaError
-from .gymnasium import GymnasiumWorld, check_size
+from .gymnasium import Adapter, GymnasiumWorld, check_size
 from .snapshot import NotCopyable
 
 FRAMES_PER_SECOND = 60
@@ -27,7 +27,7 @@ class AtariWorld(GymnasiumWorld):
     frames: of the console in a step, its last two merged by maximum, for sprites that flicker.
     sticky: the chance that a step repeats the last action (Machado et al. 2018). With 0 the game is deterministic and
             its states are values; else they are tickets.
-    noops:  a story begins after 1 to `noops` frames without a button, drawn from the rng.
+    noops:  an episode begins after 1 to `noops` frames without a button, drawn from the rng.
 
     Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, when the game is over; lives float32 [B].
     """
@@ -59,10 +59,9 @@ class AtariWorld(GymnasiumWorld):
             dt_s=frames / FRAMES_PER_SECOND,
             forkable=forkable if sticky == 0 else False,
             snapshots=_Savestates,
-            told=("lives",),
+            info_channels=("lives",),
             name=f"gym:{game}",
-            action_names=names,
-            keys=keys_of(names),
+            adapter=Adapter(action_names=names, keys=keys_of(names)),
         )
 
 

@@ -6,6 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -15,13 +16,50 @@ from gymnasium import spaces
 from PIL import Image
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, REWARD, Spec
+from ..core.spec import DONE, REWARD, Camera, Spec
 from ..core.state import State
 from ..core.world import make_rng
 from .snapshot import NotCopyable, Snapshots
 
 _KNOWN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 _TRIALS, _TRIAL_STEPS = 3, 40
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel that an environment can show: `read(env)` gives one value [*space.shape] of the environment as it now stands."""
+
+    read: Callable[[gymnasium.Env], np.ndarray | float]
+    space: spaces.Space
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """What an environment has beyond Gymnasium's own words, so that a world with depth and poses can be learned of it.
+
+        class MyGame(gymnasium.Env):
+            terrella = Adapter(
+                channels={
+                    "depth": Channel(lambda env: env.depth_buffer(), spaces.Box(0, 100, (96, 128), np.float32), "m"),
+                    "pose": Channel(lambda env: env.camera_pose(), POSE, POSE_UNIT),
+                },
+                cameras={"rgb": Camera((0.5, 0.67, 0.5, 0.5), (96, 128))},
+            )
+
+    channels: name -> Channel. depth: metres along the optical axis; pose: x, y, z in metres and quaternion w, x, y, z of
+              T_world_cam, world z up, camera x forward, y left, z up; "rgb.wrist" and the like are further cameras.
+    cameras:  picture channel -> Camera.
+    action_names, action_units, action_mode, action_frame, keys: as in Spec.
+    """
+
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    action_names: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
+    action_mode: str = ""
+    action_frame: str = ""
+    keys: Mapping[str, list[float]] | None = None
 
 
 class GymnasiumWorld:
@@ -32,12 +70,14 @@ class GymnasiumWorld:
     rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array". Where its observation is
               a picture already (uint8 [H, W, 3]), that is `rgb`, and takes the place of `observation`.
     size:     (height, width) to which rgb is area-averaged; None leaves it as it is drawn.
-    told:     numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
+    info_channels: numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
     forkable: None finds out: an environment whose Python state is plain numbers is copied between two instances on
               trial, and only if every step agrees bit for bit are its states values. False makes states tickets for
               the present.
     snapshots: what copies the environment's state, by default sim/snapshot.py.
-    name, action_names, keys: for the spec, where the environment's own say too little.
+    name:     for the spec, where the environment's own says too little.
+    adapter:  further channels (depth, pose, more cameras) and what actions mean; by default the attribute `terrella` of
+              the environment, where it has one.
     dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second.
     options:  handed to gymnasium.make.
 
@@ -53,18 +93,17 @@ class GymnasiumWorld:
         *,
         rgb: bool = True,
         size: tuple[int, int] | None = None,
-        told: Sequence[str] = (),
+        info_channels: Sequence[str] = (),
         forkable: bool | None = None,
         snapshots: Callable[[gymnasium.Env], Any] | None = None,
         dt_s: float | None = None,
         name: str = "",
-        action_names: tuple[str, ...] = (),
-        keys: Mapping[str, list[float]] | None = None,
+        adapter: Adapter | None = None,
         **options,
     ):
-        self._lock = threading.Lock()  # one environment serves all stories, so only one may move at a time
+        self._lock = threading.Lock()  # one environment serves all episodes, so only one may move at a time
         self._env, found = _build(env, rgb, options)
-        name, self._size, self._told = name or found, check_size(size), tuple(told)
+        name, self._size, self._info = name or found, check_size(size), tuple(info_channels)
         for space in (self._env.observation_space, self._env.action_space):
             if not isinstance(space, _KNOWN_SPACES):
                 raise TerrellaError(
@@ -84,7 +123,8 @@ class GymnasiumWorld:
                     raise TerrellaError(f"{name} cannot be copied ({why}); leave out forkable=True.")
         self._ticket = 0
         self._env.reset(seed=0)
-        self.spec = self._describe(name, dt_s, rgb, action_names, keys)
+        self._adapter = adapter or getattr(self._env.unwrapped, "terrella", None) or Adapter()
+        self.spec = self._describe(name, dt_s, rgb)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` resets of the environment, seeded from `rng`."""
@@ -127,7 +167,7 @@ class GymnasiumWorld:
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
         self._check(state)
-        return {name: state[name] if name in state else self._pictures(state) for name in channels}
+        return {name: state[name] if name in state else self._read(name, state) for name in channels}
 
     def close(self) -> None:
         self._env.close()
@@ -140,7 +180,7 @@ class GymnasiumWorld:
             **({"rgb": _resized(seen, self._size)} if self._pictured else {"observation": seen}),
             "reward": np.float32(reward),
             "done": np.bool_(done),
-            **{name: np.float32(info[name]) for name in self._told},
+            **{name: np.float32(info[name]) for name in self._info},
         }
         if self._snapshots is not None:
             try:
@@ -169,19 +209,26 @@ class GymnasiumWorld:
         elif "numbers" not in state or state["numbers"].shape[1:] != self._width:
             raise TerrellaError(f"this is not a state of {self.spec.name}: {state}.")
 
-    def _pictures(self, state: State) -> torch.Tensor:
+    def _read(self, name: str, state: State) -> torch.Tensor:
+        """A channel that is made when it is asked for: what the environment draws, or what its adapter reads off it."""
+        space, channel = self.spec.channels[name], self._adapter.channels.get(name)
         with self._lock:
-            frames = []
+            found = []
             for entry in range(state.batch):
                 if self._snapshots is not None:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
-                frames.append(_resized(np.array(self._viewer.render(), dtype=np.uint8), self._size))
-        return torch.from_numpy(np.stack(frames))
+                drawn = self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped)
+                found.append(np.array(_resized(drawn, self._size) if channel is None else drawn, space.dtype))
+                if found[-1].shape != space.shape:
+                    raise TerrellaError(
+                        f"{self.spec.name} gave '{name}' of shape {found[-1].shape}; its space is {space}."
+                    )
+        return torch.from_numpy(np.stack(found))
 
-    def _describe(self, name: str, dt_s: float | None, rgb: bool, action_names, keys) -> Spec:
+    def _describe(self, name: str, dt_s: float | None, rgb: bool) -> Spec:
         channels = {} if self._pictured else {"observation": self._env.observation_space}
         channels |= {"reward": REWARD, "done": DONE}
-        channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._told}
+        channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}
         drawn = (
             self._env.observation_space.shape[:2] if self._pictured else _picture_size(self._viewer) if rgb else None
         )
@@ -189,14 +236,21 @@ class GymnasiumWorld:
             channels["rgb"] = spaces.Box(0, 255, (*(self._size or drawn), 3), np.uint8)
         if self._snapshots is not None:
             self._width = (len(self._snapshots.take(self._env)[0]),)
+        more = self._adapter
+        channels |= {name: channel.space for name, channel in more.channels.items()}
         return Spec(
             name=name,
             action=self._env.action_space,
             channels=channels,
             observes=(),
             dt_s=dt_s or _step_seconds(self._env),
-            action_names=action_names,
-            keys=keys if keys is not None else _arrow_keys(self._env.action_space),
+            units={name: channel.unit for name, channel in more.channels.items() if channel.unit},
+            cameras=more.cameras,
+            action_names=more.action_names,
+            action_units=more.action_units,
+            action_mode=more.action_mode,
+            action_frame=more.action_frame,
+            keys=more.keys if more.keys is not None else _arrow_keys(self._env.action_space),
             forkable=self._snapshots is not None,
             max_batch=None if self._snapshots is not None else 1,
             card={"what": f"the Gymnasium environment {name.removeprefix('gym:')}", "kind": "simulator"},

@@ -136,18 +136,25 @@ def _frame(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 def slide(
-    walls: torch.Tensor, places: torch.Tensor, wish: torch.Tensor, half_m: float, short: float = 0.0
+    walls: torch.Tensor,
+    places: torch.Tensor,
+    wish: torch.Tensor,
+    half_m: float,
+    short: float = 0.0,
+    own: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How bodies of half width `half_m` at `places` [N, 2] move when they wish to by `wish` [N, 2], among walls [S, 4].
+    """How bodies of half width `half_m` at `places` [N, 2] move when they wish to by `wish` [N, 2], among walls [S, 4] that
+    stop all of them and `own` [N, W, 4] that stop one each (those that are NOWHERE stop none).
 
     At a wall the rest of the wish goes on along it, twice at most; `short` is the share of the wish by which a body
     stops short of the wall. Returns the displacement [N, 2] and what is left of the wish, the momentum [N, 2].
     """
     from .kernels_numba import slide as kernel
 
-    parts = [tensor.detach().cpu().double().contiguous().numpy() for tensor in (walls, places, wish)]
-    moved, left = np.zeros_like(parts[1]), np.zeros_like(parts[1])
-    kernel(parts[0], parts[1], parts[2], half_m, short, moved, left)
+    own = walls.new_zeros(len(places), 0, 4) if own is None else own
+    parts = [tensor.detach().cpu().double().contiguous().numpy() for tensor in (walls, own, places, wish)]
+    moved, left = np.zeros_like(parts[2]), np.zeros_like(parts[2])
+    kernel(*parts, half_m, short, moved, left)
     return torch.from_numpy(moved).to(wish), torch.from_numpy(left).to(wish)
 
 

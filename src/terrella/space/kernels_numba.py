@@ -429,17 +429,14 @@ def straight_runs(inverse, left, fewest, straight, gap, least):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def slide(walls, places, wish, half, short, moved, left):
-    """The kernel of floorplan.slide: walls [S, 4], places [N, 2], wish [N, 2]; fills moved [N, 2] and left [N, 2]."""
+def slide(walls, own, places, wish, half, short, moved, left):
+    """The kernel of floorplan.slide: walls [S, 4], own [N, W, 4], places [N, 2], wish [N, 2]; fills moved [N, 2] and left
+    [N, 2]."""
+    close = np.empty((len(walls) + own.shape[1], 4))
     for n in range(len(places)):
         x, y, mx, my = places[n, 0], places[n, 1], wish[n, 0], wish[n, 1]
-        reach, near = half + abs(mx) + abs(my), 0
-        close = np.empty((len(walls), 4))
-        for s in range(len(walls)):
-            ax, ay, bx, by = walls[s, 0] - x, walls[s, 1] - y, walls[s, 2] - x, walls[s, 3] - y
-            if min(ax, bx) < reach and max(ax, bx) > -reach and min(ay, by) < reach and max(ay, by) > -reach:
-                close[near] = walls[s]
-                near += 1
+        near = close_by(walls, x, y, half + abs(mx) + abs(my), close, 0)
+        near = close_by(own[n], x, y, half + abs(mx) + abs(my), close, near)
         for bump in range(3):
             share, along_x, along_y = first_touch(close[:near], x, y, mx, my, half)
             if share > 1:
@@ -450,6 +447,17 @@ def slide(walls, places, wish, half, short, moved, left):
             rest = (1 - max(share, 0.0)) * (mx * along_x + my * along_y) if bump < 2 else 0.0
             mx, my = rest * along_x, rest * along_y
         moved[n, 0], moved[n, 1], left[n, 0], left[n, 1] = x - places[n, 0], y - places[n, 1], mx, my
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def close_by(walls, x, y, reach, close, near):
+    """Adds to `close`, of which `near` are filled, those of walls [S, 4] that come within `reach` of x, y; how many it is then."""
+    for s in range(len(walls)):
+        ax, ay, bx, by = walls[s, 0] - x, walls[s, 1] - y, walls[s, 2] - x, walls[s, 3] - y
+        if min(ax, bx) < reach and max(ax, bx) > -reach and min(ay, by) < reach and max(ay, by) > -reach:
+            close[near] = walls[s]
+            near += 1
+    return near
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

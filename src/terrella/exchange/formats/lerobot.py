@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -21,8 +22,8 @@ from ...data.source import Readings, Sensor, Source, Take, follows
 from ...data.storage import durable
 
 
-def read(root: str | Path) -> Source:
-    """A LeRobot v3.0 folder, or the address of one."""
+def read(root: str | Path, fps: float | None = None) -> Source:
+    """A LeRobot v3.0 folder, or the address of one, which says its own fps."""
     return Dataset(root).source()
 
 
@@ -45,7 +46,7 @@ class Rows:
 
 
 def write(
-    source: Source, root: str | Path, rows: Rows = Rows(), progress: Callable[[int, int], None] | None = None
+    source: Source, root: str | Path, progress: Callable[[int, int], None] | None = None, rows: Rows = Rows()
 ) -> list[str]:
     """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
 
@@ -71,11 +72,20 @@ def write(
         if root.exists():
             root.rmdir()
         durable.move_into_place(staged, root)
+    except DatasetError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        raise _unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with the staged folder
     except OSError as error:
-        raise DatasetError(f"{root} cannot be written ({error}); choose another place, or free some space.") from error
+        raise _unwritten(root, error) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
-    return [*source.notes, *notes]
+    return notes
+
+
+def _unwritten(root: Path, error: OSError) -> DatasetError:
+    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+    return DatasetError(f"{root} was not written: {why}; free some space, or choose another place, and convert again.")
 
 
 def _write(source: Source, layout: Layout, root: Path, lead: str, rows: Rows, progress) -> list[str]:

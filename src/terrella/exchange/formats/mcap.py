@@ -46,7 +46,7 @@ _CHUNK = 2**20
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read(path: str | Path, verify: bool = False) -> Source:
+def read(path: str | Path, verify: bool = True, fps: float | None = None) -> Source:
     """An .mcap file as one take, or a folder of them as one take each, in the order of their names.
 
     Values are read and decoded when they are looked at; only where they lie is kept in memory (24 bytes a message).

@@ -168,8 +168,8 @@ def _info(episode: Episode, place: tuple, sensor: Sensor, steps: int):
 def write(
     source: Source,
     path: str | Path,
-    dataset_id: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    dataset_id: str | None = None,
 ) -> list[str]:
     """Writes a source as a Minari dataset (HDF5, pictures lossless); returns sentences on what had no place in it.
 

@@ -18,11 +18,8 @@ from PIL import Image
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import rows
+from .suffixes import IMAGES, VIDEOS
 
-VIDEOS = frozenset(
-    ".mp4 .m4v .mov .mkv .webm .avi .mpg .mpeg .ts .m2ts .mts .wmv .flv .ogv .3gp .gif .nut .y4m .h264 .264 .h265 .hevc".split()
-)
-IMAGES = frozenset(".png .jpg .jpeg .webp .bmp .tif .tiff .ppm .pgm".split())
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
 _TURNS = {  # EXIF orientation -> what undoes it
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -44,7 +41,7 @@ _LOSSLESS = {"preset": "veryfast", "qp": "0", "g": "8", "bf": "0", "threads": "1
 # -- videos
 
 
-def read_videos(path: str | Path) -> Source:
+def read_videos(path: str | Path, fps: float | None = None) -> Source:
     """A folder of videos as a Source of pictures alone.
 
     Videos in the folder itself are one take each, of the camera "observation.images.rgb". Or the folder has sub-folders:
@@ -224,7 +221,7 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def write_videos(
-    source: Source, path: str | Path, lossless: bool = False, progress: Callable[[int, int], None] | None = None
+    source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None, lossless: bool = False
 ) -> list[str]:
     """Writes a source's pictures as mp4 files in a folder as `read_videos` reads it; returns what had no place in it.
 
@@ -316,8 +313,8 @@ def _encode(path: Path, sensor: Sensor, readings: Readings, begin: float, lossle
 # -- images
 
 
-def read_images(path: str | Path, fps: float) -> Source:
-    """A folder of images as a Source of pictures alone, `fps` a second.
+def read_images(path: str | Path, fps: float | None = None) -> Source:
+    """A folder of images as a Source of pictures alone, `fps` a second (None: 10).
 
     Images in the folder itself are one take of the camera "observation.images.rgb". Or each sub-folder is one take: with
     images in it, or with a folder of images for each camera ("take_0/front/1.png": "observation.images.front"). Takes and
@@ -327,7 +324,7 @@ def read_images(path: str | Path, fps: float) -> Source:
     "observation.depth.NAME" for the folder NAME or NAME_depth. DatasetError where there are no images, one is damaged, of
     absurd size, or not of its camera's size and kind.
     """
-    path = Path(path)
+    path, fps = Path(path), rows.FPS_UNKNOWN if fps is None else fps
     rows.check_fps(fps, "a folder of images")
     takes = _takes_of(path, IMAGES, "images", deep=True)
     sensors: dict[str, Sensor] = {}

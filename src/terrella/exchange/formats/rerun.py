@@ -1,4 +1,5 @@
 """Hands a recording to Rerun (https://rerun.io), whose viewer shows it, or writes the .rrd files that it opens."""
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import simplejpeg
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
 from ...data.storage.durable import move_into_place, sync_file
-from ..browse import pose_columns
+from ..poses import pose_columns
 
 try:
     import rerun as rr  # pyright: ignore[reportMissingImports]

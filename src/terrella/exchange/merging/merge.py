@@ -16,6 +16,7 @@ from ...data.format import WORLD
 from ...data.resample import SAME_TIME_S, blank, clock_of, pick, resample, row_times, stacked
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from ...data.storage import durable
+from ..formats import lerobot
 from .mapping import (
     ACTION,
     CAMERAS_MASK,
@@ -443,8 +444,6 @@ def merge_into(
         return {"mapping": str(path), "notes": notes}, "\n".join(
             [*said, f"the mapping is {path}: edit it, then merge by it"]
         )
-    from ..formats import lerobot
-
     report = Report()
     terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
     merged = merge(sources, found, report, out.name, terminal)
@@ -453,7 +452,7 @@ def merge_into(
     durable.write_json(out / WORLD, {**about, "embodiments": report.embodiments()})
     durable.write_json(out / "meta" / "merge.json", {**report.to_json(), "notes": notes})
     write_mapping(found, out / "meta" / "merge.toml")
-    new = [f"note: {note}" for note in notes if note not in merged.notes]
+    new, notes = [f"note: {note}" for note in notes], [*merged.notes, *notes]
     text = "\n".join([report.text().rstrip(), *new, f"{len(sources)} recordings are now {out}, merged by {path}"])
     return {"out": str(out), "mapping": str(path), "notes": notes, **report.to_json()}, text
 

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from terrella.core.errors import DatasetError
 from terrella.data.source import Readings, Sensor, Source, Take
-from terrella.exchange.formats import rollouts, rows
+from terrella.exchange.formats import environments, rollouts, rows
 
 
 class Arm(gymnasium.Env):
@@ -71,7 +71,7 @@ def equal(one: Take, other: Take) -> None:
 
 
 def test_a_rollout_keeps_the_terminal_observation_and_flattens_spaces():
-    source = rollouts.from_env(Arm, episodes=2, render=True)
+    source = environments.from_env(Arm, episodes=2, render=True)
     assert {name: (s.kind, s.shape, s.dtype) for name, s in source.sensors.items()} == {
         "observation.images.camera": ("image", (40, 36, 3), "uint8"),
         "observation.images.render": ("image", (12, 10, 3), "uint8"),
@@ -99,12 +99,12 @@ def test_a_rollout_keeps_the_terminal_observation_and_flattens_spaces():
 
 
 def test_a_registered_environment_gives_the_same_takes_at_each_call_and_others_with_another_seed():
-    source = rollouts.from_env("CartPole-v1", episodes=3, seed=4)
+    source = environments.from_env("CartPole-v1", episodes=3, seed=4)
     first, second = list(source.takes()), list(source.takes())
     assert source.fps == 50 and source.sensors["action"].dtype == "int64"  # CartPole's tau is 0.02 s
     for one, other in zip(first, second, strict=True):
         equal(one, other)
-    other = next(iter(rollouts.from_env("CartPole-v1", episodes=1, seed=5).takes()))
+    other = next(iter(environments.from_env("CartPole-v1", episodes=1, seed=5).takes()))
     start = [take.readings["observation.state"].values[0].tolist() for take in (*first, other)]
     assert len({str(value) for value in start}) == 4
 
@@ -117,7 +117,7 @@ def test_a_policy_is_asked_and_a_long_episode_cut():
         return 1
 
     env = gymnasium.make("CartPole-v1")
-    source = rollouts.from_env(env, policy, episodes=1, fps=10, max_steps=4)
+    source = environments.from_env(env, policy, episodes=1, fps=10, max_steps=4)
     (take,) = source.takes()
     assert take.readings["action"].values.ravel().tolist() == [1] * 4
     np.testing.assert_array_equal(np.stack(seen), take.readings["observation.state"].values[:-1])
@@ -134,7 +134,7 @@ def test_takes_are_collected_one_by_one():
         made.append(Arm())
         return made[-1]
 
-    takes = rollouts.from_env(make, episodes=1000).takes()
+    takes = environments.from_env(make, episodes=1000).takes()
     assert next(takes).readings["action.0"].values.shape == (5, 1)
     assert made[-1].step_count == 5
     takes.close()
@@ -142,27 +142,27 @@ def test_takes_are_collected_one_by_one():
 
 def test_what_is_no_environment_is_said():
     with pytest.raises(DatasetError, match="NoSuchThing-v0"):
-        rollouts.from_env("NoSuchThing-v0")
+        environments.from_env("NoSuchThing-v0")
     with pytest.raises(DatasetError, match="no Gymnasium environment"):
-        rollouts.from_env(lambda: 3)
+        environments.from_env(lambda: 3)
     with pytest.raises(DatasetError, match="0 episodes"):
-        rollouts.from_env(Arm, episodes=0)
+        environments.from_env(Arm, episodes=0)
     env = Arm()
     env.observation_space = spaces.Sequence(spaces.Discrete(2))
     with pytest.raises(DatasetError, match="no place in a recording"):
-        rollouts.from_env(env)
+        environments.from_env(env)
     env = Arm()
     env.render = lambda: None
     with pytest.raises(DatasetError, match="draws no pictures"):
-        rollouts.from_env(env, render=True)
+        environments.from_env(env, render=True)
     env = Arm()
     env.observation_space = spaces.Box(-1, 1, (7,))
     with pytest.raises(DatasetError, match="another shape"):
-        next(rollouts.from_env(env).takes())
+        next(environments.from_env(env).takes())
 
 
 def test_an_environments_rollouts_survive_the_folder(tmp_path):
-    source = rollouts.from_env(lambda: Arm(4), episodes=11)
+    source = environments.from_env(lambda: Arm(4), episodes=11)
     assert rollouts.write(source, tmp_path / "a") == []
     found = rollouts.read(tmp_path / "a")
     assert found.fps == source.fps and found.facts == source.facts and dict(found.sensors) == dict(source.sensors)

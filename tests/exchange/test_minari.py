@@ -16,8 +16,8 @@ from PIL import Image
 
 from terrella.core.errors import DatasetError
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.exchange.formats import environments
 from terrella.exchange.formats import minari as ours
-from terrella.exchange.formats import rollouts
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'terrella[hdf5]'")
 minari = pytest.importorskip("minari", reason="minari is not installed: pip install 'minari[hdf5,arrow]'")
@@ -181,7 +181,7 @@ def test_jpeg_pictures_are_decoded_when_looked_at(store, kind, monkeypatch):
 
 
 def test_an_environments_rollouts_are_a_minari_dataset(store):
-    source = rollouts.from_env("CartPole-v1", episodes=3)
+    source = environments.from_env("CartPole-v1", episodes=3)
     ours.write(source, store / "cartpole-v0")
     dataset = minari.load_dataset("cartpole-v0")
     assert dataset.action_space == spaces.Discrete(2)
