@@ -67,7 +67,7 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
     }
     controls = about.get("controls") or {"kind": "buttons", "low": [0.0] * config.actions, "high": [1.0] * config.actions}
     said = {name: about[name] for name in ("dt_s", "action_names", "keys")}
-    card = {{"eye": "estimator"}.get(name, name): fact for name, fact in about["card"].items()}
+    card = {{"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()}
     return {
         "kind": KIND,
         "version": VERSION,

@@ -211,7 +211,7 @@ class LearnedWorld:
         after = self.outcome.followed(state, drawn, self.scene.frame, numbers, seeds)
         at_hand = [name for name in after if name not in self._drawn_names and after[name] is not state[name]]
         kept = {name: _where(still, state[name], after[name]) for name in at_hand}
-        return after.replace(**kept, reward=torch.where(still, 0.0, after["reward"]))
+        return after.replace(**{**kept, "reward": torch.where(still, 0.0, after["reward"])})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)

@@ -16,9 +16,9 @@ from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics, yaw
-from ..space.floorplan import floor_plan
+from ..space.floorplan import NOWHERE, floor_plan
 from ..space.keyframes import Glimpse, Keyframes
-from ..space.memory import RECORDED, Memory, keyframe_table
+from ..space.memory import DREAMT, EMPTY, RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
@@ -29,7 +29,8 @@ from .moving import Frame, carry_frames, covering, still
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
 
 SEEN = ("rgb", "depth", "things", "pose", "instances")  # of a frame that is still needed two steps later, where things move
-NEAR_M = 1.5  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
+NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
+EXACTLY = "donot_use_mm_for_euclid_dist"
 
 
 @final
@@ -163,7 +164,7 @@ class KeyframeScene:
     def drawn_names(self) -> tuple[str, ...]:
         """The tensors of a state that follow from drawing its frame."""
         moving = ("things", "instances", *(f"earlier_{part}" for part in SEEN)) if self.config.moving else ()
-        return "rgb", "depth", "known", *moving, *self.own.names
+        return "rgb", "depth", "known", *moving, *self.own.empty(1)
 
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
@@ -174,8 +175,8 @@ class KeyframeScene:
         if self.config.moving:
             tensors |= {"things": plane, "instances": mask}
             tensors |= {f"earlier_{part}": tensors[part] for part in SEEN}
-        held = self.own.empty(batch, there)
-        return held.replace(**tensors, observed_walls=self._observed_walls(held))
+        state = State({**tensors, **self.own.empty(batch)})
+        return state.replace(observed_walls=self._own_walls(state, dreamt=False))
 
     def pictured(self, state: State, evidence: Evidence) -> State:
         """`state` with the picture of the evidence."""
@@ -183,8 +184,9 @@ class KeyframeScene:
 
     def kept(self, state: State, begins: bool) -> State:
         """`state`, whose memory keeps the picture that was observed; an episode that begins has stood still."""
-        state = self.own.observed(state, state["rgb"], self._lasting(state), state["pose"])
-        state = state.replace(observed_walls=self._observed_walls(state))
+        kept = self.own.observed(state, state["rgb"], self._lasting(state), state["pose"])
+        state = state.replace(**kept)
+        state = state.replace(observed_walls=self._own_walls(state, dreamt=False))
         return self.aged(state, state) if begins else state
 
     def aged(self, state: State, before: State) -> State:
@@ -198,10 +200,10 @@ class KeyframeScene:
     def walls(self, state: State) -> Walls:
         """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
         own = state["observed_walls"]
-        away = self.nearest(state["pose"][:, :2], self.recorded.pose[:, :2]) > NEAR_M
-        rows = away.nonzero()[:, 0]
-        if len(rows):
-            own = own.index_copy(0, rows, self.own.walls(state.at(rows)))
+        apart = torch.cdist(state["pose"][:, :2], self.recorded.pose[:, :2], compute_mode=EXACTLY)
+        away = F.pad(apart, (0, 1), value=AWAY_M).amin(1) > NEAR_M
+        if away.any():
+            own = torch.where(away[:, None, None], self._own_walls(state, dreamt=True), own)
         return Walls(self._plan, own)
 
     def familiar(self, state: State) -> torch.Tensor:
@@ -209,7 +211,7 @@ class KeyframeScene:
         logarithm and share: [B, 2]."""
         pose, kept = state["pose"], self.recorded.pose
         angle = (yaw(kept) - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
-        apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode="donot_use_mm_for_euclid_dist") + 2 * angle.abs()
+        apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY) + 2 * angle.abs()
         nearest = F.pad(apart, (0, 1), value=AWAY_M).amin(1)
         own = self.own.count(state).float() / max(1, self.own.capacity)
         return torch.stack([nearest.clamp_max(20).log1p(), own], 1)
@@ -238,8 +240,8 @@ class KeyframeScene:
         if self.config.moving:
             state = paint(state.replace(things=clean[:, 4].sigmoid()))
             known = known * (state["things"] < 0.5)
-        state = self.own.dreamt(state, state["rgb"], self._lasting(state), state["pose"], known)
-        return state.replace(known=(known * 255).round().to(torch.uint8))
+        kept = self.own.dreamt(state, state["rgb"], self._lasting(state), state["pose"], known)
+        return state.replace(**kept, known=(known * 255).round().to(torch.uint8))
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
         return {
@@ -248,6 +250,12 @@ class KeyframeScene:
             "things": lambda: state["things"] > 0.5,
             "keyframes": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
+
+    def _own_walls(self, state: State, dreamt: bool) -> torch.Tensor:
+        """The walls [B, N, 4] that an episode's own keyframes saw, those of dreamt ones with `dreamt`; NOWHERE the rest."""
+        kind = state["memory_kind"]
+        counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
+        return torch.where(counts[..., None, None], state["memory_walls"], NOWHERE).flatten(1, 2)
 
     def _lasting(self, state: State) -> torch.Tensor:
         """What a keyframe may keep of the frame's depth."""
