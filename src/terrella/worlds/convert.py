@@ -14,7 +14,7 @@ from .config import VideoConfig
 from .folder import KIND, MEMORY_FILE, VERSION, WEIGHTS_FILE, _plain, load_world, read_about, write_folder
 
 OLD_KIND, OLD_VERSION = "video", 2
-PARTS = {"generator": "generator", "motion": "body", "outcome": "outcome", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}
+PARTS = {"motion": "body", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}  # the others keep their names
 LAYERS = {"leave": "output", "time": "context"}  # of generator, estimator and uncertainty
 RETIRED = ("own_keyframes",)  # settings that mean nothing any more
 
@@ -91,4 +91,4 @@ def _renamed(name: str) -> str:
     part, *rest = name.split(".")
     if part in ("generator", "eye", "doubt"):
         rest = [LAYERS.get(word, word) for word in rest]
-    return ".".join([PARTS[part], *rest])
+    return ".".join([PARTS.get(part, part), *rest])

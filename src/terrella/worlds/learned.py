@@ -32,7 +32,7 @@ from .generator import Conditioning, channels_last, generate
 from .history import FrameHistory, Starts
 from .objects import NoObjects, Objects
 from .outcome import Constant, ConstantConfig, Outcome
-from .parts import NOISE, Channels, Evidence
+from .parts import NOISE, Evidence
 from .places import KeyframeScene
 from .uncertainty import GONE, Asked, NoUncertainty, Uncertainty, gone_on
 
@@ -108,8 +108,7 @@ class LearnedWorld:
     def config(self) -> VideoConfig:
         """The settings of all parts in one."""
         drawn, posed = self.generator.config, self.scene.posed
-        settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5)}
-        settings |= {name: value for name, value in vars(self.scene.config).items()}
+        settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
         settings |= {} if not self.body else {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
         settings |= {"vitals": self.outcome.begins, "actions": self.controls.numbers}

@@ -297,18 +297,19 @@ def in_sight(state: State) -> torch.Tensor:
     return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 
-def likest(off: torch.Tensor, was: torch.Tensor) -> torch.Tensor:
+def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
     """Of looks `off` [..., looks] away the one [...] that a thing has which looked like `was` [...]: that one, unless another is
     clearly nearer; NONE where all are far."""
     least, best = off.min(-1)
+    was = torch.as_tensor(was, device=off.device)
     stays = (was != NONE) & (off.gather(-1, was.clamp_min(0)[..., None])[..., 0] < least + STICKS)
     return torch.where(least > ALIKE, NONE, torch.where(stays, was, best))
 
 
-def fresh(number: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
+def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
     """Billboards [..., COLUMNS] that are seen for the first time: number and look [...], place [..., 3]."""
     billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
-    billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look.to(place)
+    billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
     billboards[..., BEFORE], billboards[..., AGE], billboards[..., RESTED], billboards[..., LIGHT] = NONE, AGES, AGES, 1.0
     return billboards
 

@@ -1,4 +1,4 @@
-"""Uncertainty: how wrong a world expects the frame that it has just drawn to be, learned from its own dreams (learn/uncertainty.py).
+"""Uncertainty: how wrong a world expects the frame that it has just drawn to be, learned from its own dreams.
 
 One small network beside the generator, no ensemble: it reads what memory knew, what was drawn, and how far the dream has
 gone since it last saw anything, and answers with the mean absolute error that such frames had.

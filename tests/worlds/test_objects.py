@@ -1,13 +1,14 @@
-"""A cast: cards that are known again, that wait out of sight, that stand in the way, and that end."""
+"""Billboards: they are known again, that wait out of sight, that stand in the way, and that end."""
 
 from __future__ import annotations
 
 import torch
 
-from terrella.core import make_rng
+from terrella.core import chance, make_rng
+from terrella.core.state import State
 from terrella.space.billboards import PICTURE, cut_out
 from terrella.space.camera import planar_pose
-from terrella.space.floorplan import slide
+from terrella.space.floorplan import NOWHERE, slide
 from terrella.worlds.objects import (
     AGE,
     BEFORE,
@@ -29,12 +30,12 @@ CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 RED, BLUE = 0, 1
 
 
-def estimator(heading: float = 0.0) -> torch.Tensor:
+def viewer(heading: float = 0.0) -> torch.Tensor:
     one = torch.ones(1)
     return planar_pose(0 * one, 0 * one, one, heading * one)
 
 
-def cast_of_two() -> Objects:
+def two_looks() -> Objects:
     """A tall red look and a flat blue one; its network is as it was born."""
     torch.manual_seed(0)
     objects = Objects(ObjectsConfig(actions=3, history=2, looks=4, moves=3, rows=4, starts=1)).eval()
@@ -57,7 +58,7 @@ def sure(objects: Objects, look: int, move: int, gone: bool = False) -> Objects:
     return objects
 
 
-def cards(objects: Objects, *places: tuple[float, float, float]) -> torch.Tensor:
+def billboards(objects: Objects, *places: tuple[float, float, float]) -> torch.Tensor:
     whole = objects.empty(1)
     for row, place in enumerate(places):
         whole[0, row] = fresh(row + 1, torch.tensor(place), RED)
@@ -65,12 +66,12 @@ def cards(objects: Objects, *places: tuple[float, float, float]) -> torch.Tensor
 
 
 def step(objects: Objects, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
-    return objects.step(before, torch.tensor([seen]), estimator(), torch.zeros(1, 2, 3), make_rng(0))
+    return objects.step(before, torch.tensor([seen]), viewer(), torch.zeros(1, 2, 3), chance.seeds(1, make_rng(0)))
 
 
-def test_a_card_does_what_is_told_of_it_and_its_ages_go_on():
-    objects = sure(cast_of_two(), BLUE, 1)
-    one = step(objects, cards(objects, (4.0, 0.0, 0.0)))
+def test_a_billboard_does_what_is_told_of_it_and_its_ages_go_on():
+    objects = sure(two_looks(), BLUE, 1)
+    one = step(objects, billboards(objects, (4.0, 0.0, 0.0)))
     assert one[0, 0, LOOK] == BLUE and one[0, 0, BEFORE] == RED and one[0, 0, AGE] == 0 and one[0, 0, RESTED] == 0
     assert one[0, 0, PLACE].tolist() == [4.25, 0.0, 0.0] and one[0, 0, GOING].tolist() == [0.25, 0.0]
     two = step(objects, one)
@@ -79,45 +80,45 @@ def test_a_card_does_what_is_told_of_it_and_its_ages_go_on():
 
 
 def test_what_is_out_of_sight_waits_and_what_is_gone_is_gone():
-    objects = sure(cast_of_two(), BLUE, 1, gone=True)
-    there = cards(objects, (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+    objects = sure(two_looks(), BLUE, 1, gone=True)
+    there = billboards(objects, (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
     after = step(objects, there, (True, False, True, True))
     assert after[0, :, NUMBER].tolist() == [0, 2, 0, 0] and torch.equal(after[0, 1], there[0, 1])
 
 
 def test_by_chance_as_often_as_told():
-    objects = sure(cast_of_two(), BLUE, 0)
+    objects = sure(two_looks(), BLUE, 0)
     objects.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
-    many, rng = cards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
+    many, rng = billboards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
     seen = torch.ones(800, 4, dtype=torch.bool)
-    looks = objects.step(many, seen, estimator().expand(800, 7), torch.zeros(800, 2, 3), rng)[:, 0, LOOK]
+    looks = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[:, 0, LOOK]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = objects.step(many, seen, estimator().expand(800, 7), torch.zeros(800, 2, 3), make_rng(1))[:, 0, LOOK]
+    again = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[:, 0, LOOK]
     assert torch.equal(looks, again)
 
 
 def shown(objects: Objects, there: torch.Tensor):
-    """What evidence tells of a frame with these cards: its cut, and number and place of each."""
+    """What evidence tells of a frame with these billboards: its cut, and number and place of each."""
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    rgb, depth, instances = objects.paint(there, *behind, estimator(), CAMERA)
-    told = there[..., :4]
-    return cut_out((rgb * 255).to(torch.uint8), instances, depth, told[..., PLACE], estimator(), CAMERA), told
+    rgb, depth, instances = objects.paint(there, *behind, viewer(), CAMERA)
+    listed = there[..., :4]
+    return cut_out((rgb * 255).to(torch.uint8), instances, depth, listed[..., PLACE], viewer(), CAMERA), listed
 
 
 def test_what_was_painted_is_recognised_by_its_look_and_its_light():
-    objects = cast_of_two()
-    there = cards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
+    objects = two_looks()
+    there = billboards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
     there[0, 1, LOOK], there[0, 0, LIGHT] = BLUE, 0.5
     found = objects.recognised(*shown(objects, there), objects.empty(1))
     assert torch.equal(found[..., :5], there[..., :5]) and (found[0, 2:] == 0).all()
     assert 0.35 < found[0, 0, LIGHT] < 0.6 and 0.7 < found[0, 1, LIGHT] < 1.1
 
 
-def test_a_card_keeps_its_own_past_and_what_is_not_told_of_waits():
-    objects = cast_of_two()
-    before = cards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
+def test_a_billboard_keeps_its_own_past_and_what_is_not_told_of_waits():
+    objects = two_looks()
+    before = billboards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
     before[0, :2, NUMBER] = torch.tensor([7.0, 9.0])
-    now = cards(objects, (5.0, -1.25, 0.0))
+    now = billboards(objects, (5.0, -1.25, 0.0))
     now[0, 0, NUMBER] = 9.0
     found = objects.recognised(*shown(objects, now), before)
     assert found[0, :, NUMBER].tolist() == [9, 7, 0, 0]
@@ -125,22 +126,50 @@ def test_a_card_keeps_its_own_past_and_what_is_not_told_of_waits():
 
 
 def test_who_stands_upright_stops_a_body_and_who_is_walked_through_does_not():
-    objects = cast_of_two()
+    objects = two_looks()
     objects.solid[RED] = 1.0
-    there = cards(objects, (2.0, 0.0, 0.0))
+    there = billboards(objects, (2.0, 0.0, 0.0))
     place, wish = torch.zeros(1, 2), torch.tensor([[3.0, 0.0]])
-    moved, _ = slide(objects.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5), place, wish, 0.5)
+    moved, _ = slide(bodies(objects, there, 1.3)[0], place, wish, 0.5)
     assert abs(float(moved[0, 0]) - 1.0) < 1e-3
-    assert not len(objects.bodies(there[0], torch.tensor([0.0, 0.0, 4.3]), 0.5))  # a floor below
+    assert (bodies(objects, there, 4.3) == NOWHERE).all()  # a floor below
     there[0, 0, LOOK] = BLUE
-    assert not len(objects.bodies(there[0], torch.tensor([0.0, 0.0, 1.3]), 0.5))
+    assert (bodies(objects, there, 1.3) == NOWHERE).all()
+
+
+def bodies(objects: Objects, there: torch.Tensor, height: float) -> torch.Tensor:
+    pose = planar_pose(*torch.tensor([[0.0], [0.0], [height], [0.0]]))
+    return objects.bodies(State({"billboards": there, "pose": pose}), 0.5)
+
+
+def test_evidence_of_a_batch_is_taken_as_each_alone():
+    """Known again, new, seen in part or not at all, in rows of their own: as many episodes at once as one by one."""
+    objects, rng = two_looks(), make_rng(3)
+    before = torch.stack([billboards(objects, *(3 + 3 * torch.rand(4, 3, generator=rng)).tolist())[0] for _ in range(6)])
+    before[..., NUMBER] = torch.stack([torch.randperm(9, generator=rng)[:4] for _ in range(6)])
+    now = torch.stack([billboards(objects, *((-2 + 4 * torch.rand(3, 3, generator=rng)).tolist()))[0] for _ in range(6)])
+    now[..., :3, NUMBER] = torch.stack([torch.randperm(9, generator=rng)[:3] for _ in range(6)]).float()
+    now[..., :3, 1] = torch.tensor([3.0, 4.0, 5.0])
+    behind = torch.full((6, 3, *SIZE), 0.3), torch.full((6, *SIZE), 9.0)
+    pose = viewer().expand(6, 7)
+    rgb, depth, instances = objects.paint(now, *behind, pose, CAMERA)
+    listed = now[..., :4]
+    cut = cut_out((rgb * 255).to(torch.uint8), instances, depth, listed[..., PLACE], pose, CAMERA)
+    whole = objects.recognised(cut, listed, before)
+    for n in range(6):
+        picked = slice(n, n + 1)
+        parts = (rgb[picked] * 255).to(torch.uint8), instances[picked], depth[picked], listed[picked][..., PLACE]
+        alone = objects.recognised(cut_out(*parts, viewer(), CAMERA), listed[picked], before[picked])
+        assert torch.allclose(alone[0], whole[n], atol=1e-4)
+        kept = set(before[n, :, NUMBER].tolist()) | set(listed[n, :, 0].tolist())
+        assert set(whole[n, :, NUMBER].tolist()) <= kept
 
 
 def test_what_is_lit_more_than_its_picture_does_not_turn_dark():
-    objects = cast_of_two()
-    there = cards(objects, (4.0, 0.0, 0.0))
+    objects = two_looks()
+    there = billboards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LIGHT] = 4.0
-    rgb, _, seen = objects.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), estimator(), CAMERA)
+    rgb, _, seen = objects.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), viewer(), CAMERA)
     assert seen.any() and rgb.max() == 1.0
 
 
@@ -151,16 +180,16 @@ def test_a_look_lasts_unless_another_is_clearly_nearer():
 
 
 def test_a_look_that_is_not_known_is_not_painted():
-    objects = cast_of_two()
-    there = cards(objects, (4.0, 0.0, 0.0))
+    objects = two_looks()
+    there = billboards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LOOK] = NONE
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    assert not objects.paint(there, *behind, estimator(), CAMERA)[2].any()
+    assert not objects.paint(there, *behind, viewer(), CAMERA)[2].any()
     assert torch.isfinite(step(objects, there)).all()
 
 
 def test_ages_are_counted_to_a_limit():
-    card = fresh(1, torch.zeros(3), RED)[None]
+    one = fresh(1, torch.zeros(3), RED)[None]
     for _ in range(40):
-        card = noted(card, torch.zeros(1, 3), torch.tensor([float(RED)]))
-    assert card[0, AGE] == card[0, RESTED] == 24
+        one = noted(one, torch.zeros(1, 3), torch.tensor([float(RED)]))
+    assert one[0, AGE] == one[0, RESTED] == 24
