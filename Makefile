@@ -7,10 +7,12 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test test-lerobot check format bench clean
+.PHONY: help play test test-all test-portable test-lerobot check format bench clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
+	@echo "make test-all  the same with the slow sweeps (damaged files, many seeds)"
+	@echo "make test-portable  run the numeric tests as a plain processor would: no wide vectors, one thread"
 	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
@@ -20,9 +22,22 @@ help:
 play: $(VENV)/.ready-play
 	$(BIN)/terrella play doom-maze $(ARGS)
 
+# Two at a time, file by file; those that drive a browser afterwards, for its event loop lives in the process.
+PYTEST = $(BIN)/python -m pytest
+RUN_TESTS = $(PYTEST) -n 2 --dist loadfile -m "not browser$(1)" $(ARGS) && { $(PYTEST) -m "browser$(1)" $(ARGS) || [ $$? -eq 5 ]; }
+
 test: $(VENV)/.ready-dev
 	@sh tests/browser_setup.sh $(BIN)/python
-	$(BIN)/python -m pytest $(ARGS)
+	$(call RUN_TESTS, and not slow)
+
+test-all: $(VENV)/.ready-dev
+	@sh tests/browser_setup.sh $(BIN)/python
+	$(call RUN_TESTS)
+
+NUMERIC = tests/core tests/space tests/worlds tests/learn tests/measure
+test-portable: $(VENV)/.ready-dev
+	ATEN_CPU_CAPABILITY=default DNNL_MAX_CPU_ISA=SSE41 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OMP_NUM_THREADS=1 \
+	$(PYTEST) -q -n 2 --dist loadfile -m "not browser and not slow" $(NUMERIC) $(ARGS)
 
 test-lerobot: $(VENV)/.ready-dev
 	@python=$$(sh tests/lerobot_setup.sh .venv-lerobot); \

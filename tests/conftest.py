@@ -46,6 +46,9 @@ def browser():
 
 def pytest_collection_modifyitems(items):
     """Browser tests come last: playwright keeps an event loop running in this thread while its browser is open."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker("browser")
     items.sort(key=lambda item: "browser" in getattr(item, "fixturenames", ()))
 
 

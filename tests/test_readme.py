@@ -1,4 +1,4 @@
-"""The README keeps its word: its Python runs, its commands exist, its files are there."""
+"""The README and the guides keep their word: their Python runs, their commands exist, their files are there."""
 
 from __future__ import annotations
 
@@ -7,32 +7,57 @@ from pathlib import Path
 
 import pytest
 
-from terrella.library import BUNDLED
-
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-SNIPPETS = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))}
+GUIDES = {name: page for name, page in PAGES.items() if name != "log.md"}
+SNIPPETS = [
+    pytest.param(name, snippet, id=f"{name}-{number}")
+    for name, page in GUIDES.items()
+    for number, snippet in enumerate(re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL))
+]
+COMMANDS = [
+    pytest.param(line.strip(), id=" ".join(line.split()[1:4]))
+    for page in GUIDES.values()
+    for line in re.findall(r"^    (?:\.venv/bin/)?(terrella .+)$", page, re.MULTILINE)
+]
 
 
-@pytest.mark.parametrize("number", range(len(SNIPPETS)))
-def test_the_python_of_the_readme_runs(number, tmp_path, monkeypatch):
-    snippet = SNIPPETS[number]
+@pytest.mark.parametrize(("page", "snippet"), SNIPPETS)
+def test_the_python_of_the_guides_runs(page, snippet, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if '"doom-maze")' in snippet and not (BUNDLED / "doom-maze" / "world.json").is_file():
-        pytest.skip("the bundled world doom-maze is not in this checkout, so README's Python did not run")
-    exec(compile(snippet, f"README.md, snippet {number}", "exec"), {})
+    exec(compile(snippet, page, "exec"), {"__name__": "guide"})
 
 
-def test_there_is_python_to_run():
-    assert len(SNIPPETS) >= 2
+def test_there_is_python_and_there_are_commands_to_try():
+    assert len(SNIPPETS) >= 4 and len(COMMANDS) >= 15
 
 
-def test_the_commands_of_the_readme_exist():
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_commands_of_the_guides_have_the_flags_that_they_name(command, capsys):
+    """Every subcommand answers --help, and that names each flag."""
+    from terrella.cli import main
+
+    words = re.sub(r"\s+#.*", "", command).split()[1:]
+    path = [word for word in words[:2] if re.fullmatch(r"[a-z][a-z-]*", word)]
+    for taken in (path, path[:1]):
+        with pytest.raises(SystemExit) as stopped:
+            main([*taken, "--help"])
+        shown = capsys.readouterr().out
+        if stopped.value.code in (0, None) and shown:
+            break
+    for flag in re.findall(r"(?<!\S)--[a-z][a-z-]*", " ".join(words)):
+        plain = flag.replace("--no-", "--")
+        assert flag in shown or plain in shown, f"`{' '.join(taken)} --help` knows no {flag}"
+
+
+def test_the_make_targets_of_the_readme_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in set(re.findall(r"^    make (\w+)", README, re.MULTILINE)):
+    for target in set(re.findall(r"^    make (\w+)", PAGES["README.md"], re.MULTILINE)):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"README says `make {target}`, the Makefile has none"
 
 
-def test_the_files_that_the_readme_links_are_there():
-    for link in re.findall(r"\]\(([\w./-]+)\)", README):
-        assert (ROOT / link).exists(), f"README links {link}"
+@pytest.mark.parametrize("page", GUIDES)
+def test_the_files_that_the_guides_link_are_there(page):
+    folder = ROOT if page == "README.md" else ROOT / "docs"
+    for link in re.findall(r"\]\(([\w./-]+)\)", PAGES[page]):
+        assert (folder / link).exists(), f"{page} links {link}"

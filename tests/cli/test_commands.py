@@ -21,7 +21,7 @@ OPTIONS = {
     "--token --truth",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --seed",
     "list": "--json",
-    "data doctor": "--json --out --repair",
+    "data doctor": "--json --out --repair --yes",
     "data convert": "--episodes --fps --json --pictures --policy --seed --to",
     "data merge": "--dry --fps --json --mapping --out",
     "data label": "--frames --json --labelled --out --seed",

@@ -13,6 +13,8 @@ from terrella.core import check_world
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.sim.replay import Replay
 
+from ..robot import Robot
+
 BUNDLED = Path(terrella.__file__).parent / "bundled" / "doom-maze"
 
 
@@ -57,3 +59,7 @@ def test_the_bundled_learned_world():
         pytest.skip("the learned world doom-maze is not bundled yet: src/terrella/bundled/doom-maze is absent")
     world = terrella.load("doom-maze")
     assert "states_are_values" in check_world(world, steps=3)
+
+
+def test_a_robot_with_two_cameras_and_axes():
+    assert "a_batch_equals_its_singles" in check_world(Robot(), steps=20)

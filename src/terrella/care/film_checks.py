@@ -1,4 +1,4 @@
-"""What a doctor finds in videos and streams: lengths against rows and times, files that cannot be read."""
+"""What a doctor finds in videos and streams: lengths against rows and times, pictures that are damaged or exchanged."""
 
 from __future__ import annotations
 
@@ -9,42 +9,63 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..core.errors import DatasetError
+from ..data import stats
+from ..data.episodes import Episode
 from ..data.format import STREAM_PATH, where
 from ..data.source import Sensor
+from ..data.staged import SAMPLE_EVERY
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
-from .survey import LEFTOVER, RESTORE, Fault, Survey, Told, listed
+from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
 from .tables import read_whole
 
 _SHORTEN = "let --repair keep the rows that the video shows"
+_EXCHANGE = "exchange the two videos, as --repair does"
+_SAMPLES, _OF_STRANGERS = 64, 6  # pictures of an episode that are looked at, at most
+_LIKE, _UNLIKE = 0.02, 0.06  # by so much of full brightness a look may, or must, differ from the statistics
+_BETTER = 4.0  # times closer that the statistics of another episode must be
+
+Key = tuple[int, str]  # episode, camera
 
 
 @dataclass
 class Shown:
-    """digests: number of an episode -> what its pictures are; static: episodes whose pictures do not change."""
+    """What the videos show.
+
+    digests: number of an episode -> what its pictures are; static: episodes whose pictures do not change;
+    looks: mean and deviation of each colour [6]; noise: by how much looks differ because few pictures were looked at;
+    exchanged: whose video shows the pictures of whom, where two were exchanged.
+    """
 
     digests: dict[int, hashlib.blake2b] = field(default_factory=dict)
     static: set[int] = field(default_factory=set)
+    looks: dict[Key, np.ndarray] = field(default_factory=dict)
+    noise: dict[Key, float] = field(default_factory=dict)
+    exchanged: dict[Key, Key] = field(default_factory=dict)
 
 
 def examine_films(survey: Survey, shown: Shown, busy: bool) -> Iterator[Fault]:
-    """Every video that meta/episodes names: its packets are read, the first and last frame of each episode decoded."""
-    named: dict[tuple[str, str], list[Told]] = {}
-    for episode in survey.told.values():
-        for camera, film in episode.films.items():
+    """Every video that meta/episodes names: its packets are read, the first, the last and some more frames decoded."""
+    named: dict[tuple[str, str], list[Episode]] = {}
+    for episode in survey.episodes.values():
+        for camera, film in episode.videos.items():
             named.setdefault((camera, film.file), []).append(episode)
-    there = set(survey.films)
+    there, moving = set(survey.films), set()
     for (camera, file), episodes in named.items():
         if file in there:
-            yield from _film(survey, camera, file, episodes, shown)
+            yield from _film(survey, camera, file, episodes, shown, moving)
         else:
             yield from (Fault(file, episode.start, "the video is missing", RESTORE) for episode in episodes)
+    shown.static -= moving
+    yield from _looks(survey, shown)
     if survey.complete and not busy:
         for file in sorted(there - {file for _, file in named}):
             yield Fault(file, None, "no episode of info.json uses this file", LEFTOVER)
 
 
-def _film(survey: Survey, camera: str, file: str, episodes: list[Told], shown: Shown) -> Iterator[Fault]:
+def _film(
+    survey: Survey, camera: str, file: str, episodes: list[Episode], shown: Shown, moving: set[int]
+) -> Iterator[Fault]:
     first = min(episode.start for episode in episodes)
     try:
         found = reel(survey.path(file), survey.fps)
@@ -52,8 +73,8 @@ def _film(survey: Survey, camera: str, file: str, episodes: list[Told], shown: S
         yield Fault(file, first, "the video is truncated or not mp4", RESTORE)
         return
     count, needed = found.count, 0
-    for episode in sorted(episodes, key=lambda episode: episode.films[camera].first):
-        begin = episode.films[camera].first
+    for episode in sorted(episodes, key=lambda episode: episode.videos[camera].first):
+        begin = episode.videos[camera].first
         end = begin + episode.length
         if begin < needed:
             what = f"episode {episode.number} begins at frame {begin}, which the episode before it shows too"
@@ -62,29 +83,96 @@ def _film(survey: Survey, camera: str, file: str, episodes: list[Told], shown: S
         if end > count:
             what = f"the video has {count} frames, episode {episode.number} needs {end}"
             yield Fault(file, episode.start + max(0, min(count - begin, episode.length - 1)), what, _SHORTEN)
-        elif episode.length:
-            yield from _decoded(survey, camera, episode, found, shown)
+        stop = min(end, count) if len(episodes) > 1 else count
+        if episode.length and stop > begin:
+            yield from _decoded(survey, camera, episode, found, stop - begin, shown, moving)
     if len(found.frames) > needed + (len(episodes) > 1):
         what = f"the video has {len(found.frames)} frames, its episodes need {needed}"
         yield Fault(file, first, what, "let --repair leave out the frames that belong to no row")
 
 
-def _decoded(survey: Survey, camera: str, episode: Told, found: Reel, shown: Shown) -> Iterator[Fault]:
-    film, shape = episode.films[camera], tuple(survey.features[camera]["shape"])
-    ends = sorted({film.first, film.first + episode.length - 1})
-    try:
-        pictures = mp4.frames_at(survey.path(film.file), ends, survey.fps)
-    except DatasetError:
-        yield Fault(film.file, episode.start, "the video's first or last frame cannot be decoded", RESTORE)
-        return
-    if pictures.shape[1:] != shape:
-        what = f"its pictures are {pictures.shape[1]}x{pictures.shape[2]}, info.json promises {shape[0]}x{shape[1]}"
-        yield Fault(film.file, episode.start, what, "set the shape in info.json to that of the video")
-    if len(pictures) < 2 or np.abs(pictures[0].astype(np.int16) - pictures[1]).max() < 8:
-        shown.static.add(episode.number)
+def _decoded(
+    survey: Survey, camera: str, episode: Episode, found: Reel, count: int, shown: Shown, moving: set[int]
+) -> Iterator[Fault]:
+    """Looks at some of the `count` pictures from the episode's first on."""
+    film, shape = episode.videos[camera], tuple(survey.features[camera]["shape"])
+    path, seen, first = survey.path(film.file), [], None
     inside = (found.frames >= film.first) & (found.frames < film.first + episode.length)
-    digest = shown.digests.setdefault(episode.number, hashlib.blake2b(digest_size=16))
-    digest.update(found.digests[inside].tobytes())
+    shown.digests.setdefault(episode.number, hashlib.blake2b(digest_size=16)).update(found.digests[inside].tobytes())
+    zeroed = np.sort(found.frames[inside & found.zeroed]) - film.first
+    if len(zeroed):
+        what = f"{len(zeroed)} frames of episode {episode.number} were overwritten with zeros and cannot be decoded"
+        yield Fault(film.file, episode.start + int(zeroed[0]), what, RESTORE)
+        return
+    shown.static.add(episode.number)
+    for row in _sampled(survey, count):
+        try:
+            picture = mp4.frames_at(path, [film.first + row], survey.fps)[0]
+        except DatasetError:
+            what = f"the video's frame {film.first + row} cannot be decoded"
+            yield Fault(film.file, episode.start + min(row, episode.length - 1), what, RESTORE)
+            return
+        first = picture if first is None else first
+        if picture.shape != shape:
+            what = f"its pictures are {picture.shape[0]}x{picture.shape[1]}, info.json promises {shape[0]}x{shape[1]}"
+            yield Fault(film.file, episode.start, what, "set the shape in info.json to that of the video")
+            return
+        if np.abs(picture.astype(np.int16) - first).max() >= 8:
+            moving.add(episode.number)
+        if not survey.ours or row % SAMPLE_EVERY == 0:
+            seen.append(stats.summarise_pictures(picture[None, ::4, ::4]))
+    look = stats.merge([{camera: each} for each in seen])[camera]
+    shown.looks[episode.number, camera] = np.concatenate([look["mean"].ravel(), look["std"].ravel()])
+    spread = np.std([each["mean"].ravel() for each in seen], 0).max() / np.sqrt(len(seen))
+    shown.noise[episode.number, camera] = 0.0 if survey.ours else 4 * float(spread)
+
+
+def _sampled(survey: Survey, count: int) -> list[int]:
+    """Rows whose pictures are looked at: where our recorder looked for its statistics, else some; always first and last."""
+    if survey.ours:
+        step = SAMPLE_EVERY * -(-count // (SAMPLE_EVERY * _SAMPLES))
+        return sorted({*range(0, count, step), count - 1})
+    return sorted({round(row) for row in np.linspace(0, count - 1, _OF_STRANGERS)})
+
+
+def _looks(survey: Survey, shown: Shown) -> Iterator[Fault]:
+    """The pictures against the statistics that meta/episodes keeps of them: exchanged, black or other ones are named."""
+    keys = [key for key in survey.looks if key in shown.looks]
+    if not keys:
+        return
+    kept = np.stack([np.concatenate(survey.looks[key]) for key in keys])
+    there = np.stack([shown.looks[key] for key in keys])
+    own = _distance(there, kept)
+    noise = np.array([shown.noise[key] for key in keys])
+    candidates: dict[Key, Key] = {}
+    for i in np.flatnonzero(own > np.maximum(_LIKE, noise)):
+        distance = _distance(there[i], kept)
+        nearest = int(distance.argmin())
+        if distance[nearest] * _BETTER < own[i]:
+            candidates[keys[i]] = keys[nearest]
+    while lonely := [key for key, other in candidates.items() if other not in candidates]:
+        for key in lonely:
+            del candidates[key]
+    if len(set(candidates.values())) == len(candidates):
+        shown.exchanged |= candidates
+    for i, key in enumerate(keys):
+        number, camera = key
+        episode = survey.episodes[number]
+        file, what = episode.videos[camera].file, ""
+        if key in shown.exchanged:
+            other, of = shown.exchanged[key]
+            what = f"the video of episode {number} shows what episode {other} looked like{f' to {of}' * (of != camera)}"
+            yield Fault(file, episode.start, f"{what} when it was recorded: they were exchanged", _EXCHANGE)
+        elif own[i] > _UNLIKE + noise[i]:
+            means = there[i, :3].mean(), kept[i, :3].mean()
+            what = f"the pictures of episode {number} are not those that were recorded"
+            what += f": their mean brightness is {means[0]:.0%}, in meta/episodes {means[1]:.0%}"
+            yield Fault(file, episode.start, what, "restore the video from a copy, or leave the episode out")
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The largest difference of two looks [..., 6]; deviations, which coding smooths, count half."""
+    return (np.abs(a - b) * np.array([1, 1, 1, 0.5, 0.5, 0.5])).max(-1)
 
 
 # -- streams ---------------------------------------------------------------------------------------------------------
@@ -96,7 +184,7 @@ def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
     known: set[str] = set()
     for name, sensor in survey.streams.items():
         seen = False
-        for episode in survey.told.values():
+        for episode in survey.episodes.values():
             place = STREAM_PATH.format(name=name, suffix="parquet", **where(episode.number))
             film = STREAM_PATH.format(name=name, suffix="mp4", **where(episode.number))
             known |= {place, film}
@@ -105,7 +193,7 @@ def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
                 yield from _stream(survey, sensor, episode, place, film, film in files)
             elif film in files:
                 yield Fault(film, episode.start, "the times of this film are missing", RESTORE)
-        if survey.told and not seen:
+        if survey.episodes and not seen:
             what = f"stream '{name}' is declared in meta/terrella.json, but no episode has any of it"
             yield Fault(f"streams/{name}", None, what, "restore its files from a copy, or record anew")
     if survey.complete and not busy:
@@ -113,7 +201,7 @@ def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
             yield Fault(file, None, "no episode and no stream of meta/terrella.json uses this file", LEFTOVER)
 
 
-def _stream(survey: Survey, sensor: Sensor, episode: Told, place: str, film: str, has_film: bool) -> Iterator[Fault]:
+def _stream(survey: Survey, sensor: Sensor, episode: Episode, place: str, film: str, has_film: bool) -> Iterator[Fault]:
     try:
         table = read_whole(survey.path(place))
         time_s = table["time_s"].to_numpy().astype(np.float64)
@@ -151,7 +239,7 @@ def _checked_values(table, sensor: Sensor) -> None:
 
 
 def _stream_film(
-    survey: Survey, sensor: Sensor, episode: Told, film: str, has_film: bool, times: int
+    survey: Survey, sensor: Sensor, episode: Episode, film: str, has_film: bool, times: int
 ) -> Iterator[Fault]:
     if not has_film:
         yield Fault(film, episode.start, f"the film of stream '{sensor.name}' is missing", RESTORE)

@@ -13,7 +13,7 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data.dataset import decoded
 from ..data.format import AUTOMATIC, to_numpy
-from .survey import Survey, camera_of, found_features
+from .survey import Survey
 from .tables import batches, open_parquet
 
 _MOST_LOST = 10_000_000  # rows that cannot be read at a stretch; more is damage
@@ -57,70 +57,6 @@ class Table:
     missing: dict[str, np.ndarray] = field(default_factory=dict)  # column -> rows in which it is no finite number
 
 
-def as_found(found: Survey, said: list[str]) -> dict[str, dict]:
-    """The features as the rows have them; what info.json says otherwise is said."""
-    features = {name: dict(feature) for name, feature in found.features.items()}
-    forms = []
-    for file in found.data:
-        try:
-            with open_parquet(found.path(file)) as opened:
-                forms.append(opened.schema_arrow)
-        except (DatasetError, OSError, pa.ArrowException, ValueError):
-            continue
-    _swapped(found, features, forms, said)
-    for name, feature in list(features.items()):
-        if feature["dtype"] == "video":
-            size = found.size(name)
-            if size and list(size) != feature["shape"][:2]:
-                said.append(f"the pictures of {name} are {size[0]}x{size[1]}, and so in info.json now")
-                features[name] = {**feature, "shape": [*size, 3]}
-        if feature["dtype"] in ("video", "image") or name in AUTOMATIC or not forms:
-            continue
-        kinds = list(dict.fromkeys(form.field(name).type for form in forms if name in form.names))
-        if len(kinds) == 1 and (changed := _retyped(feature, kinds[0])) != feature:
-            said.append(f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, and so in info.json now")
-            features[name] = changed
-    for name in AUTOMATIC:
-        features.setdefault(name, {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None})
-    return features
-
-
-def _swapped(found: Survey, features: dict[str, dict], forms: list[pa.Schema], said: list[str]) -> None:
-    """Takes away what no table and no video has; where something is missed, what they have beside it is taken in."""
-    columns = {name for form in forms for name in form.names}
-    cameras = {camera for file in found.films if (camera := camera_of(file, found.video_path))}
-    if not forms and not cameras:
-        return  # there is no episode yet: what is promised may still come
-    lost = [name for name, feature in features.items() if feature["dtype"] == "video" and name not in cameras]
-    if forms:
-        lost += [name for name, feature in features.items() if feature["dtype"] != "video" and name not in columns]
-    lost = [name for name in lost if name not in AUTOMATIC]
-    for name in lost:
-        said.append(f"no file has '{name[:100]}', which info.json promises: it is left out")
-        del features[name]
-    if lost:
-        for name, feature in found_features(found.root, found.data, found.films, found.video_path).items():
-            if name not in features:
-                said.append(f"'{name[:100]}' is in the files, though info.json does not say so, and kept")
-                features[name] = feature
-
-
-def _retyped(feature: dict, kind: pa.DataType) -> dict:
-    """The feature with the type, and for plain lists the length, that the column has."""
-    lengths = []
-    while isinstance(kind, pa.BaseExtensionType):
-        kind = kind.storage_type
-    while pa.types.is_nested(kind) and hasattr(kind, "value_type"):
-        lengths.append(kind.list_size if pa.types.is_fixed_size_list(kind) else None)
-        kind = kind.value_type
-    changed = dict(feature)
-    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
-        changed["dtype"] = "bool" if pa.types.is_boolean(kind) else str(np.dtype(kind.to_pandas_dtype()))
-    if len(lengths) == 1 and lengths[0] and len(feature["shape"]) == 1:
-        changed["shape"] = [lengths[0]]
-    return changed if changed["shape"] == feature["shape"] else {**changed, "names": None}
-
-
 def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dict]) -> Table:
     """Reads all columns of a data file, keeps the counters; DatasetError where the file as a whole cannot be read."""
     with open_parquet(path) as opened:
@@ -145,7 +81,7 @@ def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dic
             for name in columns:
                 try:
                     if features[name]["dtype"] == "image":
-                        whole &= _pictures(table[name], tuple(features[name]["shape"]))
+                        whole &= whole_pictures(table[name], tuple(features[name]["shape"]))
                     else:
                         found[name] = to_numpy(table[name], tuple(features[name]["shape"]))
                 except (ValueError, TypeError, NotImplementedError):
@@ -163,7 +99,7 @@ def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dic
     return Table(file, path, joined, np.concatenate(good) if good else np.zeros(0, bool), bad)
 
 
-def _pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
+def whole_pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
     """bool [n]: which of the pictures can be read."""
     good = np.zeros(len(column), bool)
     for i, picture in enumerate(column):
@@ -179,11 +115,11 @@ def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[Piece]
     for number in dict.fromkeys(numbers[numbers >= 0].tolist()):
         rows = np.flatnonzero(numbers == number)
         good = table.good[rows] & ~_unmeasured(table, rows, int(number), notes)
-        told = survey.told.get(int(number))
-        frames = _frames(survey, table, rows, None if told is None else told.start)
+        listed = survey.episodes.get(int(number))
+        frames = _frames(survey, table, rows, None if listed is None else listed.start)
         task = np.nan_to_num(table.columns["task_index"][rows], nan=-1).astype(np.int64)
         cuts = np.flatnonzero((np.diff(frames) != 1) | (np.diff(rows) != 1) | (np.diff(good.astype(np.int8)) != 0)) + 1
-        length = None if told is None else told.length
+        length = None if listed is None else listed.length
         for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(rows)]):
             if good[begin] and frames[begin] >= 0:
                 whole = frames[begin] == 0 and end - begin == (len(rows) if length is None else length)
@@ -195,7 +131,7 @@ def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[Piece]
 def _numbers(survey: Survey, table: Table) -> np.ndarray:
     """int64: the episode of each row; where the column is missing, that to which alone the file belongs; else -1."""
     found = table.columns["episode_index"]
-    here = [episode.number for episode in survey.told.values() if episode.data == table.file]
+    here = [episode.number for episode in survey.episodes.values() if episode.data == table.file]
     if np.isnan(found).all() and len(here) == 1:
         return np.full(len(found), here[0], np.int64)
     return np.where(np.isfinite(found) & (np.abs(found) < 2**53), found, -1).astype(np.int64)
@@ -293,3 +229,8 @@ def uncovered(pieces: Sequence[Piece]) -> Iterator[Piece]:
         for begin, end in runs(mask):
             yield piece.part(begin, end)
         seen.update(range(piece.frame, piece.frame + piece.count))
+
+
+def short(error: BaseException) -> str:
+    """What an error says, without its advice."""
+    return (str(error).splitlines() or [type(error).__name__])[0].split(";")[0][:300]

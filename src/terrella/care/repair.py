@@ -19,7 +19,6 @@ from ..data.format import (
     ACTION_VALID,
     AUTOMATIC,
     INFO,
-    STREAM_PATH,
     TIME,
     Layout,
     fill,
@@ -28,21 +27,27 @@ from ..data.format import (
     tidy,
     where,
 )
-from ..data.source import Sensor, follows, is_action
-from ..data.staged import LOG, Staged
+from ..data.source import follows, is_action
+from ..data.staged import LOG, SAMPLE_EVERY, Staged
 from ..data.storage import durable, mp4
 from ..data.storage.films import Reel, cut, reel, whole_frames
 from ..data.storage.tables import read_json
-from ..data.writer import NAME, ROWS_PER_GROUP, Draft, Writer, fresh
+from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh
+from .features import BROKEN, mended_features
+from .film_checks import Shown, examine_films
 from .footers import rebuild
-from .pieces import Piece, RowReader, Table, as_found, pieces_of, read_table, runs, uncovered
+from .pieces import Piece, RowReader, Table, pieces_of, read_table, runs, short, uncovered
+from .stream_mending import StreamMender, possible
 from .survey import Survey, survey
-from .tables import open_parquet, read_whole
+from .tables import open_parquet
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read
-_LOOKED_AT = 24  # pictures of an episode for the statistics, the first and the last among them
-_BROKEN = (DatasetError, OSError, pa.ArrowException, ValueError, KeyError, TypeError, AttributeError)
+_MOST_PIECES = 8  # episodes that a repair may make beside two of each without asking
+
+
+class _Refused(DatasetError):
+    """Most would be lost, and nobody allowed it."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ def repair(
     out: str | Path,
     keep: Collection[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    allow_loss: bool | Callable[[str], bool] = False,
 ) -> list[str]:
     """Writes a sound copy of what is whole in `root` to `out`; returns, in sentences, what was done.
 
@@ -67,8 +73,10 @@ def repair(
     one every row is kept that all its cameras still show; where rows are missing in the middle, or one holds a number
     that is not finite (in a column that mostly does), the episode is split there. Counters, timestamps, statistics and
     all of meta/ are made anew from the rows; an interrupted episode of a killed recorder is made an episode. `keep`: only
-    the episodes of these numbers. `progress(pieces, of)` is called after each piece of rows is written. DatasetError
-    where `root` holds nothing whole, or `out` is in use, or the disk is full.
+    the episodes of these numbers. `progress(pieces, of)` is called after each piece of rows is written. `allow_loss`: what
+    is done where most rows would be lost or episodes be cut to many pieces: True goes on, a function is asked with a
+    sentence, and without either DatasetError is raised and nothing is written. DatasetError, too, where `root` holds
+    nothing whole, or `out` is in use, or the disk is full.
     """
     root, out = Path(root), Path(out)
     found = survey(root)
@@ -77,7 +85,7 @@ def repair(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} is not empty; choose another folder for the mended copy.")
     try:
-        return _Mender(found, out, keep, progress).mend()
+        return _Mender(found, out, keep, progress, allow_loss).mend()
     except OSError as error:
         raise DatasetError(f"the mended copy at {out} cannot be written ({error}); free some space there.") from error
 
@@ -85,8 +93,8 @@ def repair(
 class _Mender:
     """One repair: what was said, and of each episode which rows were kept (as runs of frames) and why others were not."""
 
-    def __init__(self, found: Survey, out: Path, keep: Collection[int] | None, progress):
-        self.found, self.out, self.only, self.progress = found, out, keep, progress
+    def __init__(self, found: Survey, out: Path, keep: Collection[int] | None, progress, allow_loss):
+        self.found, self.out, self.only, self.progress, self.allow_loss = found, out, keep, progress, allow_loss
         self.said: list[str] = []
         self.reels: dict[str, Reel | None] = {}
         self.kept: dict[int, list[tuple[int, int]]] = {}
@@ -95,8 +103,8 @@ class _Mender:
     def mend(self) -> list[str]:
         found = self.found
         self.staged = _staged(found) if self.only is None else None
-        self.features = as_found(found, self.said)
-        self.streams = {name: sensor for name, sensor in found.streams.items() if _possible(sensor)}
+        self._features()
+        self.streams = {name: sensor for name, sensor in found.streams.items() if possible(sensor)}
         self.said += [
             f"stream {name!r:.100} is none that can be kept" for name in found.streams if name not in self.streams
         ]
@@ -105,14 +113,16 @@ class _Mender:
             raise DatasetError(f"nothing in {found.root} is whole; restore it from a copy.")
         self.tasks = _sentences(found, pieces, self.said)
         self.films = self._films(pieces)
+        self._ask(pieces, [end - begin for piece in pieces for begin, end in runs(self._shown(piece, False))])
         self.writer = Writer(self.out, self._layout())
         self.reader = RowReader(self.features)
-        fresh(self.writer.staging)
+        self.stream_mender = StreamMender(found, self.features, self.streams, fresh(self.writer.staging), self.said)
         try:
             for done, piece in enumerate(pieces, 1):
                 self._put(piece)
                 if self.progress:
                     self.progress(done, len(pieces))
+            self._ask(pieces, [end - begin for kept in self.kept.values() for begin, end in kept])
             self._summarise(pieces)
             self._recover()
             self.writer.tidy(0)
@@ -120,12 +130,39 @@ class _Mender:
                 raise DatasetError(
                     f"nothing of {found.root} could be kept: {'; '.join(self.said) or 'it has no rows'}."
                 )
+        except _Refused as refused:
+            shutil.rmtree(self.out)
+            raise DatasetError(str(refused)) from None
         finally:
             self.writer.close()
             for folder in (self.writer.staging, self.out / _REBUILT, self.out / _INTERRUPTED):
                 shutil.rmtree(folder, ignore_errors=True)
         self._keep_facts()
         return self.said
+
+    def _features(self) -> None:
+        """As the files have them; where fps was wrong, so it was perhaps in what is said of the videos."""
+        found = self.found
+        self.features = mended_features(
+            found.root, found.features, found.data, found.films, found.video_path, self.said
+        )
+        self.said += [fault.what for fault in found.faults if fault.what.startswith("fps") and found.info]
+        for name, feature in self.features.items():
+            if isinstance(feature.get("info"), dict) and "video.fps" in feature["info"]:
+                self.features[name] = {**feature, "info": {**feature["info"], "video.fps": found.fps}}
+
+    def _ask(self, pieces: list[Piece], kept: list[int]) -> None:
+        """Whether most rows may be lost, or episodes be cut to many pieces: lengths `kept` are left of `pieces`."""
+        rows, of, episodes = sum(kept), sum(piece.count for piece in pieces), len({piece.number for piece in pieces})
+        if not rows or self.allow_loss is True or (2 * rows >= of and len(kept) <= 2 * episodes + _MOST_PIECES):
+            return
+        why = next(iter(self.why.values()), "others are damaged")
+        sentence = f"of {of} rows in {episodes} episodes only {rows} would be kept, in {len(kept)} pieces ({why})"
+        if not callable(self.allow_loss) or not self.allow_loss(f"{sentence}."):
+            raise _Refused(
+                f"{sentence}; mend what the doctor names first, or allow the loss (--yes, in Python allow_loss=True)."
+            )
+        self.allow_loss = True
 
     def _layout(self) -> Layout:
         found, ours = self.found, ("version", "world", "sensors", "streams", "terminal")
@@ -145,13 +182,13 @@ class _Mender:
 
     def _pieces(self) -> list[Piece]:
         found, pieces = self.found, []
-        named = list(dict.fromkeys(episode.data for episode in found.told.values()))
+        named = list(dict.fromkeys(episode.data for episode in found.episodes.values()))
         for file in [*named, *(file for file in found.data if file not in set(named))]:
             try:
                 pieces += pieces_of(found, self._table(file), self.said)
-            except _BROKEN as error:
-                self.said.append(f"{file} cannot be read ({_short(error)})")
-                for episode in found.told.values():
+            except BROKEN as error:
+                self.said.append(f"{file} cannot be read ({short(error)})")
+                for episode in found.episodes.values():
                     if episode.data == file:
                         self.why[episode.number] = f"{file} cannot be read"
         if self.staged is not None:  # of an episode whose commit was killed, the staging folder has all
@@ -167,7 +204,7 @@ class _Mender:
             raise DatasetError("the file is missing")
         try:
             return read_table(self.found, file, path, self.features)
-        except _BROKEN as error:
+        except BROKEN as error:
             try:
                 copy = self.out / _REBUILT / file
                 rows = rebuild(path, self._form(), self.features, copy)
@@ -183,7 +220,7 @@ class _Mender:
             try:
                 with open_parquet(self.found.path(file)) as opened:
                     return opened.schema_arrow
-            except _BROKEN:
+            except BROKEN:
                 continue
         return schema(self.features)
 
@@ -197,14 +234,22 @@ class _Mender:
         if file not in self.reels:
             try:
                 self.reels[file] = reel(self.found.path(file), self.found.fps)
-            except _BROKEN as error:
-                self.said.append(f"{file} cannot be read ({_short(error)})")
+            except BROKEN as error:
+                self.said.append(f"{file} cannot be read ({short(error)})")
                 self.reels[file] = None
         return self.reels[file]
 
     def _films(self, pieces: list[Piece]) -> dict[tuple[int, str], Film]:
         """(episode, camera) -> where its pictures lie: as meta/episodes tells, or by counting frames where it does not."""
-        films = {(n, camera): film for n, episode in self.found.told.items() for camera, film in episode.films.items()}
+        listed = {
+            (n, camera): film for n, episode in self.found.episodes.items() for camera, film in episode.videos.items()
+        }
+        shown = Shown()
+        for _ in examine_films(self.found, shown, False):
+            pass
+        films = {key: listed[key] for key in listed} | {of: listed[key] for key, of in shown.exchanged.items()}
+        for (n, camera), (other, of) in shown.exchanged.items():
+            self.said.append(f"the video {listed[n, camera].file} shows episode {other} ({of}), and is put there")
         lengths: dict[int, int] = {}
         for piece in pieces:
             lengths[piece.number] = max(lengths.get(piece.number, 0), piece.frame + piece.count)
@@ -229,7 +274,7 @@ class _Mender:
                 first += lengths[rest.pop(0)]
             if first != room:
                 self.said.append(
-                    f"{file} has {room} frames, {first} of them of whole episodes: what follows cannot be told apart"
+                    f"{file} has {room} frames, {first} of them of whole episodes: what follows cannot be listed apart"
                 )
                 break
         found = {(n, camera): placed[n, camera] for n in unknown if (n, camera) in placed}
@@ -252,7 +297,7 @@ class _Mender:
             draft, anew = self._draft(piece)
             self.writer.put(draft)
         except (DatasetError, ValueError, pa.ArrowException) as error:
-            self.why[piece.number] = _short(error)
+            self.why[piece.number] = short(error)
             return False
         for camera in anew:
             what = f"the video of {camera} from frame {piece.frame} on is encoded again, as no copy could begin there"
@@ -269,7 +314,7 @@ class _Mender:
             there = np.zeros(piece.count, bool)
             if film and opened:
                 first = film.first + piece.frame
-                there = np.isin(first + np.arange(piece.count), opened.frames)
+                there = np.isin(first + np.arange(piece.count), opened.frames[~opened.zeroed])
                 if strict:
                     there &= whole_frames(self.found.path(film.file), first, piece.count, self.found.fps)
             if not there.all():
@@ -280,7 +325,6 @@ class _Mender:
     def _draft(self, piece: Piece) -> tuple[Draft, list[str]]:
         """(what the writer takes, cameras whose video was encoded again); DatasetError where a frame cannot be decoded."""
         staging, videos, pictures, anew = self.writer.staging, {}, {}, []
-        looked_at = np.unique(np.linspace(0, piece.count - 1, _LOOKED_AT).round().astype(int)).tolist()
         for camera in self._cameras():
             film, videos[camera] = self.films[piece.number, camera], staging / f"{camera}.mp4"
             opened = self._reel(film.file)
@@ -291,20 +335,26 @@ class _Mender:
                 anew.append(camera)
             if not whole_frames(videos[camera], 0, piece.count, self.found.fps).all():
                 raise DatasetError(f"{film.file} has frames that cannot be decoded")
-            some = mp4.frames_at(videos[camera], looked_at, self.found.fps)
-            if some.shape[1:] != tuple(self.features[camera]["shape"]):
-                raise DatasetError(f"the pictures of {film.file} have another size than the others of {camera}")
-            pictures[camera] = stats.summarise_pictures(some[:, ::4, ::4])
-        told = self.found.told.get(piece.number)
-        begin, end, shift = self._times(piece)
-        streams, films = self._streams(piece.number, begin, end, shift)
-        start_ns = None if told is None or told.start_ns is None else told.start_ns + round(shift * 1e9)
-        only = {} if told is None or len(told.tasks) != 1 else dict.fromkeys(piece.task.tolist(), told.tasks[0])
+            pictures[camera] = self._look(videos[camera], piece.count, camera)
+        listed = self.found.episodes.get(piece.number)
+        streams, films, shift = self.stream_mender.cut(piece)
+        start_ns = None if listed is None or listed.start_ns is None else listed.start_ns + round(shift * 1e9)
+        only = {} if listed is None or len(listed.tasks) != 1 else dict.fromkeys(piece.task.tolist(), listed.tasks[0])
         texts = {**self.tasks, **only, **self.found.tasks}
         tasks = [texts[int(task)] for task in piece.task]
         pictures |= self._image_statistics(piece)
         rows, counts = self._rows(piece, shift), self._counts(piece)
         return Draft(piece.count, rows, videos, pictures, tasks[0], streams, films, start_ns, tasks, counts), anew
+
+    def _look(self, video: Path, count: int, camera: str) -> stats.Summary:
+        """Statistics of an episode's pictures, from as many as our recorder looks at."""
+        parts = []
+        for row in range(0, count, SAMPLE_EVERY):
+            picture = mp4.frames_at(video, [row], self.found.fps)
+            if picture.shape[1:] != tuple(self.features[camera]["shape"]):
+                raise DatasetError(f"the pictures of {video.name} have another size than the others of {camera}")
+            parts.append({camera: stats.summarise_pictures(picture[:, ::4, ::4])})
+        return stats.merge(parts)[camera]
 
     def _image_statistics(self, piece: Piece) -> dict[str, stats.Summary]:
         """Of pictures that the rows hold themselves, from some of them."""
@@ -318,10 +368,10 @@ class _Mender:
 
     def _counts(self, piece: Piece) -> dict[str, int]:
         """Sensor -> rows up to the last that has it, where that is not the piece's last."""
-        told = self.found.told.get(piece.number)
-        known = None if told is None else told.counts
+        listed = self.found.episodes.get(piece.number)
+        known = None if listed is None else listed.counts
         if known is None:
-            length = piece.frame + piece.count if told is None else told.length
+            length = piece.frame + piece.count if listed is None else listed.length
             ended = ACTION_VALID in self.features and self.found.about.get("terminal", True)
             known = {name: length - 1 for name in self.features if follows(name)} if ended else {}
         kept = {
@@ -329,7 +379,7 @@ class _Mender:
             for name, count in known.items()
             if name in self.features
         }
-        if told is not None and piece.frame + piece.count < told.length and ACTION_VALID in self.features:
+        if listed is not None and piece.frame + piece.count < listed.length and ACTION_VALID in self.features:
             reader = RowReader({ACTION_VALID: self.features[ACTION_VALID]})  # what comes after its last row is gone
             acted = np.flatnonzero(np.concatenate([part[ACTION_VALID].reshape(-1) for part in reader.columns(piece)]))
             last = int(acted[-1]) + 1 if len(acted) else 0
@@ -348,9 +398,9 @@ class _Mender:
     def _summarise(self, pieces: list[Piece]) -> None:
         """Says which episodes are as they were, and which rows of the others are kept."""
         whole, rows = 0, 0
-        lengths = {number: episode.length for number, episode in self.found.told.items()}
+        lengths = {number: episode.length for number, episode in self.found.episodes.items()}
         for piece in pieces:
-            if piece.number not in self.found.told:
+            if piece.number not in self.found.episodes:
                 lengths[piece.number] = max(lengths.get(piece.number, 0), piece.frame + piece.count)
         for number, length in sorted(lengths.items()):
             kept = self.kept.get(number, [])
@@ -364,60 +414,6 @@ class _Mender:
         self.said.insert(
             0, f"{whole} whole episodes ({rows} rows) are carried over; counters, statistics and meta/ are made anew"
         )
-
-    # -- streams ------------------------------------------------------------------------------------------------
-
-    def _times(self, piece: Piece) -> tuple[float, float, float]:
-        """(begin, end, shift): true times between which streams belong to the piece, and its own time 0."""
-        if piece.whole or not self.streams:
-            return -np.inf, np.inf, 0.0
-        fps = self.found.fps
-        told = self.found.told.get(piece.number)
-        time_s = piece.frame + np.arange(piece.count) / fps
-        if TIME in self.features:
-            time_s = np.concatenate([columns[TIME].reshape(-1) for columns in RowReader(self.features).columns(piece)])
-        first, last = piece.frame == 0, told is not None and piece.frame + piece.count == told.length
-        shift = 0.0 if first else float(time_s[0])
-        return (-np.inf if first else float(time_s[0])), (np.inf if last else float(time_s[-1]) + 1 / fps), shift
-
-    def _streams(self, number: int, begin: float, end: float, shift: float) -> tuple[dict, dict]:
-        streams, films = {}, {}
-        for name, sensor in self.streams.items():
-            place = STREAM_PATH.format(name=name, suffix="parquet", **where(number))
-            try:
-                if not self.found.path(place).exists():
-                    continue
-                time_s, values = _readings(self.found.path(place), sensor)
-                keep = _ascending(time_s) & (time_s >= begin) & (time_s < end)
-                if sensor.kind == "image":
-                    film = STREAM_PATH.format(name=name, suffix="mp4", **where(number))
-                    at = self._stream_film(name, sensor, film, np.flatnonzero(keep))
-                    if not len(at):
-                        continue
-                    films[name] = self.writer.staging / f"stream-{name}.mp4"
-                    streams[name] = [(float(time_s[i] - shift), None) for i in at]
-                else:
-                    streams[name] = [(float(time_s[i] - shift), values[i]) for i in np.flatnonzero(keep)]
-                if not keep.all() and np.isinf(begin) and np.isinf(end):
-                    self.said.append(
-                        f"episode {number}: {int((~keep).sum())} readings of stream {name} were out of order and left out"
-                    )
-            except _BROKEN as error:
-                self.said.append(f"episode {number}: stream {name} cannot be read ({_short(error)}) and is left out")
-        return streams, films
-
-    def _stream_film(self, name: str, sensor: Sensor, film: str, wanted: np.ndarray) -> np.ndarray:
-        """Cuts the wanted frames out of a stream's film, up to the first that is damaged; returns which they are."""
-        rate, path = sensor.rate_hz or self.found.fps, self.found.path(film)
-        opened = reel(path, rate)
-        good = np.append(whole_frames(path, 0, opened.count, rate), False)
-        follows_on = np.diff(wanted, prepend=wanted[:1] - 1) == 1
-        bad = np.flatnonzero(~(good[wanted.clip(max=opened.count)] & follows_on))
-        there = wanted[: bad[0]] if len(bad) else wanted
-        if len(there):
-            target = self.writer.staging / f"stream-{name}.mp4"
-            cut(path, int(there[0]), len(there), rate, target, opened)
-        return there
 
     # -- what is left -------------------------------------------------------------------------------------------
 
@@ -443,16 +439,16 @@ class _Mender:
             self.writer.put(replace(draft, streams=streams))
             self.said.append(f"the interrupted episode is recovered up to its last whole row: {rows} rows")
         except (DatasetError, ValueError, KeyError, pa.ArrowException) as error:
-            self.said.append(f"the interrupted episode cannot be recovered ({_short(error)})")
+            self.said.append(f"the interrupted episode cannot be recovered ({short(error)})")
 
     def _keep_facts(self) -> None:
         """What else meta/info.json said stays."""
-        told = read_json(self.out / INFO)
-        if isinstance(told, dict) and self.found.info:
-            kept = {key: value for key, value in self.found.info.items() if key not in told}
-            if self.found.info.get("total_episodes") == told["total_episodes"] and "splits" in self.found.info:
+        listed = read_json(self.out / INFO)
+        if isinstance(listed, dict) and self.found.info:
+            kept = {key: value for key, value in self.found.info.items() if key not in listed}
+            if self.found.info.get("total_episodes") == listed["total_episodes"] and "splits" in self.found.info:
                 kept["splits"] = self.found.info["splits"]
-            durable.write_json(self.out / INFO, json.loads(json.dumps({**told, **kept}).replace("NaN", "null")))
+            durable.write_json(self.out / INFO, json.loads(json.dumps({**listed, **kept}).replace("NaN", "null")))
 
 
 def _staged(found: Survey) -> int | None:
@@ -465,46 +461,18 @@ def _staged(found: Survey) -> int | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError, DatasetError):
         return None
     total = found.info.get("total_episodes")
-    missing = number == total if isinstance(total, int) else number not in found.told
+    missing = number == total if isinstance(total, int) else number not in found.episodes
     return number if missing else None
-
-
-def _possible(sensor: Sensor) -> bool:
-    """Whether a recording can hold the stream."""
-    sizes = sensor.shape[1:] if sensor.kind == "points" else sensor.shape
-    odd = sensor.kind == "image" and any(size % 2 for size in sensor.shape[:2])
-    return bool(NAME.fullmatch(sensor.name)) and bool(sizes) and min(sizes) > 0 and not odd and sensor.dtype != "string"
 
 
 def _sentences(found: Survey, pieces: list[Piece], said: list[str]) -> dict[int, str]:
     """task_index -> its sentence; where tasks.parquet is lost, by the episodes that have one task alone."""
     tasks = dict(found.tasks)
     for piece in pieces:
-        told = found.told.get(piece.number)
-        if told and len(told.tasks) == 1 and len(set(piece.task.tolist())) == 1:
-            tasks.setdefault(int(piece.task[0]), told.tasks[0])
+        listed = found.episodes.get(piece.number)
+        if listed and len(listed.tasks) == 1 and len(set(piece.task.tolist())) == 1:
+            tasks.setdefault(int(piece.task[0]), listed.tasks[0])
     lost = sorted({int(task) for piece in pieces for task in piece.task} - set(tasks))
     if lost:
         said.append(f"the sentences of {len(lost)} tasks are lost: they are called 'task {lost[0]}' and so on")
     return tasks | {task: f"task {task}" for task in lost}
-
-
-def _readings(path: Path, sensor: Sensor) -> tuple[np.ndarray, list[np.ndarray]]:
-    table = read_whole(path)
-    time_s = table["time_s"].to_numpy().astype(np.float64)
-    if sensor.kind == "image":
-        return time_s, []
-    value = table["value"].combine_chunks()
-    flat, offsets = value.values.to_numpy(zero_copy_only=False), value.offsets.to_numpy()
-    return time_s, [flat[begin:end] for begin, end in zip(offsets, offsets[1:])]
-
-
-def _ascending(time_s: np.ndarray) -> np.ndarray:
-    """bool [n]: the readings that are at a finite time, none of them before one that came earlier."""
-    finite = np.isfinite(time_s)
-    newest = np.maximum.accumulate(np.where(finite, time_s, -np.inf))
-    return finite & (time_s >= newest)
-
-
-def _short(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].split(";")[0][:300]

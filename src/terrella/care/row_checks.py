@@ -1,9 +1,8 @@
-"""What a doctor finds in the rows: schema, counters, timestamps, values, statistics, and what later tests need of them."""
+"""What a doctor finds in the rows: schema, counters, timestamps, values, pictures, and what later tests need of them."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -12,9 +11,9 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.format import ACTION, ACTION_VALID, DONE, STATS, TASKS, contained, names_of, schema, to_numpy
-from ..data.storage.tables import read_json
-from .survey import LEFTOVER, RESTORE, Fault, Survey
+from ..data.format import ACTION, ACTION_VALID, DONE, STATE, TASKS, schema, to_numpy
+from .pieces import whole_pictures
+from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey
 from .tables import batches, open_parquet
 
 _LEAVE_OUT = "let --repair split the episode around such rows, or leave it out of training"
@@ -24,9 +23,10 @@ _KEPT_EPISODES, _KEPT_ROWS = 64, 1024  # of so many the actions and states are k
 
 @dataclass
 class Seen:
-    """What the rows of one episode told.
+    """What the rows of one episode hold.
 
-    file: where they lie; rows: how many; first: the column "index" of the first; kept: columns of the first rows.
+    file: where they lie; rows: how many; first: the column "index" of the first; kept: columns of the first rows;
+    moved: of the state and the action, in which rows they differ from the row before; unreadable: pictures, by row.
     """
 
     number: int
@@ -37,14 +37,20 @@ class Seen:
     digest: hashlib.blake2b = field(default_factory=lambda: hashlib.blake2b(digest_size=16))
     pictures: hashlib.blake2b = field(default_factory=lambda: hashlib.blake2b(digest_size=16))
     kept: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    moved: dict[str, list[np.ndarray]] = field(default_factory=dict)
     done: list[np.ndarray] = field(default_factory=list)
+    unreadable: dict[str, list[int]] = field(default_factory=dict)
     wrong: dict[str, Fault] = field(default_factory=dict)
-    start: dict[str, np.ndarray] = field(default_factory=dict)
+    last: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def note(self, kind: str, at: int, what: str, mend: str) -> None:
+        """A fault of row `at` of the episode, the first of its kind."""
+        self.wrong.setdefault(kind, Fault(self.file, (self.first or 0) + at, what, mend))
 
 
 @dataclass
 class Rows:
-    """What all rows told: episodes by their number; a Summary of each column; acted: of the actions that count."""
+    """What all rows hold: episodes by their number; a Summary of each column; acted: of the actions that count."""
 
     episodes: dict[int, Seen] = field(default_factory=dict)
     summary: dict[str, stats.Summary] = field(default_factory=dict)
@@ -55,24 +61,24 @@ class Rows:
 def examine_rows(survey: Survey, found: Rows, busy: bool) -> Iterator[Fault]:
     """Reads every data file once; fills `found`. `busy`: somebody is recording, what is not yet listed is no fault."""
     promised = schema(survey.features)
-    named = {episode.data for episode in survey.told.values()}
-    every = len(survey.told) or 1
-    sampled = set(list(survey.told or range(_KEPT_EPISODES))[:: max(1, every // _KEPT_EPISODES)])
+    every = len(survey.episodes) or 1
+    sampled = set(list(survey.episodes or range(_KEPT_EPISODES))[:: max(1, every // _KEPT_EPISODES)])
     firsts: dict[str, int] = {}
-    for episode in survey.told.values():
+    for episode in survey.episodes.values():
         firsts[episode.data] = min(episode.start, firsts.get(episode.data, episode.start))
-    for file in sorted(named - set(survey.data)):
-        for episode in survey.told.values():
-            if episode.data == file:
-                found.broken.add(file)
-                yield Fault(file, episode.start, f"the table of episode {episode.number} is missing", RESTORE)
+        if episode.data not in survey.data:
+            found.broken.add(episode.data)
+            what = f"the table of episode {episode.number} is missing"
+            yield Fault(episode.data, episode.start, what, RESTORE)
     for file in survey.data:
-        if survey.complete and file not in named:
-            if not busy:
-                yield Fault(file, None, "no episode of info.json uses this file", LEFTOVER)
-            continue
-        yield from _file(survey, file, firsts.get(file), promised, found, sampled)
+        if not survey.complete or file in firsts:
+            yield from _file(survey, file, firsts.get(file), promised, found, sampled)
+        elif not busy:
+            yield Fault(file, None, "no episode of info.json uses this file", LEFTOVER)
     for seen in found.episodes.values():
+        for name, rows in seen.unreadable.items():
+            what = f"{len(rows)} of {seen.rows} pictures of {name} cannot be decoded"
+            seen.note(f"pictures {name}", rows[0], what, _LEAVE_OUT)
         yield from seen.wrong.values()
     yield from _lengths(survey, found)
 
@@ -138,9 +144,8 @@ def _batch(survey: Survey, file: str, at: int, table: pa.Table, found: Rows, sam
             continue
         _counters(survey, seen, part)
         _values(survey, seen, part)
-        for column in pictures.values():
-            for picture in column.slice(begin, end - begin):
-                seen.pictures.update((picture["bytes"].as_py() if picture.is_valid else None) or b"")
+        for name, column in pictures.items():
+            _pictures(survey, seen, name, column.slice(begin, end - begin))
         _keep(seen, part, number in sampled)
         seen.rows += end - begin
     _summarise(found, columns)
@@ -150,47 +155,50 @@ def _batch(survey: Survey, file: str, at: int, table: pa.Table, found: Rows, sam
 
 
 def _counters(survey: Survey, seen: Seen, part: Mapping[str, np.ndarray]) -> None:
-    count, told = len(part["episode_index"]), survey.told.get(seen.number)
-    frame = seen.rows + np.arange(count)
+    listed = survey.episodes.get(seen.number)
+    frame = seen.rows + np.arange(len(part["episode_index"]))
     index = part["index"].reshape(-1) if "index" in part else None
     if seen.first is None:
-        seen.first = told.start if told else (int(index[0]) if index is not None else 0)
-    expected = {"frame_index": frame, "index": seen.first + frame}
-    for name, should in expected.items():
-        if name in part and name not in seen.wrong:
-            for at in np.flatnonzero(part[name].reshape(-1) != should)[:1]:
-                what = f"{name} is {int(part[name].reshape(-1)[at])} where {int(should[at])} is due: rows are missing or moved"
-                seen.wrong[name] = Fault(seen.file, seen.first + seen.rows + int(at), what, _COUNT_ANEW)
-    if "timestamp" in part and "timestamp" not in seen.wrong:
+        seen.first = listed.start if listed else (int(index[0]) if index is not None else 0)
+    for name, due in {"frame_index": frame, "index": seen.first + frame}.items():
+        if name in part:
+            there = part[name].reshape(-1)
+            for at in np.flatnonzero(there != due)[:1]:
+                what = f"{name} is {int(there[at])} where {int(due[at])} is due: rows are missing or moved"
+                seen.note(name, int(frame[at]), what, _COUNT_ANEW)
+    if "timestamp" in part:
         late = np.abs(part["timestamp"].reshape(-1).astype(np.float64) - frame / survey.fps)
         late[~np.isfinite(late)] = 0  # named as no number elsewhere
         slack = 0.1 / survey.fps + 1e-6 * np.abs(frame / survey.fps)  # float32 at its coarsest
         for at in np.flatnonzero(late > slack)[:1]:
             what = f"timestamp is {late[at]:.3f} s off frame_index / {survey.fps:g} frames per second"
-            mend = "set timestamp to frame_index / fps, as --repair does"
-            seen.wrong["timestamp"] = Fault(seen.file, seen.first + seen.rows + int(at), what, mend)
+            seen.note("timestamp", int(frame[at]), what, "set timestamp to frame_index / fps, as --repair does")
 
 
 def _values(survey: Survey, seen: Seen, part: Mapping[str, np.ndarray]) -> None:
-    first = seen.first or 0
     for name, column in part.items():
-        if column.dtype.kind != "f" or np.isfinite(column).all():
-            continue
-        bad = np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(1))
-        if f"finite {name}" not in seen.wrong:
-            what = f"{name} is not a finite number"
-            seen.wrong[f"finite {name}"] = Fault(seen.file, first + seen.rows + int(bad[0]), what, _LEAVE_OUT)
-    if "task_index" in part and survey.tasks and "task_index" not in seen.wrong:
+        if column.dtype.kind == "f" and not np.isfinite(column).all():
+            bad = np.flatnonzero(~np.isfinite(column.reshape(len(column), -1)).all(1))
+            seen.note(f"finite {name}", seen.rows + int(bad[0]), f"{name} is not a finite number", _LEAVE_OUT)
+    if "task_index" in part and survey.tasks:
         task = part["task_index"].reshape(-1)
         for at in np.flatnonzero(~np.isin(task, list(survey.tasks)))[:1]:
             what, mend = f"task {int(task[at])} is not in {TASKS}", "let --repair make it anew from meta/episodes"
-            seen.wrong["task_index"] = Fault(seen.file, first + seen.rows + int(at), what, mend)
+            seen.note("task_index", seen.rows + int(at), what, mend)
     if DONE in part:
         seen.done.append(part[DONE].reshape(-1).astype(bool))
 
 
+def _pictures(survey: Survey, seen: Seen, name: str, column: pa.ChunkedArray) -> None:
+    for picture in column:
+        seen.pictures.update((picture["bytes"].as_py() if picture.is_valid else None) or b"")
+    bad = np.flatnonzero(~whole_pictures(column, tuple(survey.features[name]["shape"])))
+    if len(bad):
+        seen.unreadable.setdefault(name, []).extend((seen.rows + bad).tolist())
+
+
 def _keep(seen: Seen, part: Mapping[str, np.ndarray], sampled: bool) -> None:
-    kept = sum(len(some) for some in seen.kept.get(ACTION, ()))
+    sampled = sampled and sum(len(some) for some in seen.kept.get(ACTION, ())) < _KEPT_ROWS
     for name, column in part.items():
         if name != ACTION and not name.startswith("observation."):
             continue
@@ -198,11 +206,14 @@ def _keep(seen: Seen, part: Mapping[str, np.ndarray], sampled: bool) -> None:
             seen.digest.update("\0".join(map(str, column.reshape(-1))).encode())
             continue
         seen.digest.update(np.ascontiguousarray(column).data.cast("B") if column.size else b"")
-        seen.start.setdefault(name, column[:1].copy())
-        seen.changes = seen.changes or bool((column != seen.start[name]).any())
-        if sampled and column.ndim <= 2 and kept < _KEPT_ROWS:
-            seen.kept.setdefault(name, []).append(column.reshape(len(column), -1).astype(np.float64))
-    if sampled and ACTION_VALID in part and kept < _KEPT_ROWS:
+        flat = column.reshape(len(column), -1)
+        moved = (np.concatenate([seen.last.get(name, flat[:1]), flat[:-1]]) != flat).any(1)
+        seen.changes, seen.last[name] = seen.changes or bool(moved.any()), flat[-1:].copy()
+        if name == ACTION or name.startswith(STATE):
+            seen.moved.setdefault(name, []).append(moved)
+        if sampled and column.ndim <= 2:
+            seen.kept.setdefault(name, []).append(flat.astype(np.float64))
+    if sampled and ACTION_VALID in part:
         seen.kept.setdefault(ACTION_VALID, []).append(part[ACTION_VALID].reshape(-1, 1).astype(np.float64))
 
 
@@ -242,97 +253,23 @@ def _alike(found: pa.DataType, promised: pa.DataType) -> bool:
 
 
 def _lengths(survey: Survey, found: Rows) -> Iterator[Fault]:
-    for number, episode in survey.told.items():
+    for number, episode in survey.episodes.items():
         seen = found.episodes.get(number)
         if seen is None and episode.data not in found.broken and episode.length:
             what = f"episode {number} has 0 rows here, {episode.length} in meta/episodes"
             yield Fault(episode.data, episode.start, what, RESTORE)
         elif seen is not None and seen.file != episode.data and seen.file not in found.broken:
             what = f"the rows of episode {number} lie here, meta/episodes looks for them in {episode.data}"
-            yield Fault(seen.file, episode.start, what, "let --repair make meta/episodes anew from the rows")
+            yield Fault(seen.file, episode.start, what, FROM_ROWS)
         elif seen is not None and seen.rows != episode.length and seen.file not in found.broken:
             what = f"episode {number} has {seen.rows} rows here, {episode.length} in meta/episodes"
             yield Fault(seen.file, episode.start, what, RESTORE)
     for number, seen in found.episodes.items():
-        if number not in survey.told and survey.complete:
+        if number not in survey.episodes and survey.complete:
             what = f"it holds {seen.rows} rows of episode {number}, which meta/episodes does not list"
-            yield Fault(seen.file, seen.first, what, "let --repair make meta/episodes anew from the rows")
+            yield Fault(seen.file, seen.first, what, FROM_ROWS)
         done = np.concatenate(seen.done) if seen.done else np.zeros(0, bool)
         for at in np.flatnonzero(done[:-2])[:1]:  # the last two: the step that ended it, and its end
             what = f"done is set {len(done) - 1 - int(at)} rows before the end of episode {number}"
             mend = "split the episode there, or clear the flag"
             yield Fault(seen.file, (seen.first or 0) + int(at), what, mend)
-
-
-def statistics(survey: Survey, found: Rows) -> Iterator[Fault]:
-    """meta/stats.json against the rows."""
-    again = "let --repair compute it from the rows"
-    try:
-        told = read_json(contained(survey.root, STATS))
-        if not isinstance(told, dict):
-            raise ValueError("it is no JSON object")
-    except FileNotFoundError:
-        if survey.info.get("total_episodes") == 0 and not survey.data:
-            return
-        yield Fault(STATS, None, "the file is missing, LeRobot cannot normalise without it", again)
-        return
-    except (OSError, ValueError, DatasetError) as error:
-        yield Fault(STATS, None, f"the file cannot be read ({error})", again)
-        return
-    if found.broken:
-        return
-    for name, summary in found.summary.items():
-        if name not in told or not np.isfinite(summary["max"]).all():
-            continue
-        off = _differs(told[name], summary)
-        if off:
-            yield Fault(STATS, None, f"{name}: {off}", again)
-
-
-def _differs(told: object, summary: stats.Summary) -> str:
-    """The first figure that is not that of the rows; "" where all agree."""
-    if not isinstance(told, dict):
-        return "it is no summary"
-    spread = np.maximum(summary["std"], 1e-3 * np.maximum(np.abs(summary["max"]), np.abs(summary["min"]))) + 1e-6
-    for key in ("count", "min", "max", "mean", "std"):
-        if key not in told:
-            continue
-        try:
-            figure = np.asarray(told[key], np.float64).reshape(-1)
-        except (ValueError, TypeError):
-            return f"{key} is no list of numbers"
-        true = np.asarray(summary[key], np.float64).reshape(-1)
-        if len(figure) != len(true):
-            return f"{key} has {len(figure)} numbers, the rows have {len(true)}"
-        slack = 0.0 if key == "count" else 0.02 * spread
-        for at in np.flatnonzero(~(np.abs(figure - true) <= slack))[:1]:
-            return f"{key} {json.dumps(float(figure[at]))} is not that of the rows, {json.dumps(float(true[at]))}"
-    return ""
-
-
-def constants(survey: Survey, found: Rows) -> tuple[list[Fault], list[str]]:
-    """(faults, notes): an action that never changes teaches nothing; single numbers that never change are worth knowing."""
-    faults, notes = [], []
-    rows = sum(seen.rows for seen in found.episodes.values())
-    if rows < 32:
-        return faults, notes
-    for name, summary in {**found.summary, **found.acted}.items():
-        if name != ACTION and not name.startswith("observation."):
-            continue
-        still = np.flatnonzero(summary["min"] == summary["max"])
-        if not len(still):
-            continue
-        values = summary["min"].tolist()
-        if len(still) == len(values):
-            what = (
-                f"the {name} is {values if len(values) <= 16 else values[:16]} in all {int(summary['count'][0])} rows"
-            )
-            if name == ACTION:
-                faults.append(Fault("data", None, what, "check that actions are recorded, and record anew"))
-            else:
-                notes.append(f"{what}: a sensor that sees nothing, or was not plugged in?")
-            continue
-        names = names_of(survey.features[name])
-        labels = [names[at] if len(names) == len(values) else f"number {at}" for at in still]
-        notes.append(f"{name}: {', '.join(labels)} never change{'s' * (len(labels) == 1)} in {rows} rows")
-    return faults, notes

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,36 +20,37 @@ Policy = Annotated[
 ]
 
 
-def doctor(folder: Positional[Path], repair: bool = False, out: Path | None = None, json: Json = False) -> int:
+def doctor(
+    folder: Positional[Path], repair: bool = False, out: Path | None = None, yes: bool = False, json: Json = False
+) -> int:
     """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
 
     Args:
         folder: Folder of a LeRobot v3 dataset, ours or anybody's.
         repair: Write a mended copy that keeps every whole row; the original is not touched.
         out: Where the mended copy goes; without it FOLDER-mended.
+        yes: Repair without asking even where most rows would be lost.
     """
-    from ..care import doctor as examine
     from ..care import repair as mend
+    from ..care.doctor import examine
 
-    faults = examine(folder)
-    facts: dict[str, object] = {
-        "dataset": str(folder),
-        "sound": not faults,
-        "faults": [asdict(fault) for fault in faults],
-    }
-    lines = [
-        f"{fault.file}{'' if fault.row is None else f', row {fault.row}'}: {fault.what}.\n    mend: {fault.mend}."
-        for fault in faults
-    ]
-    lines.append(f"{folder}: {len(faults) or 'no'} fault{'s' * (len(faults) != 1)}")
+    def allowed(sentence: str) -> bool:
+        if sys.stdin.isatty():
+            say(f"{sentence} Go on? [y/N]")
+            return sys.stdin.readline().strip().lower() in ("y", "yes")
+        return False
+
+    found = examine(folder)
+    facts: dict[str, object] = {"dataset": str(folder), "sound": not found.faults, **found.facts()}
+    lines = [found.report(str(folder))]
     if repair:
         target = out or folder.resolve().with_name(f"{folder.resolve().name}-mended")
         with progress.shown("mending") as report:
-            done = mend(folder, target, progress=lambda pieces, of: report(pieces, of))
+            done = mend(folder, target, progress=lambda pieces, of: report(pieces, of), allow_loss=yes or allowed)
         facts |= {"mended": str(target), "done": done}
         lines += [*done, f"the mended copy: {target}"]
     result(facts, json, "\n".join(lines))
-    return 1 if faults and not repair else 0
+    return 1 if found.faults and not repair else 0
 
 
 def convert(

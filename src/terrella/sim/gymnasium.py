@@ -218,7 +218,8 @@ class GymnasiumWorld:
                 if self._snapshots is not None:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
                 drawn = self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped)
-                found.append(np.array(_resized(drawn, self._size) if channel is None else drawn, space.dtype))
+                seen = np.asarray(drawn)
+                found.append(np.array(_resized(seen, self._size) if channel is None else seen, space.dtype))
                 if found[-1].shape != space.shape:
                     raise TerrellaError(
                         f"{self.spec.name} gave '{name}' of shape {found[-1].shape}; its space is {space}."

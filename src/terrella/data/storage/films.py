@@ -20,6 +20,7 @@ from .mp4 import Mp4Writer
 _BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MOST = 50_000_000  # frames of one file; more is damage
+_PACKED, _ZEROS = ("h264", "hevc", "av1", "libdav1d", "vp9"), bytes(24)  # entropy coding leaves no such run of zeros
 _FINISHED = {"movflags": "+faststart"}
 
 
@@ -30,11 +31,13 @@ class Reel:
     frames:  int64 [n]: which frame (by its time and the rate) each packet is.
     keys:    bool [n]: whether decoding may begin there.
     digests: bytes of n: 8 of each packet, equal where packets are.
+    zeroed:  bool [n]: whether a part of it was overwritten with zeros, as no encoder writes them.
     """
 
     frames: np.ndarray
     keys: np.ndarray
     digests: np.ndarray
+    zeroed: np.ndarray
 
     @property
     def count(self) -> int:
@@ -45,23 +48,26 @@ class Reel:
 
 def reel(path: Path, fps: float) -> Reel:
     """Reads the packets, decodes nothing; DatasetError where the file is none."""
-    found, keys, digests = [], [], []
+    found, keys, digests, zeroed = [], [], [], []
     try:
         boxes.check(path)
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
             a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+            codec = stream.codec_context.name if stream.codec_context else ""
             for packet in container.demux(stream):
                 if packet.size == 0 or packet.is_corrupt or packet.pts is None or len(found) == _MOST:
                     break
                 found.append(round(packet.pts * a_tick))
                 keys.append(packet.is_keyframe)
-                digests.append(hashlib.blake2b(bytes(packet), digest_size=8).digest())
+                raw = bytes(packet)
+                digests.append(hashlib.blake2b(raw, digest_size=8).digest())
+                zeroed.append(codec in _PACKED and _ZEROS in raw)
     except _BROKEN as error:
         if not found:
             raise _broken(path, str(error)) from error
     frames = np.array(found, np.int64) if all(abs(at) < 2**62 for at in found) else np.full(len(found), -1)
-    return Reel(frames, np.array(keys, bool), np.array(digests, "V8"))
+    return Reel(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
 
 
 def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel) -> bool:

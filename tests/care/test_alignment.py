@@ -123,12 +123,13 @@ def _walked(root, shift: int, pose: bool) -> None:
     world, rng = Corridor(), make_rng(1)
     with Recorder(root, Layout.of_channels(35, BUTTONS, rgb=(48, 64), pose=pose)) as recorder:
         for _ in range(6):
-            state, seen, done = world.start(1, rng), [], []
-            for i in range(60):
+            state, memory, seen, done = world.start(1, rng), keys.begin(1, rng), [], []
+            for _ in range(60):
                 rendered = world.render(state, ["rgb", "pose"] if pose else ["rgb"])
                 seen.append({name: array[0].numpy() for name, array in rendered.items()})
-                done.append(keys(seen[-1], {"step": i}, rng)[0].numpy())
-                state = world.imagine(state, keys.held, rng)
+                action, memory = keys.act(rendered, memory, rng)
+                done.append(action[0].numpy())
+                state = world.imagine(state, action, rng)
             for observation, action in zip(seen, np.roll(np.array(done), shift, 0)):
                 recorder.add(observation, action)
             recorder.end_episode()

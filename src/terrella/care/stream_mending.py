@@ -1,0 +1,112 @@
+"""The streams of an episode that is mended: their readings within its rows' times, in order, films cut to match."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..data.format import STREAM_PATH, TIME, where
+from ..data.source import Sensor
+from ..data.storage.films import cut, reel, whole_frames
+from ..data.writer import NAME
+from .features import BROKEN
+from .pieces import Piece, RowReader, short
+from .survey import Survey
+from .tables import read_whole
+
+
+class StreamMender:
+    """Cuts streams to pieces of rows; films go to the folder `staging`, what was left out is added to `said`."""
+
+    def __init__(
+        self,
+        survey: Survey,
+        features: Mapping[str, dict],
+        streams: Mapping[str, Sensor],
+        staging: Path,
+        said: list[str],
+    ):
+        self.survey, self.features, self.streams, self.staging, self.said = survey, features, streams, staging, said
+
+    def cut(self, piece: Piece) -> tuple[dict, dict, float]:
+        """(readings by stream, films by stream, seconds from the episode's time 0 to the piece's own)."""
+        begin, end, shift = self._times(piece)
+        return *self._streams(piece.number, begin, end, shift), shift
+
+    def _times(self, piece: Piece) -> tuple[float, float, float]:
+        """(begin, end, shift): true times between which streams belong to the piece, and its own time 0."""
+        if piece.whole or not self.streams:
+            return -np.inf, np.inf, 0.0
+        fps = self.survey.fps
+        listed = self.survey.episodes.get(piece.number)
+        time_s = piece.frame + np.arange(piece.count) / fps
+        if TIME in self.features:
+            time_s = np.concatenate([columns[TIME].reshape(-1) for columns in RowReader(self.features).columns(piece)])
+        first, last = piece.frame == 0, listed is not None and piece.frame + piece.count == listed.length
+        shift = 0.0 if first else float(time_s[0])
+        return (-np.inf if first else float(time_s[0])), (np.inf if last else float(time_s[-1]) + 1 / fps), shift
+
+    def _streams(self, number: int, begin: float, end: float, shift: float) -> tuple[dict, dict]:
+        streams, films = {}, {}
+        for name, sensor in self.streams.items():
+            place = STREAM_PATH.format(name=name, suffix="parquet", **where(number))
+            try:
+                if not self.survey.path(place).exists():
+                    continue
+                time_s, values = _readings(self.survey.path(place), sensor)
+                keep = _ascending(time_s) & (time_s >= begin) & (time_s < end)
+                if sensor.kind == "image":
+                    film = STREAM_PATH.format(name=name, suffix="mp4", **where(number))
+                    at = self._stream_film(name, sensor, film, np.flatnonzero(keep))
+                    if not len(at):
+                        continue
+                    films[name] = self.staging / f"stream-{name}.mp4"
+                    streams[name] = [(float(time_s[i] - shift), None) for i in at]
+                else:
+                    streams[name] = [(float(time_s[i] - shift), values[i]) for i in np.flatnonzero(keep)]
+                if not keep.all() and np.isinf(begin) and np.isinf(end):
+                    self.said.append(
+                        f"episode {number}: {int((~keep).sum())} readings of stream {name} were out of order and left out"
+                    )
+            except BROKEN as error:
+                self.said.append(f"episode {number}: stream {name} cannot be read ({short(error)}) and is left out")
+        return streams, films
+
+    def _stream_film(self, name: str, sensor: Sensor, film: str, wanted: np.ndarray) -> np.ndarray:
+        """Cuts the wanted frames out of a stream's film, up to the first that is damaged; returns which they are."""
+        rate, path = sensor.rate_hz or self.survey.fps, self.survey.path(film)
+        opened = reel(path, rate)
+        good = np.append(whole_frames(path, 0, opened.count, rate), False)
+        follows_on = np.diff(wanted, prepend=wanted[:1] - 1) == 1
+        bad = np.flatnonzero(~(good[wanted.clip(max=opened.count)] & follows_on))
+        there = wanted[: bad[0]] if len(bad) else wanted
+        if len(there):
+            target = self.staging / f"stream-{name}.mp4"
+            cut(path, int(there[0]), len(there), rate, target, opened)
+        return there
+
+
+def possible(sensor: Sensor) -> bool:
+    """Whether a recording can hold the stream."""
+    sizes = sensor.shape[1:] if sensor.kind == "points" else sensor.shape
+    odd = sensor.kind == "image" and any(size % 2 for size in sensor.shape[:2])
+    return bool(NAME.fullmatch(sensor.name)) and bool(sizes) and min(sizes) > 0 and not odd and sensor.dtype != "string"
+
+
+def _readings(path: Path, sensor: Sensor) -> tuple[np.ndarray, list[np.ndarray]]:
+    table = read_whole(path)
+    time_s = table["time_s"].to_numpy().astype(np.float64)
+    if sensor.kind == "image":
+        return time_s, []
+    value = table["value"].combine_chunks()
+    flat, offsets = value.values.to_numpy(zero_copy_only=False), value.offsets.to_numpy()
+    return time_s, [flat[begin:end] for begin, end in zip(offsets, offsets[1:])]
+
+
+def _ascending(time_s: np.ndarray) -> np.ndarray:
+    """bool [n]: the readings that are at a finite time, none of them before one that came earlier."""
+    finite = np.isfinite(time_s)
+    newest = np.maximum.accumulate(np.where(finite, time_s, -np.inf))
+    return finite & (time_s >= newest)

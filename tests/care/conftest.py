@@ -1,0 +1,30 @@
+"""Lets the tests of this room import their helpers and the small world of tests/data, and gives them a small recording."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "data")]
+
+
+@pytest.fixture(scope="session")
+def _recorded(tmp_path_factory) -> Path:
+    from corridor import Corridor, keys
+
+    from terrella.core import make_rng
+    from terrella.data import record
+
+    root = tmp_path_factory.mktemp("recorded") / "corridor"
+    record(Corridor(), keys, root, frames=100, rng=make_rng(0), max_episode_steps=29)
+    return root
+
+
+@pytest.fixture
+def recording(_recorded, tmp_path) -> Path:
+    """A folder of 100 rows: episodes of 30, 30, 30 and 10, free to be damaged."""
+    shutil.copytree(_recorded, tmp_path / "recording")
+    return tmp_path / "recording"
