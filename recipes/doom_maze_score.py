@@ -34,7 +34,6 @@ from terrella.measure import (
 )
 from terrella.space.keyframes import merge
 from terrella.worlds.generator import encode_depth
-from terrella.worlds.video import VideoWorld
 
 ARMS = ("memory", "no memory", "no network")
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
@@ -60,11 +59,14 @@ def exam(arm: str, name: str, data: str, count: int) -> Scorecard:
 class Average(torch.nn.Module):
     """In the place of the generator: what memory knows, averaged, and the last frame where it knows nothing."""
 
-    def __init__(self):
-        super().__init__()
-        self.where = torch.nn.Parameter(torch.zeros(()))  # a world asks its generator which device it is on
+    kind = "average"
 
-    def forward(self, noisy, time, glimpse, last, told):
+    def __init__(self, config):
+        super().__init__()
+        self.config = config
+
+    def forward(self, noisy, time, conditioning):
+        glimpse, last = conditioning.glimpse, conditioning.last
         rgb = torch.where(last[:, 3:] > 0, last[:, :3], merge(glimpse))
         return torch.cat([rgb * 2 - 1, encode_depth(glimpse.depth)[:, None]], 1)
 
@@ -73,7 +75,7 @@ def load(arm: str, name: str):
     world = terrella.load(name, memory=arm != "no memory")
     if arm != "no network":
         return world
-    return VideoWorld(world.spec, world.config, Average(), world.motion, world.memory, world.starts, world.rewards)
+    return world.replaced(generator=Average(world.generator.config), uncertainty=None, estimator=None)
 
 
 def places(world, data: str, count: int, rng, steps: int = max(HORIZONS)):
