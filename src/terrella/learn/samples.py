@@ -13,7 +13,7 @@ from ..core.spec import Spec
 from ..data import ClipCache
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
-from ..space.keyframes import Glimpse, Keyframes, doubled, look, retrieve
+from ..space.keyframes import Glimpse, Keyframes, doubled, gathered, look, retrieve
 from ..space.reproject import least_around
 from ..worlds.controls import AXES, CHOICE, Controls
 from ..worlds.generator import VideoConfig
@@ -198,15 +198,21 @@ def draw(
     for index, row in enumerate(target):
         pose = recording.pose([row])[0]
         if index % 2 == 0:
-            picks = retrieve([memory], pose, config.camera, config.size, config.sources)[0]
+            picks = _retrieved(memory, pose, config)
             if rng.random() < 0.4:
                 picks = [pick for pick in picks if rng.random() < 0.6]
             chosen.append(memory.at(picks))
         else:
             past = _past(recording, int(row), rng)
             own = recording.keyframes(past, config.camera)
-            chosen.append(own.at(retrieve([own], pose, config.camera, config.size, config.sources)[0]))
+            chosen.append(own.at(_retrieved(own, pose, config)))
     return Shown(chosen, target - 1, target)
+
+
+def _retrieved(memory: Keyframes, pose: torch.Tensor, config: VideoConfig) -> list[int]:
+    """The keyframes to use for the view from `pose` [7]."""
+    picks = retrieve(memory, pose[None], config.camera, config.size, config.sources)[0]
+    return picks[picks >= 0].tolist()
 
 
 def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarray:
@@ -221,7 +227,8 @@ def _past(recording: Recording, row: int, rng: np.random.Generator) -> np.ndarra
 
 def glimpse_of(shown: Shown, rows: np.ndarray, recording: Recording, config: VideoConfig):
     """What the chosen keyframes know of the views at `rows`."""
-    return look(shown.chosen, recording.pose(rows), config.camera, config.size, config.slots)
+    memory, picks = gathered(shown.chosen, config.size)
+    return look(memory, picks, recording.pose(rows), config.camera, config.size, config.slots)
 
 
 def carried(rgb, depth, from_rows, to_rows, glimpse, recording: Recording, config: VideoConfig) -> torch.Tensor:

@@ -61,7 +61,8 @@ def arrive(
         found.append(known)
         poses.append(place.pose if place is not None and known else corner[0])
         if known:
-            (picks,) = retrieve([memory], poses[-1], camera, (rgb.shape[-2], rgb.shape[-1]), sources)
-            seen = look([memory.at(picks)], poses[-1][None], camera, (rgb.shape[-2], rgb.shape[-1]), 1)
+            size = (rgb.shape[-2], rgb.shape[-1])
+            picks = retrieve(memory, poses[-1][None], camera, size, sources)
+            seen = look(memory, picks, poses[-1][None], camera, size, 1)
             depth[view] = torch.where(seen.known[0] > 0, seen.depth[0], depth[view])
     return Arrival(torch.stack(poses), depth, torch.tensor(found))
