@@ -8,10 +8,21 @@ import torch
 import torch.nn.functional as F
 
 from terrella.core import make_rng
-from terrella.space.camera import planar_pose, rotation
+from terrella.space import billboards
+from terrella.space.billboards import PICTURE, painted, painted_slowly
+from terrella.space.camera import FAR_M, planar_pose, rotation
+from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
 from terrella.space.keyframes import Keyframes, pick, pick_slowly
-from terrella.space.patches import FAR_M, cast, cast_slowly, patches
-from terrella.space.reproject import carry_unknown, carry_unknown_slowly, fill_holes, fill_holes_slowly
+from terrella.space.patches import cast, cast_slowly, patches
+from terrella.space.reproject import (
+    carry_things,
+    carry_things_slowly,
+    carry_unknown,
+    carry_unknown_slowly,
+    fill_holes,
+    fill_holes_slowly,
+)
+from terrella.space.views import over_views
 
 CAMERA = (0.5, 0.667, 0.5, 0.5)
 
@@ -53,12 +64,14 @@ def test_patches_at_the_rim_are_not_lost(camera):
 def test_the_picks_are_those_of_the_slow_twin():
     rng = make_rng(2)
     for keys, points, count in ((30, 40, 6), (5, 7, 9), (1, 3, 2), (0, 3, 2)):
-        seen = torch.rand(keys, points, generator=rng) < 0.3
-        votes = torch.where(seen, torch.rand(keys, points, generator=rng), 0.0)
-        assert pick(votes, count) == pick_slowly(votes, count)
-    assert pick(torch.zeros(4, 5), 3) == pick_slowly(torch.zeros(4, 5), 3) == []
-    alike = torch.ones(3, 5)
-    assert pick(alike, 3) == pick_slowly(alike, 3) == [0], "the first of equals, and then nothing is gained"
+        seen = torch.rand(4, keys, points, generator=rng) < 0.3
+        votes = torch.where(seen, torch.rand(4, keys, points, generator=rng), 0.0)
+        assert torch.equal(pick(votes, count), pick_slowly(votes, count))
+    assert pick(torch.zeros(1, 4, 5), 3).tolist() == pick_slowly(torch.zeros(1, 4, 5), 3).tolist() == [[-1, -1, -1]]
+    alike = torch.ones(1, 3, 5)
+    assert pick(alike, 3).tolist() == pick_slowly(alike, 3).tolist() == [[0, -1, -1]], (
+        "the first of equals, then no gain"
+    )
 
 
 def test_the_last_frame_is_carried_where_memory_knows_nothing():
@@ -82,17 +95,6 @@ def test_a_gradient_goes_through_what_is_carried():
     assert seen.grad is not None
 
 
-def test_holes_are_filled_as_from_the_whole_pyramid(monkeypatch):
-    """Stopping where no hole is left changes nothing."""
-    rng = make_rng(5)
-    depth = 1 + 5 * torch.rand(2, 24, 40, generator=rng)
-    depth[0, 5:7, 9:12], depth[1, 3:21, 2:35] = FAR_M, FAR_M
-    found = fill_holes_slowly(depth, 5)
-    assert (found < FAR_M).all()
-    monkeypatch.setattr(torch.Tensor, "all", lambda self, *rest: False)
-    assert torch.equal(fill_holes_slowly(depth, 5), found)
-
-
 @pytest.mark.parametrize("size", [(96, 128), (17, 23), (1, 1)])
 def test_holes_are_filled_as_the_slow_way_does(size):
     rng = make_rng(1)
@@ -112,3 +114,95 @@ def test_keyframes_are_taken_by_a_list_as_by_a_mask():
     assert all(torch.equal(a, b) for a, b in zip(vars(one).values(), vars(other).values()))
     assert len(keys.at([])) == 0 and np.prod(keys.at([]).rgb.shape[1:]) == 3 * 16 * 16
     assert patches(keys.depth, keys.pose, CAMERA, 8).shape == keys.coarse.shape
+
+
+def test_things_are_carried_as_the_slow_twin_does():
+    rng = make_rng(7)
+    rgb = torch.randint(0, 256, (3, 3, 24, 32), generator=rng, dtype=torch.uint8)
+    depth, things = 2 + torch.rand(3, 24, 32, generator=rng) * 0.1, (torch.rand(3, 24, 32, generator=rng) < 0.3).float()
+    given = (
+        rgb,
+        depth,
+        things,
+        torch.rand(3, 24, 32, generator=rng) < 0.1,
+        poses(3, rng, 0.2),
+        poses(3, rng, 0.2),
+        CAMERA,
+    )
+    quick, slow = carry_things(*given), carry_things_slowly(*given)
+    assert (slow[:, 3] > 0).float().mean() > 0.3
+    assert float(torch.isclose(quick, slow, atol=1e-3).float().mean()) > 0.98, "but for points on the rim of a pixel"
+
+
+def walls_and_walks(rng: torch.Generator, batch: int = 64):
+    shared, own = torch.rand(30, 4, generator=rng) * 6 - 3, torch.rand(batch, 5, 4, generator=rng) * 6 - 3
+    own[:, 3:] = NOWHERE
+    return shared, torch.rand(batch, 2, generator=rng) * 4 - 2, torch.randn(batch, 2, generator=rng) * 0.3, own
+
+
+def test_bodies_slide_as_the_slow_twin_does():
+    shared, places, wish, own = walls_and_walks(make_rng(8))
+    for quick, slow in zip(
+        slide(shared, places, wish, 0.2, 0.03, own), slide_slowly(shared, places, wish, 0.2, 0.03, own)
+    ):
+        torch.testing.assert_close(quick, slow, atol=1e-5, rtol=1e-5)
+    alone = torch.cat(
+        [slide(torch.cat([shared, own[n]]), places[n, None], wish[n, None], 0.2, 0.03)[0] for n in range(64)]
+    )
+    assert torch.equal(slide(shared, places, wish, 0.2, 0.03, own)[0], alone)
+
+
+def test_straight_runs_are_those_of_the_slow_twin():
+    rng = make_rng(9)
+    left = torch.linspace(1, -1, 64, dtype=torch.float64)
+    slope, level = (torch.rand(20, 4, 1, generator=rng, dtype=torch.float64) - part for part in (0.5, -0.3))
+    inverse = (slope * left.view(4, 16) + level).flatten(1).clamp(1e-3, 20)
+    inverse[5] = torch.rand(64, generator=rng, dtype=torch.float64)
+    runs = straight_runs(inverse, left)
+    torch.testing.assert_close(runs, straight_runs_slowly(inverse, left))
+    assert (runs[..., 1] > 0).sum() > 40
+
+
+def test_billboards_are_painted_as_the_slow_twin_does(monkeypatch):
+    rng = make_rng(10)
+    rgb, depth = torch.rand(2, 3, 48, 64, generator=rng), 3 + torch.rand(2, 48, 64, generator=rng)
+    places = torch.rand(2, 3, 3, generator=rng) * torch.tensor([2.0, 2.0, 0.2]) + torch.tensor([1.5, -1.0, -0.5])
+    pictures = F.avg_pool2d(torch.rand(2, 3, 4, *PICTURE, generator=rng).flatten(0, 1), 9, 1, 4).view(2, 3, 4, *PICTURE)
+    boards = places, pictures, torch.full((2, 3, 4), 0.4)
+    there, pose = torch.tensor([[True, True, False], [True, True, True]]), planar_pose(*torch.zeros(4, 2))
+    quick = painted(rgb, depth, boards, there, pose, CAMERA)
+    monkeypatch.setattr(billboards, "paint_views", lambda first, last, *parts: None)
+    given: list = []
+    monkeypatch.setattr(billboards, "arrays", lambda *parts: given.extend(parts) or [part.numpy() for part in parts])
+    painted(rgb, depth, boards, there, pose, CAMERA)
+    order, _, _, sides, far = given[:5]
+    slow = painted_slowly(rgb, depth, pictures, order, there, sides.float(), far.float())
+    assert (quick[2] > 0).float().mean() > 0.02
+    for one, other in zip(quick, slow):
+        assert float(torch.isclose(one.float(), other.float(), atol=0.02).float().mean()) > 0.97, "but for the rims"
+
+
+def test_views_are_shared_out_whole_and_errors_come_back():
+    for batch in (0, 1, 2, 7, 64):
+        seen = torch.zeros(batch)
+        over_views(batch, lambda first, last, seen=seen: seen[first:last].add_(1))
+        assert seen.tolist() == [1] * batch
+    with pytest.raises(ZeroDivisionError):
+        over_views(5, lambda first, last: 1 // (last - 5))
+
+
+def test_everything_runs_on_another_device():
+    rng = make_rng(11)
+    shared, places, wish, own = (part.to("meta") for part in walls_and_walks(rng))
+    assert slide(shared, places, wish, 0.2, 0.03, own)[0].device.type == "meta"
+    depth = torch.ones(2, 24, 32, device="meta")
+    pose, rgb = poses(2, rng).to("meta"), torch.zeros(2, 3, 24, 32, dtype=torch.uint8, device="meta")
+    assert carry_unknown(rgb, depth, pose, depth, depth, pose, CAMERA).shape == (2, 4, 24, 32)
+    assert carry_things(rgb, depth, depth, depth > 0, pose, pose, CAMERA).shape == (2, 6, 24, 32)
+    boards = (
+        torch.ones(2, 3, 3, device="meta"),
+        torch.ones(2, 3, 4, *PICTURE, device="meta"),
+        torch.ones(2, 3, 4, device="meta"),
+    )
+    there = torch.ones(2, 3, dtype=torch.bool, device="meta")
+    assert painted(rgb.float(), depth, boards, there, pose, CAMERA)[2].device.type == "meta"

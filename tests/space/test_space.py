@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from terrella.space.camera import planar_pose, project, unproject, yaw
 from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
-from terrella.space.keyframes import Keyframes, look, recall, recall_slowly, retrieve, vote, vote_slowly
+from terrella.space.keyframes import Keyframes, doubled, gathered, look, look_slowly, retrieve, retrieve_slowly
 from terrella.space.patches import FAR_M, cast, cast_slowly, patches, patches_slowly
 from terrella.space.reproject import fill_holes, warp
 
@@ -99,45 +99,75 @@ def test_warp_carries_colour_to_where_it_belongs_and_distrusts_other_surfaces():
     assert wrong.mean() < 0.1
 
 
-def test_the_compiled_vote_equals_its_slow_twin():
-    memory = Keyframes.joined([keyframe(0, 0, 0.0), keyframe(1, -1, 2.0), keyframe(-2, 0, 0.5)])
-    view = pose_at(0.2, 0.1, 0.1)
-    depth = room_depth(view)[0, ::4, ::4].flatten()
-    points = unproject(room_depth(view), view, CAMERA)[0, ::4, ::4].reshape(-1, 3)
-    fast, slow = vote(memory, points, depth, CAMERA), vote_slowly(memory, points, depth, CAMERA)
-    assert fast.max() > 0.5
-    assert ((fast - slow).abs() > 1e-3).float().mean() < 0.01
+def four() -> Keyframes:
+    return Keyframes.joined([keyframe(0, 0, 0.0), keyframe(1, -1, 0.4), keyframe(-2, 0, 0.5), keyframe(0, 2, -0.6)])
 
 
-def test_the_compiled_recall_equals_its_slow_twin():
-    memory = Keyframes.joined([keyframe(0, 0, 0.0), keyframe(1, -1, 0.4), keyframe(-2, 0, 0.5), keyframe(0, 2, -0.6)])
-    view = pose_at(0.2, 0.1, 0.1)[0]
-    found = []
-    for way in (recall, recall_slowly):
-        colours, trust = torch.zeros(3, 3, *SIZE), torch.zeros(3, *SIZE)
-        way(memory, room_depth(view[None])[0], view, CAMERA, colours, trust)
-        found.append((colours, trust))
-    (fast, sure), (slow, also) = found
-    assert sure[1].max() > 0.3 and ((sure - also).abs() > 1e-3).float().mean() < 0.01
-    told = (sure[0] > 0.1) & (sure[0] - sure[1] > 1e-3)
-    assert told.float().mean() > 0.3 and ((fast - slow).abs()[0, :, told] > 0.02).float().mean() < 0.01
+def as_kept(keys: Keyframes) -> Keyframes:
+    """Keyframes as rows of an arena, of which the first is nothing."""
+    whole = Keyframes.joined([keys.at([0]), keys])
+    return Keyframes(**{**vars(whole), "fine": whole.fine[:, :0]})
+
+
+VIEWS = torch.cat([pose_at(0.2, 0.1, 0.1), pose_at(-0.5, 0.6, 0.4), pose_at(0, 0, math.pi)])
+
+
+@pytest.mark.parametrize("mine", [False, True])
+def test_the_compiled_retrieval_equals_its_slow_twin(mine):
+    shared, rows = four(), torch.tensor([[1, 2], [0, 3], [4, 0]])
+    own = as_kept(shared) if mine else Keyframes.none(SIZE)
+    rows = rows if mine else rows[:, :0]
+    fast = retrieve(shared, VIEWS, CAMERA, SIZE, 3, own, rows)
+    assert torch.equal(fast, retrieve_slowly(shared, VIEWS, CAMERA, SIZE, 3, own, rows))
+    assert (fast[0] >= 0).sum() >= 2
+    nothing = Keyframes.none(SIZE)
+    alone = retrieve(nothing, VIEWS, CAMERA, SIZE, 3, as_kept(shared), torch.tensor([[1, 2], [0, 3], [4, 0]]))
+    assert alone[2, 1:].tolist() == [-1, -1] and alone[1, 0] == 3
+
+
+@pytest.mark.parametrize("lots", ["shared", "own", "both"])
+def test_the_compiled_look_equals_its_slow_twin(lots):
+    shared = Keyframes.none(SIZE) if lots == "own" else four()
+    shared = Keyframes(**{**vars(shared), "rgb": doubled(shared.rgb)})
+    own = as_kept(four()) if lots != "shared" else Keyframes.none(SIZE)
+    picks = {"shared": [[0, 1, 3], [2, -1, -1]], "own": [[1, 2, 4], [3, -1, -1]], "both": [[0, 6, 3], [5, 1, -1]]}[lots]
+    picks = torch.tensor([*picks, [-1, -1, -1]])
+    fast = look(shared, picks, VIEWS, CAMERA, SIZE, 4, own)
+    slow = look_slowly(shared, picks, VIEWS, CAMERA, SIZE, 4, own)
+    assert fast.trust[0, 1].max() > 0.3 and fast.known[2].max() == 0 and fast.trust[:, 3].max() == 0
+    for name, far in (("trust", 1e-3), ("depth", 1e-2), ("known", 0.5)):
+        assert ((vars(fast)[name] - vars(slow)[name]).abs() > far).float().mean() < 0.01, name
+    certain = (fast.trust[:, 0] > 0.1) & (fast.trust[:, 0] - fast.trust[:, 1] > 1e-3)
+    apart = (fast.rgb - slow.rgb).abs()[:, 0].amax(1)
+    assert certain.float().mean() > 0.2 and (apart[certain] > 0.02).float().mean() < 0.01
+
+
+def test_a_batch_of_looks_equals_its_singles():
+    shared = four()
+    picks = retrieve(shared, VIEWS, CAMERA, SIZE, 3)
+    together = look(shared, picks, VIEWS, CAMERA, SIZE, 2)
+    for n in range(len(VIEWS)):
+        view = VIEWS[n : n + 1]
+        assert torch.equal(retrieve(shared, view, CAMERA, SIZE, 3), picks[n : n + 1])
+        alone = look(shared, picks[n : n + 1], view, CAMERA, SIZE, 2)
+        assert all(torch.equal(part[0], vars(together)[name][n]) for name, part in vars(alone).items())
 
 
 def test_memory_finds_the_keyframe_that_saw_the_place():
     memory = Keyframes.joined([keyframe(0, 0, math.pi), keyframe(0, 0, 0.0), keyframe(0, 0, math.pi / 2)])
-    picks = retrieve([memory], pose_at(0.3, 0, 0.1)[0], CAMERA, SIZE, 2)[0]
-    assert picks[0] == 1
+    assert retrieve(memory, pose_at(0.3, 0, 0.1), CAMERA, SIZE, 2)[0, 0] == 1
 
 
 def test_what_memory_knows_it_draws_and_what_it_does_not_it_says():
     memory = keyframe(0, 0, 0.0)
     near = pose_at(0.4, 0.2, 0.05)
-    known = look([memory], near, CAMERA, SIZE, 2)
+    known = look(memory, torch.tensor([[0]]), near, CAMERA, SIZE, 2)
     truth = painted(near, room_depth(near)).float() / 255
     mask = known.known[0] > 0
     assert mask.float().mean() > 0.8
     assert (known.rgb[0, 0] - truth[0]).abs().mean(0)[mask].mean() < 0.03
-    assert look([memory], pose_at(0, 0, math.pi), CAMERA, SIZE, 2).known.mean() < 0.05
+    away, picks = gathered([None, memory], SIZE)
+    assert look(away, picks, pose_at(0, 0, math.pi).expand(2, -1), CAMERA, SIZE, 2).known.mean() < 0.05
 
 
 def looks_around(half: float, noise_m: float = 0.0):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.errors import TerrellaError
 from ..space.camera import Intrinsics
-from ..space.kernels_numba import cast_prisms
+from .kernels_numba import cast_prisms
 
 SKY = b"F_SKY1"
 

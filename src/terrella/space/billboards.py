@@ -1,6 +1,6 @@
-"""Cards: what stands in a place, as upright pictures that face the eye: cut out of frames, and painted into them.
+"""Billboards: what stands in a place, as upright pictures that face the camera: cut out of frames, and painted into them.
 
-A card has a place, its feet (x, y, z in metres, world frame), and a look: a picture [4, *PICTURE] (rgb and cover in [0, 1])
+A billboard has a place, its feet (x, y, z in metres, world frame), and a look: a picture [4, *PICTURE] (rgb and cover in [0, 1])
 and its box [4], how far it reaches to the left, the right, below and above of its feet, in metres across the line of sight.
 """
 
@@ -12,14 +12,16 @@ import torch
 import torch.nn.functional as F
 
 from .camera import Intrinsics, project
+from .kernels_numba.paint import TOUCHED, paint_views
+from .views import arrays, over_views
 
-PICTURE = (48, 32)  # rows and columns of a card's picture
-NEAREST_M = 0.25  # of a card that is still painted
-BEHIND_M = 0.4  # by which a card may stand behind the surface that a frame shows: its feet are in the floor
+PICTURE = (48, 32)  # rows and columns of a billboard's picture
+NEAREST_M = 0.25  # of a billboard that is still painted
+BEHIND_M = 0.4  # by which a billboard may stand behind the surface that a frame shows: its feet are in the floor
 
 
 class Cutout(NamedTuple):
-    """n cards that frames show: view and row [n], which frame and which row of its list; picture [n, 4, *PICTURE]; box
+    """n billboards that frames show: view and row [n], which frame and which row of its list; picture [n, 4, *PICTURE]; box
     [n, 4]; pixels [n], how many show it; whole [n] bool, seen all of it: not cut off by the frame's edge or hidden in part."""
 
     view: torch.Tensor
@@ -38,7 +40,7 @@ def cut_out(
     pose: torch.Tensor,
     camera: Intrinsics,
 ) -> Cutout:
-    """The cards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], which of the places [B, K, 3] is seen at a pixel,
+    """The billboards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], which of the places [B, K, 3] is seen at a pixel,
     counted from 1 (0: none); depth [B, h, w] metres; pose [B, 7]."""
     height, width = rgb.shape[-2:]
     there, depth = (
@@ -80,34 +82,54 @@ def painted(
     pose: torch.Tensor,
     camera: Intrinsics,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Frames with cards in them, each hidden by what is nearer: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
-    which card is seen at a pixel, counted from 1 (uint8 [B, H, W], 0: none).
+    """Frames with billboards in them, each hidden by what is nearer: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
+    which billboard is seen at a pixel, counted from 1 (uint8 [B, H, W], 0: none).
 
-    rgb and depth are what stands behind; cards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
+    rgb and depth are what stands behind; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
     [B, K] bool, which of them there are.
     """
     places, pictures, boxes = billboards
-    instances = torch.zeros_like(depth, dtype=torch.uint8)
-    where, ahead = project(places, pose, camera)
-    view, row = (there & (ahead > NEAREST_M)).nonzero(as_tuple=True)
-    if not len(view):
-        return rgb, depth, instances
-    where, ahead, box = where[view, row], ahead[view, row], boxes[view, row]
     height, width = depth.shape[-2:]
+    where, ahead = project(places, pose, camera)
+    there = there & (ahead > NEAREST_M)
+    far = torch.where(there, ahead, 1.0)
     sides = torch.stack(
-        [where[:, 0] * width - box[:, 0] / ahead * camera[0] * width,
-         where[:, 0] * width + box[:, 1] / ahead * camera[0] * width,
-         where[:, 1] * height - box[:, 3] / ahead * camera[1] * height,
-         where[:, 1] * height + box[:, 2] / ahead * camera[1] * height], 1
+        [where[..., 0] * width - boxes[..., 0] / far * camera[0] * width,
+         where[..., 0] * width + boxes[..., 1] / far * camera[0] * width,
+         where[..., 1] * height - boxes[..., 3] / far * camera[1] * height,
+         where[..., 1] * height + boxes[..., 2] / far * camera[1] * height], -1
     )  # fmt: skip
-    from .kernels_numba import paint
+    order = far.argsort(dim=1, descending=True, stable=True)  # the nearest is painted last
+    if rgb.device.type != "cpu":
+        return painted_slowly(rgb, depth, pictures, order, there, sides, far)
+    rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
+    given = arrays(order, there, pictures, sides.double(), far.double(), depth + BEHIND_M)
+    parts = (*given, *arrays(rgb, onto, instances))
+    over_views(len(rgb), lambda first, last: paint_views(first, last, *parts))
+    return rgb, onto, instances
 
-    rgb, depth, hides = rgb.clone(), depth.clone(), (depth + BEHIND_M).numpy()
-    onto, pictures = (rgb.numpy(), depth.numpy(), instances.numpy()), pictures.numpy()
-    for billboard in ahead.argsort(descending=True).tolist():  # the nearest is painted last
-        at, number = int(view[billboard]), int(row[billboard]) + 1
-        box, far = tuple(sides[billboard].tolist()), float(ahead[billboard])
-        paint(pictures[at, number - 1], box, far, number, hides[at], *(part[at] for part in onto))
+
+def painted_slowly(rgb, depth, pictures, order, there, sides, far) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The same as `painted`, in plain tensor algebra, of all views one billboard at a time; the way on a GPU."""
+    height, width = depth.shape[-2:]
+    hides, instances = depth + BEHIND_M, torch.zeros_like(depth, dtype=torch.uint8)
+    quarters = torch.tensor([0.25, 0.75], device=rgb.device)
+    u = (
+        torch.arange(width, device=rgb.device)[:, None] + quarters
+    ).flatten()  # two places along either side of a pixel
+    v = (torch.arange(height, device=rgb.device)[:, None] + quarters).flatten()
+    for rank in order.unbind(1):
+        view = torch.arange(len(rgb), device=rgb.device)
+        left, right, top, bottom = sides[view, rank].clamp(-1e6, 1e6)[..., None].unbind(1)
+        a, b = (u - left) / (right - left).clamp_min(1e-6), (v - top) / (bottom - top).clamp_min(1e-6)
+        grid = torch.stack(torch.broadcast_tensors(a[:, None] * 2 - 1, b[:, :, None] * 2 - 1), -1)
+        found = F.grid_sample(pictures[view, rank], grid, padding_mode="border", align_corners=False)
+        mask = (found[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1)[:, None]
+        shown = (far[view, rank][:, None, None] < hides) & there[view, rank][:, None, None]
+        cover = F.avg_pool2d(mask.float(), 2) * shown[:, None]
+        rgb = rgb * (1 - cover) + F.avg_pool2d(found[:, :3] * mask, 2) * shown[:, None]
+        depth = torch.where(cover[:, 0] > 0.5, far[view, rank][:, None, None], depth)
+        instances = torch.where(cover[:, 0] > TOUCHED, (rank + 1)[:, None, None].to(torch.uint8), instances)
     return rgb, depth, instances
 
 

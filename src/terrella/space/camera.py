@@ -10,6 +10,10 @@ import torch
 
 Intrinsics = tuple[float, float, float, float]
 
+NEAR_M = 0.05  # nearer surfaces are not seen
+FAR_M = 100.0  # deeper than any depth: "nothing is known there"
+SAME = 0.06  # depths that differ by less than this share are of one surface
+
 _STAY = torch.eye(3)
 _TURN = torch.tensor(  # a rotation less the identity, of the products ww, wx, wy, wz, xw, ... of a unit quaternion
     [

@@ -1,16 +1,17 @@
-"""The floor plan that depth images draw: straight walls at eye height, and how a body slides along them.
+"""The floor plan that depth images draw: straight walls at the camera's height, and how a body slides along them.
 
 World frame, metres; a body is an upright box with sides along x and y, as in Doom and Quake.
 """
 
 from __future__ import annotations
 
-from itertools import islice
-
-import numpy as np
 import torch
+import torch.nn.functional as F
 
 from .camera import Intrinsics, unproject, yaw
+from .kernels_numba.walls import WITHIN_M, straight_runs_of
+from .kernels_numba.walls import slide as slide_kernel
+from .views import arrays, over_views
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 on the map
 
@@ -30,47 +31,85 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     and where two runs meet they are drawn to their corner. What is farther than SEEN_M, or so far that neighbouring columns
     lie half a metre apart (32 m for a wall seen head-on by 128 columns over 90 degrees), is left for a nearer look.
     """
-    from .kernels_numba import straight_runs
-
-    there, depth, pose = depth.device, depth.cpu(), pose.cpu()
     width, row = depth.shape[-1], horizon(camera, depth.shape[-2])
-    left = -((np.arange(width) + 0.5) / width - camera[2]) / camera[0]
-    walls = np.full((len(depth), WALLS, 4), NOWHERE, np.float32)
-    heading = yaw(pose).double().numpy()
-    cosine, sine, eye = np.cos(heading), np.sin(heading), pose[:, :2].double().numpy()
-    level = torch.where(depth[:, row] > 0, depth[:, row], 1e3).double()
-    for key, inverse in enumerate(1 / level.clamp(0.05, 1e3).numpy()):
-        found = straight_runs(inverse, left, FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
-        runs = _corners([(int(first), int(stop), *line) for first, stop, *line in found], left)
-        runs.sort(key=lambda run: run[0] - run[1])
-        known = (run for run in runs if run[1] - run[0] >= FEWEST_FAR or 1 / inverse[run[0] : run[1]].mean() < NEARBY_M)
-        for slot, (_, _, slope, level, *ends) in enumerate(islice(known, WALLS)):
-            for end, side in enumerate(ends):
-                ahead = 1 / (slope * side + level)
-                x, y = ahead * cosine[key] - ahead * side * sine[key], ahead * sine[key] + ahead * side * cosine[key]
-                walls[key, slot, 2 * end : 2 * end + 2] = eye[key] + (x, y)
-    return torch.from_numpy(walls).to(there)
+    columns = torch.arange(width, dtype=torch.float64, device=depth.device)
+    left = -((columns + 0.5) / width - camera[2]) / camera[0]
+    inverse = 1 / torch.where(depth[:, row] > 0, depth[:, row], 1e3).double().clamp(0.05, 1e3)
+    runs = straight_runs(inverse, left)
+    first, stop, slope, level = runs[..., 0].long(), runs[..., 1].long(), runs[..., 2], runs[..., 3]
+    sides = _corners(first, stop, slope, level, left)
+    sums = F.pad(inverse.cumsum(1), (1, 0))
+    long = stop - first
+    mean = (sums.gather(1, stop) - sums.gather(1, first)) / long.clamp_min(1)
+    known = (long > 0) & ((long >= FEWEST_FAR) | (1 / mean < NEARBY_M))
+    most, order = torch.where(known, long, 0).sort(dim=1, descending=True, stable=True)
+    sides, slope, level = (part.gather(-1, order.expand(part.shape)) for part in (sides, slope, level))
+    ahead = 1 / torch.where(most > 0, slope * sides + level, 1.0)
+    heading, position = yaw(pose).double()[:, None], pose[:, :2].double()[..., None]
+    x = position[:, 0] + ahead * heading.cos() - ahead * sides * heading.sin()
+    y = position[:, 1] + ahead * heading.sin() + ahead * sides * heading.cos()
+    walls = torch.where(most > 0, torch.stack([x[0], y[0], x[1], y[1]]), NOWHERE).permute(1, 2, 0)[:, :WALLS].float()
+    return F.pad(walls, (0, 0, 0, WALLS - walls.shape[1]), value=NOWHERE)
 
 
-def _corners(runs: list[tuple], left: np.ndarray) -> list[tuple]:
-    """The runs with both their ends: their outer columns, or the corner with the neighbour that they run into."""
-    ends = [[float(left[first]), float(left[stop - 1])] for first, stop, *_ in runs]
-    for number, (one, other) in enumerate(zip(runs, runs[1:])):
-        if other[0] - one[1] > 2 or one[2] == other[2]:
-            continue
-        corner = (other[3] - one[3]) / (one[2] - other[2])
-        near = left[min(other[0] + 1, len(left) - 1)] <= corner <= left[one[1] - 2]
-        if near and all(
-            _apart(corner, float(left[column]), run) < GAP_M for run, column in ((one, one[1] - 1), (other, other[0]))
-        ):
-            ends[number][1] = ends[number + 1][0] = corner
-    return [(*run, *pair) for run, pair in zip(runs, ends)]
+def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+    """Runs of columns on which inverse depth [K, w] is a line of `left` [w] (float64 both), neighbours less than GAP_M apart
+    and nothing beyond SEEN_M: [K, n, 4] = first, stop, slope, level; zeros after the last."""
+    if inverse.device.type != "cpu":
+        return straight_runs_slowly(inverse, left)
+    found = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
+    parts = (*arrays(inverse, left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M, found.numpy())
+    over_views(len(inverse), lambda first, last: straight_runs_of(first, last, *parts))
+    return found
 
 
-def _apart(one: float, other: float, run: tuple) -> float:
+def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+    """The same as `straight_runs`: how far a run goes from every column, then the runs taken from left to right."""
+    count, width = inverse.shape
+    near, far = 1 / inverse, left / inverse
+    joins = (near.diff(dim=1).square() + far.diff(dim=1).square()).sqrt() <= GAP_M
+    joins &= (inverse[:, 1:] >= 1 / SEEN_M) & (inverse[:, :-1] >= 1 / SEEN_M)
+    alive = torch.ones(count, width, dtype=torch.bool, device=inverse.device)
+    stop = torch.arange(1, width + 1, device=inverse.device).repeat(count, 1)
+    slope, level = torch.zeros_like(inverse), torch.zeros_like(inverse)
+    for length in range(2, width + 1):
+        x, y, starts = left.unfold(0, length, 1), inverse.unfold(1, length, 1), width - length + 1
+        middle, mean = x.mean(1, keepdim=True), y.mean(2, keepdim=True)
+        steep = ((x - middle) * (y - mean)).sum(2) / (x - middle).square().sum(1)
+        off = (steep[..., None] * (x - middle) + mean - y).abs().amax(2)
+        fits = alive[:, :starts] & joins[:, length - 2 :] & (off <= STRAIGHT * y.amax(2))
+        alive = F.pad(fits, (0, width - starts))
+        stop = stop + alive
+        slope = torch.where(alive, F.pad(steep, (0, width - starts)), slope)
+        level = torch.where(alive, F.pad(mean[..., 0] - steep * middle[:, 0], (0, width - starts)), level)
+    columns, turn = torch.arange(width, device=inverse.device), torch.zeros_like(stop[:, 0])
+    taken = torch.zeros_like(alive)
+    for column in range(width):
+        taken[:, column] = (turn == column) & (stop[:, column] - column >= FEWEST)
+        turn = torch.where(taken[:, column], stop[:, column], torch.maximum(turn, columns[column] + 1))
+    runs = torch.stack([columns.expand(count, -1).double(), stop.double(), slope, level], 2) * taken[..., None]
+    order = (~taken).to(torch.uint8).argsort(dim=1, stable=True)[:, : width // FEWEST]
+    return runs.gather(1, order[..., None].expand(-1, -1, 4))
+
+
+def _corners(first, stop, slope, level, left) -> torch.Tensor:
+    """Both ends [2, K, n] of runs [K, n]: their outer columns, or the corner with the neighbour that they run into."""
+    last = len(left) - 1
+    begin, end = left[first.clamp_max(last)], left[(stop - 1).clamp_min(0)]
+    one, other = slice(None, -1), slice(1, None)
+    meet = (stop[:, other] > 0) & (first[:, other] - stop[:, one] <= 2) & (slope[:, one] != slope[:, other])
+    corner = (level[:, other] - level[:, one]) / torch.where(meet, slope[:, one] - slope[:, other], 1.0)
+    meet &= (corner >= left[(first[:, other] + 1).clamp_max(last)]) & (corner <= left[(stop[:, one] - 2).clamp_min(0)])
+    meet &= _apart(corner, end[:, one], slope[:, one], level[:, one]) < GAP_M
+    meet &= _apart(corner, begin[:, other], slope[:, other], level[:, other]) < GAP_M
+    begin = torch.cat([begin[:, :1], torch.where(meet, corner, begin[:, other])], 1)
+    return torch.stack([begin, torch.cat([torch.where(meet, corner, end[:, one]), end[:, -1:]], 1)])
+
+
+def _apart(one, other, slope, level) -> torch.Tensor:
     """Metres between two columns of a run."""
-    near, far = 1 / (run[2] * one + run[3]), 1 / (run[2] * other + run[3])
-    return float(np.hypot(near - far, near * one - far * other))
+    near, far = 1 / (slope * one + level), 1 / (slope * other + level)
+    return torch.hypot(near - far, near * one - far * other)
 
 
 def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
@@ -136,26 +175,79 @@ def _frame(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 def slide(
-    walls: torch.Tensor,
-    places: torch.Tensor,
-    wish: torch.Tensor,
-    half_m: float,
-    short: float = 0.0,
+    walls: torch.Tensor, places: torch.Tensor, wish: torch.Tensor, half_m: float, short: float = 0.0,
     own: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """How bodies of half width `half_m` at `places` [N, 2] move when they wish to by `wish` [N, 2], among walls [S, 4] that
-    stop all of them and `own` [N, W, 4] that stop one each (those that are NOWHERE stop none).
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    """How bodies of half width `half_m` at `places` [B, 2] move when they wish to by `wish` [B, 2], among walls [S, 4] that
+    all share and walls of their `own` [B, n, 4].
 
     At a wall the rest of the wish goes on along it, twice at most; `short` is the share of the wish by which a body
-    stops short of the wall. Returns the displacement [N, 2] and what is left of the wish, the momentum [N, 2].
+    stops short of the wall. Returns the displacement [B, 2] and what is left of the wish, the momentum [B, 2].
     """
-    from .kernels_numba import slide as kernel
-
     own = walls.new_zeros(len(places), 0, 4) if own is None else own
-    parts = [tensor.detach().cpu().double().contiguous().numpy() for tensor in (walls, own, places, wish)]
-    moved, left = np.zeros_like(parts[2]), np.zeros_like(parts[2])
-    kernel(*parts, half_m, short, moved, left)
-    return torch.from_numpy(moved).to(wish), torch.from_numpy(left).to(wish)
+    if places.device.type != "cpu":
+        return slide_slowly(walls, places, wish, half_m, short, own)
+    moved, left = torch.zeros(2, len(places), 2, dtype=torch.float64)
+    parts = (*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, moved.numpy(), left.numpy())
+    over_views(len(places), lambda first, last: slide_kernel(first, last, *parts))
+    return moved.to(wish), left.to(wish)
+
+
+def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same as `slide`, in plain tensor algebra; the way on a GPU."""
+    whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1).double()
+    whole = F.pad(whole, (0, 0, 0, 1), value=NOWHERE)
+    place, rest, free = (
+        places.double(),
+        wish.double(),
+        torch.ones(len(places), 1, dtype=torch.bool, device=places.device),
+    )
+    for bump in range(3):
+        share, along = _first_touch(whole - place.repeat(1, 2)[:, None], rest, half_m)
+        open_way, share = share[:, None] > 1, share[:, None]
+        go = torch.where(open_way, 1.0, (share - short).clamp_min(0))
+        place = torch.where(free, place + go * rest, place)
+        onward = (1 - share.clamp_min(0)) * (rest * along).sum(1, keepdim=True) * along * float(bump < 2)
+        rest, free = torch.where(free & ~open_way, onward, rest), free & ~open_way
+    return (place - places.double()).to(wish), rest.to(wish)
+
+
+def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """At which share [B] of the move [B, 2] a box around the origin first touches a wall [B, S, 4] (2: none), and the direction
+    [B, 2] along which it may go on: kernels_numba/walls.first_touch."""
+    a, b = walls.split(2, -1)
+    length = (b - a).norm(dim=-1, keepdim=True)
+    across = torch.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], -1) / length.clamp_min(1e-9)
+    unit = torch.stack(
+        [across.new_tensor([1.0, 0]).expand_as(across), across.new_tensor([0, 1.0]).expand_as(across), across], 2
+    )
+    one, other = (unit @ a[..., None])[..., 0], (unit @ b[..., None])[..., 0]  # [B, S, 3 axes]
+    reach = half * unit.abs().sum(-1)
+    low, high, speed = (
+        torch.minimum(one, other) - reach,
+        torch.maximum(one, other) + reach,
+        (unit @ move[:, None, :, None])[..., 0],
+    )
+    moves = speed.abs() >= 1e-12
+    ends = torch.stack([low, high]) / torch.where(moves, speed, 1.0)
+    enter, face = torch.where(moves, ends.amin(0), -1e9).max(-1)
+    leave = torch.where(moves, ends.amax(0), torch.where((low >= -1e-9) | (high <= 1e-9), -1e9, 1e9)).amin(-1)
+    faced = unit.gather(2, face[..., None, None].expand(*face.shape, 1, 2))[:, :, 0]
+    pace = speed.gather(2, face[..., None])[..., 0].abs()
+    deep = torch.minimum(enter[..., None] * speed - low, high - enter[..., None] * speed)
+    crossing = (unit[..., 0] * faced[..., None, 1] - unit[..., 1] * faced[..., None, 0]).abs()
+    grazes = ((crossing > 0.02) & (deep < WITHIN_M)).any(-1)
+    meets = (
+        (enter < leave)
+        & (enter <= 1)
+        & (enter > -1e9)
+        & (enter * pace > -WITHIN_M)
+        & ~grazes
+        & (length[..., 0] >= 1e-9)
+    )
+    share, which = torch.where(meets, enter, 2.0).min(1)
+    met = faced.gather(1, which[:, None, None].expand(-1, 1, 2))[:, 0]
+    return share, torch.stack([-met[:, 1], met[:, 0]], 1)
 
 
 def horizon(camera: Intrinsics, height: int) -> int:

@@ -1,27 +1,29 @@
 """Posed RGB-D keyframes as spatial memory: what is known of a new view, and from which keyframes.
 
-`look` asks the memory for a view: the keyframes' coarse patches say roughly which surfaces the view sees; each keyframe
-then votes for the surfaces that it saw itself (occlusion included), and those that add most are taken greedily; their
-fine patches give the view's depth, and their colours are warped into it.
+`retrieve` asks which keyframes know a view: their coarse patches say roughly which surfaces it sees; each keyframe then
+votes for the surfaces that it saw itself (occlusion included), and those that add most are taken greedily. `look` casts
+their fine patches for the view's depth, and warps their colours into it. Both take a batch of views, and two lots of
+keyframes: `shared` ones, ready to be looked at, and `own` ones as a memory keeps them, of which each view may use some.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 
-from .camera import Intrinsics, project, rays, rotation
-from .floorplan import wall_segments
-from .patches import FAR_M, SAME, cast_all, patches
+from .camera import FAR_M, SAME, Intrinsics, project, rays, rotation
+from .floorplan import WALLS, wall_segments
+from .kernels_numba import recall as kernels
+from .kernels_numba.surfaces import surfaces
+from .patches import SLANT, cast_slowly, patch_count, patches, patches_slowly
 from .reproject import fill_holes, warp
+from .views import arrays, over_views
 
 COARSE, FINE = 8, 2  # strides of the patches for finding keyframes and for the view's depth
 _GRID = 4  # a keyframe votes on every 4th pixel of a half-size view
 ANYWAY = 0.02  # of its strongest vote counts for a keyframe, so that more than nothing is picked where all is covered
-_FRUSTUM = (4, 6, 8)  # without depth, on points at this many distances, in this many rows and columns
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,16 @@ class Keyframes:
         return Keyframes(rgb, depth, pose, rotation(pose), coarse, made, walls)
 
     @staticmethod
+    def none(size: tuple[int, int], device=None) -> Keyframes:
+        """No keyframes, of pictures of `size`."""
+        shapes = {"rgb": (3, *size), "depth": size, "pose": (7,), "turn": (3, 3), "walls": (WALLS, 4)}
+        shapes |= {name: (patch_count(size, stride), 9) for name, stride in (("coarse", COARSE), ("fine", FINE))}
+        kinds = {"rgb": torch.uint8}
+        return Keyframes(
+            **{name: torch.zeros(0, *shape, dtype=kinds.get(name), device=device) for name, shape in shapes.items()}
+        )
+
+    @staticmethod
     def joined(parts: Sequence[Keyframes]) -> Keyframes:
         """Keyframes with pictures of one size, one after the other."""
         if len(parts) == 1:
@@ -63,22 +75,29 @@ class Keyframes:
             return Keyframes(*(getattr(self, field.name).index_select(0, rows) for field in fields(self)))
         return Keyframes(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def unfolded(self, camera: Intrinsics) -> Keyframes:
-        """The same, as a memory keeps them, ready to be looked at: with fine patches and pictures of double size."""
-        return replace(self, rgb=doubled(self.rgb), fine=patches(self.depth, self.pose, camera, FINE))
-
 
 def doubled(rgb: torch.Tensor) -> torch.Tensor:
     """uint8 [..., 3, H, W] -> [..., 3, 2H, 2W], every pixel four times: a warp then blurs it by half a pixel only."""
     return rgb.repeat_interleave(2, -1).repeat_interleave(2, -2)
 
 
+def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple[Keyframes, torch.Tensor]:
+    """One set of keyframes a view -> all of them, and each view's picks [B, S] among them (-1: none)."""
+    sets = [Keyframes.none(size) if keys is None else keys for keys in chosen]
+    picks = torch.full((len(sets), max((len(keys) for keys in sets), default=0)), -1)
+    start = 0
+    for view, keys in enumerate(sets):
+        picks[view, : len(keys)] = torch.arange(start, start + len(keys))
+        start += len(keys)
+    some = [keys for keys in sets if len(keys)]
+    return Keyframes.joined(some) if some else Keyframes.none(size), picks
+
+
 @dataclass(frozen=True)
 class Glimpse:
-    """What memory knows of B views. `slots` colours are sorted at every pixel, the most trusted first.
-
-    rgb [B, slots, 3, H, W] in [0, 1]; trust [B, slots, H, W] in [0, 1], 0 where the slot saw another surface;
-    depth [B, H, W] metres, holes filled; known [B, H, W] 1 where a patch was hit and some keyframe agrees.
+    """What memory knows of B views: colours [B, slots, 3, H, W] in [0, 1] and how trusted [B, slots, H, W], best first;
+    the depth of the nearest known surface [B, H, W] (holes filled, FAR_M where nothing is known); known [B, H, W], 1 where
+    depth is known and at least one keyframe agrees.
     """
 
     rgb: torch.Tensor
@@ -96,153 +115,150 @@ def merge(glimpse: Glimpse) -> torch.Tensor:
     return (glimpse.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
 
 
+# -- which keyframes --------------------------------------------------------------------------------------------------
+
+
 def retrieve(
-    memories: Sequence[Keyframes], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int
-) -> list[list[int]]:
-    """For one view from `pose` [7]: which keyframes of each memory to use, `count` in all, best first.
+    shared: Keyframes, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int,
+    own: Keyframes | None = None, rows: torch.Tensor | None = None,
+) -> torch.Tensor:  # fmt: skip
+    """Which keyframes to use for the views of `size` from `pose` [B, 7], `count` each, best first: int64 [B, count], numbers
+    of shared ones, or len(shared) + those of own ones, of which a view may use its `rows` [B, n] (0: none); -1: no more.
 
     Coverage-greedy: a keyframe's vote at a point is how alike its distance is (1 equal, 1/2 at twice or half), 0 where
     it saw something else there; each pick adds what the picks before it lack.
     """
-    half = (size[0] // 2, size[1] // 2)
-    depth = cast_all([m.coarse.flatten(0, 1) for m in memories], pose, camera, half)
-    some = slice(_GRID // 2, None, _GRID)
-    there = depth[some, some].flatten()
-    beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
-    points = (there[:, None] * beams) @ rotation(pose).T + pose[:3]
-    votes = (
-        torch.cat([vote(m, points, there, camera) for m in memories]) if memories else points.new_zeros(0, len(points))
-    )
-    return _picks(memories, votes, count)
-
-
-def retrieve_by_overlap(
-    memories: Sequence[Keyframes], pose: torch.Tensor, camera: Intrinsics, count: int
-) -> list[list[int]]:
-    """The same as `retrieve` without depth, as in WorldMem (Xiao et al. 2025): a keyframe votes for the points of the
-    view's frustum, at distances of 1 to 8 m, that lie in its own, as `retrieve` does by how alike their distance is; it
-    cannot know of walls between."""
-    beams = rays(camera, *_FRUSTUM[1:], pose.device).flatten(0, 1)
-    distance = torch.logspace(0, 3, _FRUSTUM[0], 2.0, device=pose.device)
-    points = (distance[:, None, None] * beams).flatten(0, 1) @ rotation(pose).T + pose[:3]
-    there = distance.repeat_interleave(len(beams))
-    votes = [points.new_zeros(0, len(points))]
-    for memory in memories:
-        where, depth = project(points.expand(len(memory), -1, -1), memory.pose, camera)
-        inside = (depth > 0.05) & (where > 0).all(-1) & (where < 1).all(-1)
-        ratio = there / depth.clamp_min(0.05)
-        votes.append(torch.where(inside, torch.minimum(ratio, 1 / ratio), 0.0))
-    return _picks(memories, torch.cat(votes), count)
-
-
-def _picks(memories: Sequence[Keyframes], votes: torch.Tensor, count: int) -> list[list[int]]:
-    """Of votes [K, P] of all keyframes on the points of a view: `count` keyframes, each adding what those before lack."""
-    picks = pick(votes, count)
-    bounds = [0]
-    for memory in memories:
-        bounds.append(bounds[-1] + len(memory))
-    return [[p - low for p in picks if low <= p < high] for low, high in zip(bounds, bounds[1:])]
-
-
-def pick(votes: torch.Tensor, count: int) -> list[int]:
-    """The rows of votes [K, P], at most `count`, of which each adds most to what those before it cover."""
-    if votes.device.type != "cpu":
-        return pick_slowly(votes, count)
-    from .kernels_numba import pick as kernel
-
-    picks = np.zeros(min(count, len(votes)), np.int64)
-    return picks[: kernel(votes.contiguous().numpy(), ANYWAY, picks)].tolist()
-
-
-def pick_slowly(votes: torch.Tensor, count: int) -> list[int]:
-    """The same as `pick`, in plain tensor algebra; the way on a GPU."""
-    if len(votes):
-        votes = torch.cat([votes, ANYWAY * votes.amax(1, keepdim=True)], 1)
-    best, picks = torch.zeros(votes.shape[1], device=votes.device), []
-    for _ in range(min(count, len(votes))):
-        gain = (votes - best).clamp_min(0).sum(1)
-        chosen = int(gain.argmax())
-        if gain[chosen] <= 0:
-            break
-        picks.append(chosen)
-        best = torch.maximum(best, votes[chosen])
+    if own is None or rows is None:
+        own, rows = Keyframes.none(size, pose.device), torch.zeros(len(pose), 0, dtype=torch.int64, device=pose.device)
+    if pose.device.type != "cpu":
+        return retrieve_slowly(shared, pose, camera, size, count, own, rows)
+    picks = torch.full((len(pose), count), -1)
+    lots = (tuple(arrays(keys.coarse, keys.depth, keys.turn, keys.pose)) for keys in (shared, own))
+    parts = (*lots, *arrays(rows, rotation(pose), pose[:, :3]), camera, (size[0] // 2, size[1] // 2), _GRID, ANYWAY)
+    over_views(len(pose), lambda first, last: kernels.choose(first, last, *parts, picks.numpy()))
     return picks
 
 
-def vote(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """[K, P]: what each keyframe has to say of surface points [P, 3] that lie `distance` [P] deep in the new view."""
-    if points.device.type != "cpu":
-        return vote_slowly(memory, points, distance, camera)
-    from .kernels_numba import vote as kernel
+def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tensor:
+    """The same as `retrieve`, in plain tensor algebra; the way on a GPU."""
+    half, batch, some = (size[0] // 2, size[1] // 2), len(pose), slice(_GRID // 2, None, _GRID)
+    both = [(part.expand(batch, *part.shape), mine[rows] if len(mine) else mine.expand(batch, *mine.shape))
+            for part, mine in ((shared.coarse, own.coarse), (shared.depth, own.depth), (shared.pose, own.pose))]  # fmt: skip
+    coarse, depth, poses = (torch.cat(pair, 1) for pair in both)
+    there = cast_slowly(coarse.flatten(1, 2), pose, camera, half)[:, some, some].flatten(1)
+    beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
+    points = (there[..., None] * beams) @ rotation(pose).mT + pose[:, None, :3]
+    votes = vote_slowly(depth, poses, points, there, camera)
+    numbers = torch.arange(len(shared), device=pose.device).expand(batch, -1)
+    numbers = torch.cat([numbers, torch.where(rows > 0, len(shared) + rows, -1)], 1)
+    picks = pick_slowly(votes * (numbers >= 0)[..., None], count)
+    if not numbers.shape[1]:
+        return picks
+    return torch.where(picks >= 0, numbers.gather(1, picks.clamp_min(0)), -1)
 
-    votes = torch.empty(len(memory), len(points))
-    turn, eye = memory.turn.contiguous().numpy(), memory.pose[:, :3].contiguous().numpy()
-    depth = memory.depth.contiguous().numpy()
-    kernel(points.contiguous().numpy(), distance.contiguous().numpy(), depth, turn, eye, camera, votes.numpy())
-    return votes
 
-
-def vote_slowly(memory: Keyframes, points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """The same as `vote`, in plain tensor algebra; the way on a GPU."""
-    height, width = memory.depth.shape[-2:]
-    where, depth = project(points.expand(len(memory), -1, -1), memory.pose, camera)
-    inside = (depth > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)
-    column, row = (
-        (where[..., 0] * width).long().clamp(0, width - 1),
-        (where[..., 1] * height).long().clamp(0, height - 1),
-    )
-    held = memory.depth.flatten(1).gather(1, row * width + column)
-    same = inside & ((held - depth).abs() < SAME * depth)
-    ratio = distance / depth.clamp_min(0.05)
+def vote_slowly(depth, pose, points, distance, camera) -> torch.Tensor:
+    """[B, K, P]: what keyframes with depth [B, K, h, w] from pose [B, K, 7] say of points [B, P, 3] that lie `distance` [B, P]
+    deep in the new views."""
+    height, width = depth.shape[-2:]
+    where, ahead = project(points[:, None].expand(-1, depth.shape[1], -1, -1), pose, camera)
+    inside = (ahead > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)[:, None]
+    column = (where[..., 0] * width).clamp(0, width - 1).long()
+    row = (where[..., 1] * height).clamp(0, height - 1).long()
+    held = depth.flatten(2).gather(2, row * width + column)
+    same = inside & ((held - ahead).abs() < SAME * ahead)
+    ratio = distance[:, None] / ahead.clamp_min(0.05)
     return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
 
 
+def pick(votes: torch.Tensor, count: int) -> torch.Tensor:
+    """Of votes [B, K, P], the keyframes of which each adds most to what those before it cover: int64 [B, count], -1: no more."""
+    if votes.device.type != "cpu":
+        return pick_slowly(votes, count)
+    picks = torch.full((len(votes), count), -1)
+    parts = (*arrays(votes), ANYWAY, picks.numpy())
+    over_views(len(votes), lambda first, last: kernels.pick_views(first, last, *parts))
+    return picks
+
+
+def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
+    """The same as `pick`, in plain tensor algebra; the way on a GPU."""
+    picks = torch.full((len(votes), count), -1, device=votes.device)
+    if not votes.shape[1]:
+        return picks
+    votes = torch.cat([votes, ANYWAY * votes.amax(2, keepdim=True)], 2)
+    best = torch.zeros_like(votes[:, 0])
+    for n in range(count):
+        gain, chosen = (votes - best[:, None]).clamp_min(0).sum(2).max(1)
+        picks[:, n] = torch.where(gain > 0, chosen, -1)
+        best = torch.maximum(best, votes.gather(1, chosen[:, None, None].expand(-1, 1, votes.shape[2]))[:, 0])
+    return picks
+
+
+# -- what they show ---------------------------------------------------------------------------------------------------
+
+
 def look(
-    chosen: Sequence[Keyframes | None], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int
-) -> Glimpse:
-    """The view from `pose` [B, 7] as the `chosen` keyframes, one set a view (None: none are known), know it."""
+    shared: Keyframes, picks: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int,
+    own: Keyframes | None = None,
+) -> Glimpse:  # fmt: skip
+    """The views of `size` from `pose` [B, 7] as the picked keyframes [B, S] (of `retrieve`) know them."""
+    own = Keyframes.none(size, pose.device) if own is None else own
+    if pose.device.type != "cpu":
+        return look_slowly(shared, picks, pose, camera, size, slots, own)
     batch, (height, width) = len(pose), size
-    depth = torch.full((batch, height, width), FAR_M, device=pose.device)
-    for view, keys in enumerate(chosen):
-        if keys is not None and len(keys):
-            depth[view] = cast_all([keys.fine.flatten(0, 1)], pose[view], camera, size)
+    depth = torch.full((batch, height, width), FAR_M)
+    turns, positions, chosen = arrays(rotation(pose), pose[:, :3], picks)
+    mine = arrays(own.depth, own.turn, own.pose)
+    cast = (chosen, *arrays(shared.fine), *mine, turns, positions, camera, FINE, SLANT, depth.numpy())
+    over_views(batch, lambda first, last: surfaces(first, last, *cast))
     hit = depth < FAR_M
     depth = fill_holes(depth)
-    colours = torch.zeros(batch, slots, 3, height, width, device=pose.device)
-    trust = torch.zeros(batch, slots, height, width, device=pose.device)
-    for view, keys in enumerate(chosen):
-        if keys is not None and len(keys):
-            recall(keys, depth[view], pose[view], camera, colours[view], trust[view])
-    known = hit & (trust[:, 0] > 0)
-    return Glimpse(colours, trust, depth, known.float())
+    colours, trust = torch.zeros(batch, slots, 3, height, width), torch.zeros(batch, slots, height, width)
+    lots = (tuple(arrays(keys.rgb, keys.depth, keys.turn, keys.pose)) for keys in (shared, own))
+    parts = (chosen, *lots, depth.numpy(), turns, positions, camera, colours.numpy(), trust.numpy())
+    over_views(batch, lambda first, last: kernels.recall(first, last, *parts))
+    return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 
 
-def recall(
-    keys: Keyframes,
-    depth: torch.Tensor,
-    pose: torch.Tensor,
-    camera: Intrinsics,
-    colours: torch.Tensor,
-    trust: torch.Tensor,
-) -> None:
-    """Fills colours [slots, 3, H, W] and trust [slots, H, W] with the most trusted that keyframes know of the surfaces that
-    lie `depth` [H, W] deep in the view from `pose` [7]."""
-    if pose.device.type != "cpu":
-        return recall_slowly(keys, depth, pose, camera, colours, trust)
-    from .kernels_numba import recall as kernel
+def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
+    """The same as `look`, in plain tensor algebra; the way on a GPU."""
+    batch, there, mine = len(pose), picks >= 0, picks >= len(shared)
+    if not picks.shape[1] or not len(shared) + len(own):
+        nothing = pose.new_zeros(batch, slots, 3, *size)
+        return Glimpse(nothing, nothing[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
 
-    rgb, held, turns, eyes, seen, turn, eye = (
-        part.contiguous().numpy()
-        for part in (keys.rgb, keys.depth, keys.turn, keys.pose[:, :3], depth, rotation(pose), pose[:3])
-    )
-    kernel(rgb, held, turns, eyes, seen, turn, eye, camera, colours.numpy(), trust.numpy())
+    def both(part: str, change: Callable[[torch.Tensor], torch.Tensor] = lambda tensor: tensor) -> torch.Tensor:
+        """[B, S, ...]: that part of the picked keyframes, of own ones as `change` makes it."""
+        first, second = getattr(shared, part), getattr(own, part)
+        if not len(own):
+            return first[picks.clamp_min(0)]
+        ours = change(second[torch.where(mine, picks - len(shared), 0)])
+        if not len(shared):
+            return ours
+        flags = mine.view(*mine.shape, *[1] * (first.ndim - 1))
+        return torch.where(flags, ours, first[torch.where(mine, 0, picks.clamp_min(0))])
+
+    key_depth, poses, rgb = both("depth"), both("pose"), both("rgb", doubled).float().div(255)
+    patch = patches_slowly(key_depth, poses, camera, FINE)
+    if len(shared):
+        patch = torch.where(mine[..., None, None], patch, shared.fine[torch.where(mine, 0, picks.clamp_min(0))])
+    patch = patch * there[..., None, None]
+    depth = cast_slowly(patch.flatten(1, 2), pose, camera, size)
+    hit = depth < FAR_M
+    depth = fill_holes(depth)
+    colours, trust = recall_slowly(rgb, key_depth, poses, there, depth, pose, camera, slots)
+    return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 
 
-def recall_slowly(keys, depth, pose, camera, colours, trust) -> None:
-    """The same as `recall`, in plain tensor algebra; the way on a GPU."""
-    rgb = keys.rgb.float().div(255)[None]
-    colour, agreement, closeness = warp(rgb, keys.depth[None], keys.pose[None], depth[None], pose[None], camera)
+def recall_slowly(rgb, depth, poses, there, seen, pose, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
+    """Colours [B, slots, 3, H, W] and trust [B, slots, H, W] of the most trusted that keyframes (rgb [B, S, 3, h, w] in [0, 1],
+    depth [B, S, h, w], poses [B, S, 7], there [B, S]) know of the surfaces that lie `seen` [B, H, W] deep from `pose` [B, 7]."""
+    colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera)
     likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
-    best, order = (agreement * likeness**2)[0].topk(min(len(trust), len(keys)), dim=0)
-    trust[: len(best)] = best
-    colours[: len(best)] = colour[0].gather(0, order[:, None].expand(-1, 3, -1, -1))
+    sure = torch.where(there[..., None, None], agreement * likeness**2, -1.0)
+    best, order = sure.topk(min(slots, sure.shape[1]), dim=1)
+    shown = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]
+    missing = slots - best.shape[1]
+    colours = torch.cat([shown, shown.new_zeros(len(shown), missing, *shown.shape[2:])], 1)
+    return colours, torch.cat([best.clamp_min(0), best.new_zeros(len(best), missing, *best.shape[2:])], 1)

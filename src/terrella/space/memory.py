@@ -1,4 +1,4 @@
-"""Memory: what a story has seen and dreamt, as posed RGB-D keyframes in the tensors of its State, within a byte budget.
+"""Memory: what a story has seen and dreamt, as posed RGB-D keyframes that its State points at, within a byte budget.
 
 It keeps a dreamt frame that shows a new view of which much had to be invented; evidence it keeps always, in the place of
 what it held of that view. When it is full it forgets the keyframe whose view the others cover best (evidence is covered by
@@ -10,36 +10,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import prod
 
 import numpy as np
 import torch
 from gymnasium import spaces
 
+from ..core.arena import Arena
 from ..core.errors import ContractError
 from ..core.spec import Spec
+from ..core.state import State
 from .camera import Intrinsics, yaw
-from .floorplan import WALLS
-from .keyframes import COARSE, Glimpse, Keyframes, look, retrieve, retrieve_by_overlap, vote
+from .floorplan import NOWHERE, WALLS
+from .kernels_numba import recall as kernels
+from .keyframes import COARSE, Glimpse, Keyframes, look, retrieve, vote_slowly
 from .patches import patch_count
+from .views import arrays, over_views
 
 EMPTY, RECORDED, OBSERVED, DREAMT = range(4)  # kinds of keyframes
-PAGE = 16  # keyframes that are kept together: remembering one copies one page, and all others are shared with the past
+PAGE = 16  # a memory has room for a multiple of so many keyframes, if for as many
 _EVERY = 11  # every so-manyth coarse patch of a keyframe is a point that another may cover
 _ALIKE = 0.02  # views whose covered shares differ by less are covered equally well
 
-_SMALL = ("memory_pose", "memory_kind", "memory_born", "memory_walls")
-
+ROWS = "memory_rows"  # the pointer into the arena: where a story's keyframes lie
 Held = Mapping[str, torch.Tensor]  # a State, or the part of one that is memory's: the tensors of `Memory.empty`
 
 
 @dataclass(frozen=True)
 class Memory:
-    """The rules of a memory; what it holds is in the State. Every tensor leads with the batch axis.
+    """The rules of a memory. What a story holds is in its State, by the row of an arena that all stories share.
 
     camera: intrinsics of all keyframes; size: height and width of their pictures; budget_mb: MiB that one story may take;
     new_view: metres and radians from the nearest keyframe, whose sum of shares makes a view new; known_enough: share of a
-    dreamt frame that memory knew, above which it is not kept.
+    dreamt frame that memory knew, above which it is not kept; device: where the arena lies.
     """
 
     camera: Intrinsics
@@ -47,31 +49,31 @@ class Memory:
     budget_mb: float = 16.0
     new_view: tuple[float, float] = (0.4, 0.2)
     known_enough: float = 0.95
+    device: str = "cpu"
 
     def __post_init__(self):
         if not 0 <= self.budget_mb < float("inf"):
             raise ContractError(f"a memory's budget is 0 MiB or more; got {self.budget_mb}.")
 
     @cached_property
-    def _parts(self) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
-        """What a page holds of each of its keyframes."""
+    def _arena(self) -> Arena:
         height, width = self.size
-        return {
-            "depth": (torch.float32, (height, width)),
-            "turn": (torch.float32, (3, 3)),
+        parts = {
+            "rgb": (torch.uint8, (3, height, width)), "depth": (torch.float32, (height, width)),
+            "pose": (torch.float32, (7,)), "turn": (torch.float32, (3, 3)), "walls": (torch.float32, (WALLS, 4)),
             "coarse": (torch.float32, (patch_count(self.size, COARSE), 9)),
-            "rgb": (torch.uint8, (3, height, width)),
-        }
+        }  # fmt: skip
+        return Arena(parts, self.device)
 
-    @cached_property
-    def _row_bytes(self) -> int:
-        used = sum(dtype.itemsize * prod(shape) for dtype, shape in self._parts.values())
-        return -(-used // 8) * 8  # so that every story's page of floats begins where floats may
+    @property
+    def arenas(self) -> dict[str, Arena]:
+        """For the State that is made of `empty`."""
+        return {ROWS: self._arena}
 
     @cached_property
     def keyframe_bytes(self) -> int:
-        """Of one keyframe, with its pose, its kind, its age and its walls."""
-        return self._row_bytes + 7 * 4 + 1 + 8 + WALLS * 4 * 4
+        """Of one keyframe: its row, and its pose, kind, age and row number in the state."""
+        return self._arena.row_bytes + 7 * 4 + 1 + 8 + 8
 
     @cached_property
     def capacity(self) -> int:
@@ -81,23 +83,21 @@ class Memory:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of one story's memory when it is full, and of its tensors always."""
+        """Bytes of one story's memory when it is full."""
         return self.capacity * self.keyframe_bytes
 
     def empty(self, batch: int) -> dict[str, torch.Tensor]:
         """The tensors of memories that hold nothing."""
-        page = torch.zeros(1, min(PAGE, self.capacity) * self._row_bytes, dtype=torch.uint8)
+        kinds = {"pose": torch.float32, "kind": torch.uint8, "born": torch.int64, "rows": torch.int64}
+        shape = batch, self.capacity
         return {
-            "memory_pose": torch.zeros(batch, self.capacity, 7),
-            "memory_kind": torch.zeros(batch, self.capacity, dtype=torch.uint8),
-            "memory_born": torch.zeros(batch, self.capacity, dtype=torch.int64),
-            "memory_walls": torch.zeros(batch, self.capacity, WALLS, 4),
-            **{self._page(slot): page.expand(batch, -1) for slot in range(0, self.capacity, PAGE)},
+            f"memory_{name}": torch.zeros(*shape, *([7] if name == "pose" else []), dtype=dtype, device=self.device)
+            for name, dtype in kinds.items()
         }
 
     def of(self, state: Held) -> dict[str, torch.Tensor]:
         """The tensors of `state` that are memory's."""
-        return {name: state[name] for name in self.empty(1)}
+        return {name: state[name] for name in self.empty(0)}
 
     def count(self, held: Held) -> torch.Tensor:
         """Keyframes held by each story: [B]."""
@@ -113,7 +113,7 @@ class Memory:
         self, held: Held, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """The tensors that change where evidence is kept: rgb uint8 [B, 3, H, W], depth [B, H, W] metres, pose [B, 7]."""
-        return self._keep(held, OBSERVED, rgb, depth, pose, torch.ones(len(rgb), dtype=torch.bool))
+        return self._keep(held, OBSERVED, rgb, depth, pose, torch.ones(len(rgb), dtype=torch.bool, device=rgb.device))
 
     def dreamt(
         self, held: Held, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, known: torch.Tensor
@@ -130,118 +130,115 @@ class Memory:
         apart = away + torch.atan2(angle.sin(), angle.cos()).abs() / turn
         return torch.where(held["memory_kind"] > EMPTY, apart, torch.inf).min(1)
 
-    def _keep(self, held, kind: int, rgb, depth, pose, which: torch.Tensor) -> dict[str, torch.Tensor]:
-        if not self.capacity or not which.any():
+    def _keep(self, held: Held, kind: int, rgb, depth, pose, which: torch.Tensor) -> dict[str, torch.Tensor]:
+        if not self.capacity:
             return {}
         apart, nearest = self.nearest(held, pose)
         which = which if kind == OBSERVED else which & (apart > 1)
-        rows = which.nonzero()[:, 0]
-        if not len(rows):
-            return {}
-        new = Keyframes.of(rgb[rows], depth[rows], pose[rows], self.camera, fine=False)
-        changed = {name: held[name].clone() for name in _SMALL}
-        for row, view in enumerate(rows.tolist()):
-            slot = int(nearest[view]) if apart[view] <= 1 else self._room(held, view)
-            changed["memory_pose"][view, slot] = pose[view]
-            changed["memory_kind"][view, slot] = kind
-            changed["memory_born"][view, slot] = held["memory_born"][view].max() + 1
-            changed["memory_walls"][view, slot] = new.walls[row]
-            page = self._page(slot)
-            if page not in changed:
-                changed[page] = held[page].clone(memory_format=torch.contiguous_format)
-            for name, part in self._read(changed[page][view]).items():
-                part[slot % PAGE] = vars(new)[name][row]
+        views = torch.arange(len(pose), device=pose.device)
+        if pose.device.type == "cpu":  # elsewhere it costs less to write all rows than to ask how many there are
+            views = which.nonzero()[:, 0]
+            if not len(views):
+                return {}
+        apart, nearest, pose = apart[views], nearest[views], pose[views]
+        new = Keyframes.of(rgb[views], depth[views], pose, self.camera, fine=False)
+        arena = self._arena_of(held)
+        kept, kinds, born = held[ROWS], held["memory_kind"], held["memory_born"]
+        slot = torch.where(apart <= 1, nearest, self._room(held, views, apart > 1))
+        rows = arena.keep({name: vars(new)[name] for name in arena.parts})
+        fresh = {
+            "memory_pose": pose, "memory_kind": torch.full_like(slot, kind, dtype=torch.uint8),
+            "memory_born": born[views].amax(1) + 1, ROWS: rows,
+        }  # fmt: skip
+        before = {"memory_pose": held["memory_pose"], "memory_kind": kinds, "memory_born": born, ROWS: kept}
+        flags = which[views]
+        changed = {}
+        for name, value in fresh.items():
+            old = before[name][views, slot]
+            value = torch.where(flags.view(-1, *[1] * (value.ndim - 1)), value, old)
+            changed[name] = before[name].index_put((views, slot), value)
+        arena.hold(changed[ROWS])
         return changed
 
-    def _room(self, held: Held, view: int) -> int:
-        """The slot for a new keyframe of one story: a free one, or that of the one which is forgotten."""
-        kind, born = held["memory_kind"][view], held["memory_born"][view]
-        if (kind == EMPTY).any():
-            return int((kind == EMPTY).int().argmax())
-        covered = self.covered(held, view)
-        best = (covered > covered.max() - _ALIKE).nonzero()[:, 0].tolist()
-        return min(best, key=lambda slot: (kind[slot] != DREAMT, born[slot]))
+    def _room(self, held: Held, views: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+        """The slot for a new keyframe of each of `views` [n]: a free one, or, where one is `wanted` [n], that of the one which
+        is forgotten."""
+        kind, born = held["memory_kind"][views], held["memory_born"][views]
+        free, slot = (kind == EMPTY).max(1)
+        full = wanted & ~free
+        if kind.device.type == "cpu" and not full.any():
+            return slot
+        some = full.nonzero()[:, 0] if kind.device.type == "cpu" else torch.arange(len(views), device=kind.device)
+        covered = self.covered(held, views[some])
+        best = covered > covered.amax(1, keepdim=True) - _ALIKE
+        age = torch.where(kind[some] == DREAMT, born[some], born[some] + 2**62)
+        forgotten = torch.where(best, age, 2**63 - 1).argmin(1)
+        return slot.index_put((some,), torch.where(full[some], forgotten, slot[some]))
 
-    def covered(self, held: Held, view: int) -> torch.Tensor:
-        """How well the others cover the view of each keyframe of one story, 0..1: [n]. At points of the surfaces that it
-        saw, the best vote of another (keyframes.vote: did it see them too, from as near?)."""
-        pages = self.keyframes(held, view)
-        points = torch.cat([page.coarse[:, ::_EVERY, :3] for page in pages])
-        ahead = torch.cat([page.turn[:, :, 0] for page in pages])
-        eyes = torch.cat([page.pose[:, :3] for page in pages])
-        distance = ((points - eyes[:, None]) * ahead[:, None]).sum(-1)
-        flat = points.flatten(0, 1), distance.flatten()
-        votes = torch.cat([vote(page, *flat, self.camera) for page in pages]).unflatten(1, (len(points), -1))
-        dreamt = held["memory_kind"][view, : len(points)] == DREAMT
-        others = ~torch.eye(len(points), dtype=torch.bool) & (dreamt[None, :] | ~dreamt[:, None])
-        return (votes * others[:, :, None]).amax(0).mean(1)
+    def covered(self, held: Held, views: torch.Tensor) -> torch.Tensor:
+        """How well the others cover the view of each keyframe of those `views` [n], whose memories are full, 0..1:
+        [n, capacity]. At points of the surfaces that it saw, the best vote of another: did it see them too, from as near?"""
+        rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
+        if rows.device.type != "cpu":
+            return self.covered_slowly(held, views)
+        keys, share = self._keyframes(held), torch.zeros(rows.shape)
+        given = arrays(keys.coarse, keys.depth, keys.turn, keys.pose, rows, dreamt)
+        parts = (*given, self.camera, _EVERY, share.numpy())
+        over_views(len(views), lambda first, last: kernels.covered(first, last, *parts))
+        return share
+
+    def covered_slowly(self, held: Held, views: torch.Tensor) -> torch.Tensor:
+        """The same as `covered`, in plain tensor algebra; the way on a GPU."""
+        rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
+        keys, count = self._keyframes(held), self.capacity
+        points, pose = keys.coarse[rows][:, :, ::_EVERY, :3], keys.pose[rows]
+        distance = ((points - pose[..., None, :3]) * keys.turn[rows][:, :, None, :, 0]).sum(-1)
+        votes = vote_slowly(keys.depth[rows], pose, points.flatten(1, 2), distance.flatten(1), self.camera)
+        others = ~torch.eye(count, dtype=torch.bool, device=rows.device) & (dreamt[:, None, :] | ~dreamt[:, :, None])
+        return (votes.unflatten(2, (count, -1)) * others[..., None]).amax(1).mean(2)
 
     # -- recalling ----------------------------------------------------------------------------------------------------
 
-    def keyframes(self, held: Held, view: int) -> list[Keyframes]:
-        """The keyframes of one story, page by page, without fine patches; nothing is copied."""
-        count = int((held["memory_kind"][view] > EMPTY).sum())
-        pages = []
-        for first in range(0, count, PAGE):
-            parts = {name: part[: count - first] for name, part in self._read(held[self._page(first)][view]).items()}
-            some = slice(first, min(first + PAGE, count))
-            pose, walls = held["memory_pose"][view, some], held["memory_walls"][view, some]
-            pages.append(Keyframes(pose=pose, walls=walls, fine=pose.new_zeros(len(pose), 0, 9), **parts))
-        return pages
+    def keyframes(self, held: Held, view: int) -> Keyframes:
+        """The keyframes of one story, copied, as memory keeps them: without fine patches."""
+        rows = held[ROWS][view][held["memory_kind"][view] > EMPTY]
+        return self._keyframes(held).at(rows)
 
-    def walls(self, held: Held, view: int) -> torch.Tensor:
-        """The walls [n, 4] that the keyframes of one story saw (floorplan.py)."""
-        count = int((held["memory_kind"][view] > EMPTY).sum())
-        return held["memory_walls"][view, :count].flatten(0, 1)
+    def walls(self, held: Held, dreamt: bool = True) -> torch.Tensor:
+        """The walls [B, n, 4] that the keyframes of each story saw (floorplan.py), with `dreamt` those of dreams, too; NOWHERE
+        for those that are none."""
+        rows, kind = held[ROWS], held["memory_kind"]
+        counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
+        walls = self._arena_of(held).read("walls")[rows]
+        return torch.where(counts[..., None, None], walls, NOWHERE).flatten(1, 2)
 
     def look(
-        self,
-        held: Held,
-        pose: torch.Tensor,
-        sources: int = 6,
-        slots: int = 3,
-        recorded: Keyframes | None = None,
-        overlap: bool = False,
+        self, held: Held, pose: torch.Tensor, sources: int = 6, slots: int = 3, recorded: Keyframes | None = None
     ) -> Glimpse:
         """What memory, and `recorded` keyframes that all stories share, know of the views from `pose` [B, 7].
 
-        `sources` keyframes are found for a view by their votes on its surfaces, or by `overlap` of fields of view alone,
-        where depth is not to be trusted; `slots` of them show at each pixel.
+        `sources` keyframes are found for a view by their votes on its surfaces; `slots` of them show at each pixel.
         """
-        chosen = []
-        for view in range(len(pose)):
-            own = self.keyframes(held, view)
-            memories = ([recorded] if recorded is not None and len(recorded) else []) + own
-            if overlap:
-                picks = retrieve_by_overlap(memories, pose[view], self.camera, sources)
-            else:
-                picks = retrieve(memories, pose[view], self.camera, self.size, sources)
-            shared = len(memories) - len(own)
-            found = [keys.at(pick) for keys, pick in zip(memories[:shared], picks) if pick]
-            mine = [keys.at(pick) for keys, pick in zip(own, picks[shared:]) if pick]
-            found += [Keyframes.joined(mine).unfolded(self.camera)] if mine else []
-            chosen.append(Keyframes.joined(found) if found else None)
-        return look(chosen, pose, self.camera, self.size, slots)
+        shared = Keyframes.none(self.size, pose.device) if recorded is None else recorded
+        rows = held[ROWS]  # before the arena is read: what waits may be written there
+        own = self._keyframes(held)
+        picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
+        return look(shared, picks, pose, self.camera, self.size, slots, own)
 
-    # -- pages --------------------------------------------------------------------------------------------------------
+    def _arena_of(self, held: Held) -> Arena:
+        return held.arenas.get(ROWS, self._arena) if isinstance(held, State) else self._arena
 
-    def _page(self, slot: int) -> str:
-        return f"memory_{slot // PAGE:02d}"
-
-    def _read(self, page: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The bytes [n] of one story's page as its parts, each [PAGE, ...]: views, through which it can be written."""
-        number, parts, at = min(PAGE, self.capacity), {}, 0
-        for name, (dtype, shape) in self._parts.items():
-            size = number * dtype.itemsize * prod(shape)
-            parts[name] = page[at : at + size].view(dtype).view(number, *shape)
-            at += size
-        return parts
+    def _keyframes(self, held: Held) -> Keyframes:
+        """All rows of the arena, without fine patches; nothing is copied."""
+        arena = self._arena_of(held)
+        parts = {name: arena.read(name) for name in arena.parts}
+        return Keyframes(fine=parts["depth"].new_zeros(len(parts["depth"]), 0, 9), **parts)
 
 
 def keyframe_table(pose: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
     """Poses [..., 7] and kinds [...] as float32 [..., 4] = x, y in metres, heading in radians, kind; zeros where empty."""
-    told = torch.cat([pose[..., :2], yaw(pose)[..., None], kind[..., None].float()], -1)
-    return torch.where((kind > EMPTY)[..., None], told, 0.0)
+    row = torch.cat([pose[..., :2], yaw(pose)[..., None], kind[..., None].float()], -1)
+    return torch.where((kind > EMPTY)[..., None], row, 0.0)
 
 
 def remembering_spec(spec: Spec, size: tuple[int, int], keyframes: int) -> Spec:

@@ -2,21 +2,18 @@
 
 Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
 the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
-`patches` and `cast` run compiled kernels on a CPU (space/kernels_numba.py); `patches_slowly` and `cast_slowly` are their
+`patches` and `cast` run compiled kernels on a CPU (kernels_numba/surfaces.py); `patches_slowly` and `cast_slowly` are their
 obvious twins, and the way on a GPU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 
-from .camera import Intrinsics, rays, rotation, unproject
+from .camera import FAR_M, NEAR_M, Intrinsics, rays, rotation, unproject
+from .kernels_numba.surfaces import cast_views, lift_views
+from .views import arrays, over_views
 
-FAR_M = 100.0  # deeper than any depth: "nothing is known there"
-SAME = 0.06  # depths that differ by less than this share are of one surface
-NEAR_M = 0.05
 SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall seen head-on is no surface
 
 
@@ -24,21 +21,19 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
     """Depth [..., H, W] seen from `pose` [..., 7] -> patches [..., N, 9]: centre, half side across, half side down.
 
     One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
-    their neighbours' by half, and cross(down, across) points towards the eye that saw them. A patch that would reach
+    their neighbours' by half, and cross(down, across) points towards the camera that saw them. A patch that would reach
     over an edge in the depth image keeps to its own pixel; one that is too slanted to be told from a bridge between two
     surfaces shrinks to nothing, lest from the side it be a wall across the room.
     """
     if depth.device.type != "cpu":
         return patches_slowly(depth, pose, camera, stride)
-    from .kernels_numba import lift
-
     height, width = depth.shape[-2:]
-    images = depth.detach().float().reshape(-1, height, width).contiguous().numpy()
-    turn = rotation(pose).reshape(-1, 3, 3).contiguous().numpy()
-    eye = pose[..., :3].reshape(-1, 3).contiguous().numpy()
+    images, turns, positions = arrays(
+        depth.float().reshape(-1, height, width), rotation(pose).reshape(-1, 3, 3), pose[..., :3].reshape(-1, 3)
+    )
     found = torch.empty(len(images), patch_count((height, width), stride), 9)
-    for image, patch in enumerate(found.numpy()):
-        lift(images[image], turn[image], eye[image], camera, stride, SLANT, patch)
+    parts = images, turns, positions, camera, stride, SLANT, found.numpy()
+    over_views(len(images), lambda first, last: lift_views(first, last, *parts))
     return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
 
 
@@ -88,21 +83,9 @@ def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tupl
     """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9]; FAR_M where it sees none."""
     if patch.device.type != "cpu":
         return cast_slowly(patch, pose, camera, size)
-    return torch.stack([cast_all([patch[view]], pose[view], camera, size) for view in range(len(pose))])
-
-
-def cast_all(
-    sets: Sequence[torch.Tensor], pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]
-) -> torch.Tensor:
-    """Depth [H, W] that the view from `pose` [7] sees of several sets of patches [N, 9]; FAR_M where it sees none."""
-    depth = torch.full(size, FAR_M, device=pose.device)
-    if pose.device.type != "cpu":
-        return torch.stack([depth, *(cast_slowly(one[None], pose[None], camera, size)[0] for one in sets)]).amin(0)
-    from .kernels_numba import cast_one
-
-    turn, eye, into = rotation(pose).contiguous().numpy(), pose[:3].contiguous().numpy(), depth.numpy()
-    for one in sets:
-        cast_one(one.contiguous().numpy(), turn, eye, camera, into)
+    depth = torch.full((len(pose), *size), FAR_M)
+    parts = (*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy())
+    over_views(len(pose), lambda first, last: cast_views(first, last, *parts))
     return depth
 
 

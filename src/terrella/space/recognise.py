@@ -42,7 +42,7 @@ def recognise(
 ) -> Found | None:
     """The best pose for a level picture, uint8 [3, H, W], among `memory` with its `thumbnails`; None in an empty memory.
 
-    Keyframes are compared with the picture as it would be with the eye turned a little; the best are searched around, each
+    Keyframes are compared with the picture as it would be with the camera turned a little; the best are searched around, each
     time rendering what memory knows. Whether what is found is the place is for the caller to say, from its likeness.
     """
     if not len(memory):
@@ -85,13 +85,12 @@ class _View:
     def __init__(self, memory: Keyframes, pose: torch.Tensor, camera: Intrinsics, sources: int, picture: torch.Tensor):
         self.camera, self.picture, self.pose = camera, picture, pose
         self.size = (picture.shape[-2], picture.shape[-1])
-        (picks,) = retrieve([memory], pose, camera, self.size, sources)
-        self.keys = memory.at(picks)
+        self.memory, self.picks = memory, retrieve(memory, pose[None], camera, self.size, sources)
         self.best = self._score(pose)
 
     def judged(self, pose: torch.Tensor) -> tuple[float, float]:
         """Likeness and known share of what the keyframes show from `pose`."""
-        glimpse = look([self.keys], pose[None], self.camera, self.size, 1)
+        glimpse = look(self.memory, self.picks, pose[None], self.camera, self.size, 1)
         known = glimpse.known[0] > 0
         share = float(known.float().mean())
         if share < 0.05:
@@ -101,7 +100,7 @@ class _View:
 
     def edges(self, pose: torch.Tensor) -> float:
         """Likeness of the differences between neighbours, at half the size."""
-        glimpse = look([self.keys], pose[None], self.camera, self.size, 1)
+        glimpse = look(self.memory, self.picks, pose[None], self.camera, self.size, 1)
         half = [F.avg_pool2d(part, 2) for part in (self.picture, glimpse.rgb[0, 0], glimpse.known)]
         sure = half[2][0] == 1
         pairs = [[(part.diff(dim=axis) * _both(sure, axis - 1)) for part in half[:2]] for axis in (1, 2)]

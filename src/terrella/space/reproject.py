@@ -9,8 +9,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from .camera import Intrinsics, project, rotation, unproject
-from .patches import FAR_M, SAME
+from .camera import FAR_M, SAME, Intrinsics, project, rotation, unproject
+from .kernels_numba.carried import carry_views, fetch_views, splat_views
+from .kernels_numba.planes import fill_views
+from .views import arrays, over_views
 
 
 def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
@@ -40,11 +42,9 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     """
     if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
-    from .kernels_numba import fill as kernel
-
     filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
-    for holed, near, whole in zip(depth.contiguous().numpy(), least_around(depth).numpy(), filled.numpy()):
-        kernel(holed, near, FAR_M, levels, whole)
+    parts = (*arrays(depth, least_around(depth)), FAR_M, levels, filled.numpy())
+    over_views(len(depth), lambda first, last: fill_views(first, last, *parts))
     return filled
 
 
@@ -57,8 +57,6 @@ def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     stack = []
     values, weights = inverse * weight, weight
     for _ in range(levels):
-        if (weights > 1e-6).all():
-            break  # nothing is left to fill from coarser averages
         stack.append((values, weights))
         values, weights = F.avg_pool2d(values, 2, ceil_mode=True), F.avg_pool2d(weights, 2, ceil_mode=True)
     filled = values / weights.clamp_min(1e-6)
@@ -106,15 +104,12 @@ def carry_unknown(
     """One frame (rgb uint8 [B, 3, H, W], depth [B, h, w], pose [B, 7]) warped into the view that sees target_depth
     [B, H', W'] from target_pose [B, 7], where it does not know [B, H', W'] the surface: [B, 4, H', W'] of colour in [0, 1]
     and trust, 0 elsewhere."""
-    if rgb.device.type != "cpu" or rgb.dtype != torch.uint8 or depth.requires_grad or target_depth.requires_grad:
+    if not _kernels_do(rgb, depth, pose, known, target_depth, target_pose):
         return carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera)
-    from .kernels_numba import carry as kernel
-
     carried = torch.zeros(len(rgb), 4, *target_depth.shape[-2:])
-    parts = rgb, depth, rotation(pose), pose[:, :3], known, target_depth, rotation(target_pose), target_pose[:, :3]
-    ready = [part.detach().contiguous().numpy() for part in parts]
-    for view, (colour, held, turn, eye, sure, seen, new_turn, new_eye) in enumerate(zip(*ready)):
-        kernel(colour, held, turn, eye, sure, seen, new_turn, new_eye, camera, carried[view].numpy())
+    given = rgb, depth, rotation(pose), pose, known, target_depth, rotation(target_pose), target_pose
+    parts = (*arrays(*given), camera, carried.numpy())
+    over_views(len(rgb), lambda first, last: carry_views(first, last, *parts))
     return carried
 
 
@@ -125,3 +120,62 @@ def carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, cam
     )
     trust = agreement * (1 - known[:, None])
     return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
+
+
+def carry_things(
+    rgb: torch.Tensor, depth: torch.Tensor, things: torch.Tensor, covered: torch.Tensor, pose: torch.Tensor,
+    target_pose: torch.Tensor, camera: Intrinsics,
+) -> torch.Tensor:  # fmt: skip
+    """Frames (rgb uint8 [B, 3, H, W]; depth in metres, things in 0..1 and covered bool [B, H, W]; pose [B, 7]) brought into the
+    views from target_pose [B, 7] by their own depth: [B, 6, H, W] = colour, trust, depth and things; all but the depth are 0
+    where the frame did not see, or was `covered`. Pixels are moved whole: what is carried again at every step stays sharp."""
+    given = rgb, depth, things, covered, pose, target_pose
+    if not _kernels_do(*given):
+        return carry_things_slowly(*given, camera)
+    pixels = arrays(rgb, depth, things, covered)
+    turns, poses, new_turns, new_poses = arrays(rotation(pose), pose, rotation(target_pose), target_pose)
+    flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
+    splat = (*pixels[1:3], turns, poses, new_turns, new_poses, camera, flat.numpy(), canvas.numpy())
+    over_views(len(rgb), lambda first, last: splat_views(first, last, *splat))
+    (seen,) = arrays(_closed(canvas))
+    found = torch.zeros(len(rgb), 6, *depth.shape[1:])
+    fetch = pixels[0], flat.numpy(), *pixels[2:], turns, poses, seen, new_turns, new_poses, camera, found.numpy()
+    over_views(len(rgb), lambda first, last: fetch_views(first, last, *fetch))
+    return found
+
+
+def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) -> torch.Tensor:
+    """The same as `carry_things`, in plain tensor algebra; the way on a GPU and for gradients."""
+    height, width = depth.shape[-2:]
+    flat = _flattened(depth, things)
+    points = unproject(flat, pose, camera).flatten(1, 2)
+    seen = _closed(splat_depth(points, target_pose, camera, (height, width)))
+    where, ahead = project(unproject(seen, target_pose, camera).flatten(1, 2), pose, camera)
+    grid, ahead = (where * 2 - 1).view(-1, height, width, 2), ahead.view(-1, height, width)
+    planes = torch.cat([rgb.float() / 255, torch.stack([things, flat, covered.float()], 1)], 1)
+    found = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
+    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (found[:, 5] < 0.5)
+    error = (found[:, 4] - ahead).abs() / ahead.clamp_min(0.05)
+    trust = torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)[:, None]
+    found = found * (trust > 0)
+    return torch.cat([found[:, :3], trust, seen[:, None], found[:, 3:4]], 1)
+
+
+def _closed(depth: torch.Tensor) -> torch.Tensor:
+    """Depth [B, H, W] with FAR_M in holes -> the same without."""
+    for fill in (least_around, fill_holes):  # the first closes the gaps of a surface that comes nearer
+        depth = torch.where(depth < FAR_M, depth, fill(depth))
+    return depth
+
+
+def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
+    """Depth [B, H, W] with that of things averaged over their surroundings: a figure whose pixels lie at depths of their own
+    would fall to pieces."""
+    there = (things > 0.5).float()
+    summed = F.avg_pool2d(torch.stack([depth * there, there], 1), 9, 1, 4)
+    return torch.where(there > 0, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
+
+
+def _kernels_do(rgb: torch.Tensor, *others: torch.Tensor) -> bool:
+    """Whether compiled kernels take these: on the CPU, bytes of colour, and no gradient asked for."""
+    return rgb.device.type == "cpu" and rgb.dtype == torch.uint8 and not any(part.requires_grad for part in others)

@@ -1,0 +1,92 @@
+"""The compiled kernel of doom_map.py: a map of prisms seen from a place in it."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cast_prisms(lines, solid, first, heights, sky, x, y, eye, yaw, camera, farthest, depth, sector):
+    """Fills `depth` [H, W] and `sector` int32 [H, W] of the view from x, y and height `eye` along `yaw` (radians).
+
+    lines [N, 4] = x1, y1, x2, y2, sector by sector: those of sector s are rows first[s] to first[s + 1]; solid [N] where
+    nothing is behind; heights [S, 2] = floor, ceiling; sky [S] where the ceiling is the open sky. Depth is along the optical
+    axis, in the units of the map, `farthest` at most and for the sky. `sector` is that whose floor, ceiling or edge is seen,
+    -1 for a solid wall and the sky.
+    """
+    rows, columns = depth.shape
+    fx, fy, cx, cy = camera
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    ahead, right = np.empty((len(lines), 2)), np.empty((len(lines), 2))
+    for n in range(len(lines)):
+        for end in range(2):
+            px, py = lines[n, 2 * end] - x, lines[n, 2 * end + 1] - y
+            ahead[n, end], right[n, end] = px * cosine + py * sine, px * sine - py * cosine
+    near = np.zeros(len(first) - 1, np.bool_)  # sectors of which a line lies before the eye
+    for s in range(len(near)):
+        for n in range(first[s], first[s + 1]):
+            near[s] |= max(ahead[n, 0], ahead[n, 1]) > 0 and min(ahead[n, 0], ahead[n, 1]) < farthest
+    down = np.empty(rows)
+    for v in range(rows):
+        slope = ((v + 0.5) / rows - cy) / fy
+        down[v] = slope if abs(slope) > 1e-9 else 1e-9
+    cuts = np.empty(len(lines) + 2)
+    for u in range(columns):
+        side = ((u + 0.5) / columns - cx) / fx
+        wall = farthest
+        for n in range(len(lines)):
+            if solid[n]:
+                wall = min(wall, crossing(ahead, right, n, side))
+        depth[:, u], sector[:, u] = wall, -1
+        for s in range(len(near)):
+            if not near[s]:
+                continue
+            count = 0
+            for n in range(first[s], first[s + 1]):
+                cut = crossing(ahead, right, n, side)
+                if cut < np.inf:
+                    at = count
+                    while at > 0 and cuts[at - 1] > cut:
+                        cuts[at] = cuts[at - 1]
+                        at -= 1
+                    cuts[at] = cut
+                    count += 1
+            if count == 0:
+                continue
+            if count % 2 == 1:  # the eye is in this sector
+                for at in range(count, 0, -1):
+                    cuts[at] = cuts[at - 1]
+                cuts[0] = 0.0
+                count += 1
+            floor, ceiling = heights[s, 0], heights[s, 1]
+            for pair in range(0, count, 2):
+                enter, leave = cuts[pair], cuts[pair + 1]
+                if enter >= wall:
+                    break
+                for v in range(rows):
+                    high = (
+                        eye - down[v] * enter
+                    )  # where the ray enters: on the edge of a floor or ceiling, or between them
+                    if high <= floor or high >= ceiling:
+                        hit = enter
+                    else:
+                        hit = (eye - floor) / down[v] if down[v] > 0 else (eye - ceiling) / down[v]
+                    if hit <= leave and hit < depth[v, u]:
+                        open_air = sky[s] and eye - down[v] * hit > ceiling - 1e-3
+                        depth[v, u], sector[v, u] = hit, -2 if open_air else s
+        for v in range(rows):
+            if sector[v, u] == -2:
+                depth[v, u], sector[v, u] = farthest, -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def crossing(ahead, right, n, side):
+    """How far ahead the vertical plane of a column, `side` to the right for each unit ahead, meets line n; inf where not."""
+    a, b = right[n, 0] - side * ahead[n, 0], right[n, 1] - side * ahead[n, 1]
+    if (a > 0) == (b > 0):
+        return np.inf
+    along = ahead[n, 0] + a / (a - b) * (ahead[n, 1] - ahead[n, 0])
+    return along if along > 0 else np.inf

@@ -1,0 +1,28 @@
+"""The views of a batch, shared out over threads: for kernels that hold no lock of Python's."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+
+_POOL = ThreadPoolExecutor(os.cpu_count() or 1, "views")
+
+
+def over_views(batch: int, work: Callable[[int, int], object]) -> None:
+    """Calls work(first, last) for parts of range(batch), on as many threads as torch may use. Parts must not call this."""
+    threads = min(torch.get_num_threads(), batch)
+    bounds = [batch * part // max(threads, 1) for part in range(threads + 1)]
+    others = [_POOL.submit(work, *part) for part in zip(bounds[1:], bounds[2:])]
+    if batch:
+        work(0, bounds[1])
+    for other in others:
+        other.result()
+
+
+def arrays(*parts: torch.Tensor) -> list[np.ndarray]:
+    """Tensors of the CPU as contiguous arrays, for kernels."""
+    return [part.detach().contiguous().numpy() for part in parts]
