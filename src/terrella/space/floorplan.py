@@ -58,7 +58,7 @@ def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
     if inverse.device.type != "cpu":
         return straight_runs_slowly(inverse, left)
     found = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
-    parts = (*arrays(inverse, left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M, found.numpy())
+    parts = [*arrays(inverse, left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M, found.numpy()]
     over_views(len(inverse), lambda first, last: straight_runs_of(first, last, *parts))
     return found
 
@@ -188,7 +188,7 @@ def slide(
     if places.device.type != "cpu":
         return slide_slowly(walls, places, wish, half_m, short, own)
     moved, left = torch.zeros(2, len(places), 2, dtype=torch.float64)
-    parts = (*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, moved.numpy(), left.numpy())
+    parts = [*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, moved.numpy(), left.numpy()]
     over_views(len(places), lambda first, last: slide_kernel(first, last, *parts))
     return moved.to(wish), left.to(wish)
 

@@ -32,7 +32,7 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
         depth.float().reshape(-1, height, width), rotation(pose).reshape(-1, 3, 3), pose[..., :3].reshape(-1, 3)
     )
     found = torch.empty(len(images), patch_count((height, width), stride), 9)
-    parts = images, turns, positions, camera, stride, SLANT, found.numpy()
+    parts = [images, turns, positions, camera, stride, SLANT, found.numpy()]
     over_views(len(images), lambda first, last: lift_views(first, last, *parts))
     return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
 
@@ -84,7 +84,7 @@ def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tupl
     if patch.device.type != "cpu":
         return cast_slowly(patch, pose, camera, size)
     depth = torch.full((len(pose), *size), FAR_M)
-    parts = (*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy())
+    parts = [*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy()]
     over_views(len(pose), lambda first, last: cast_views(first, last, *parts))
     return depth
 
