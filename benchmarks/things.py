@@ -17,7 +17,7 @@ import tyro
 import terrella
 from terrella.core import chance
 from terrella.data import ClipCache
-from terrella.learn.samples import Recording, controls_of
+from terrella.learn.recording import Recording, controls_of
 from terrella.space.billboards import cut_out
 from terrella.space.camera import project
 from terrella.worlds.learned import LearnedWorld

@@ -29,7 +29,7 @@ import terrella
 from terrella.core import State
 from terrella.core.spec import Spec
 from terrella.data import ClipCache, split
-from terrella.measure import ScoreConfig, as_dict, clips_from_cache, score
+from terrella.measure import Exam, ExamConfig, as_dict, clips_from_cache, examine
 
 SIZE, CONTEXT, HORIZONS, CLIPS = (64, 64), 4, (1, 8, 32), 50
 
@@ -142,7 +142,7 @@ def train_theirs(checkout: Path, out: Path, minutes: float, batch: int = 32) -> 
 def train_ours(out: Path, minutes: float, **settings) -> None:
     """All that `terrella train video` does but for the head that says how far it errs, for `minutes`; the processor time
     that it took in all is what DIAMOND should be given."""
-    from terrella.learn.train_video import TrainConfig, train_video
+    from terrella.learn.recipes.video import TrainConfig, train_video
 
     folder, before = out / "run", 0.0
     folder.mkdir(parents=True, exist_ok=True)
@@ -208,16 +208,19 @@ def compare(name: str, checkout: Path, out: Path, longest: int) -> None:
     world, cache, rng = arm(name, checkout, out), ClipCache.open(out / "test", SIZE), terrella.make_rng(0)
     clips = clips_from_cache(cache, range(len(cache.episodes)), CONTEXT, max(HORIZONS), CLIPS, rng)
     horizons = tuple(step for step in HORIZONS if step <= longest)
-    config = ScoreConfig(horizons=horizons, control_horizons=(), drop=(1, horizons[-1]), batch=10)
-    card = score({name: world}, {"held out": clips}, terrella.make_rng(1), config)
+    config = ExamConfig(
+        horizons=horizons, control_horizons=(), drop=(1, horizons[-1]), batch=10, closure_deg=(), closure_walk=0,
+        long_steps=0, speed_steps=0,
+    )  # fmt: skip
+    card = examine(Exam({name: world}, {"clips": {"held out": clips}}, config, seed=1))
     used = json.loads((out / ("run/cpu.json" if name == "terrella" else "diamond/facts.json")).read_text())
     (out / f"beside-{name}.json").write_text(json.dumps({"trained": used, "card": as_dict(card)}, indent=1))
     for number, picture in enumerate(card.pictures):
         strip(picture.rows, picture.columns).save(out / f"beside-{name}-{number}.png")
     print(name, used, f"{len(clips)} clips")
-    for row, look in zip(card.fidelity, card.looks):
-        print(row.horizon, "psnr", row.psnr, "ssim", row.ssim, "sharp", row.sharpness, "frechet", row.frechet)
-        print(row.horizon, "gain over copy last", row.gain, "copy last: psnr", row.copy_last, "frechet", look.copy_last)
+    for row in card.rows:
+        beside = ", ".join(f"{words} {figure}" for words, figure in row.baselines.items())
+        print(row.horizon, row.what, row.figure, row.unit, beside, "" if row.gain is None else f"gain {row.gain}")
 
 
 def pace(checkout: Path, out: Path, rounds: int = 6, steps: int = 10) -> dict[str, list[float]]:

@@ -1,4 +1,4 @@
-"""The reported scorecard of doom-maze, on a recording that training saw nothing of; one process and thread an arm.
+"""The reported scorecard of doom-maze, on a recording that training saw nothing of; goes on where it was stopped.
 
 python recipes/doom_maze_score.py RECORDING OUT [--clips 50]
 
@@ -9,61 +9,45 @@ sharpened and nothing invented.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 
 import terrella
+from terrella import progress
 from terrella.data import ClipCache
 from terrella.measure import (
+    CLIPS,
+    LONG,
     Album,
+    Bar,
+    Exam,
     ExamConfig,
+    Row,
     Scorecard,
-    ScoreConfig,
-    bars,
     clips_from_cache,
     examine,
     in_box,
     out_of_sight,
-    speed,
+    verdict,
+    worst_of,
     write_report,
 )
 from terrella.space.keyframes import merge
 from terrella.worlds.generator import encode_depth
 
-ARMS = ("memory", "no memory", "no network")
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
 DRIFT, DRIFT_CLIPS = 256, 24
-
-
-def exam(arm: str, name: str, data: str, count: int) -> Scorecard:
-    """One arm's scorecard, without speeds: those are measured alone."""
-    torch.set_num_threads(1)
-    world, rng = load(arm, name), terrella.make_rng(0)
-    clips, cache = places(world, data, count, rng)
-    long, _ = places(world, data, DRIFT_CLIPS, terrella.make_rng(1), DRIFT)
-    scoring = ScoreConfig(horizons=HORIZONS, control_horizons=(8, 32))
-    config = ExamConfig(score=scoring, closure_clips=24, closure_step_deg=6.0)
-    closing = {"last frame only": world.with_memory_of(0)} if arm == "no memory" else None
-
-    def tell(share: float, words: str) -> None:
-        print(f"{arm}: {share:.0%} {words}", file=sys.stderr, flush=True)
-
-    return examine({arm: world}, clips, rng, config, Album.of_cache(cache), tell, long, closing)
 
 
 class Average(torch.nn.Module):
     """In the place of the generator: what memory knows, averaged, and the last frame where it knows nothing."""
 
-    kind = "average"
-
-    def __init__(self, config):
+    def __init__(self):
         super().__init__()
-        self.config = config
+        self.where = torch.nn.Parameter(torch.zeros(()))  # a world asks its generator which device it is on
 
     def forward(self, noisy, time, conditioning):
         glimpse, last = conditioning.glimpse, conditioning.last
@@ -71,22 +55,46 @@ class Average(torch.nn.Module):
         return torch.cat([rgb * 2 - 1, encode_depth(glimpse.depth)[:, None]], 1)
 
 
-def load(arm: str, name: str):
-    world = terrella.load(name, memory=arm != "no memory")
-    if arm != "no network":
-        return world
-    return world.replaced(generator=Average(world.generator.config), uncertainty=None, estimator=None)
-
-
-def places(world, data: str, count: int, rng, steps: int = max(HORIZONS)):
+def places(world, cache, count: int, seed: int, steps: int) -> dict:
     """Clips of `steps` steps of the places that training saw, and of those that it never did."""
-    cache = ClipCache.open(data, world.spec.channels["rgb"].shape[:2])
-    box, every = world.spec.card["keep_out"], range(len(cache.episodes))
+    box, every, rng = world.spec.card["keep_out"], range(len(cache.episodes)), terrella.make_rng(seed)
     asked = (cache, every, CONTEXT, steps, count, rng)
     return {
         "recorded": clips_from_cache(*asked, out_of_sight(*box)),
         "new": clips_from_cache(*asked, in_box(*box)),
-    }, cache
+    }
+
+
+def bars(card: Scorecard) -> Iterator[Bar]:
+    """The targets of this world, for the first arm."""
+
+    def row(probe: str, what: str, place: str, motion: str, horizon: int | None = None) -> Row | None:
+        found = [
+            one
+            for one in card.find(probe, what, place=place, motion=motion, arm=next(iter(card.worlds)))
+            if horizon in (None, one.horizon)
+        ]
+        return worst_of(found) if horizon is None else next(iter(found), None)
+
+    for motion in ("predicted", "true"):
+        for place, horizon, least in (("recorded", 8, 26.0), ("new", 8, 23.0), ("new", 32, 20.0)):
+            found = row("pixels", "PSNR", place, motion, horizon)
+            yield Bar(f"PSNR after {horizon} steps, {place} places, {motion} motion", found, least)
+        found = row("pixels", "PSNR lost from 8 to 64 steps", "recorded", motion, 64)
+        yield Bar(f"PSNR lost from 8 to 64 steps, {motion} motion", found, high=1.0)
+        for place in ("recorded", "new"):
+            found = row("pixels", "sharpness", place, motion)
+            yield Bar(f"sharpness, worst horizon, {place} places, {motion} motion", found, 0.7, 1.3)
+    for place in ("recorded", "new"):
+        what = "PSNR: true actions over other actions"
+        yield Bar(f"obeys the actions, {place} places, 8 steps", row("control", what, place, "predicted", 8), 3.0)
+        yield Bar(f"obeys the actions, {place} places, 32 steps", row("control", what, place, "predicted", 32), 0.0)
+        what = "distance over the way gone, mean"
+        yield Bar(f"position, {place} places", row("pose", what, place, "predicted", 64), high=5.0)
+        for way, least in (("yaw 0-90-0", 25.0), ("yaw 0-180-0", 27.0), ("walk of 100 steps", 25.0)):
+            yield Bar(f"back from {way}, {place} places", row("memory", way, place, "true"), least)
+    for what in ("sharpness", "mean of green", "spread of green"):
+        yield Bar(f"{what} over 1,000 steps, worst stretch", row("endurance", what, "recorded", "predicted"), 0.7, 1.3)
 
 
 def main() -> None:
@@ -95,26 +103,23 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--world", default="doom-maze")
     parser.add_argument("--clips", type=int, default=50)
-    parser.add_argument("--workers", type=int, default=2)
     given = parser.parse_args()
-    with ProcessPoolExecutor(given.workers, get_context("spawn")) as pool:
-        futures = [pool.submit(exam, arm, given.world, given.data, given.clips) for arm in ARMS]
-        cards = [future.result() for future in futures]
-    card = cards[0]
-    for other in cards[1:]:
-        lists = {
-            field.name: getattr(card, field.name) + getattr(other, field.name)
-            for field in dataclasses.fields(card)
-            if isinstance(getattr(card, field.name), list) and field.name not in ("places", "looks")
-        }
-        card = dataclasses.replace(card, worlds=card.worlds | other.worlds, **lists)
-    rng, speeds = terrella.make_rng(0), []
-    for arm in ARMS:
-        world = load(arm, given.world)
-        speeds.append(speed(world, places(world, given.data, 1, rng)[0]["recorded"], rng, arm, 600))
-    card = dataclasses.replace(card, speeds=speeds)
-    found = bars(card, "memory")
-    print(*write_report(card, found, given.out, "doom-maze: the scorecard"))
+    world = terrella.load(given.world)
+    bare = terrella.load(given.world, memory=False)
+    arms = {"memory": world, "no memory": bare, "no network": world.replaced(generator=Average())}
+    cache = ClipCache.open(given.data, world.spec.channels["rgb"].shape[:2])
+    sets = {
+        CLIPS: places(world, cache, given.clips, 0, max(HORIZONS)),
+        LONG: places(world, cache, DRIFT_CLIPS, 1, DRIFT),
+    }
+    closing = {"last frame only": bare.with_memory_of(0)}
+    exam = Exam(arms, sets, ExamConfig(horizons=HORIZONS), album=Album.of_cache(cache), closing=closing)
+    with progress.shown("scoring") as report:
+        tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
+        card = examine(exam, given.out / "parts", f"{given.world} {cache.path}", tell)
+    print(*verdict(card), sep="\n")
+    print(*write_report(card, list(bars(card)), given.out, "doom-maze: the scorecard"))
+    shutil.rmtree(given.out / "parts")
 
 
 if __name__ == "__main__":

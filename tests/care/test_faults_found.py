@@ -16,6 +16,7 @@ from terrella.care import doctor, repair
 from terrella.care.doctor import examine
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
+from terrella.data.source import Sensor
 from terrella.data.storage import mp4
 
 CAMERA, OTHER = "observation.images.rgb", "observation.images.side"
@@ -172,6 +173,40 @@ def test_exchanged_films_of_other_lengths_are_named_first(thirteen, tmp_path):
     assert "they were exchanged" in faults[0].what and any("needs 20" in fault.what for fault in faults)
     repair(thirteen, tmp_path / "out")
     assert [episode.length for episode in Dataset(tmp_path / "out").episodes] == LENGTHS
+
+
+@pytest.mark.parametrize("episodes", [[1], [0, 1, 2, 3, 4]])
+def test_films_exchanged_between_cameras_are_named_and_put_back(tmp_path, episodes):
+    cameras = {name: Sensor(name, "image", (32, 32, 3), "uint8") for name in (CAMERA, OTHER)}
+    action = {"action": Sensor("action", "vector", (1,), names=("go",))}
+    rng = np.random.default_rng(0)
+    with Recorder(tmp_path / "set", Layout(13, {**cameras, **action})) as recorder:
+        for number in range(5):
+            for i in range(20):
+                dark = np.full((32, 32, 3), 20 + 3 * number + i, np.uint8)
+                row = {CAMERA: dark, OTHER: 255 - dark // 2, "action": rng.normal(size=1).astype(np.float32)}
+                recorder.add_row(row)
+            recorder.end_episode()
+    assert doctor(tmp_path / "set") == []
+    before = [Dataset(tmp_path / "set").episode(number, [CAMERA])[CAMERA] for number in range(5)]
+    for number in episodes:
+        _exchange(tmp_path / "set", video(number), video(number, OTHER))
+    faults = doctor(tmp_path / "set")
+    assert len(faults) == 2 * len(episodes) and all("they were exchanged" in fault.what for fault in faults)
+    repair(tmp_path / "set", tmp_path / "out")
+    for number, pictures in enumerate(before):
+        assert np.array_equal(Dataset(tmp_path / "out").episode(number, [CAMERA])[CAMERA], pictures)
+    assert doctor(tmp_path / "out") == []
+
+
+def test_films_that_are_all_black_are_named(thirteen):
+    for number, length in enumerate(LENGTHS):
+        writer = mp4.Mp4Writer(thirteen / video(number), (32, 48), 13)
+        for _ in range(length):
+            writer.add(np.zeros((32, 48, 3), np.uint8))
+        writer.close()
+    found = examine(thirteen)
+    assert len(found.faults) == len(LENGTHS) and len(found.groups) == 1
 
 
 # -- rows ------------------------------------------------------------------------------------------------------------

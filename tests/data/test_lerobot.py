@@ -18,7 +18,7 @@ from terrella.data import ClipCache, Dataset
 from terrella.data.source import Readings, Sensor, Source, Take
 from terrella.exchange.convert import open_source, write_source
 from terrella.exchange.formats.lerobot import Rows
-from terrella.exchange.merging.merge import merge_into
+from terrella.exchange.merging.write import merge_into
 
 PYTHON = os.environ.get("TERRELLA_LEROBOT_PYTHON")
 pytestmark = pytest.mark.skipif(

@@ -135,11 +135,15 @@ def test_the_viewer_shows_all_cameras_and_the_units_of_axes(tmp_path):
     sensors += [Sensor("action", "vector", (2,), names=("lift", "grip"), units={"lift": "m", "grip": "N"})]
     time_s = np.arange(3) / 10
     values = {it.name: Readings(time_s, np.zeros((3, *it.shape), it.dtype)) for it in sensors}
-    write_source(Source("arm", {it.name: it for it in sensors}, lambda: [Take(values)], 10.0), tmp_path / "arm")
+    mount = {"intrinsics": [1, 1, 0.5, 0.5], "size": [16, 32], "pose": "pose", "mount": [0.1, 0, 0, 1, 0, 0, 0]}
+    facts = {"world": {"cameras": {"rgb.wrist": mount}}}
+    source = Source("arm", {it.name: it for it in sensors}, lambda: [Take(values)], 10.0, facts=facts)
+    write_source(source, tmp_path / "arm")
     looked = browse(tmp_path / "arm")
     shown = {sensor["name"]: sensor for sensor in looked.about()["sensors"]}
     assert [name for name in shown if shown[name]["kind"] == "image"] == cameras
     assert shown["observation.depth.wrist"]["kind"] == "depth"
+    assert shown["observation.images.wrist"]["camera"] == mount and shown[cameras[0]]["camera"] is None
     assert shown["action"]["names"] == ["lift", "grip"] and shown["action"]["units"] == ["m", "N"]
     for name in [*cameras, "observation.depth.wrist"]:
         assert looked.reading(0, name, 2).shape[:2] == tuple(shown[name]["shape"][:2])

@@ -22,10 +22,8 @@ from terrella.exchange.merging.mapping import (
     Vector,
     affine,
     check_mapping,
-    read_mapping,
-    to_toml,
-    write_mapping,
 )
+from terrella.exchange.merging.mapping_file import mapping_of, read_mapping, to_toml, write_mapping
 from terrella.exchange.merging.propose import propose
 from terrella.exchange.merging.units import basic, convert, quantity
 
@@ -245,9 +243,7 @@ mappings = st.builds(
 def test_any_mapping_is_read_as_it_was_written(mapping):
     import tomllib
 
-    from terrella.exchange.merging.mapping import _mapping
-
-    assert _mapping(tomllib.loads(to_toml(mapping))) == mapping
+    assert mapping_of(tomllib.loads(to_toml(mapping))) == mapping
 
 
 def test_the_file_is_read_back_and_explains_itself(tmp_path):
@@ -255,7 +251,7 @@ def test_the_file_is_read_back_and_explains_itself(tmp_path):
     write_mapping(mapping, tmp_path / "mapping.toml")
     assert read_mapping(tmp_path / "mapping.toml") == mapping
     text = (tmp_path / "mapping.toml").read_text()
-    assert '{ name = "elbow", unit = "deg", to = "elbow" },  # converted to "rad"' in text and text.count("#") > 15
+    assert '{name = "elbow", to = "elbow", unit = "deg"}, # converted to "rad"' in text and text.count("#") > 15
     with pytest.raises(DatasetError, match="cannot write the mapping"):
         write_mapping(mapping, tmp_path / "missing" / "mapping.toml")
 
@@ -292,18 +288,18 @@ def test_the_file_is_read_back_and_explains_itself(tmp_path):
         ('to = "elbow"', 'to = "elbow", offset = inf', "offset = inf must be finite"),
         ('to = "elbow"', 'too = "elbow"', "unknown key 'too'; it may have name, to"),
         (
-            'unit = "deg", to = "elbow"',
-            'unit = "mm", to = "elbow"',
+            'to = "elbow", unit = "deg"',
+            'to = "elbow", unit = "mm"',
             r"number 1 \(elbow\): 'mm' measures length and 'rad' measures angle",
         ),
         (
-            'unit = "deg", to = "elbow"',
-            'unit = "ticks", to = "elbow"',
+            'to = "elbow", unit = "deg"',
+            'to = "elbow", unit = "ticks"',
             "no conversion from 'ticks' to 'rad' is known; give its scale",
         ),
         ('frame = "base"\nnumbers', 'frame = "world"\nnumbers', "in the frame 'world' and 'shoulder' in 'base'"),
         (
-            '  { name = "elbow", unit = "deg", to = "elbow" },  # converted to "rad"\n',
+            '  {name = "elbow", to = "elbow", unit = "deg"}, # converted to "rad"\n',
             "",
             "lists 2 numbers; that sensor is of kind vector, float32 and shape",
         ),

@@ -15,10 +15,12 @@ from robots import arm, robot, rover
 from terrella.core.errors import DatasetError
 from terrella.data.resample import resample
 from terrella.data.source import Readings, Sensor, Source, Take
-from terrella.exchange.merging.mapping import Number, Rows, Vector, affine, read_mapping, write_mapping
-from terrella.exchange.merging.merge import letterbox, merge, merge_into
+from terrella.exchange.merging.mapping import Number, Rows, Vector, affine
+from terrella.exchange.merging.mapping_file import read_mapping, write_mapping
+from terrella.exchange.merging.merge import letterbox, merge
 from terrella.exchange.merging.propose import propose
 from terrella.exchange.merging.report import Report, Running
+from terrella.exchange.merging.write import merge_into
 
 VECTORS = {"action", "observation.state", "next.reward", "next.done"}
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from terrella.core.errors import DatasetError
 from terrella.data.source import Readings, Sensor, Source, Take
-from terrella.exchange.formats import pictures, rows
+from terrella.exchange.formats import images, rows, videos
 
 RGB = "observation.images.rgb"
 
@@ -64,7 +64,7 @@ def number_of(picture: np.ndarray) -> int:
 def test_times_of_variable_rate_are_the_files_own_and_b_frames_come_in_order(tmp_path):
     ticks = [0, 40, 75, 180, 181, 300, 420, 421, 500, 900, 1000, 1033]
     encode(tmp_path / "phone.mp4", ticks, options={"bf": "3", "g": "5", "b-pyramid": "normal"})
-    source = pictures.read_videos(tmp_path)
+    source = videos.read(tmp_path)
     (take,) = source.takes()
     np.testing.assert_allclose(take.readings[RGB].time_s, np.array(ticks) / 1000, atol=1e-9)
     assert "action" not in source.sensors and source.fps is None
@@ -84,22 +84,22 @@ def test_random_access_gives_what_reading_in_order_gives(tmp_path, name, codec, 
     else:
         base = Fraction(1, 25) if codec == "mpeg2video" else Fraction(1, 10)
         encode(tmp_path / name, list(range(30)), codec, fmt, base, options={"g": "7"})
-    (take,) = pictures.read_videos(tmp_path).takes()
+    (take,) = videos.read(tmp_path).takes()
     readings = take.readings[RGB]
     assert len(readings.time_s) == 30 and (np.diff(readings.time_s) > 0).all() and readings.time_s[0] == 0
     in_order = np.stack(list(readings.values))
     assert [number_of(value) for value in in_order] == list(range(30))
-    (again,) = pictures.read_videos(tmp_path).takes()
+    (again,) = videos.read(tmp_path).takes()
     for i in np.random.default_rng(0).permutation(30)[:15].tolist() + [29, 29, 0, -1]:
         np.testing.assert_array_equal(again.readings[RGB].values[i], in_order[i])
 
 
 def test_reading_in_order_opens_the_file_once_and_closes_it(tmp_path, monkeypatch):
     encode(tmp_path / "a.mp4", list(range(40)), time_base=Fraction(1, 10), options={"g": "4"})
-    (take,) = pictures.read_videos(tmp_path).takes()
+    (take,) = videos.read(tmp_path).takes()
     begun = []
-    original = pictures._Video._begin
-    monkeypatch.setattr(pictures._Video, "_begin", lambda self, to: (begun.append(to), original(self, to))[1])
+    original = videos._Video._begin
+    monkeypatch.setattr(videos._Video, "_begin", lambda self, to: (begun.append(to), original(self, to))[1])
     values = take.readings[RGB].values
     for i in range(40):
         values[i], values[i]
@@ -124,7 +124,7 @@ def test_a_phones_rotation_is_applied(tmp_path):
     ]
     data[at : at + 36] = b"".join(clockwise)
     (tmp_path / "a.mp4").write_bytes(data)
-    source = pictures.read_videos(tmp_path)
+    source = videos.read(tmp_path)
     (take,) = source.takes()
     assert source.sensors[RGB].shape == (64, 48, 3)
     picture = take.readings[RGB].values[1]
@@ -138,7 +138,7 @@ def test_sub_folders_are_takes_and_their_videos_cameras(tmp_path):
         for camera in cameras:
             encode(tmp_path / take / f"{camera}.mp4", [0, 1, 2], time_base=Fraction(1, 10))
     (tmp_path / "notes.txt").write_text("no video")
-    source = pictures.read_videos(tmp_path)
+    source = videos.read(tmp_path)
     assert set(source.sensors) == {"observation.images.front", "observation.images.wrist_left"}
     takes = list(source.takes())
     assert [take.facts["file"] for take in takes] == ["ep_2", "ep_10"]
@@ -154,10 +154,10 @@ def test_lossless_videos_are_exact_in_values_and_microseconds(tmp_path_factory, 
     folder = tmp_path_factory.mktemp("v")
     time_s = np.cumsum([0, *gaps])[: len(data)] / 1e6
     name = "observation.images.front"
-    pictures.write_videos(source_of([{name: (time_s, data)}] * 2), folder / "a", lossless=True)
-    first = pictures.read_videos(folder / "a")
-    pictures.write_videos(first, folder / "b", lossless=True)
-    for source in (first, pictures.read_videos(folder / "b")):
+    videos.write(source_of([{name: (time_s, data)}] * 2), folder / "a", lossless=True)
+    first = videos.read(folder / "a")
+    videos.write(first, folder / "b", lossless=True)
+    for source in (first, videos.read(folder / "b")):
         assert set(source.sensors) == {name}
         takes = list(source.takes())
         assert len(takes) == 2
@@ -172,9 +172,9 @@ def test_lossy_videos_keep_cameras_in_step_and_say_what_is_left_out(tmp_path):
         [{"observation.images.a": (times(9), data), "observation.images.b": ([t + 0.05 for t in times(9)], data),
           "action": (times(9), np.zeros((9, 2), np.float32))}], {"action": "vector"},
     )  # fmt: skip
-    notes = pictures.write_videos(source, tmp_path / "out")
+    notes = videos.write(source, tmp_path / "out")
     assert len(notes) == 1 and "'action'" in notes[0]
-    (take,) = pictures.read_videos(tmp_path / "out").takes()
+    (take,) = videos.read(tmp_path / "out").takes()
     np.testing.assert_allclose(take.readings["observation.images.a"].time_s, times(9), atol=1e-6)
     np.testing.assert_allclose(take.readings["observation.images.b"].time_s, np.array(times(9)) + 0.05, atol=1e-6)
     assert [number_of(v) for v in take.readings["observation.images.b"].values] == list(range(9))
@@ -182,23 +182,23 @@ def test_lossy_videos_keep_cameras_in_step_and_say_what_is_left_out(tmp_path):
 
 def test_bad_videos_are_named(tmp_path):
     with pytest.raises(DatasetError, match="no videos"):
-        pictures.read_videos(tmp_path)
+        videos.read(tmp_path)
     with pytest.raises(DatasetError, match="not a folder"):
-        pictures.read_videos(tmp_path / "none")
+        videos.read(tmp_path / "none")
     encode(tmp_path / "b.mp4", list(range(30)), time_base=Fraction(1, 10))
     whole = (tmp_path / "b.mp4").read_bytes()
     for damaged in (b"", b"no video at all", whole[: len(whole) // 2], b"#EXTM3U\n#EXTINF:1,\nb.mp4\n"):
         (tmp_path / "b.mp4").write_bytes(damaged)
         with pytest.raises(DatasetError, match=r"b\.mp4"):
-            list(pictures.read_videos(tmp_path).takes())
+            list(videos.read(tmp_path).takes())
     (tmp_path / "b.mp4").write_bytes(whole)
     encode(tmp_path / "c.mp4", [0, 1], time_base=Fraction(1, 10), size=(32, 32))
     with pytest.raises(DatasetError, match=r"c\.mp4 is 32 x 32 where"):
-        list(pictures.read_videos(tmp_path).takes())
+        list(videos.read(tmp_path).takes())
     (tmp_path / "folder").mkdir()
     (tmp_path / "c.mp4").rename(tmp_path / "folder" / "c.mp4")
     with pytest.raises(DatasetError, match="beside folders"):
-        pictures.read_videos(tmp_path)
+        videos.read(tmp_path)
 
 
 def test_every_flipped_byte_is_an_error_or_a_picture_of_the_right_size(tmp_path):
@@ -210,7 +210,7 @@ def test_every_flipped_byte_is_an_error_or_a_picture_of_the_right_size(tmp_path)
         data[at] ^= 1 << int(rng.integers(8))
         (tmp_path / "a.mp4").write_bytes(data)
         try:
-            source = pictures.read_videos(tmp_path)
+            source = videos.read(tmp_path)
             (take,) = source.takes()
             for value in take.readings[RGB].values:
                 assert value.shape == source.sensors[RGB].shape
@@ -223,7 +223,7 @@ def test_absurd_sizes_are_refused(tmp_path, monkeypatch):
     encode(tmp_path / "a.mp4", [0, 1], time_base=Fraction(1, 10))
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
     monkeypatch.setattr(rows, "MAX_PIXELS", 1000)
-    for read in (pictures.read_videos, lambda path: pictures.read_images(path, 10)):
+    for read in (videos.read, lambda path: images.read(path, 10)):
         with pytest.raises(DatasetError, match="64 x 48"):
             read(tmp_path)
 
@@ -231,19 +231,19 @@ def test_absurd_sizes_are_refused(tmp_path, monkeypatch):
 def test_what_cannot_be_a_video_is_said_and_nothing_is_left_behind(tmp_path):
     odd, even = np.zeros((2, 5, 4, 3), np.uint8), np.zeros((2, 4, 4, 3), np.uint8)
     with pytest.raises(DatasetError, match="even sizes"):
-        pictures.write_videos(source_of([{RGB: (times(2), odd)}]), tmp_path / "out")
+        videos.write(source_of([{RGB: (times(2), odd)}]), tmp_path / "out")
     with pytest.raises(DatasetError, match="within a microsecond"):
-        pictures.write_videos(source_of([{RGB: ([0, 1e-7], even)}]), tmp_path / "out")
+        videos.write(source_of([{RGB: ([0, 1e-7], even)}]), tmp_path / "out")
     with pytest.raises(DatasetError, match="backwards"):
-        pictures.write_videos(source_of([{RGB: ([0, np.nan], even)}]), tmp_path / "out")
+        videos.write(source_of([{RGB: ([0, np.nan], even)}]), tmp_path / "out")
     with pytest.raises(DatasetError, match="no pictures"):
         vectors = {"action": (times(2), np.zeros((2, 1)))}
-        pictures.write_videos(source_of([vectors], {"action": "vector"}), tmp_path / "out")
+        videos.write(source_of([vectors], {"action": "vector"}), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-    pictures.write_videos(source_of([{RGB: (times(2), even)}]), tmp_path / "out")
+    videos.write(source_of([{RGB: (times(2), even)}]), tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["take_0.mp4"]
     with pytest.raises(DatasetError, match="exists already"):
-        pictures.write_videos(source_of([{RGB: (times(2), even)}]), tmp_path / "out")
+        videos.write(source_of([{RGB: (times(2), even)}]), tmp_path / "out")
 
 
 # -- images
@@ -266,10 +266,10 @@ def test_images_are_exact(tmp_path_factory, data, depth_mm, plain):
             "observation.depth": (times(len(data)), np.stack([depth_m] * len(data))),
         }
     kinds = {name: "depth" for name in seen if name.startswith("observation.depth")}
-    assert pictures.write_images(source_of([seen, seen], kinds, fps=10), folder / "a") == []
-    first = pictures.read_images(folder / "a", 10)
-    pictures.write_images(first, folder / "b")
-    for source in (first, pictures.read_images(folder / "b", 10)):
+    assert images.write(source_of([seen, seen], kinds, fps=10), folder / "a") == []
+    first = images.read(folder / "a", 10)
+    images.write(first, folder / "b")
+    for source in (first, images.read(folder / "b", 10)):
         assert set(source.sensors) == set(seen)
         takes = list(source.takes())
         assert len(takes) == 2
@@ -287,7 +287,7 @@ def test_images_are_sorted_naturally_turned_upright_and_made_rgb(tmp_path):
         exif[0x0112] = 6  # hold the camera upright: turn clockwise to see
         picture.save(tmp_path / f"frame{number}.png", exif=exif)
     (tmp_path / "frame3.txt").write_text("not an image")
-    source = pictures.read_images(tmp_path, 5)
+    source = images.read(tmp_path, 5)
     (take,) = source.takes()
     assert source.fps == 5 and source.sensors[RGB].shape == (64, 48, 3)
     values = list(take.readings[RGB].values)
@@ -296,7 +296,7 @@ def test_images_are_sorted_naturally_turned_upright_and_made_rgb(tmp_path):
     for mode in ("L", "P", "RGBA", "1"):
         Image.fromarray(coloured(1)).convert(mode).save(tmp_path / "frame1.png")
         Image.fromarray(coloured(1)).convert(mode).rotate(90, expand=True).save(tmp_path / "frame1.png")
-        (take,) = pictures.read_images(tmp_path, 5).takes()
+        (take,) = images.read(tmp_path, 5).takes()
         assert take.readings[RGB].values[0].shape == (64, 48, 3)
 
 
@@ -304,40 +304,40 @@ def test_mixed_sizes_and_kinds_are_named(tmp_path):
     Image.new("RGB", (8, 6)).save(tmp_path / "1.png")
     Image.new("RGB", (8, 7)).save(tmp_path / "2.png")
     with pytest.raises(DatasetError, match=r"2\.png is a picture of 8 x 7 where .* a picture of 8 x 6"):
-        list(pictures.read_images(tmp_path, 5).takes())
+        list(images.read(tmp_path, 5).takes())
     Image.fromarray(np.full((6, 8), 1500, np.uint16)).save(tmp_path / "2.png")
     with pytest.raises(DatasetError, match=r"2\.png is depth of 8 x 6"):
-        list(pictures.read_images(tmp_path, 5).takes())
+        list(images.read(tmp_path, 5).takes())
     (tmp_path / "1.png").unlink()
-    (take,) = pictures.read_images(tmp_path, 5).takes()
+    (take,) = images.read(tmp_path, 5).takes()
     assert take.readings["observation.depth"].values[0][0, 0] == np.float32(1.5)
 
 
 def test_bad_images_are_named(tmp_path):
     with pytest.raises(DatasetError, match="no images"):
-        pictures.read_images(tmp_path, 5)
+        images.read(tmp_path, 5)
     with pytest.raises(DatasetError, match="fps"):
-        pictures.read_images(tmp_path, float("nan"))
+        images.read(tmp_path, float("nan"))
     Image.fromarray(coloured(1)).save(tmp_path / "1.png")
     whole = (tmp_path / "1.png").read_bytes()
     for damaged in (b"", b"no image", whole[:20]):
         (tmp_path / "1.png").write_bytes(damaged)
         with pytest.raises(DatasetError, match=r"1\.png"):
-            list(pictures.read_images(tmp_path, 5).takes())
+            list(images.read(tmp_path, 5).takes())
     (tmp_path / "1.png").write_bytes(whole[: len(whole) // 2])
-    (take,) = pictures.read_images(tmp_path, 5).takes()
+    (take,) = images.read(tmp_path, 5).takes()
     with pytest.raises(DatasetError, match=r"1\.png is damaged"):
         take.readings[RGB].values[0]
     Image.new("1", (16_000, 6000)).save(tmp_path / "1.png")  # more than Pillow itself would open
     with pytest.raises(DatasetError, match=r"1\.png"):
-        pictures.read_images(tmp_path, 5)
+        images.read(tmp_path, 5)
 
 
 def test_depth_beyond_sixteen_bits_is_nothing(tmp_path):
     depth = np.array([[[0.0, 0.0004, 1.2344, 65.535, 65.6, np.inf, np.nan, -1.0]]], np.float32)
     source = source_of([{"observation.depth": ([0.0], depth)}], {"observation.depth": "depth"}, fps=1)
-    pictures.write_images(source, tmp_path / "d")
-    (take,) = pictures.read_images(tmp_path / "d", 1).takes()
+    images.write(source, tmp_path / "d")
+    (take,) = images.read(tmp_path / "d", 1).takes()
     found = take.readings["observation.depth"].values[0][0]
     inf = np.inf
     np.testing.assert_array_equal(found, np.array([inf, inf, 1.234, 65.535, inf, inf, inf, inf], np.float32))

@@ -7,22 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from benchmarks.latent_actions import agreement, examine_latent, shown_shift
+from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Layout, Recorder
-from terrella.exchange import open_source
-from terrella.learn import latent_actions as module
-from terrella.learn.latent_actions import LatentConfig, load_latent, posterior, train_latent_actions
-from terrella.learn.latent_codes import agreement, examine_latent, label, map_keys, shown_shift
-from terrella.learn.latent_model import Forward, warped
+from terrella.exchange import open_source, write_source
+from terrella.exchange.formats.lerobot import Rows
+from terrella.learn.latent_codes import labelled, map_keys
+from terrella.learn.objectives.latent_actions import posterior
+from terrella.learn.objectives.latent_model import Forward, warped
+from terrella.learn.recipes.latent_actions import LatentConfig, load_latent, train_latent_actions
 
 CONFIG = LatentConfig(codes=4, stride=1, size=(32, 32), steps=100, batch=8, strip_every_s=1e9)
 MOVES = {"up": (-2, 0), "down": (2, 0), "left": (0, -2), "right": (0, 2)}
-
-
-def quiet(done, total, words=""):
-    pass
 
 
 def scrolling(folder, acted=True, episodes=4, length=120):
@@ -82,7 +80,7 @@ def test_keys_are_mapped_by_a_few_labelled_frames(recording, run):
 
 
 def test_a_labelled_copy_has_codes_for_actions(recording, run, tmp_path):
-    told = label(run, recording, tmp_path / "copy", quiet)
+    told = write(run, recording, tmp_path / "copy").facts
     copy, original = Dataset(tmp_path / "copy"), Dataset(recording)
     assert told["frames"] == copy.length == original.length
     codes = [code for code in range(4) if code + 1 != told["still"]]
@@ -102,34 +100,24 @@ def test_pictures_alone_are_enough(run, tmp_path):
     silent = scrolling(tmp_path / "set", False, episodes=2, length=40)
     assert ClipCache.open(silent, (32, 32)).action is None
     assert "actions" not in examine_latent(run, silent, quiet)
-    assert Dataset(label(run, silent, tmp_path / "copy", quiet)["dataset"]).episode(0)["action"].shape == (40, 3)
+    assert write(run, silent, tmp_path / "copy").exact
+    assert Dataset(tmp_path / "copy").episode(0)["action"].shape == (40, 3)
     with pytest.raises(DatasetError, match="no recorded actions"):
         map_keys(run, silent, quiet)
 
 
-def test_a_stopped_run_goes_on_exactly(recording, tmp_path, monkeypatch):
+def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
     config = replace(CONFIG, steps=4, batch=4)
-    train_latent_actions(recording, tmp_path / "whole", config, quiet)
-
-    class Stop(Exception):
-        pass
-
-    original = module._Run.step
-
-    def stopping(self, step):
-        if step == 2:
-            raise Stop
-        return original(self, step)
-
-    monkeypatch.setattr(module._Run, "step", stopping)
-    with pytest.raises(Stop):
-        train_latent_actions(recording, tmp_path / "cut", replace(config, save_every_s=-1.0), quiet)
-    monkeypatch.setattr(module._Run, "step", original)
-    train_latent_actions(recording, tmp_path / "cut", config, quiet)
-    whole, cut = (load_file(tmp_path / name / "resume.safetensors") for name in ("whole", "cut"))
-    assert whole.keys() == cut.keys() and all(torch.equal(whole[name], cut[name]) for name in whole)
+    train = lambda out: train_latent_actions(recording, out, config, quiet)  # noqa: E731
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"codes": 1})
     with pytest.raises(TrainingError, match="other settings"):
-        train_latent_actions(recording, tmp_path / "cut", replace(config, codes=5), quiet)
+        train_latent_actions(recording, tmp_path / "b", replace(config, codes=5), quiet)
+
+
+def write(run, recording, out):
+    labels = labelled(run, recording, quiet)
+    write_source(labels.source, out, "lerobot", Rows(pictures="png"))
+    return labels
 
 
 def test_bad_input_is_refused_in_one_sentence(recording, run, tmp_path):
@@ -144,12 +132,10 @@ def test_bad_input_is_refused_in_one_sentence(recording, run, tmp_path):
         map_keys(run, recording, quiet, frames=100_000)
     with pytest.raises(DatasetError, match="no action 'fire'"):
         map_keys(run, recording, quiet, names=("fire",))
-    with pytest.raises(DatasetError, match="not empty"):
-        label(run, recording, recording, quiet)
     with Recorder(tmp_path / "blind", Layout.of_channels(10.0, ("a",), pose=True)) as recorder:
         for _ in range(3):
             recorder.add({"pose": np.eye(7, dtype=np.float32)[3]}, np.zeros(1))
-    with pytest.raises(DatasetError, match="no pictures"):
+    with pytest.raises(DatasetError, match="holds no rgb"):
         train_latent_actions(tmp_path / "blind", tmp_path / "run", CONFIG, quiet)
 
 

@@ -15,16 +15,17 @@ from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.data import ClipCache, record
-from terrella.learn import moving
-from terrella.learn.moving import mirrored, moving_lesson, other_side
-from terrella.learn.objects import ThingsConfig, train_things
-from terrella.learn.samples import THINGS, Recording, choose_keyframes
-from terrella.learn.train_video import TrainConfig, train_video
+from terrella.learn import moving_batches
+from terrella.learn.moving_batches import mirrored, moving_batch, other_side
+from terrella.learn.recipes.objects import ObjectsTraining, train_objects
+from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recording import THINGS, Recording, choose_keyframes
+from terrella.learn.trainer import Now
 from terrella.space.camera import yaw
+from terrella.worlds.body import climbed
+from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import VideoConfig
 from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
-from terrella.worlds.video import VideoWorld
 
 CONFIG = TrainConfig(
     size=(24, 32),
@@ -38,6 +39,10 @@ CONFIG = TrainConfig(
     uncertainty_frames=0,
     strip_every_s=1e9,
 )
+
+
+def now(seed: int) -> Now:
+    return Now(0, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
 
 
 class Haunted(Corridor):
@@ -109,7 +114,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
     train_video(recording, tmp_path, CONFIG, lambda *told: None)
     for memory in (True, False):
         world = load_world(tmp_path / "world", memory=memory)
-        assert isinstance(world, VideoWorld) and (world.starts.depth == 0).any(), "what moves is in no keyframe"
+        assert (world.starts.depth == 0).any(), "what moves is in no keyframe"
         assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
         assert "observes" in check_world(world) and world.spec.may_observe == ("things", "health")
     state = world.start(2, make_rng(0))
@@ -120,7 +125,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
 
 def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
     world, _ = peopled
-    assert world.config.objects and world.objects is not None and world.spec.card["cast_looks"] >= 1
+    assert world.config.objects and world.objects is not None and world.spec.card["objects_looks"] >= 1
     assert "observes" in check_world(world) and world.spec.may_observe == ("things", "instances", "objects", "health")
     state = world.start(2, make_rng(0))
     assert (state["billboards"][:, 0, NUMBER] == 1).all() and (state["billboards"][:, 0, LOOK] != NONE).all()
@@ -141,8 +146,8 @@ def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
 
 def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
     world, folder = peopled
-    told = train_things(
-        folder / "run" / "world", folder / "set", tmp_path / "new", ThingsConfig(5, seed=1), lambda *told: None
+    told = train_objects(
+        folder / "run" / "world", folder / "set", tmp_path / "new", ObjectsTraining(5, seed=1), lambda *told: None
     )
     new = load_world(told["world"])
     assert torch.equal(new.memory.rgb, world.memory.rgb) and new.spec.may_observe == world.spec.may_observe
@@ -153,11 +158,11 @@ def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
 
 def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(peopled, recording, tmp_path):
     _, folder = peopled
-    with pytest.raises(DatasetError, match=r"does not tell of observation\.cast"):
-        train_things(folder / "run" / "world", recording, tmp_path / "x", ThingsConfig(5), lambda *told: None)
+    with pytest.raises(DatasetError, match="holds no observation.objects"):
+        train_objects(folder / "run" / "world", recording, tmp_path / "x", ObjectsTraining(5), lambda *told: None)
     still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
     with pytest.raises(TrainingError, match="knows of no things"):
-        train_things(still["world"], folder / "set", tmp_path / "x", ThingsConfig(5), lambda *told: None)
+        train_objects(still["world"], folder / "set", tmp_path / "x", ObjectsTraining(5), lambda *told: None)
 
 
 def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
@@ -182,11 +187,11 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
         {"instances": seen["instances"].float()},
         {"objects": told * torch.nan},
     ):
-        with pytest.raises(ObservationError, match="cast is"):
+        with pytest.raises(ObservationError, match="objects is"):
             world.observe({**seen, **bad}, state, rng)
 
 
-def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled, monkeypatch):
+def test_a_batch_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled, monkeypatch):
     world, folder = peopled
     cache = ClipCache.open(folder / "set", CONFIG.size)
     marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "objects"))
@@ -198,19 +203,17 @@ def test_a_lesson_of_cards_hides_them_and_asks_nothing_of_what_they_cover(people
     )
     start = np.zeros(cache.length, np.int64)
     rows = Recording(cache, start, np.ones(cache.length, bool))
-    lesson = moving_lesson(rows, world.memory, world.config, 8, np.random.default_rng(1), None)
-    covered = lesson.truth[:, 4] > 0.5  # nothing else moves here
-    assert covered.any() and (lesson.weight[:, 0][covered] == 0).all() and (lesson.weight[:, 0][~covered] > 0).all()
-    assert (lesson.last[:, 3][covered] == 0).float().mean() > 0.6 and not (lesson.last[:, 5] > 0.5).any()
-    monkeypatch.setattr(moving, "OFTEN", (0, 0, 0, 1))  # the same where the frames shown are dreamt
-    dreamt = moving_lesson(
-        rows, world.memory, world.config, 8, np.random.default_rng(1), lambda asked: 0 * asked.last[:, :5]
-    )
-    assert (dreamt.last[:, 3] > 0).float().mean() > 0.2
-    assert (dreamt.last[:, 3][dreamt.truth[:, 4] > 0.5] == 0).float().mean() > 0.6
-    drawn = torch.zeros_like(lesson.truth)
-    judged = lesson.judged(drawn)
-    assert torch.equal(judged[:, :3].movedim(1, -1)[covered], lesson.truth[:, :3].movedim(1, -1)[covered])
+    batch = moving_batch(rows, world.memory, world.config, 8, now(1), None)
+    covered = batch.truth[:, 4] > 0.5  # nothing else moves here
+    assert covered.any() and (batch.weight[:, 0][covered] == 0).all() and (batch.weight[:, 0][~covered] > 0).all()
+    assert (batch.shown.last[:, 3][covered] == 0).float().mean() > 0.6 and not (batch.shown.last[:, 5] > 0.5).any()
+    monkeypatch.setattr(moving_batches, "OFTEN", (0, 0, 0, 1))  # the same where the frames shown are dreamt
+    dreamt = moving_batch(rows, world.memory, world.config, 8, now(1), lambda asked, now: 0 * asked.last[:, :5])
+    assert (dreamt.shown.last[:, 3] > 0).float().mean() > 0.2
+    assert (dreamt.shown.last[:, 3][dreamt.truth[:, 4] > 0.5] == 0).float().mean() > 0.6
+    drawn = torch.zeros_like(batch.truth)
+    judged = batch.judged(drawn)
+    assert torch.equal(judged[:, :3].movedim(1, -1)[covered], batch.truth[:, :3].movedim(1, -1)[covered])
     assert (judged[:, :3].movedim(1, -1)[~covered] == 0).all()
 
 
@@ -226,28 +229,28 @@ def test_evidence_of_vitals_and_things_is_taken(recording, tmp_path):
     assert torch.equal(world.render(told, ("things",))["things"], things)
 
 
-def test_a_lesson_masks_memory_and_shows_the_thing_in_the_last_frame(rows):
+def test_a_batch_masks_memory_and_shows_the_thing_in_the_last_frame(rows):
     config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
     picks = choose_keyframes(np.asarray(rows.cache.pose), np.flatnonzero(rows.usable), 12)
     memory = rows.keyframes(picks, config.camera)
     assert (memory.depth == 0).float().mean() == pytest.approx(10 * 10 / (24 * 32), abs=0.005)  # the thing and its rim
-    lesson = moving_lesson(rows, memory, config, 8, np.random.default_rng(1), None)
-    assert lesson.last.shape == (8, 10, 24, 32) and lesson.truth.shape == (8, 5, 24, 32)
-    truth = lesson.truth[:, 4] > 0.5
-    shown = lesson.last[:, 3].amax((1, 2)) > 0  # in some samples the last frame is unknown
-    assert shown.any() and (lesson.last[shown, 5] > 0.5)[truth[shown]].float().mean() > 0.6
-    assert lesson.weight is not None and lesson.weight[:, 0][truth].min() > lesson.weight[:, 0][~truth].min()
+    batch = moving_batch(rows, memory, config, 8, now(1), None)
+    assert batch.shown.last.shape == (8, 10, 24, 32) and batch.truth.shape == (8, 5, 24, 32)
+    truth = batch.truth[:, 4] > 0.5
+    shown = batch.shown.last[:, 3].amax((1, 2)) > 0  # in some samples the last frame is unknown
+    assert shown.any() and (batch.shown.last[shown, 5] > 0.5)[truth[shown]].float().mean() > 0.6
+    assert batch.weight is not None and batch.weight[:, 0][truth].min() > batch.weight[:, 0][~truth].min()
 
 
-def test_a_mirrored_lesson_mirrored_again_is_itself(rows):
+def test_a_mirrored_batch_mirrored_again_is_itself(rows):
     config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
     memory = rows.keyframes(np.arange(4), config.camera)
-    lesson = moving_lesson(rows, memory, config, 2, np.random.default_rng(0), None)
+    batch = moving_batch(rows, memory, config, 2, now(0), None)
     names = rows.cache.action_names
-    once = mirrored(lesson, names)
+    once = mirrored(batch, names)
     again = mirrored(once, names)
-    assert torch.equal(again.truth, lesson.truth) and torch.equal(again.told, lesson.told)
-    assert not torch.equal(once.told, lesson.told)
+    assert torch.equal(again.truth, batch.truth) and torch.equal(again.shown.context, batch.shown.context)
+    assert not torch.equal(once.shown.context, batch.shown.context)
 
 
 def test_the_other_side_of_a_button():
@@ -256,13 +259,9 @@ def test_the_other_side_of_a_button():
     assert THINGS == "observation.things"
 
 
-def test_the_eye_rises_with_the_recorded_ground_and_stays_where_it_stands(recording, tmp_path):
-    train_video(recording, tmp_path, CONFIG, lambda *told: None)
-    world = load_world(tmp_path / "world")
-    assert isinstance(world, VideoWorld)
-    pose = torch.tensor([[0.0, 0, 1, 1, 0, 0, 0], [2.0, 0, 2, 1, 0, 0, 0]])  # a step up of a metre within two
-    stairs = world.with_memory(replace(world.memory.at([0, 1]), pose=pose))
+def test_a_body_rises_with_the_recorded_ground_and_stays_where_it_stands():
+    levels = torch.tensor([[0.0, 0, 1], [2.0, 0, 2]])  # a step up of a metre within two
     here, ahead, z = torch.tensor([[0.5, 0.0]]), torch.tensor([[0.8, 0.0]]), torch.tensor([1.4])
-    assert stairs._height(here, here, z).item() == pytest.approx(1.4)
-    assert 1.4 < stairs._height(ahead, ahead + 0.2, z).item() < 1.71
-    assert world.without_memory()._height(here, ahead, z).item() == pytest.approx(1.4)
+    assert climbed(levels, here, here, z).item() == pytest.approx(1.4)
+    assert 1.4 < climbed(levels, ahead, ahead + 0.2, z).item() < 1.71
+    assert climbed(levels + 100, here, ahead, z).item() == pytest.approx(1.4), "none is near"

@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.learn.stopping import quiet
 
 from terrella.core import check_world, make_rng
 from terrella.data import ClipCache, Layout, Recorder
-from terrella.learn.lessons import changing, history_lesson
-from terrella.learn.outcome import Happenings, examine_outcome, levels, train_outcome, two_hot
-from terrella.learn.samples import Recording, controls_of
-from terrella.learn.train_video import TrainConfig, train_video
-from terrella.worlds.folder import load_world, video_spec
-from terrella.worlds.generator import Generator, VideoConfig
-from terrella.worlds.history import HistoryWorld, Starts
+from terrella.learn.history_batches import changing, clips_at, history_batch
+from terrella.learn.objectives.outcome import Happenings, Pieces, learn_outcome, levels, two_hot
+from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recording import Recording, controls_of
+from terrella.learn.trainer import Now, Run
+from terrella.worlds.config import VideoConfig
+from terrella.worlds.folder import load_world
+from terrella.worlds.generator import Generator
+from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import Outcome
 
 SIZE, FACTS = (16, 24), {"discrete": True, "action_low": [0], "action_high": [2], "action_names": ["STAY", "L", "R"]}
@@ -26,10 +30,6 @@ def picture(place: int) -> np.ndarray:
     rgb = np.full((*SIZE, 3), 30, np.uint8)
     rgb[6:10, 4 * place : 4 * place + 4] = (240, 200, 90)
     return rgb
-
-
-def quiet(done, total, words=""):
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def recording(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def learned(recording):
+def learned(recording, tmp_path_factory):
     cache = ClipCache.open(recording, SIZE)
     start = np.zeros(cache.length, np.int64)
     for first, last in cache.episodes:
@@ -66,14 +66,34 @@ def learned(recording):
     happened = Happenings.of(cache, seen.action(slice(None)).numpy(), usable)
     torch.manual_seed(0)
     outcome = Outcome(happened.config())
-    train_outcome(outcome, seen.rgb, happened, 300, 0, quiet, batch=6, learning_rate=5e-3)
+    run = Run(tmp_path_factory.mktemp("run"), {}, quiet)
+    learn_outcome(run, Pieces(outcome, seen.rgb, happened, batch=6, learning_rate=5e-3), 300)
     return cache, seen, happened, outcome
+
+
+@torch.inference_mode()
+def examine_outcome(outcome: Outcome, rgb, happened: Happenings, first: int, stop: int) -> dict[str, np.ndarray]:
+    """Follows the recorded frames of rows first..stop: predicted reward, done (probability) and vitals' change, one row
+    for each recorded step."""
+    found: dict[str, list] = {"reward": [], "done": [], "change": []}
+    hidden = outcome.begin(1)
+    for row in range(first, stop - 1):
+        frames = rgb(np.array([row, row + 1]))
+        vitals = torch.from_numpy(happened.vitals[row : row + 1])
+        predicted = outcome(
+            frames[:1], frames[1:], torch.from_numpy(happened.action[row : row + 1]).float(), vitals, hidden
+        )
+        hidden = predicted.hidden
+        found["reward"].append(float(predicted.reward))
+        found["done"].append(float(torch.sigmoid(predicted.done)))
+        found["change"].append((predicted.vitals - vitals)[0].numpy())
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def test_levels_and_shares_are_those_of_the_recording(learned):
     _, seen, happened, outcome = learned
     assert outcome.config.rewards == (0.0, 2.0) and outcome.config.vitals == ("lives",)
-    assert outcome.config.changes == ((-1.0, 0.0),) and seen.controls.told == 3
+    assert outcome.config.changes == ((-1.0, 0.0),) and seen.controls.numbers == 3
     among = torch.tensor([-1.0, 0.0, 4.0])
     values = torch.tensor([-9.0, -0.25, 3.0, 4.0])
     shares = two_hot(values, among)
@@ -110,14 +130,14 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
 def test_a_dream_pays_costs_lives_and_ends(learned):
     _, seen, _, outcome = learned
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8, 8), slots=4, geometry=False)
-    spec = video_spec("row", config, 1 / 15, (), {}, {}, seen.controls, ("lives",))
     starts = replace(Starts.of(torch.zeros(1, 4, 3, *SIZE, dtype=torch.uint8), 3), vitals=torch.full((1, 1), 3.0))
-    world, rng = HistoryWorld(spec, config, Generator(config), starts, 0.0, outcome, seen.controls), make_rng(0)
+    parts = {"scene": FrameHistory(config.frames, starts), "generator": Generator(config.generator), "outcome": outcome}
+    world, rng = LearnedWorld(About("row", seen.controls, 1 / 15), **parts), make_rng(0)
     before, after = (torch.from_numpy(np.stack([picture(place) for place in pair])) for pair in ((1, 4), (0, 5)))
     state = world.observe({"rgb": before, "lives": torch.tensor([1.0, 3.0])}, None, rng)
-    told = world.controls.tell(torch.tensor([1, 2]))[:, None]
-    shown = world.observe({"rgb": after}, state, rng).replace(actions=torch.cat([told, state["actions"][:, 1:]], 1))
-    then = world.followed(state, shown)  # as if these frames had been dreamt
+    numbers = world.controls.encode(torch.tensor([1, 2]))
+    drawn = world.observe({"rgb": after, "lives": torch.tensor([1.0, 3.0])}, state, rng)  # as if it had been dreamt
+    then = world.outcome.followed(state, drawn, world.scene.frame, numbers, torch.zeros(2, dtype=torch.int64))
     assert then["vitals"][:, 0].tolist() == [0.0, 3.0] and then["done"].tolist() == [True, False]
     assert then["reward"][1] > 1.5 and then["reward"][0] < 0.5
     still = world.imagine(then, torch.tensor([2, 2]), rng)
@@ -125,21 +145,23 @@ def test_a_dream_pays_costs_lives_and_ends(learned):
     assert not torch.equal(still.at(1)["frames"], then.at(1)["frames"])
 
 
-def test_before_an_episode_began_it_stood_still_and_nobody_acted(learned):
+def test_a_clip_that_is_shown_as_a_beginning_stood_still_and_nobody_had_acted(learned):
     _, seen, _, _ = learned
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, slots=4, geometry=False)
-    told, moods = [], 36
+    found, thumbnail = [], 36
     for number in range(40):
-        lesson = history_lesson(seen, config, 8, np.random.default_rng(number), None)
-        actions = lesson.told[:, moods:].unflatten(1, (4, 3))
+        now = Now(0, 0.0, torch.device("cpu"), np.random.default_rng(number), make_rng(number))
+        clips = clips_at(seen, config, 8, now.rng)
+        batch = history_batch(clips, seen.controls, config, now, None)
+        actions = batch.shown.context[:, thumbnail:].unflatten(1, (4, 3))
         early = actions.sum(2) == 0
-        told.append(early.any(1))
+        found.append(early.any(1))
         for one in early.any(1).nonzero()[:, 0].tolist():
             assert not early[one, 0], "the action that led to the target was recorded"
             first = int(early[one].float().argmax())
-            shown = lesson.glimpse.rgb[one]
+            shown = batch.shown.glimpse.rgb[one]
             assert all(torch.equal(shown[first - 1 + k], shown[first - 1]) for k in range(1, 4 - first + 1))
-    assert torch.cat(told).any() and not torch.cat(told).all()
+    assert torch.cat(found).any() and not torch.cat(found).all()
 
 
 def test_pixels_that_change_count_for_more_and_one_in_the_mean():

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import json
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file
 from tests.data.corridor import Corridor
+from tests.learn.stopping import goes_on_exactly, quiet
 from tests.learn.test_moving import Haunted
 
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import Layout, Recorder, record
-from terrella.learn.distil import DistilConfig, Matching, distil, drawn
-from terrella.learn.post_training import beside
-from terrella.learn.self_forcing import Dreams, DreamsConfig, beginnings, train_dreams
-from terrella.learn.train_video import TrainConfig, train_video
-from terrella.learn.updates import Updates
+from terrella.learn.objectives import distillation
+from terrella.learn.objectives.distillation import Matching, drawn
+from terrella.learn.objectives.dreams import Rollouts, beginnings
+from terrella.learn.paired import paired
+from terrella.learn.recipes.distillation import DistilConfig, distil
+from terrella.learn.recipes.dreams import DreamsConfig, train_dreams
+from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.trainer import Now
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
-from terrella.worlds.history import HistoryWorld
+from terrella.worlds.uncertainty import Asked
 
 TEACHER = TrainConfig(
     size=(24, 32),
@@ -40,10 +43,6 @@ TEACHER = TrainConfig(
 PLACES = replace(TEACHER, geometry=True, flow_steps=1, motion_steps=5, keyframes=6, critic_from=9)
 FEW = DistilConfig(steps=3, batch=2)
 DREAMS = DreamsConfig(steps=2, horizon=3, batch=2)
-
-
-def quiet(done, total, words=""):
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -83,21 +82,22 @@ def moving(haunted, tmp_path_factory):
     return load_world(out / "world")
 
 
-def saved_facts(run) -> str:
-    with safe_open(run / "resume.safetensors", "pt") as file:
-        return file.metadata()["facts"]
+def now(seed: int, step: int = 0) -> Now:
+    return Now(step, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
 
 
-def wild(world):
-    """The same world with a generator whose every weight counts (a fresh one only copies)."""
+def tame(world):
+    """The same world with a generator whose every weight counts a little (a fresh one only copies), and which no step of the
+    flow blows up: on any processor, its gradients agree."""
+    generator = copy.deepcopy(world.generator)
     with torch.no_grad():
-        for weight in world.generator.parameters():
-            weight.add_(0.1 * torch.randn(weight.shape, generator=make_rng(weight.numel())))
-    return world
+        for weight in generator.parameters():
+            weight.add_(0.02 * torch.randn(weight.shape, generator=make_rng(weight.numel())))
+    return world.replaced(generator=generator)
 
 
 def test_a_teacher_is_a_history_world_of_many_steps(teacher):
-    assert isinstance(teacher, HistoryWorld) and teacher.config.steps == 4
+    assert not teacher.config.geometry and teacher.config.steps == 4
     assert teacher.config.channels == (8, 8, 8)
 
 
@@ -112,27 +112,23 @@ def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(recording,
     assert list(tmp_path.glob("strip-*.png"))
 
 
-@pytest.mark.parametrize("train, config", [(distil, FEW), (train_dreams, DREAMS)])
-def test_a_stopped_run_goes_on_exactly(train, config, recording, teacher, tmp_path, monkeypatch):
-    train(teacher, recording, tmp_path / "whole", config, quiet)
-    save = Updates.save
+@pytest.mark.parametrize("stage", ["distil", "dreams"])
+def test_a_stopped_run_goes_on_exactly(stage, recording, teacher, tmp_path):
+    def train(out):
+        run = {"distil": (distil, FEW), "dreams": (train_dreams, DREAMS)}[stage]
+        return run[0](teacher, recording, out, run[1], quiet)
 
-    class Stop(Exception):
-        pass
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {stage: 0})
 
-    def stop(self):
-        save(self)
-        raise Stop
 
-    monkeypatch.setattr(Updates, "save", stop)
-    with pytest.raises(Stop):
-        train(teacher, recording, tmp_path / "cut", replace(config, save_every_s=-1.0), quiet)
-    monkeypatch.undo()
-    assert json.loads(saved_facts(tmp_path / "cut"))["step"] == 1, "it goes on from the middle"
-    assert train(teacher, recording, tmp_path / "cut", config, quiet)["step"] == config.steps
-    whole, cut = (load_file(tmp_path / name / "resume.safetensors") for name in ("whole", "cut"))
-    assert whole.keys() == cut.keys()
-    assert all(torch.equal(whole[name], cut[name]) for name in whole)
+def test_a_student_of_dreams_with_a_teacher_goes_on_exactly(recording, teacher, tmp_path):
+    distil(teacher, recording, tmp_path / "student", FEW, quiet)
+    student = load_world(tmp_path / "student" / "world")
+
+    def train(out):
+        return train_dreams(student, recording, out, DREAMS, quiet, teacher)
+
+    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"dreams": 0})
 
 
 def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(recording, teacher, places, tmp_path):
@@ -146,26 +142,27 @@ def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(r
 @pytest.mark.parametrize("kind, data, seed", [("teacher", "recording", 0), ("places", "recording", 0),
                                               ("places", "recording", 1), ("moving", "haunted", 0)])  # fmt: skip
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
-    world = wild(request.getfixturevalue(kind))
-    pair = beside(world, request.getfixturevalue(data), None, quiet)
-    dreams = Dreams(pair, 4, 2, np.random.default_rng(seed), make_rng(0))
-    world, state = dreams.world, dreams.state
+    world = tame(request.getfixturevalue(kind))
+    pair = paired(world, request.getfixturevalue(data), None, quiet)
+    dreams, noted = Rollouts(world, pair.recording, 4, 2, now(seed)), []
+    playing = dreams.world.replaced(uncertainty=Asked(lambda shown, clean, situation: noted.append((shown, clean))))
+    state = dreams.state
     for step in range(4):
-        noise_rng = make_rng(step)
         action = pair.recording.action(dreams.row)
         if kind == "teacher":
-            state = world.imagine(state, action.to(torch.int8), noise_rng)
+            state = playing.imagine(state, action.to(torch.int8), make_rng(step))
         else:
             state = state.replace(actions=torch.cat([state["actions"][:, 1:], action[:, None]], 1))
-            state = world.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, noise_rng)
-        lesson = dreams.next_lesson()
-        noise = torch.randn(2, 4, *world.config.size, generator=make_rng(step))
-        with torch.inference_mode():
-            clean = generate(world.generator, noise, lesson.glimpse, lesson.last, lesson.told, world.config.steps)
-        dreams.go_on(clean.clone())
-        assert torch.equal(world.render(state, ("rgb",))["rgb"], world.render(dreams.state, ("rgb",))["rgb"])
+            state = playing.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, make_rng(step))
+        rgb, batch = playing.render(state, ("rgb",))["rgb"], dreams.next_batch()
+        shown, clean = noted.pop()
+        for one, other in ((shown.glimpse.rgb, batch.shown.glimpse.rgb), (shown.last, batch.shown.last)):
+            torch.testing.assert_close(one, other)
+        torch.testing.assert_close(shown.context, batch.shown.context)
+        dreams.go_on(clean)
+        assert torch.equal(rgb, dreams.world.render(dreams.state, ("rgb",))["rgb"])
         truth = pair.recording.rgb(dreams.row).float() / 127.5 - 1
-        assert torch.equal(lesson.truth[:, :3], truth)
+        assert torch.equal(batch.truth[:, :3], truth)
 
 
 def test_a_teacher_may_watch_the_dreams(recording, teacher, places, tmp_path):
@@ -199,46 +196,56 @@ def test_a_many_step_world_of_moving_things_teaches_a_student_and_its_dreams(hau
 
 
 def test_dreams_begin_where_the_episode_lasts(recording, teacher):
-    pair = beside(teacher, recording, None, quiet)
-    rows = beginnings(pair, 20)
+    pair = paired(teacher, recording, None, quiet)
+    rows = beginnings(pair.recording, 20)
     start = pair.recording.start
     assert len(rows) and all(start[row - 9] == start[row + 20] for row in rows)
     assert pair.recording.usable[np.concatenate([rows - 9, rows + 20])].all()
     with pytest.raises(DatasetError, match="shorter --horizon"):
-        beginnings(pair, 200)
+        beginnings(pair.recording, 200)
 
 
-def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(recording, teacher):
-    pair = beside(wild(teacher), recording, None, quiet)
-    generator = pair.world.generator.requires_grad_(True)
-    lesson = pair.lesson(2, np.random.default_rng(0))
-    seen = lesson.glimpse, lesson.last, lesson.told
-    noise, exits = torch.randn(lesson.truth.shape, generator=make_rng(1)), set()
+@pytest.mark.parametrize("half", [False, True])  # where bfloat16 is native, training uses it
+def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, recording, teacher, monkeypatch):
+    def precision(device):
+        return torch.autocast(device.type, torch.bfloat16, enabled=half)
+
+    monkeypatch.setattr(distillation, "half_precision", precision)
+    pair = paired(tame(teacher), recording, None, quiet)
+    generator = copy.deepcopy(pair.world.generator).requires_grad_(True)
+    batch = pair.real(2, now(0))
+    noise, exits = torch.randn(batch.truth.shape, generator=make_rng(1)), set()
+
+    def clean_at(x, step):
+        with precision(x.device):
+            return generator(x, torch.full((2,), step / 4), batch.shown).float()
+
     for seed in range(12):
         exit_at = int(np.random.default_rng(seed).integers(4))
         exits.add(exit_at)
         x = noise
         with torch.no_grad():
             for step in range(exit_at):
-                x = x + (generator(x, torch.full((2,), step / 4), *seen) - x) / (4 - step)
-        alone = torch.autograd.grad(generator(x, torch.full((2,), exit_at / 4), *seen).sum(), generator.enter.weight)
-        clean = drawn(generator, noise, lesson, 4, np.random.default_rng(seed))
-        torch.testing.assert_close(torch.autograd.grad(clean.sum(), generator.enter.weight), alone)
-        if exit_at == 3:
-            torch.testing.assert_close(clean, generate(generator, noise, *seen, 4))
+                x = x + (clean_at(x, step) - x) / (4 - step)
+        (alone,) = torch.autograd.grad(clean_at(x, exit_at).sum(), generator.enter.weight)
+        clean = drawn(generator, noise, batch.shown, 4, np.random.default_rng(seed))
+        (found,) = torch.autograd.grad(clean.sum(), generator.enter.weight)
+        assert float((found - alone).norm()) < 1e-2 * float(alone.norm()), "relative: as near as rounding allows"
+        if exit_at == 3 and not half:
+            torch.testing.assert_close(clean, generate(generator, noise, batch.shown, 4), rtol=1e-3, atol=1e-3)
     assert exits == {0, 1, 2, 3}
 
 
 def test_where_the_student_draws_as_the_teacher_nothing_pulls(recording, teacher):
-    pair = beside(wild(teacher), recording, None, quiet)
-    lesson, matching = pair.lesson(2, np.random.default_rng(0)), Matching(teacher.generator)
-    clean = lesson.truth.clone().requires_grad_()
-    (still,) = torch.autograd.grad(matching.towards_teacher(clean, lesson, make_rng(2)), clean)
+    pair = paired(tame(teacher), recording, None, quiet)
+    batch, matching = pair.real(2, now(0)), Matching(teacher.generator)
+    clean = batch.truth.clone().requires_grad_()
+    (still,) = torch.autograd.grad(matching.towards_teacher(clean, batch.shown, make_rng(2)), clean)
     assert not still.any()
     with torch.no_grad():
         for weight in matching.mimic.parameters():
             weight.mul_(1.05)
-    (pull,) = torch.autograd.grad(matching.towards_teacher(clean, lesson, make_rng(2)), clean)
+    (pull,) = torch.autograd.grad(matching.towards_teacher(clean, batch.shown, make_rng(2)), clean)
     assert pull.abs().sum() > 0
 
 
@@ -248,8 +255,6 @@ def test_a_world_of_one_step_teaches_nobody(recording, places, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
-    with pytest.raises(TrainingError, match="no world of pictures"):
-        train_dreams(Corridor(), recording, tmp_path / "run", DREAMS, quiet)
     with Recorder(tmp_path / "other", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(2):
             for step in range(60):

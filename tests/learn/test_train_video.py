@@ -9,29 +9,26 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from safetensors import safe_open
 from safetensors.torch import load_file
 from tests.data.corridor import Corridor
+from tests.learn.stopping import goes_on_exactly, quiet, same_run
 
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Layout, Recorder, record
-from terrella.learn.lessons import varied
-from terrella.learn.samples import Lesson, choose_keyframes, usable_rows
-from terrella.learn.train_video import TrainConfig, train_video
+from terrella.learn.batches import Batch, varied
+from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recording import choose_keyframes, usable_rows
+from terrella.learn.trainer import Trainer
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import context_thumbnail
+from terrella.worlds.generator import Conditioning, context_thumbnail
 
 CONFIG = TrainConfig(
     size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, estimator_steps=0,
     uncertainty_frames=0,
 )  # fmt: skip
-
-
-def quiet(done, total, words=""):
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -60,37 +57,59 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
     assert list(out.glob("strip-*.png"))
 
 
-def test_a_stopped_run_goes_on_exactly(recording, trained, tmp_path):
-    class Stop(Exception):
-        pass
+def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
+    """Within the motion model, the generator, the estimator and the uncertainty; in the first step, too."""
+    config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
+    stages = {"motion": 7, "flow": 0, "estimator": 1, "uncertainty": 3}
+    goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
+    worlds = [load_file(tmp_path / run / "world" / "weights.safetensors") for run in ("a", "b")]
+    assert all(torch.allclose(worlds[0][name].float(), worlds[1][name].float(), atol=1e-4) for name in worlds[0])
 
-    steps = 0
 
-    def stop_after_two(monkeypatch_step):
-        def step(self, number):
-            nonlocal steps
-            if steps == 2:
-                raise Stop
-            steps += 1
-            return monkeypatch_step(self, number)
+def test_a_run_without_geometry_reads_clips_and_goes_on_exactly(recording, tmp_path):
+    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=3)
+    stages = {"outcome": 1, "flow": 1}
+    goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
 
-        return step
 
-    from terrella.learn import train_video as module
+def test_a_step_that_a_second_ctrl_c_cuts_is_done_again(recording, trained, tmp_path, monkeypatch):
+    original, steps = Trainer._step, []
 
-    original = module._Run._step
-    module._Run._step = stop_after_two(original)
-    try:
-        with pytest.raises(Stop):
-            train_video(recording, tmp_path, replace(CONFIG, save_every_s=-1.0), quiet)
-    finally:
-        module._Run._step = original
-    with safe_open(tmp_path / "resume.safetensors", "pt") as saved:
-        assert json.loads(saved.metadata()["facts"])["step"] == 2, "it goes on from a trained state"
+    def cut_in_the_third(self, number):
+        if self.stage == "flow":
+            steps.append(number)
+        result = original(self, number)
+        if self.stage == "flow" and len(steps) == 3:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(Trainer, "_step", cut_in_the_third)
+    config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
+    with pytest.raises(KeyboardInterrupt):
+        train_video(recording, tmp_path, replace(config, save_every_s=-1.0), quiet)
+    train_video(recording, tmp_path, config, quiet)
+    assert steps == [0, 1, 2, 2, 3], "the step that was cut is done again"
+    same_run(trained[0], tmp_path, "flow")
+
+
+def test_the_log_repeats_no_step_after_a_kill(recording, tmp_path):
+    """What a killed run logged after its last save is dropped, and a line that was cut."""
     train_video(recording, tmp_path, CONFIG, quiet)
-    whole, resumed = (load_file(folder / "resume.safetensors") for folder in (trained[0], tmp_path))
-    assert whole.keys() == resumed.keys()
-    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+    path = tmp_path / "log.jsonl"
+    lines = path.read_text()
+    path.write_text(lines + json.dumps({"stage": "flow", "step": 9, "rgb": 0.5}) + '\n{"stage": "fl')
+    train_video(recording, tmp_path, CONFIG, quiet)
+    assert path.read_text() == lines
+
+
+def test_a_training_that_fails_leaves_no_folder(recording, tmp_path):
+    with pytest.raises(TrainingError, match="multiples of 8"):
+        train_video(recording, tmp_path / "run", replace(CONFIG, size=(20, 30)), quiet)
+    with pytest.raises(DatasetError, match="leaves 0 frames"):
+        train_video(recording, tmp_path / "run", replace(CONFIG, keep_out=(-99, -99, 99, 99)), quiet)
+    with pytest.raises(TrainingError, match="--device tpu: PyTorch has no such device here"):
+        train_video(recording, tmp_path / "run", replace(CONFIG, device="tpu"), quiet)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_with_other_settings_is_refused(recording, trained):
@@ -99,8 +118,8 @@ def test_a_run_with_other_settings_is_refused(recording, trained):
 
 
 def test_a_foreign_resume_file_is_refused(recording, tmp_path):
-    (tmp_path / "resume.safetensors").write_bytes(b"not a run at all")
-    with pytest.raises(TrainingError, match="resume.safetensors"):
+    (tmp_path / "resume-flow.safetensors").write_bytes(b"not a run at all")
+    with pytest.raises(TrainingError, match="resume-flow.safetensors"):
         train_video(recording, tmp_path, CONFIG, quiet)
 
 
@@ -116,7 +135,8 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp
     monkeypatch.setattr(module, "_l1", lambda a, b: (a - b).abs().mean() * float("nan"))
     with pytest.raises(TrainingError, match="not a number at step 0"):
         train_video(recording, tmp_path, CONFIG, quiet)
-    saved = load_file(tmp_path / "resume.safetensors")
+    assert not (tmp_path / "resume-flow.safetensors").exists()
+    saved = load_file(tmp_path / "resume-motion.safetensors")
     assert all(torch.isfinite(value.float()).all() for value in saved.values())
 
 
@@ -179,53 +199,37 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
         load_world(broken)
 
 
-def test_ctrl_c_within_a_step_goes_on_exactly_too(recording, trained, tmp_path, monkeypatch):
-    from terrella.learn import train_video as module
-
-    original, steps = module._Run._step, []
-
-    def cut_in_the_third(self, number):
-        steps.append(number)
-        result = original(self, number)
-        if len(steps) == 3:
-            raise KeyboardInterrupt
-        return result
-
-    monkeypatch.setattr(module._Run, "_step", cut_in_the_third)
-    with pytest.raises(KeyboardInterrupt):
-        train_video(recording, tmp_path, replace(CONFIG, save_every_s=-1.0), quiet)
-    train_video(recording, tmp_path, CONFIG, quiet)
-    assert steps == [0, 1, 2, 2, 3], "the step that was cut is done again"
-    whole, resumed = (load_file(folder / "resume.safetensors") for folder in (trained[0], tmp_path))
-    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
-
-
 def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
     world = load_world(trained[0] / "world")
-    save_world(world.without_memory(), tmp_path / "bare", {})
+    save_world(world.without_memory(), tmp_path / "bare")
     bare = load_world(tmp_path / "bare")
     assert len(bare.memory) == 0 and len(bare.starts) == len(world.starts)
     assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
 
 
-def test_axes_are_learned_from_pictures_and_refused_beside_poses(tmp_path):
-    for name, posed in (("flat", False), ("posed", True)):
-        layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
-        layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
-        with Recorder(tmp_path / name, layout) as recorder:
+@pytest.mark.parametrize("posed", [False, True])
+def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
+    layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
+    layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
+    with Recorder(tmp_path / "set", layout) as recorder:
+        for _ in range(2):
             for step in range(80):
                 seen = {"rgb": np.full((24, 32, 3), 40 + step, np.uint8)}
                 if posed:
-                    seen |= {"depth": np.ones((24, 32)), "pose": np.array([0, 0, 0, 1, 0, 0, 0])}
+                    half = 0.02 * step
+                    pose = np.array([0.05 * step, 0, 0, np.cos(half), 0, 0, np.sin(half)], np.float32)
+                    seen |= {"depth": np.full((24, 32), 3.0), "pose": pose}
                 recorder.add(seen, np.array([0.37 - step / 50]) if step < 79 else None, 0.0, False)
-    train_video(tmp_path / "flat", tmp_path / "run", CONFIG, quiet)
-    space = load_world(tmp_path / "run" / "world").spec.action
+            recorder.end_episode()
+    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    world = load_world(tmp_path / "run" / "world")
+    space = world.spec.action
     assert isinstance(space, spaces.Box) and space.low[0] < -1 and space.high[0] == np.float32(0.37)
-    with pytest.raises(DatasetError, match="no buttons"):
-        train_video(tmp_path / "posed", tmp_path / "other", CONFIG, quiet)
+    assert ("pose" in world.spec.channels) == posed
+    assert "batches" in check_world(world)
 
 
-def test_a_varied_lesson_is_the_same_lesson_in_another_world():
+def test_a_varied_batch_is_the_same_batch_in_another_world():
     """Where memory holds the truth itself it still does, mirrored and in other colours."""
     rng = make_rng(0)
     truth = torch.rand(2, 4, 16, 24, generator=rng)
@@ -233,9 +237,11 @@ def test_a_varied_lesson_is_the_same_lesson_in_another_world():
     pixels = (truth[:, :3] * 255).to(torch.uint8)
     changed = set()
     for seed in range(12):
-        lesson = varied(Lesson(glimpse, truth, context_thumbnail(pixels), truth), np.random.default_rng(seed))
-        assert torch.equal(lesson.glimpse.rgb[:, 0], lesson.truth[:, :3]) and torch.equal(lesson.last, lesson.truth)
-        assert torch.equal(lesson.glimpse.depth, lesson.truth[:, 3])
-        assert torch.allclose(context_thumbnail((lesson.truth[:, :3] * 255).to(torch.uint8)), lesson.told, atol=1e-5)
-        changed.add(not torch.equal(lesson.truth, truth))
+        shown = Conditioning(glimpse, truth, context_thumbnail(pixels))
+        batch = varied(Batch(shown, truth), np.random.default_rng(seed))
+        seen, last, context = batch.shown.glimpse, batch.shown.last, batch.shown.context
+        assert torch.equal(seen.rgb[:, 0], batch.truth[:, :3]) and torch.equal(last, batch.truth)
+        assert torch.equal(seen.depth, batch.truth[:, 3])
+        assert torch.allclose(context_thumbnail((batch.truth[:, :3] * 255).to(torch.uint8)), context, atol=1e-5)
+        changed.add(not torch.equal(batch.truth, truth))
     assert changed == {True, False}

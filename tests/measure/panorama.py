@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from terrella.core import Spec, State, make_rng
 from terrella.core.errors import ObservationError, TerrellaError
-from terrella.measure import Clip, clips_from_cache
+from terrella.measure import CLIPS, Clip, Exam, ExamConfig, clips_from_cache, examine
 from terrella.space.camera import planar_pose, yaw
 
 HEIGHT, WIDTH, STEP_M, TURN_RAD = 24, 32, 0.1, math.radians(3)
@@ -123,6 +123,7 @@ def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleName
     valid[length - 1 :: length] = False
     return SimpleNamespace(
         further={},
+        action_names=Panorama().spec.action_names,
         rgb=look(pose).numpy(),
         depth=None,
         pose=pose.numpy(),
@@ -137,3 +138,26 @@ def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleName
 
 def some_clips(count: int = 12, horizon: int = 32, context: int = 3, seed: int = 0) -> list[Clip]:
     return clips_from_cache(recording(seed=seed), range(4), context, horizon, count, make_rng(seed))
+
+
+SHORT = {
+    "drop": (8, 32),
+    "batch": 5,
+    "strips": 2,
+    "closure_deg": (),
+    "closure_walk": 0,
+    "long_steps": 0,
+    "speed_steps": 0,
+}
+
+
+def exam_of(arms, places=None, config=None, seed: int = 0, **more) -> Exam:
+    """An exam of worlds by name, on clips of the panorama."""
+    config = config or ExamConfig((1, 8, 32), (8, 32), **SHORT)
+    sets = {CLIPS: places or {"recorded": some_clips()}, **more.pop("sets", {})}
+    return Exam(arms, sets, config, seed, **more)
+
+
+def card_of(arms, places=None, config=None, seed: int = 0, **more):
+    """The card of an exam of the panorama."""
+    return examine(exam_of(arms, places, config, seed, **more))

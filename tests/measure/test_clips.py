@@ -18,7 +18,7 @@ from terrella.space.camera import yaw
 
 
 def rows(clip) -> range:
-    return range(clip.start, clip.start + len(clip.rgb))
+    return range(clip.start, clip.start + len(clip.action))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -90,10 +90,10 @@ def test_evidence_that_does_not_fit_is_refused():
     clips = some_clips(2)
     seen = evidence(clips, Panorama().spec, 0)
     assert set(seen) == {"rgb", "pose"} and seen["rgb"].shape == (2, 24, 32, 3)
-    lacking = [clip.__class__(**{**clip.__dict__, "pose": None}) for clip in clips]
+    lacking = [replace(clip, channels={"rgb": clip.channels["rgb"]}) for clip in clips]
     with pytest.raises(ObservationError, match="lacks"):
         evidence(lacking, Panorama().spec, 0)
-    small = [clip.__class__(**{**clip.__dict__, "rgb": clip.rgb[:, ::2]}) for clip in clips]
+    small = [replace(clip, channels={**clip.channels, "rgb": clip.channels["rgb"][:, ::2]}) for clip in clips]
     with pytest.raises(ObservationError, match="size"):
         evidence(small, Panorama().spec, 0)
 
@@ -106,7 +106,7 @@ def test_depth_of_another_size_is_shown_at_the_size_of_the_world():
     channels = {**spec.channels, "depth": spaces.Box(0, 100, (12, 16), np.float32)}
     seen = evidence(clips, replace(spec, channels=channels, observes=("rgb", "pose", "depth")), 0)["depth"]
     assert seen.shape == (3, 12, 16) and torch.equal(
-        seen[:, ::2, ::2], torch.from_numpy(np.stack([c.depth[0] for c in clips]))
+        seen[:, ::2, ::2], torch.from_numpy(np.stack([c.channels["depth"][0] for c in clips]))
     )
 
 
@@ -123,7 +123,8 @@ def test_what_a_world_heeds_is_shown_to_it_where_it_was_recorded():
     assert seen["health"].tolist() == [clip.start + 1 for clip in clips] and "ammo" not in seen
     assert seen["things"].dtype == torch.bool and seen["things"].nonzero().tolist() == [[k, 2, 3] for k in range(3)]
     odd = {"health": np.full((12, 1), np.nan, np.float32), "things": np.zeros((12, 3), bool)}
-    strange = [replace(clip, further=odd) for clip in clips]
+    plain = [{name: clip.channels[name] for name in ("rgb", "pose")} for clip in clips]
+    strange = [replace(clip, channels={**some, **odd}) for clip, some in zip(clips, plain)]
     assert set(evidence(strange, heeding, 1)) == set(spec.observes), "what does not fit is left out"
-    silent = [replace(clip, further={}) for clip in clips]
+    silent = [replace(clip, channels=some) for clip, some in zip(clips, plain)]
     assert set(evidence(silent, heeding, 1)) == set(spec.observes), "nobody is asked for what was not recorded"

@@ -23,14 +23,13 @@ import terrella
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
 from terrella.measure import (
-    ScoreConfig,
-    bars,
+    PROBES,
+    ExamConfig,
     clip_features,
     encoder,
     frame_features,
     frechet_interval,
     page,
-    score,
     shipped_encoder,
     to_json,
 )
@@ -282,39 +281,34 @@ def card():
         patch.setattr(panorama, "HEIGHT", 48)
         patch.setattr(panorama, "WIDTH", 64)
         arms = {flaw or "perfect": panorama.Panorama(flaw) for flaw in ("", "static", "fading")}
-        config = ScoreConfig((1, 8, 24), (8,), (8,), drop=(8, 24), strips=1)
-        return score(arms, {"recorded": panorama.some_clips(12, 24)}, make_rng(0), config)
+        config = ExamConfig((1, 8, 24), (8,), **{**panorama.SHORT, "drop": (8, 24), "strips": 1})
+        return panorama.card_of(arms, {"recorded": panorama.some_clips(12, 24)}, config)
 
 
-def looks(card, arm: str) -> list[float]:
-    return [row.frechet.value for row in card.fidelity if (row.arm, row.motion) == (arm, "predicted")]
+def looks(card, arm: str):
+    return card.find("pixels", "Frechet distance", arm=arm, motion="predicted")
 
 
 def test_the_scorecard_praises_the_perfect_world_and_finds_out_the_fading_one(card):
-    perfect, fading = looks(card, "perfect"), looks(card, "fading")
+    perfect, fading, static = (
+        [row.figure.value for row in looks(card, arm)] for arm in ("perfect", "fading", "static")
+    )
+    copied = [row.baselines["copy last"].value for row in looks(card, "perfect")]
     assert max(map(abs, perfect)) < 0.01 * fading[1]
-    assert fading == sorted(fading) and fading[2] > card.looks[2].copy_last.value
-    assert looks(card, "static")[2] == pytest.approx(
-        card.looks[2].copy_last.value, rel=1e-3
-    )  # real frames, of another moment
-    assert [row.horizon for row in card.looks] == [1, 8, 24] and all(row.blurred.value > 0 for row in card.looks)
+    assert fading == sorted(fading) and fading[2] > copied[2]
+    assert static[2] == pytest.approx(copied[2], rel=1e-3)  # real frames, of another moment
+    assert all(row.baselines["blurred by 1 pixel"].value > 0 for row in looks(card, "perfect"))
 
 
-def test_the_page_the_bars_and_the_json_tell_it(card):
-    found = {arm: [bar for bar in bars(card, arm) if bar.name.startswith("Frechet")] for arm in ("perfect", "fading")}
-    assert {bar.status for bar in found["perfect"] if bar.place == "recorded"} == {"met"}
-    assert {bar.status for bar in found["fading"] if bar.place == "recorded"} == {"missed"}
-    assert {bar.status for bar in found["fading"] if bar.place == "new"} == {"not measured"}
-    html = page(card, found["fading"], "t")
-    assert "<h2>Looks over time</h2>" in html and "the game blurred by 1 pixel" in html
+def test_the_page_and_the_json_tell_it(card):
+    html = page(card, [], "t", PROBES)
+    assert "Frechet distance" in html and "blurred by 1 pixel" in html
     assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
-    told = json.loads(to_json(card))
-    assert told["looks"][0]["blurred"]["count"] == 12 and told["fidelity"][0]["frechet"]["count"] == 12
+    told = [row for row in json.loads(to_json(card))["rows"] if row["what"] == "Frechet distance"]
+    assert told[0]["baselines"]["blurred by 1 pixel"]["count"] == told[0]["figure"]["count"] == 12
 
 
 def test_frames_too_small_to_look_at_are_scored_without_it():
-    config = ScoreConfig((1, 8), (8,), (8,), drop=(1, 8), strips=1)
-    card = score({"a": panorama.Panorama()}, {"recorded": panorama.some_clips(3)}, make_rng(0), config)
-    assert not card.looks and {row.frechet for row in card.fidelity} == {None}
-    assert not [bar for bar in bars(card, "a") if bar.name.startswith("Frechet")]
-    assert "Looks over time" not in page(card, [], "t")
+    config = ExamConfig((1, 8), (8,), **{**panorama.SHORT, "drop": (1, 8), "strips": 1})
+    card = panorama.card_of({"a": panorama.Panorama()}, {"recorded": panorama.some_clips(3)}, config)
+    assert not card.find("pixels", "Frechet distance") and "Frechet distance," not in page(card, [], "t", PROBES)

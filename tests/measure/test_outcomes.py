@@ -12,7 +12,8 @@ from gymnasium import spaces
 from terrella.core import Spec, State, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.spec import DONE, REWARD
-from terrella.measure.outcomes import auc, fates, passages
+from terrella.measure import CLIPS, ENDINGS, Exam, ExamConfig, examine
+from terrella.measure.outcomes import auc, correlation, passages
 
 HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -40,6 +41,7 @@ class Game:
 
     def render(self, state, channels):
         seen = {"health": state["health"], "reward": state["reward"], "done": state["health"] <= 0}
+        seen["rgb"] = torch.zeros(state.batch, 8, 8, 3, dtype=torch.uint8)
         return {name: seen[name] for name in channels}
 
 
@@ -57,17 +59,31 @@ def recording(lengths=(40, 30, 50)):
     )  # fmt: skip
 
 
+def exam_rows(shown, horizons=(4, 16)):
+    """Rows by arm, horizon and name."""
+    clips = [passage.clip for passage in shown]
+    config = ExamConfig(horizons, (), batch=5, strips=1, long_steps=0, speed_steps=0)
+    arms = {"right": Game(), "blind": Game(blind=True)}
+    going = {"recorded": [passage.real for passage in shown]}
+    card = examine(Exam(arms, {CLIPS: {"recorded": clips}, ENDINGS: {"recorded": clips}}, config, going=going))
+    return {(row.arm, row.horizon, row.what): row for row in card.rows if row.probe == "outcomes"}
+
+
 def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
     shown = passages(recording(), (0, 1, 2), 5, 16, 24, make_rng(0))
-    arms = {"right": Game(), "blind": Game(blind=True)}
-    rows = {(row.arm, row.horizon): row for row in fates(arms, "recorded", shown, (4, 16), make_rng(0), batch=5)}
+    rows = exam_rows(shown)
     for horizon in (4, 16):
-        right, blind = rows["right", horizon], rows["blind", horizon]
-        assert right.reward.value == right.vitals["health"].value == 0
-        assert blind.vitals["health"].value == blind.vitals_copied["health"].value > 1
-        assert blind.done_auc == 0.5
-    assert rows["right", 16].done_auc == 1.0 and 0 < rows["right", 16].ended < 24
-    assert rows["right", 16].reward_auc == 1.0 or np.isnan(rows["right", 16].reward_auc)
+        assert rows["right", horizon, "return error"].figure.value == rows["right", horizon, "error"].figure.value == 0
+        blind = rows["blind", horizon, "error"]
+        assert blind.figure.value == blind.baselines["copy last"].value > 1 and blind.gain.value == 0
+        assert rows["blind", horizon, "ends: AUC"].figure.value == 0.5
+        assert rows["right", horizon, "return error"].gain.value > 0
+        assert rows["right", horizon, "return correlation"].figure.value == pytest.approx(1)
+        assert np.isnan(rows["blind", horizon, "return correlation"].figure.value), "it never pays"
+    ends = rows["right", 16, "ends: AUC"]
+    assert ends.figure.value == 1.0 and 0 < int(ends.note.split()[0]) < 24
+    pays = rows["right", 16, "pays: AUC"].figure.value
+    assert pays == 1.0 or np.isnan(pays)
 
 
 def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
@@ -75,7 +91,7 @@ def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
     short = [passage for passage in shown if not passage.real.all()]
     assert len(short) >= 10
     for passage in short:
-        after = passage.clip.further["health"][int(passage.real.sum()) :]
+        after = passage.clip.channels["health"][int(passage.real.sum()) :]
         assert (after == after[0]).all() and (passage.clip.action[~passage.real] == 0).all()
         assert passage.real[:5].all()
 
@@ -86,12 +102,16 @@ def test_auc_counts_pairs():
     assert np.isnan(auc(score, torch.ones(4, dtype=torch.bool)))
 
 
+def test_correlation_is_pearsons():
+    first, second = torch.tensor([1.0, 2, 3, 4, 5]), torch.tensor([2.0, 1, 4, 3, 6])
+    found = correlation(first, second)
+    assert found.value == pytest.approx(np.corrcoef(first, second)[0, 1]) and found.low < found.value < found.high
+    assert correlation(first, -first).value == pytest.approx(-1)
+
+
 def test_what_is_too_short_is_refused():
     with pytest.raises(DatasetError, match="longer than"):
         passages(recording((4, 5)), (0, 1), 5, 8, 4, make_rng(0))
-    shown = passages(recording(), (0, 1, 2), 5, 8, 4, make_rng(0))
-    with pytest.raises(DatasetError, match="shorter than 16"):
-        fates({"right": Game()}, "recorded", shown, (16,), make_rng(0))
 
 
 def test_passages_stay_where_they_may():

@@ -8,65 +8,61 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from panorama import Panorama, some_clips
+from panorama import Panorama, card_of, some_clips
 from PIL import Image
 
-from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
-from terrella.measure import ExamConfig, ScoreConfig, bars, examine, strip, write_report
+from terrella.measure import LONG, Bar, ExamConfig, Row, strip, write_report
 from terrella.measure.plot import Line, line_chart
+from terrella.measure.statistics import Figure
 from terrella.measure.strip import jpeg
 
 
 @pytest.fixture(scope="module")
 def card():
     arms = {name: Panorama(flaw) for name, flaw in (("memory", ""), ("no <memory>", "fading"), ("still", "static"))}
-    places = {"recorded": some_clips(5, 128), "new": some_clips(4, 128, seed=4)}
-    config = ExamConfig(ScoreConfig(batch=8, strips=1), closure_step_deg=15, long_steps=200, stories=2)
-    shares = []
-    found = examine(arms, places, make_rng(0), config, progress=lambda share, words: shares.append(share))
-    assert shares == sorted(shares) and shares[-1] == 1
-    return found
+    places = {"recorded": some_clips(5, 32), "new": some_clips(4, 32, seed=4)}
+    config = ExamConfig(
+        (1, 8, 32), batch=8, strips=1, drop=(8, 32), closure_deg=(90.0,), closure_step_deg=15, closure_clips=4,
+        closure_walk=0, long_steps=100, long_rollouts=2, speed_steps=20,
+    )  # fmt: skip
+    return card_of(arms, places, config, sets={LONG: {"recorded": some_clips(3, 110)}})
 
 
-def test_every_bar_of_the_perfect_world_is_met(card):
-    found = bars(card, "memory")
-    assert {bar.status for bar in found} == {"met"}
-    assert {bar.place for bar in found} == {"recorded", "new"}
-    eight = next(bar for bar in found if bar.name == "PSNR" and bar.horizon == 8)
-    assert eight.seconds == pytest.approx(8 / 35) and eight.sure
+def row(value, low, high, void=False):
+    return Row("pixels", "rgb", "PSNR", "dB", "recorded", "a", "predicted", 8, Figure(value, low, high, 9), void=void)
 
 
-def test_flawed_worlds_miss_their_bars(card):
-    fading = {
-        bar.name: bar for bar in bars(card, "no <memory>") if bar.place == "recorded" and bar.motion == "predicted"
-    }
-    assert fading["sharpness against the game's, worst horizon"].status == "missed"
-    assert fading["sharpness against the game's, worst horizon"].horizon == 128
-    assert fading["PSNR lost from 8 to 64 steps"].status == "missed"
-    still = bars(card, "still")
-    assert {bar.status for bar in still if bar.name.startswith("closure")} == {"void"}
-    assert {bar.status for bar in still if bar.name.startswith("obeys")} == {"missed"}
-
-
-def test_what_the_card_lacks_is_not_measured(card):
-    assert {bar.status for bar in bars(card, "no such arm")} == {"not measured"}
-
-
-def test_longer_horizons_are_told_as_the_same_seconds_at_frame_skip_four(card):
-    side = [bar for bar in bars(card, "memory") if bar.side]
-    assert {bar.horizon for bar in side} == {32, 128}
-    assert {bar.note for bar in side} == {"as long as 8 steps at frame-skip 4", "as long as 32 steps at frame-skip 4"}
+def test_targets_are_judged_by_the_figure_and_sure_by_its_interval():
+    judged = [Bar("x", row(*figure), 26.0) for figure in ((30, 28, 32), (27, 25, 29), (20, 18, 22), (25, 24, 27))]
+    assert [(bar.status, bar.sure) for bar in judged] == [
+        ("met", True),
+        ("met", False),
+        ("missed", True),
+        ("missed", False),
+    ]
+    assert judged[0].target == "\u2265 26 dB" and Bar("x", row(1, 1, 1), 0.7, 1.3).target == "0.7 to 1.3 dB"
+    assert Bar("x", None, 1.0).status == Bar("x", row(*[float("nan")] * 3), 1.0).status == "not measured"
+    assert Bar("x", row(30, 28, 32, void=True), 26.0).status == "void"
 
 
 def test_the_report_stands_alone(card, tmp_path):
-    paths = write_report(card, bars(card, "memory"), tmp_path / "new" / "folder", "A <world>")
+    paths = write_report(card, [Bar("PSNR", card.rows[1], 26.0)], tmp_path / "new" / "folder", "A <world>")
     html = paths[1].read_text(encoding="utf-8")
     assert paths[0].read_text(encoding="utf-8").endswith("}\n")
     assert "A &lt;world&gt;" in html and "no &lt;memory&gt;" in html and "no <memory>" not in html
     assert not re.search(r"(src|href)=(?!\"data:)|url\(|@import|https?://", html)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
-    for heading in ("Bars", "Likeness over time", "Sharpness over time", "Position", "A long dream", "Speed"):
+    assert html.index("better than copying the last frame") < html.index("<h2>Targets")
+    for heading in (
+        "Targets",
+        "Likeness over time",
+        "Does it obey?",
+        "Position",
+        "Does it remember?",
+        "A long rollout",
+        "Speed",
+    ):
         assert f"<h2>{heading}</h2>" in html
     for svg in re.findall(r"<svg .*?</svg>", html):
         ElementTree.fromstring(re.sub(r"class=key", 'class="key"', svg))

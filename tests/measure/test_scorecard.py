@@ -8,27 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from panorama import Panorama, recording, some_clips
+from panorama import Panorama, card_of, exam_of, recording, some_clips
 
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.measure import (
-    Album,
-    ScoreConfig,
-    closure,
-    key_way,
-    long_rollout,
-    score,
-    speed,
-    to_json,
-    walk_way,
-    yaw_way,
-)
+from terrella.measure import Album, ExamConfig, as_dict, examine, to_json, verdict
 from terrella.measure.album import look
-from terrella.measure.closure import walkers
+from terrella.measure.closure import go, rows_of, turn_way, walk_way, walkers, yaw_way
+from terrella.measure.endurance import NAMES, long_rollout
+from terrella.measure.endurance import rows_of as stretches
 from terrella.measure.fidelity import PSNR_CAP_DB
+from terrella.measure.speed import speed
 
-CONFIG = ScoreConfig((1, 8, 32), (8, 32), (8, 32), drop=(8, 32), batch=5, strips=2)
+ARMS = {flaw or "perfect": Panorama(flaw) for flaw in ("", "static", "deaf", "long", "fading", "shy")}
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +30,14 @@ def clips():
 
 @pytest.fixture(scope="module")
 def card(clips):
-    arms = {flaw or "perfect": Panorama(flaw) for flaw in ("", "static", "deaf", "long", "fading", "shy")}
-    return score(arms, {"recorded": clips, "new": some_clips(6, seed=9)}, make_rng(0), CONFIG)
+    return card_of(ARMS, {"recorded": clips, "new": some_clips(6, seed=9)})
 
 
-def row(card, kind, arm, horizon, motion=None, place="recorded"):
-    found = [r for r in getattr(card, kind) if (r.arm, r.horizon, r.place) == (arm, horizon, place)]
-    return next(r for r in found if motion is None or r.motion == motion)
+def row(card, what, arm, horizon, motion="predicted", place="recorded", probe=None):
+    found = [
+        r for r in card.rows if (r.what, r.arm, r.horizon, r.place, r.motion) == (what, arm, horizon, place, motion)
+    ]
+    return next(r for r in found if probe in (None, r.probe))
 
 
 def test_the_fake_world_keeps_the_contract():
@@ -54,46 +47,75 @@ def test_the_fake_world_keeps_the_contract():
 def test_a_perfect_world_scores_at_the_cap_and_obeys(card):
     for motion in ("predicted", "true"):
         for horizon in (1, 8, 32):
-            best = row(card, "fidelity", "perfect", horizon, motion)
-            assert best.psnr.value == pytest.approx(PSNR_CAP_DB, abs=2) and best.ssim.value > 0.999
-            assert best.sharpness.value == pytest.approx(1, abs=0.01)
-    assert row(card, "control", "perfect", 32).difference.low > 3
-    assert row(card, "position", "perfect", 32).mean_share.value < 1e-4
-    assert row(card, "position", "perfect", 32).heading_deg.value < 0.1
+            best = {
+                what: row(card, what, "perfect", horizon, motion).figure.value for what in ("PSNR", "SSIM", "sharpness")
+            }
+            assert best["PSNR"] == pytest.approx(PSNR_CAP_DB, abs=2) and best["SSIM"] > 0.999
+            assert best["sharpness"] == pytest.approx(1, abs=0.01)
+    assert row(card, "PSNR: true actions over other actions", "perfect", 32).figure.low > 3
+    assert row(card, "PSNR: true actions over no action", "perfect", 32).figure.low > 3
+    assert row(card, "distance over the way gone, mean", "perfect", 32).figure.value < 0.01
+    assert row(card, "distance", "perfect", 32).figure.value < 1e-4
+    assert row(card, "turn", "perfect", 32).figure.value < 0.002
+
+
+def test_every_figure_of_likeness_stands_beside_what_knows_nothing(card):
+    for horizon in (8, 32):
+        for what in ("PSNR", "distance", "turn"):
+            beside = row(card, what, "perfect", horizon).baselines
+            assert set(beside) == {"copy last", "other actions", "no action"}
+        right = row(card, "PSNR", "perfect", horizon)
+        assert all(right.figure.low > baseline.high for baseline in right.baselines.values())
+    assert all("copy last" in r.baselines for r in card.rows if r.probe == "pixels" and r.what in ("SSIM", "sharpness"))
+
+
+def test_the_verdict_comes_first(card, clips):
+    assert next(iter(as_dict(card))) == "verdict"
+    assert (
+        verdict(card)[0] == "panorama is better than copying the last frame at every horizon: after 1, 8 and 32 steps."
+    )
+    still = verdict(card_of({"still": Panorama("static")}, {"recorded": clips}))
+    assert still[0] == "panorama static is not better than copying the last frame, after 1, 8 and 32 steps."
+    faded = verdict(card_of({"fading": Panorama("blind")}, {"recorded": clips}))
+    assert "better than copying the last frame" in faded[0]
+    alone = verdict(card_of({"one": Panorama()}, {"recorded": clips[:1]}))
+    assert "not better" in alone[0] and "no clear difference" in alone[1], "one clip cannot say"
 
 
 def test_a_static_world_gains_nothing(card):
     for horizon in (1, 8, 32):
-        figure = row(card, "fidelity", "static", horizon, "predicted").gain
+        figure = row(card, "PSNR", "static", horizon).gain
         assert (figure.value, figure.low, figure.high) == (0, 0, 0)
 
 
 def test_a_deaf_world_is_found_out(card):
     for horizon in (8, 32):
-        figure = row(card, "control", "deaf", horizon).difference
-        assert figure.value == 0 and figure.low <= 0 <= figure.high
+        for others in ("other actions", "no action"):
+            figure = row(card, f"PSNR: true actions over {others}", "deaf", horizon).figure
+            assert figure.value == 0 and figure.low <= 0 <= figure.high
 
 
 def test_a_stride_ten_percent_too_long_is_measured_as_such(card, clips):
-    straight = row(card, "position", "long", 8).mean_share
-    assert 0.05 < straight.value <= 0.1001
-    assert row(card, "position", "long", 32).mean_share.count == sum(clip.walked_m()[-1] > 0.5 for clip in clips)
+    straight = row(card, "distance over the way gone, mean", "long", 8).figure
+    assert 5 < straight.value <= 10.01
+    went = sum(clip.walked_m()[-1] > 0.5 for clip in clips)
+    assert row(card, "distance over the way gone, mean", "long", 32).figure.count == went
 
 
 def test_fading_shows_in_sharpness_and_in_the_drop(card):
-    ratios = [row(card, "fidelity", "fading", horizon, "predicted").sharpness.value for horizon in (1, 8, 32)]
+    ratios = [row(card, "sharpness", "fading", horizon).figure.value for horizon in (1, 8, 32)]
     for horizon, ratio in zip((1, 8, 32), ratios):
         assert ratio == pytest.approx(np.exp(-2 * horizon / 50), abs=0.03)
-    drops = {drop.arm: drop.loss for drop in card.drops if (drop.motion, drop.place) == ("predicted", "recorded")}
+    drops = {arm: row(card, "PSNR lost from 8 to 32 steps", arm, 32).figure for arm in ("fading", "perfect")}
     assert drops["fading"].low > 3 and abs(drops["perfect"].value) < 2
 
 
 def test_true_motion_is_scored_only_where_the_world_takes_poses(card):
-    assert {r.motion for r in card.fidelity if r.arm == "shy"} == {"predicted"}
-    assert {r.motion for r in card.fidelity if r.arm == "long"} == {"predicted", "true"}
-    assert (
-        row(card, "fidelity", "long", 32, "true").psnr.value > row(card, "fidelity", "long", 32, "predicted").psnr.value
-    )
+    motions = {arm: {r.motion for r in card.rows if r.arm == arm and r.what == "PSNR"} for arm in ("shy", "long")}
+    assert motions == {"shy": {"predicted"}, "long": {"predicted", "true"}}
+    true, predicted = (row(card, "PSNR", "long", 32, motion).figure.value for motion in ("true", "predicted"))
+    assert true > predicted
+    assert {r.motion for r in card.rows if r.probe == "pose"} == {"predicted"}, "what was given is not predicted"
 
 
 def test_places_are_kept_apart_and_described(card):
@@ -101,64 +123,92 @@ def test_places_are_kept_apart_and_described(card):
         ("recorded", 12, 3, 32),
         ("new", 6, 3, 32),
     ]
-    assert row(card, "fidelity", "perfect", 8, "predicted", "new").psnr.count == 6
-    assert len(card.pictures) == 4 and card.pictures[0].rows["truth"].shape == (4, 24, 32, 3)
+    assert row(card, "PSNR", "perfect", 8, place="new").figure.count == 6
+    strips = [picture for picture in card.pictures if picture.probe == "pixels"]
+    assert len(strips) == 4 and strips[0].rows["truth, rgb"].shape == (4, 24, 32, 3)
 
 
 def test_the_same_seed_gives_the_same_card_whatever_the_other_arms(clips, card):
-    again = [score({"deaf": Panorama("deaf")}, {"recorded": clips}, make_rng(seed), CONFIG) for seed in (0, 0)]
+    again = [card_of({"deaf": Panorama("deaf")}, {"recorded": clips}) for _ in range(2)]
     assert to_json(again[0]) == to_json(again[1])
-    assert row(again[0], "fidelity", "deaf", 32).psnr.value == row(card, "fidelity", "deaf", 32).psnr.value
+    assert row(again[0], "PSNR", "deaf", 32).figure == row(card, "PSNR", "deaf", 32).figure
+
+
+def test_a_batch_of_clips_gives_the_figures_of_one_at_a_time(clips, card):
+    config = replace(exam_of({}).config, batch=1)
+    alone = card_of({"long": Panorama("long")}, {"recorded": clips}, config)
+    for what in ("PSNR", "distance", "sharpness"):
+        one, many = row(alone, what, "long", 32).figure, row(card, what, "long", 32).figure
+        assert one.value == pytest.approx(many.value, rel=1e-3) and one.count == many.count
 
 
 def test_the_json_is_strict_and_whole(card):
     told = json.loads(to_json(card), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    assert len(told["fidelity"]) == len(card.fidelity) and "pictures" not in told
-    assert told["fidelity"][1]["psnr"]["count"] == 12 and told["dt_s"] == pytest.approx(1 / 35, rel=1e-5)
+    assert len(told["rows"]) == len(card.rows) and "pictures" not in told
+    assert told["rows"][1]["figure"]["count"] == 12 and told["dt_s"] == pytest.approx(1 / 35, rel=1e-5)
+
+
+def test_what_a_world_lacks_is_listed_and_no_error(clips, card):
+    gone = {(one.probe, one.arm): one.why for one in card.missing}
+    assert (
+        gone["calibration", "perfect"].startswith("needs uncertainty") and gone["drift", "deaf"] == "needs longer clips"
+    )
+    assert ("pose", "perfect") not in gone and ("pixels", "perfect") not in gone
+    blind = card_of({"blind": Panorama("blind")}, {"recorded": clips})
+    assert {one.probe: one.why for one in blind.missing}["pose"] == "needs pose, of the world and of the recording"
+    assert not [r for r in blind.rows if r.probe == "pose"] and {r.motion for r in blind.rows} == {"predicted"}
 
 
 def test_bad_clips_are_named(clips):
     with pytest.raises(DatasetError, match="no clips of new places"):
-        score({"a": Panorama()}, {"new": []}, make_rng(0), CONFIG)
+        card_of({"a": Panorama()}, {"new": []})
     with pytest.raises(DatasetError, match="largest horizon is 128"):
-        score({"a": Panorama()}, {"recorded": clips}, make_rng(0))
+        card_of({"a": Panorama()}, {"recorded": clips}, ExamConfig())
     with pytest.raises(DatasetError, match="differ in length"):
-        score({"a": Panorama()}, {"recorded": [*clips, *some_clips(2, 40)]}, make_rng(0), CONFIG)
+        card_of({"a": Panorama()}, {"recorded": [*clips, *some_clips(2, 40)]})
 
 
-def test_one_clip_has_figures_without_intervals_and_no_control(clips):
-    card = score({"a": Panorama()}, {"recorded": clips[:1]}, make_rng(0), CONFIG)
-    assert not card.control and json.loads(to_json(card))["fidelity"][0]["psnr"]["low"] is None
+def test_one_clip_has_figures_without_intervals_and_no_other_actions(clips):
+    card = card_of({"a": Panorama()}, {"recorded": clips[:1]})
+    assert not [r for r in card.rows if "other actions" in r.what]
+    assert json.loads(to_json(card))["rows"][0]["figure"]["low"] is None
+
+
+def closure(world, clips, way, batch=12):
+    """The rows of a way there and back: of the frame after coming back, and of the far view seen again."""
+    return rows_of(("recorded", "a"), way, go(world, clips[:batch], way, make_rng(0)), lambda: make_rng(0))
 
 
 def test_closure_of_a_perfect_world_closes(clips):
-    done = closure(Panorama(), clips, make_rng(0), yaw_way(180))
-    assert not done.void and done.closed.value > 45 and done.far.value < 20
-    assert done.steps == 120 and done.picture.shape == (6, 24, 32, 3) and done.again.value > 45
-    assert np.array_equal(done.picture[1], done.picture[3]) and not np.array_equal(done.picture[0], done.picture[2])
+    back, again = closure(Panorama(), clips, yaw_way(180))
+    assert not back.void and back.figure.value > 45 and back.baselines["far view"].value < 20
+    gone = go(Panorama(), clips, yaw_way(180), make_rng(0))
+    frames = gone["frames"][0].numpy()
+    assert back.horizon == 120 and frames.shape == (6, 24, 32, 3) and again.figure.value > 45
+    assert np.array_equal(frames[1], frames[3]) and not np.array_equal(frames[0], frames[2])
 
 
 def test_closure_of_a_static_world_is_void(clips):
-    done = closure(Panorama("static"), clips, make_rng(0), yaw_way(180))
-    assert done.void and done.closed.value == PSNR_CAP_DB
+    back, again = closure(Panorama("static"), clips, yaw_way(180))
+    assert back.void and again.void and back.figure.value == PSNR_CAP_DB
 
 
 def test_closure_of_a_forgetful_world_does_not_close(clips):
-    done = closure(Panorama("forgetful"), clips, make_rng(0), yaw_way(180))
-    assert not done.void and done.closed.high < 20
+    back, _ = closure(Panorama("forgetful"), clips, yaw_way(180))
+    assert not back.void and back.figure.high < 20
 
 
 def test_a_walk_there_and_back_closes_where_the_place_is_remembered():
     clips = walkers(some_clips(8, 64), 100)
     assert clips and all(clip.walked_m()[49] >= 1 for clip in clips)
-    done = {flaw: closure(Panorama(flaw), clips, make_rng(0), walk_way(100)) for flaw in ("", "static", "forgetful")}
-    assert done[""].closed.value > 45 and done[""].steps == 100 and done[""].far_m > 0.5
-    assert done["static"].void and not done["forgetful"].void and done["forgetful"].closed.high < 20
-    assert done[""].again.value > 45 > 20 > done["forgetful"].again.high
-    assert done["static"].void_again and not done[""].void_again
+    done = {flaw: closure(Panorama(flaw), clips, walk_way(100)) for flaw in ("", "static", "forgetful")}
+    assert done[""][0].figure.value > 45 and done[""][0].horizon == 100 and "m away" in done[""][0].note
+    assert done["static"][0].void and not done["forgetful"][0].void and done["forgetful"][0].figure.high < 20
+    assert done[""][1].figure.value > 45 > 20 > done["forgetful"][1].figure.high
+    assert done["static"][1].void and not done[""][1].void
 
 
-def test_a_world_without_poses_is_turned_by_its_keys(clips):
+def test_a_world_without_poses_is_turned_by_its_actions(clips):
     class Keyed(Panorama):
         """Takes pictures alone, and shows no pose."""
 
@@ -172,29 +222,35 @@ def test_a_world_without_poses_is_turned_by_its_keys(clips):
 
     left, right = torch.tensor([0, 1, 0]), torch.tensor([0, 0, 1])
     start = Panorama()._state(torch.from_numpy(np.stack([clips[0].pose[0]] * 4)))
-    way = key_way(left, right, "left and right", 60)
-    done = closure(Keyed(), clips[:4], make_rng(0), way, batch=4)
-    assert done.steps == 60 and done.closed.value > 20 > done.far.value
+    back, _ = closure(Keyed(), clips, turn_way(left, right, "left and right", 60), batch=4)
+    assert back.horizon == 60 and back.figure.value > 20 > back.baselines["far view"].value
     with pytest.raises(ObservationError, match="does not observe 'pose'"):
-        closure(Keyed(), clips[:4], make_rng(0), yaw_way(90))
+        closure(Keyed(), clips, yaw_way(90), batch=4)
+
+
+def long_report(world, clips, steps, album=None, rollouts=8):
+    gone = long_rollout(world, clips, make_rng(0), steps, rollouts)
+    return stretches(gone, clips, album, "a", "recorded", make_rng(0))
 
 
 def test_long_dreams_of_the_perfect_world_stay_and_fading_ones_do_not(clips):
-    runs = {flaw: long_rollout(Panorama(flaw), clips, make_rng(0), steps=300, bucket=100) for flaw in ("", "fading")}
-    for bucket in runs[""].buckets:
-        assert bucket.matched > 0 and 0.9 < bucket.sharpness.value < 1.1
-        assert all(0.8 < f.value < 1.2 for f in (*bucket.colour_mean, *bucket.colour_std))
-    assert runs["fading"].buckets[-1].sharpness.value < 0.05
-    assert [(b.first, b.last) for b in runs[""].buckets] == [(1, 100), (101, 200), (201, 300)]
-    assert runs[""].picture.shape == (4, 24, 32, 3)
+    album = Album.of_cache(recording())
+    runs = {flaw: long_report(Panorama(flaw), clips, 300, album) for flaw in ("", "fading")}
+    for found in runs[""].rows:
+        assert 0.8 < found.figure.value < 1.2 or np.isnan(found.figure.value)
+    assert [found.what for found in runs[""].rows] == list(NAMES)
+    assert runs["fading"].rows[0].figure.value < 0.05
+    curve = runs[""].curves[0]
+    assert list(curve.x)[:3] == [30, 60, 90] and curve.x[-1] == 300
+    assert runs[""].pictures[0].rows["a"].shape == (11, 24, 32, 3)
 
 
 def test_a_fuller_album_matches_more_of_the_dream(clips):
-    own = long_rollout(Panorama(), clips, make_rng(0), steps=100)
-    full = long_rollout(Panorama(), clips, make_rng(0), steps=100, album=Album.of_cache(recording()))
-    assert full.buckets[0].matched > own.buckets[0].matched
-    low, high = full.natural
-    assert 0.8 < low < high < 1.2
+    own, full = (long_report(Panorama(), clips, 100, album) for album in (None, Album.of_cache(recording())))
+    share = [int(found.rows[0].note.partition("(")[2].partition("%")[0]) for found in (own, full)]
+    assert share[1] > share[0]
+    natural = full.rows[0].baselines["real stretches"]
+    assert 0.8 < natural.low < natural.high < 1.2
 
 
 def test_a_dream_that_leads_where_nobody_recorded_is_not_judged(clips):
@@ -202,9 +258,9 @@ def test_a_dream_that_leads_where_nobody_recorded_is_not_judged(clips):
         def nearest(self, pose, not_episode=None):
             return torch.full((len(pose),), -1)
 
-    nowhere = Elsewhere([(clip.rgb, clip.pose, clip.episode) for clip in clips])
-    run = long_rollout(Panorama(), clips, make_rng(0), steps=100, album=nowhere)
-    assert run.buckets[0].matched == 0 and np.isnan(run.buckets[0].sharpness.value) and np.isnan(run.natural[0])
+    nowhere = Elsewhere([(clip.channels["rgb"], clip.pose, clip.episode) for clip in clips])
+    found = long_report(Panorama(), clips, 100, nowhere).rows[0]
+    assert "(0% of" in found.note and np.isnan(found.figure.value) and np.isnan(found.baselines["real stretches"].low)
 
 
 def test_the_album_finds_the_nearest_view_and_no_far_one():
@@ -220,14 +276,20 @@ def test_the_album_finds_the_nearest_view_and_no_far_one():
 
 
 def test_a_world_without_poses_is_held_against_the_mean(clips):
-    world = Panorama("blind")
-    run = long_rollout(world, clips, make_rng(0), steps=100)
-    assert run.reference == "the mean of the recordings" and run.buckets[0].matched == 1
-    assert run.natural[0] < 1 < run.natural[1]
-    card = score({"blind": world}, {"recorded": clips}, make_rng(0), CONFIG)
-    assert not card.position and {found.motion for found in card.fidelity} == {"predicted"}
+    found = long_report(Panorama("blind"), clips, 100).rows[0]
+    assert "the mean of the recordings (100%" in found.note
+    assert found.baselines["real stretches"].low < 1 < found.baselines["real stretches"].high
 
 
 def test_speed_counts_what_it_timed(clips):
-    timed = speed(Panorama(), clips, make_rng(0), "a", steps=40)
-    assert timed.threads == torch.get_num_threads() and 0 < timed.median_ms <= timed.p95_ms
+    timed = speed(Panorama(), clips, make_rng(0), steps=40)
+    assert int(timed["threads"]) == torch.get_num_threads() and len(timed["ms"]) == 40 and timed["ms"].min() > 0
+
+
+def test_nothing_learns_here(clips):
+    class Watched(Panorama):
+        def imagine(self, state, action, rng):
+            assert torch.is_inference_mode_enabled()
+            return super().imagine(state, action, rng)
+
+    examine(exam_of({"a": Watched()}, {"recorded": clips[:2]}))

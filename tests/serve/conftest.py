@@ -46,7 +46,7 @@ class ListSink:
 
 
 @contextlib.contextmanager
-def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None):
+def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, policy=None):
     listener = open_port(host, 0)
     ready, addresses = threading.Event(), []
 
@@ -61,8 +61,9 @@ def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None):
         return sinks[-1]
 
     server = make_server(
-        worlds, listener, host, token, sink_factory if record else None, on_ready, config=config or ServeConfig()
-    )
+        worlds, listener, host, token, sink_factory if record else None, on_ready, config=config or ServeConfig(),
+        policy=policy,
+    )  # fmt: skip
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     assert ready.wait(20), "the server did not start"

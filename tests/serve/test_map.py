@@ -10,9 +10,9 @@ import torch
 
 from terrella.core import check_world
 from terrella.core.errors import ProtocolError
-from terrella.serve.chart import mapped, tells_known, tinted
+from terrella.serve.chart import knows_share, mapped, tinted
 from terrella.serve.protocol import Show, parse_message
-from terrella.serve.story import Story
+from terrella.serve.timeline import Timeline
 
 from .mapped import SLOTS, Mapped
 from .panorama import Panorama
@@ -31,37 +31,37 @@ def test_show_is_read_and_junk_is_refused():
 
 
 def test_a_chart_tells_keyframes_only_when_they_changed():
-    story = Story([Mapped()], seed=0)
-    number, first = story.chart()
+    timeline = Timeline([Mapped()], seed=0)
+    number, first = timeline.chart()
     body = first.body(None)
-    assert number == 0 and len(body["keyframes"]) == 4 and body["known"] == 0.5 and len(body["eye"]) == 3
-    story.step(["KeyW"])
-    _, second = story.chart()
-    assert "keyframes" not in second.body(first) and second.eye[0] == pytest.approx(0.1)
+    assert number == 0 and len(body["keyframes"]) == 4 and body["known"] == 0.5 and len(body["camera"]) == 3
+    timeline.step(["KeyW"])
+    _, second = timeline.chart()
+    assert "keyframes" not in second.body(first) and second.camera[0] == pytest.approx(0.1)
     for _ in range(20):
-        story.step(["ArrowLeft"])
-    _, third = story.chart()
+        timeline.step(["ArrowLeft"])
+    _, third = timeline.chart()
     assert third.body(second)["keyframes"][4:] == [0.5, 0.0, 0.7, 2.0]
-    assert third.eye[2] != second.eye[2]
+    assert third.camera[2] != second.camera[2]
 
 
 def test_the_past_has_its_own_map():
-    story = Story([Mapped()], seed=0)
+    timeline = Timeline([Mapped()], seed=0)
     for _ in range(45):
-        story.step([])
-    assert len(story.chart()[1].keyframes) == 3
-    story.stand_at(3)
-    assert len(story.chart()[1].keyframes) == 1
+        timeline.step([])
+    assert len(timeline.chart()[1].keyframes) == 3
+    timeline.stand_at(3)
+    assert len(timeline.chart()[1].keyframes) == 1
 
 
 def test_a_world_without_these_channels_has_no_map():
-    assert not mapped(Panorama().spec) and not tells_known(Panorama().spec)
-    story = Story([Panorama()], seed=0)
-    assert story.chart() is None and story.tinted(story.shown) == story.shown.images
+    assert not mapped(Panorama().spec) and not knows_share(Panorama().spec)
+    timeline = Timeline([Panorama()], seed=0)
+    assert timeline.chart() is None and timeline.images(timeline.shown, invented=True) == timeline.shown.images
 
 
 def test_of_two_worlds_the_dream_is_drawn():
-    assert Story([Panorama(), Mapped()], seed=0).chart()[0] == 1
+    assert Timeline([Panorama(), Mapped()], seed=0).chart()[0] == 1
 
 
 def test_what_is_known_keeps_its_colours_and_the_rest_turns_amber():
@@ -87,18 +87,18 @@ def inside(page) -> np.ndarray:
     return np.array(data, np.uint8).reshape(*size, 4)[..., :3]
 
 
-def test_the_map_shows_keyframes_by_kind_and_the_eye(serve_world, open_page):  # noqa: F811
+def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 100)]).url)
     until(page, f"terrella.map.shown && terrella.map.keyframes === {SLOTS}")
-    assert page.locator("#map-known").text_content() == "50% remembered"
-    assert page.locator("#map-kinds span").all_text_contents() == ["3 recorded", "3 observed", "2 dreamt"]
+    assert page.locator("#map-known").text_content() == "50% from memory"
+    assert page.locator("#map-kinds span").all_text_contents() == ["3 recorded", "3 observed", "2 imagined"]
     page.keyboard.down("KeyW")
-    until(page, "terrella.map.path > 8 && terrella.map.eye[0] > 1")
+    until(page, "terrella.map.path > 8 && terrella.map.camera[0] > 1")
     page.keyboard.up("KeyW")
     red, green, blue = (inside(page)[..., channel].astype(int) for channel in range(3))
     assert ((green > red + 15) & (green > blue)).sum() > 20, "observed"
-    assert ((red > blue + 15) & (red > green)).sum() > 20, "dreamt"
-    assert (np.minimum(np.minimum(red, green), blue) > 200).sum() > 8, "the eye"
+    assert ((red > blue + 15) & (red > green)).sum() > 20, "imagined"
+    assert (np.minimum(np.minimum(red, green), blue) > 200).sum() > 8, "the camera"
     box, screen = page.locator("#map").bounding_box(), page.locator("#deck").bounding_box()
     assert box["x"] + box["width"] <= 1280 and box["y"] + box["height"] <= screen["y"] + 1
     page.keyboard.press("KeyM")
@@ -172,7 +172,7 @@ def test_on_a_phone_it_is_closed_at_first_and_fits_when_opened(serve_world, open
     page = open_page(serve_world([Mapped(size=(96, 128))]).url, **phone)
     assert not page.evaluate("terrella.map.shown")
     page.click("#map-open")
-    until(page, "terrella.map.shown && terrella.map.eye !== null")
+    until(page, "terrella.map.shown && terrella.map.camera !== null")
     for name in ("#map", "#pause", "#clip", "#map-open", "#about"):
         box = page.locator(name).bounding_box()
         assert box["x"] >= 0 and box["y"] >= 0, name

@@ -15,9 +15,9 @@ from PIL import Image
 
 from terrella.core import Spec
 from terrella.core.errors import ObservationError, ProtocolError, ServeError
-from terrella.serve.picture import MAX_DROPPED_PIXELS, doubtful, picture_of, read_picture
+from terrella.serve.picture import MAX_DROPPED_PIXELS, picture_of, read_picture, uncertainty_levels
 from terrella.serve.protocol import MAX_PICTURE, Picture, parse_message
-from terrella.serve.story import Story
+from terrella.serve.timeline import Timeline
 
 from .panorama import Panorama
 from .test_page import open_page, until  # noqa: F401
@@ -142,46 +142,46 @@ def test_bytes_from_a_page_are_pictures_and_bounded():
 
 
 def test_a_story_begins_with_a_picture_and_returns_to_it():
-    story = Story([Gallery()], 0)
-    before = story.shown.step
-    moment = story.enter(image(64, 48))
-    assert moment.step == before + 1 and story.notice == "", "half red is not strange"
+    timeline = Timeline([Gallery()], 0)
+    before = timeline.shown.step
+    moment = timeline.enter(image(64, 48))
+    assert moment.step == before + 1 and timeline.notice == "", "half red is not strange"
     assert moment.uncertainty == pytest.approx(0.05, abs=0.005)
-    story.enter(image(64, 48, "BMP"))
-    again = story.restart(3)
+    timeline.enter(image(64, 48, "BMP"))
+    again = timeline.restart(3)
     assert again.uncertainty == pytest.approx(0.05, abs=0.005), "the same picture"
-    assert story.restart(4, same_picture=False).uncertainty == 0
+    assert timeline.restart(4, same_picture=False).uncertainty == 0
 
 
 def test_what_the_world_doubts_is_said():
     world = Gallery()
     world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.01, "invents": 0.04}})
-    assert doubtful(world.spec) == (0.01, 0.04)
-    story = Story([world], 0, picture=picture_of(image(64, 48), SIZE))
-    assert "unlike" in story.notice
-    story.restart(0, same_picture=False)
-    assert story.notice == ""
+    assert uncertainty_levels(world.spec) == (0.01, 0.04)
+    timeline = Timeline([world], 0, picture=picture_of(image(64, 48), SIZE))
+    assert "unlike" in timeline.notice
+    timeline.restart(0, same_picture=False)
+    assert timeline.notice == ""
 
 
 def test_a_picture_that_is_refused_leaves_the_story():
-    story = Story([Gallery()], 0)
-    shown = story.shown
+    timeline = Timeline([Gallery()], 0)
+    shown = timeline.shown
     with pytest.raises(ServeError, match="no image"):
-        story.enter(b"nothing")
-    assert story.shown is shown
-    plain = Story([Panorama()], 0)
+        timeline.enter(b"nothing")
+    assert timeline.shown is shown
+    plain = Timeline([Panorama()], 0)
     with pytest.raises(ServeError, match="takes no pictures"):
         plain.enter(image())
     assert plain.restart(1).step == 0, "it goes on without the picture"
-    both = Story([Gallery(), Gallery()], 0)
+    both = Timeline([Gallery(), Gallery()], 0)
     with pytest.raises(ServeError, match="compar"):
         both.enter(image())
 
 
 def test_a_world_that_does_not_doubt_shows_no_bar():
     spec: Spec = Panorama().spec
-    assert doubtful(spec) is None
-    assert Story([Panorama()], 0).shown.uncertainty == -1
+    assert uncertainty_levels(spec) is None
+    assert Timeline([Panorama()], 0).shown.uncertainty == -1
 
 
 DROP = """([data, type]) => {
@@ -198,10 +198,10 @@ def test_a_picture_dropped_on_the_page_is_stepped_into(serve_world, open_page): 
     world = Gallery()
     world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.01, "invents": 0.04}})
     page = open_page(serve_world([world]).url)
-    assert page.evaluate("terrella.doubtful") == "sure"
-    assert page.evaluate("document.getElementById('doubt').dataset.level") == "sure"
+    assert page.evaluate("terrella.uncertaintyLevel") == "low"
+    assert page.evaluate("document.getElementById('uncertainty').dataset.level") == "low"
     page.evaluate(DROP, [base64.b64encode(image(3000, 2000)).decode(), "image/png"])
-    until(page, "terrella.doubtful === 'inventing'")
+    until(page, "terrella.uncertaintyLevel === 'high'")
     assert "unlike" in page.text_content("#toast")
     middle = "(() => { const c = document.querySelector('figure canvas'); const d = c.getContext('2d').getImageData(4, 30, 1, 1).data; return [d[0], d[2]]; })()"  # noqa: E501
     red, blue = page.evaluate(middle)
@@ -213,12 +213,12 @@ def test_a_picture_dropped_on_the_page_is_stepped_into(serve_world, open_page): 
 
 def test_a_page_of_a_world_without_doubt_has_no_bar(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Panorama()]).url)
-    assert page.evaluate("document.getElementById('doubt').hidden")
-    assert page.evaluate("terrella.doubt") == -1
+    assert page.evaluate("document.getElementById('uncertainty').hidden")
+    assert page.evaluate("terrella.uncertainty") == -1
 
 
 @pytest.mark.parametrize("told", ["x", float("nan"), -1, None, [0.1]])
 def test_a_strangers_card_does_not_set_the_bar(told):
     space = spaces.Box(0, 1, (), np.float32)
     spec = Spec("strange", spaces.Discrete(2), {"uncertainty": space}, (), 0.1, card={"uncertainty": {"sure": told}})
-    assert doubtful(spec) == (0.02, 0.08)
+    assert uncertainty_levels(spec) == (0.02, 0.08)

@@ -10,9 +10,24 @@ from hypothesis import strategies as st
 
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
-from terrella.serve.protocol import Ack, Branch, Frame, Keys, Pause, Record, Restart, Resume, Rewind, Seek, Sync
+from terrella.serve.history import Image
+from terrella.serve.protocol import (
+    Ack,
+    Branch,
+    Controls,
+    Drive,
+    Frame,
+    Pause,
+    Record,
+    Restart,
+    Resume,
+    Rewind,
+    Seek,
+    Show,
+    Sync,
+)
 
-u32 = st.integers(0, 2**32 - 1)
+u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)
 f32 = st.floats(width=32, allow_nan=False)
 f64 = st.floats(allow_nan=False)
 frames = st.builds(
@@ -21,7 +36,7 @@ frames = st.builds(
     step=u32,
     oldest=u32,
     newest=u32,
-    images=st.lists(st.binary(max_size=64), max_size=3).map(tuple),
+    images=st.lists(st.builds(Image, world=u8, camera=u8, jpeg=st.binary(max_size=64)), max_size=3).map(tuple),
     flags=st.integers(0, 255),
     action_id=u32,
     generation_ms=f32,
@@ -61,9 +76,12 @@ def test_no_bytes_crash_the_reader(data):
 )
 def test_no_field_crashes_the_reader(value):
     for kind, name in [
-        ("keys", "id"),
-        ("keys", "held"),
-        ("keys", "t"),
+        ("controls", "id"),
+        ("controls", "held"),
+        ("controls", "t"),
+        ("controls", "axes"),
+        ("show", "cameras"),
+        ("drive", "on"),
         ("ack", "seq"),
         ("seek", "step"),
         ("record", "on"),
@@ -78,7 +96,12 @@ def test_no_field_crashes_the_reader(value):
 
 def test_every_message_is_understood():
     said = {
-        '{"type": "keys", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': Keys(7, ("KeyW", "ArrowLeft"), 12.5),
+        '{"type": "controls", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': Controls(
+            7, ("KeyW", "ArrowLeft"), (), 12.5
+        ),
+        '{"type": "controls", "id": 8, "held": [], "axes": [0.5, -1]}': Controls(8, (), (0.5, -1.0)),
+        '{"type": "drive", "on": false}': Drive(False),
+        '{"type": "show", "map": true, "invented": false, "cameras": ["rgb.wrist"]}': Show(True, False, ("rgb.wrist",)),
         '{"type": "ack", "seq": 3}': Ack(3),
         '{"type": "pause"}': Pause(),
         '{"type": "resume"}': Resume(),
@@ -100,8 +123,10 @@ def test_every_message_is_understood():
         ("", "not JSON"),
         ("[1]", "object"),
         ('{"type": "format"}', "no message is called 'format'"),
-        ('{"type": "keys", "id": -1, "held": []}', "'id'"),
-        ('{"type": "keys", "id": 1, "held": "KeyW"}', "'held'"),
+        ('{"type": "controls", "id": -1, "held": []}', "'id'"),
+        ('{"type": "controls", "id": 1, "held": "KeyW"}', "'held'"),
+        ('{"type": "controls", "id": 1, "held": [], "axes": [NaN]}', "'axes'"),
+        ('{"type": "controls", "id": 1, "held": [], "axes": [true]}', "'axes'"),
         ('{"type": "ack", "seq": true}', "'seq'"),
         ('{"type": "record", "on": 1}', "'on'"),
         ("[" * 4000, "JSON"),
@@ -123,7 +148,7 @@ def test_a_card_becomes_plain_json():
 
 
 def test_vitals_ride_at_the_end_of_a_frame():
-    frame = protocol.Frame(1, 2, 0, 2, (b"jpeg", b"other"), vitals=(42.0, 3.0))
+    frame = protocol.Frame(1, 2, 0, 2, (Image(0, 0, b"jpeg"), Image(1, 0, b"other")), vitals=(42.0, 3.0))
     assert protocol.decode_frame(protocol.encode_frame(frame)) == frame
     with pytest.raises(ProtocolError):
         protocol.decode_frame(protocol.encode_frame(frame)[:-1])

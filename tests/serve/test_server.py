@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import errno
 import io
 import json
 import socket
@@ -15,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from terrella.core.errors import ServeError
-from terrella.serve import serve
+from terrella.serve import door, serve
 from terrella.serve.guard import RateLimit, is_loopback, refusal
 from terrella.serve.protocol import decode_frame
 from terrella.serve.server import ServeConfig, open_port
@@ -74,9 +77,13 @@ def test_a_page_is_told_about_the_world_and_gets_frames(serve_world):
     with Client(serve_world().socket_url) as client:
         hello = client.event("hello")
         world = hello["worlds"][0]
-        assert world["name"] == "panorama" and world["size"] == [48, 64] and world["card"]["scores"] == {"psnr": 31.2}
+        assert (
+            world["name"] == "panorama"
+            and world["cameras"] == [{"channel": "rgb", "name": "main", "size": [48, 64]}]
+            and world["card"]["scores"] == {"psnr": 31.2}
+        )
         frame = client.frame(5)
-        assert frame.images[0][:2] == b"\xff\xd8" and frame.newest == frame.step and frame.generation_ms > 0
+        assert frame.images[0].jpeg[:2] == b"\xff\xd8" and frame.newest == frame.step and frame.generation_ms > 0
 
 
 def test_two_worlds_come_side_by_side(serve_world):
@@ -117,7 +124,7 @@ def test_a_flood_is_cut_off_and_the_server_lives(serve_world):
     server = serve_world(config=ServeConfig(per_s=50, burst=100))
     with Client(server.socket_url) as client, pytest.raises(ConnectionClosed):
         for number in range(5000):
-            client.say("keys", id=number, held=["KeyW"], t=0)
+            client.say("controls", id=number, held=["KeyW"], t=0)
         while True:
             client.next()
     with Client(server.socket_url) as client:
@@ -279,3 +286,95 @@ def test_recording_without_a_folder_says_so(serve_world):
         assert "--record" in client.event("hello")["no_record"]
         client.say("record", on=True)
         assert "--record" in client.event("error")["text"]
+
+
+def raw(server) -> socket.socket:
+    """A connection on which nothing is said yet."""
+    port = int(server.url.partition("?")[0].rstrip("/").rpartition(":")[2])
+    return socket.create_connection(("127.0.0.1", port), timeout=10)
+
+
+def closed(connection: socket.socket) -> bool:
+    """Whether the server has let go of it (waits up to the timeout)."""
+    try:
+        return connection.recv(1) == b""
+    except ConnectionError:
+        return True
+    except TimeoutError:
+        return False
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"POST /a HTTP/1.1\r\nHost: localhost\r\nContent-"],
+)
+def test_a_request_that_is_not_finished_in_time_is_closed(serve_world, monkeypatch, begun):
+    monkeypatch.setattr(door, "REQUEST_S", 0.3)
+    server = serve_world()
+    with raw(server) as slow:
+        slow.sendall(begun)
+        assert closed(slow)
+
+
+def test_a_second_request_has_a_deadline_too(serve_world, monkeypatch):
+    monkeypatch.setattr(door, "REQUEST_S", 0.5)
+    server = serve_world()
+    with raw(server) as slow:
+        slow.sendall(b"GET /icon.svg HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert slow.recv(100).startswith(b"HTTP/1.1 200")
+        slow.sendall(b"GET /icon")
+        end = time.monotonic() + 5
+        while slow.recv(65536):
+            assert time.monotonic() < end
+
+
+def test_those_who_wait_cannot_lock_others_out(serve_world, monkeypatch, capfd):
+    monkeypatch.setattr(door, "MOST_WAITING", 8)
+    server = serve_world(token="sesame")
+    with contextlib.ExitStack() as stack:
+        idle = [stack.enter_context(raw(server)) for _ in range(60)]
+        for _ in range(3):
+            assert get(server.url)[0] == 200
+        with Client(server.socket_url + "?token=sesame") as client:
+            client.frame(2)
+        assert sum(closed(connection) for connection in idle[:40]) == 40, "the oldest make room"
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_running_out_of_descriptors_is_said_in_a_line(capfd):
+    loop = asyncio.new_event_loop()
+    try:
+        door.quiet_accepting(loop)
+        for _ in range(100):
+            error = OSError(errno.EMFILE, "Too many open files")
+            loop.call_exception_handler({"message": "socket.accept() out of system resource", "exception": error})
+    finally:
+        loop.close()
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "Too many open files" in said
+
+
+def test_a_refused_websocket_leaves_no_error_in_the_log(serve_world, capfd):
+    server = serve_world(token="sesame")
+    for _ in range(2):
+        with pytest.raises(InvalidStatus), Client(server.socket_url):
+            pass
+    hello = b"GET /play HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    with raw(server) as gone:  # and one that does not wait for the answer
+        gone.sendall(hello + b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n")
+    time.sleep(0.5)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_closed_tab_lets_another_record(serve_world):
+    server = serve_world()
+    with Client(server.socket_url) as client:
+        client.say("record", on=True)
+        while not client.event("status")["recording"]:
+            pass
+        client.frame(client.frame().step + 4)
+    for _ in range(1000):
+        if server.sinks[0].closed:
+            break
+        time.sleep(0.01)
+    assert server.sinks[0].closed and server.sinks[0].ends == 1, "long before the session itself is given up"

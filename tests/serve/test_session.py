@@ -6,9 +6,9 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from terrella.serve.protocol import REPLAY, Ack, Branch, Keys, Pause, Restart, Resume, Rewind, Seek, decode_frame
+from terrella.serve.protocol import REPLAY, Ack, Branch, Controls, Pause, Restart, Resume, Rewind, Seek, decode_frame
 from terrella.serve.session import MAX_UNACKED, Session
-from terrella.serve.story import Story
+from terrella.serve.timeline import Timeline
 
 from .panorama import Panorama
 
@@ -50,7 +50,7 @@ def play(scenario, world=None) -> None:
 
     async def main() -> None:
         with ThreadPoolExecutor(1) as worker:
-            session = Session(lambda: Story([world or Panorama(dt_s=1 / 400)], seed=0), worker)
+            session = Session(lambda: Timeline([world or Panorama(dt_s=1 / 400)], seed=0), worker)
             task = asyncio.create_task(session.run())
             try:
                 await scenario(session)
@@ -71,7 +71,7 @@ def test_a_silent_browser_gets_two_frames_and_no_more():
         session.hear(Ack(socket.frames[0].seq))
         await until(lambda: len(socket.frames) == MAX_UNACKED + 1)
         await asyncio.sleep(0.05)
-        assert socket.most_unacked == MAX_UNACKED and session.story.newest_step == MAX_UNACKED
+        assert socket.most_unacked == MAX_UNACKED and session.timeline.newest_step == MAX_UNACKED
 
     play(scenario)
 
@@ -95,9 +95,9 @@ def test_the_latest_keys_win_and_are_named_in_the_frame():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: socket.frames)
-        session.hear(Keys(1, ("ArrowLeft",), 5.0))
-        session.hear(Keys(3, ("KeyW",), 7.0))
-        session.hear(Keys(2, ("ArrowLeft",), 6.0))  # late, and older
+        session.hear(Controls(1, ("ArrowLeft",), t=5.0))
+        session.hear(Controls(3, ("KeyW",), t=7.0))
+        session.hear(Controls(2, ("ArrowLeft",), t=6.0))  # late, and older
         await until(lambda: socket.last.action_id == 3)
         obeyed = next(frame for frame in socket.frames if frame.action_id == 3)
         assert obeyed.client_ms == 7.0
@@ -165,19 +165,19 @@ def test_a_dropped_socket_pauses_the_story_and_another_goes_on():
     async def scenario(session):
         first = FakeSocket(session)
         session.attach(first)
-        session.hear(Keys(50, ("KeyW",)))
+        session.hear(Controls(50, ("KeyW",)))
         await until(lambda: first.frames and first.last.step >= 5)
         session.detach(first)
         await asyncio.sleep(0.05)
-        step = session.story.newest_step
+        step = session.timeline.newest_step
         await asyncio.sleep(0.05)
-        assert session.story.newest_step == step
+        assert session.timeline.newest_step == step
         second = FakeSocket(session)
         assert session.attach(second) is None
         await until(lambda: second.frames and second.last.step > step)
         assert second.frames[0].step == step and second.frames[0].seq > first.last.seq
         score = second.last.episode_return
-        session.hear(Keys(1, ("ArrowLeft",)))  # a reloaded page counts anew, and no key of the old page is held
+        session.hear(Controls(1, ("ArrowLeft",)))  # a reloaded page counts anew, and no key of the old page is held
         await until(lambda: second.last.action_id == 1)
         assert second.last.episode_return == score
 

@@ -65,7 +65,9 @@ def test_an_old_world_is_converted_without_loss(tmp_path, capsys, more):
     assert main(["play", str(tmp_path / "old")]) == 2 and "terrella convert-world" in capsys.readouterr().err
     assert main(["convert-world", str(tmp_path / "old"), str(tmp_path / "new")]) == 0
     converted = load_world(tmp_path / "new")
-    assert (tmp_path / "new" / "memory.safetensors").read_bytes() == (tmp_path / "old" / "memory.safetensors").read_bytes()
+    assert (tmp_path / "new" / "memory.safetensors").read_bytes() == (
+        tmp_path / "old" / "memory.safetensors"
+    ).read_bytes()
     assert converted.config == world.config and converted.spec.channels == world.spec.channels
     assert converted.spec.card == {**world.spec.card, "objects_looks": 4}
     for part in ("generator", "outcome", "objects", "uncertainty"):

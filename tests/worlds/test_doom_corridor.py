@@ -24,7 +24,9 @@ def world() -> LearnedWorld:
 def heights(world: LearnedWorld, billboards: torch.Tensor) -> torch.Tensor:
     """How tall billboards [..., COLUMNS] are, in metres; nan where there is none."""
     look = billboards[..., LOOK].long()
-    return torch.where((billboards[..., NUMBER] > 0) & (look >= 0), world.objects.boxes[look.clamp_min(0), 3], torch.nan)
+    return torch.where(
+        (billboards[..., NUMBER] > 0) & (look >= 0), world.objects.boxes[look.clamp_min(0), 3], torch.nan
+    )
 
 
 def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
@@ -61,7 +63,11 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
             low = torch.zeros(STORIES, dtype=torch.bool)
             for _ in range(STEPS):
                 billboards = objects.step(
-                    billboards, torch.ones(STORIES, objects.config.rows, dtype=torch.bool), looks, acts, chance.seeds(STORIES, rng)
+                    billboards,
+                    torch.ones(STORIES, objects.config.rows, dtype=torch.bool),
+                    looks,
+                    acts,
+                    chance.seeds(STORIES, rng),
                 )
                 low |= heights(world, billboards[:, 0]) < LOW_M
             fell.append(float(low.float().mean()))

@@ -9,8 +9,8 @@ from gymnasium import spaces
 
 from terrella.core import check_world, make_rng
 from terrella.core.errors import ActionError
-from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.config import VideoConfig
+from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import Generator
 from terrella.worlds.history import FrameHistory, Starts

@@ -22,7 +22,9 @@ KINDS = {"buttons": Controls.buttons(3), "choice": Controls(CHOICE, (2.0,), (5.0
 
 
 @pytest.mark.parametrize("controls", KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize("more", [{}, {"moving": True}, {"moving": True, "objects": True}], ids=["still", "moving", "things"])
+@pytest.mark.parametrize(
+    "more", [{}, {"moving": True}, {"moving": True, "objects": True}], ids=["still", "moving", "things"]
+)
 def test_every_kind_of_action_and_of_parts_keeps_the_contract(controls, more):
     world = place(controls, **more)
     held = check_world(world, steps=3)
@@ -33,7 +35,11 @@ def test_every_kind_of_action_and_of_parts_keeps_the_contract(controls, more):
 def test_controls_are_those_of_a_spec_and_the_spec_says_what_axes_mean():
     world = place(STEERING)
     assert Controls.of(world.spec) == STEERING
-    assert (world.spec.action_mode, world.spec.action_units, world.spec.action_frame) == ("velocity", ("m/s", "rad/s"), "body")
+    assert (world.spec.action_mode, world.spec.action_units, world.spec.action_frame) == (
+        "velocity",
+        ("m/s", "rad/s"),
+        "body",
+    )
     assert Controls.of(place(KINDS["choice"]).spec) == KINDS["choice"]
 
 
@@ -74,7 +80,9 @@ def test_gradients_are_the_callers():
     """No verb forces a mode: in grad mode tensors are ordinary, in inference mode they are not."""
     world, rng = place(KINDS["buttons"], moving=True, objects=True), make_rng(0)
     with torch.inference_mode():
-        inside = world.render(world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng), ("rgb", "pose"))
+        inside = world.render(
+            world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng), ("rgb", "pose")
+        )
     outside = world.render(world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng), ("rgb", "pose"))
     assert inside["pose"].is_inference() and not outside["pose"].is_inference() and not outside["rgb"].is_inference()
     assert not outside["pose"].requires_grad and not world.spec.differentiable, "weights of a finished world need none"
@@ -122,6 +130,8 @@ def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
     """No loop over the batch: the bundled world's generator runs as often for eight episodes as for one."""
     world, calls = terrella.load("doom-maze"), []
     real = Generator.forward
-    monkeypatch.setattr(Generator, "forward", lambda self, noisy, *rest: (calls.append(len(noisy)), real(self, noisy, *rest))[1])
+    monkeypatch.setattr(
+        Generator, "forward", lambda self, noisy, *rest: (calls.append(len(noisy)), real(self, noisy, *rest))[1]
+    )
     walk(world, look=True, steps=1, batch=8)
     assert sum(calls) == 8 and len(calls) <= 2

@@ -91,9 +91,13 @@ def test_by_chance_as_often_as_told():
     objects.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
     many, rng = billboards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
     seen = torch.ones(800, 4, dtype=torch.bool)
-    looks = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[:, 0, LOOK]
+    looks = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[
+        :, 0, LOOK
+    ]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[:, 0, LOOK]
+    again = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[
+        :, 0, LOOK
+    ]
     assert torch.equal(looks, again)
 
 
@@ -145,9 +149,13 @@ def bodies(objects: Objects, there: torch.Tensor, height: float) -> torch.Tensor
 def test_evidence_of_a_batch_is_taken_as_each_alone():
     """Known again, new, seen in part or not at all, in rows of their own: as many episodes at once as one by one."""
     objects, rng = two_looks(), make_rng(3)
-    before = torch.stack([billboards(objects, *(3 + 3 * torch.rand(4, 3, generator=rng)).tolist())[0] for _ in range(6)])
+    before = torch.stack(
+        [billboards(objects, *(3 + 3 * torch.rand(4, 3, generator=rng)).tolist())[0] for _ in range(6)]
+    )
     before[..., NUMBER] = torch.stack([torch.randperm(9, generator=rng)[:4] for _ in range(6)])
-    now = torch.stack([billboards(objects, *((-2 + 4 * torch.rand(3, 3, generator=rng)).tolist()))[0] for _ in range(6)])
+    now = torch.stack(
+        [billboards(objects, *((-2 + 4 * torch.rand(3, 3, generator=rng)).tolist()))[0] for _ in range(6)]
+    )
     now[..., :3, NUMBER] = torch.stack([torch.randperm(9, generator=rng)[:3] for _ in range(6)]).float()
     now[..., :3, 1] = torch.tensor([3.0, 4.0, 5.0])
     behind = torch.full((6, 3, *SIZE), 0.3), torch.full((6, *SIZE), 9.0)

@@ -15,7 +15,7 @@ from PIL import Image
 from ..core.errors import DatasetError
 from ..data.format import AUTOMATIC, PICTURE, TIME, Layout, contained, sensor_from_json
 from ..data.storage import boxes
-from .tables import open_parquet, read_whole
+from ..data.storage.tables import open_parquet, read_whole
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, AttributeError, DatasetError)
 _UNREADABLE = (*BROKEN, av.FFmpegError, IndexError, Image.DecompressionBombError, Image.DecompressionBombWarning)
@@ -27,7 +27,7 @@ def features_without_info(
     root: Path, about: Mapping, data: list[str], films: list[str], video_path: str, fps: float
 ) -> dict[str, dict]:
     """Without info.json: what meta/terrella.json, the tables and the videos tell."""
-    form = next(_forms(root, data), None)
+    form = next(schemas_of(root, data), None)
     try:
         sensors = {name: sensor_from_json(name, said) for name, said in dict(about["sensors"]).items()}
         pictures = "png" if form is not None and PICTURE in form.types else "video"
@@ -39,7 +39,7 @@ def features_without_info(
 def features_of_files(root: Path, data: list[str], films: list[str], video_path: str) -> dict[str, dict]:
     """The features that the tables and videos have."""
     found = {}
-    for part in next(_forms(root, data), ()):
+    for part in next(schemas_of(root, data), ()):
         found |= {part.name: feature} if (feature := _of_column(root, data, part)) else {}
     for name in sorted({camera for file in films if (camera := camera_of(file, video_path))}):
         size = film_size(root, films, video_path, name)
@@ -54,7 +54,7 @@ def mended_features(
 ) -> dict[str, dict]:
     """The features as the rows and videos have them; what info.json says otherwise is added to `said`."""
     found = {name: dict(feature) for name, feature in features.items()}
-    forms = list(_forms(root, data))
+    forms = list(schemas_of(root, data))
     cameras = {camera for file in films if (camera := camera_of(file, video_path))}
     if forms or cameras:  # else there is no episode yet: what is promised may still come
         columns = {name for form in forms for name in form.names}
@@ -122,7 +122,7 @@ def _first(files: Sequence[str], look: Callable[[str], Any]) -> Any:
     return None
 
 
-def _forms(root: Path, data: Sequence[str]) -> Iterator[pa.Schema]:
+def schemas_of(root: Path, data: Sequence[str]) -> Iterator[pa.Schema]:
     """The Arrow schemas of the data files that can be opened."""
     for name in data:
         try:

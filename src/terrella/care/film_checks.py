@@ -16,14 +16,15 @@ from ..data.source import Sensor
 from ..data.staged import SAMPLE_EVERY
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
+from ..data.storage.tables import read_whole
 from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
-from .tables import read_whole
 
 _SHORTEN = "let --repair keep the rows that the video shows"
 _EXCHANGE = "exchange the two videos, as --repair does"
-_SAMPLES, _OF_STRANGERS = 64, 6  # pictures of an episode that are looked at, at most
-_LIKE, _UNLIKE = 0.02, 0.06  # by so much of full brightness a look may, or must, differ from the statistics
-_BETTER = 4.0  # times closer that the statistics of another episode must be
+_SAMPLES, _OF_STRANGERS = 64, 24  # pictures of an episode that are looked at, at most
+_LIKE, _UNLIKE = 0.01, 0.06  # by so much of full brightness a look may, or must, differ from the statistics
+_BETTER = 3.0  # times closer that the statistics of another episode must be
+_USUAL, _FEW = 6.0, 4  # times the usual difference is no chance, where there are more episodes than a few
 
 Key = tuple[int, str]  # episode, camera
 
@@ -123,8 +124,8 @@ def _decoded(
             seen.append(stats.summarise_pictures(picture[None, ::4, ::4]))
     look = stats.merge([{camera: each} for each in seen])[camera]
     shown.looks[episode.number, camera] = np.concatenate([look["mean"].ravel(), look["std"].ravel()])
-    spread = np.std([each["mean"].ravel() for each in seen], 0).max() / np.sqrt(len(seen))
-    shown.noise[episode.number, camera] = 0.0 if survey.ours else 4 * float(spread)
+    halves = [np.mean([each["mean"].ravel() for each in seen[at::2] or seen], 0) for at in (0, 1)]
+    shown.noise[episode.number, camera] = 0.0 if survey.ours else float(np.abs(halves[0] - halves[1]).max())
 
 
 def _sampled(survey: Survey, count: int) -> list[int]:
@@ -142,19 +143,12 @@ def _looks(survey: Survey, shown: Shown) -> Iterator[Fault]:
         return
     kept = np.stack([np.concatenate(survey.looks[key]) for key in keys])
     there = np.stack([shown.looks[key] for key in keys])
-    own = _distance(there, kept)
-    noise = np.array([shown.noise[key] for key in keys])
-    candidates: dict[Key, Key] = {}
-    for i in np.flatnonzero(own > np.maximum(_LIKE, noise)):
-        distance = _distance(there[i], kept)
-        nearest = int(distance.argmin())
-        if distance[nearest] * _BETTER < own[i]:
-            candidates[keys[i]] = keys[nearest]
-    while lonely := [key for key, other in candidates.items() if other not in candidates]:
-        for key in lonely:
-            del candidates[key]
-    if len(set(candidates.values())) == len(candidates):
-        shown.exchanged |= candidates
+    for camera in {camera for _, camera in keys}:  # what coding does to all pictures alike
+        mine = np.array([camera == of for _, of in keys])
+        usual = np.median(there[mine] - kept[mine], 0) if mine.sum() >= _FEW else np.zeros(6)
+        there[mine] -= np.where(np.abs(usual) <= _LIKE, usual, 0)
+    own, noise = _distance(there, kept), np.array([shown.noise[key] for key in keys])
+    shown.exchanged |= _exchanged(keys, there, kept, noise)
     for i, key in enumerate(keys):
         number, camera = key
         episode = survey.episodes[number]
@@ -164,10 +158,29 @@ def _looks(survey: Survey, shown: Shown) -> Iterator[Fault]:
             what = f"the video of episode {number} shows what episode {other} looked like{f' to {of}' * (of != camera)}"
             yield Fault(file, episode.start, f"{what} when it was recorded: they were exchanged", _EXCHANGE)
         elif own[i] > _UNLIKE + noise[i]:
-            means = there[i, :3].mean(), kept[i, :3].mean()
+            means = shown.looks[key][:3].mean(), kept[i, :3].mean()
             what = f"the pictures of episode {number} are not those that were recorded"
             what += f": their mean brightness is {means[0]:.0%}, in meta/episodes {means[1]:.0%}"
             yield Fault(file, episode.start, what, "restore the video from a copy, or leave the episode out")
+
+
+def _exchanged(keys: list[Key], there: np.ndarray, kept: np.ndarray, noise: np.ndarray) -> dict[Key, Key]:
+    """Of episodes that look other than their statistics, those whose looks are one another's."""
+    own = _distance(there, kept)
+    usual = _USUAL * float(np.median(own)) if len(keys) >= _FEW else 0.0
+    suspects = np.flatnonzero(
+        (own > np.maximum(_LIKE, np.maximum(noise, usual))) | (own > np.maximum(2 * _LIKE, noise))
+    )
+    found: dict[Key, Key] = {}
+    for i in suspects:
+        distance = _distance(there[i], kept[suspects])
+        distance[suspects == i] = np.inf
+        if len(suspects) > 1 and distance.min() * _BETTER < own[i]:
+            found[keys[i]] = keys[suspects[int(distance.argmin())]]
+    while lonely := [key for key, other in found.items() if other not in found]:
+        for key in lonely:
+            del found[key]
+    return found if len(set(found.values())) == len(found) else {}
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

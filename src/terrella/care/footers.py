@@ -17,21 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..core.errors import DatasetError
+from ..data.storage.tables import open_parquet
 from . import thrift
 from .pages import DATA, DATA_V2, DICTIONARY, Page, page_at
-from .tables import open_parquet
 
 _MAGIC = b"PAR1"
-_TYPES = {
-    "BOOLEAN": 0,
-    "INT32": 1,
-    "INT64": 2,
-    "INT96": 3,
-    "FLOAT": 4,
-    "DOUBLE": 5,
-    "BYTE_ARRAY": 6,
-    "FIXED_LEN_BYTE_ARRAY": 7,
-}
+_TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")  # by number
 _PLAIN_CODEC, _SNAPPY, _GZIP, _BROTLI, _ZSTD, _LZ4 = 0, 1, 2, 4, 6, 7
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MOST_PAGES = 1_000_000
@@ -150,9 +141,9 @@ def _codecs(file: BinaryIO, groups: list[list[Chunk]]) -> list[int]:
 def _write(
     path: Path, target: Path, footer: thrift.Struct, leaves, groups: list[list[Chunk]], each, codec: int
 ) -> None:
-    told = [_told_group(group, leaves, _rows(group, each), codec) for group in groups]
+    described = [_footer_group(group, leaves, _rows(group, each), codec) for group in groups]
     rows = sum(_rows(group, each) for group in groups)
-    raw = thrift.write_struct({**footer, 3: (thrift.I64, rows), 4: (thrift.LIST, (thrift.STRUCT, told))})
+    raw = thrift.write_struct({**footer, 3: (thrift.I64, rows), 4: (thrift.LIST, (thrift.STRUCT, described))})
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, target)
     with open(target, "r+b") as file:
@@ -161,12 +152,12 @@ def _write(
         file.write(raw + len(raw).to_bytes(4, "little") + _MAGIC)
 
 
-def _told_group(group: list[Chunk], leaves: list[tuple[str, str]], rows: int, codec: int) -> thrift.Struct:
+def _footer_group(group: list[Chunk], leaves: list[tuple[str, str]], rows: int, codec: int) -> thrift.Struct:
     columns = []
     for chunk, (path, kind) in zip(group, leaves):
         data = [page for page in chunk if page.kind != DICTIONARY]
         about: thrift.Struct = {
-            1: (thrift.I32, _TYPES[kind]),
+            1: (thrift.I32, _TYPES.index(kind)),
             2: (thrift.LIST, (thrift.I32, sorted({3, *(page.encoding for page in chunk)}))),
             3: (thrift.LIST, (thrift.BINARY, [part.encode() for part in _parts(path)])),
             4: (thrift.I32, codec),

@@ -13,8 +13,9 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data.dataset import decoded
 from ..data.format import AUTOMATIC, to_numpy
+from ..data.storage.tables import open_parquet
 from .survey import Survey
-from .tables import batches, open_parquet
+from .tables import batches
 
 _MOST_LOST = 10_000_000  # rows that cannot be read at a stretch; more is damage
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data.format import INFO, contained, tidy
 from ..data.storage import boxes
-from .tables import read_whole
+from ..data.storage.tables import read_whole
 
 _BROKEN = (OSError, pa.ArrowException, av.FFmpegError, ValueError, KeyError, TypeError, IndexError, DatasetError)
 _FILES = 8  # of each kind that are measured

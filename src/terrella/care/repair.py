@@ -14,40 +14,32 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.dataset import decoded
-from ..data.episodes import Film
 from ..data.format import (
     ACTION_VALID,
     AUTOMATIC,
     INFO,
     TIME,
     Layout,
-    fill,
     schema,
     sensors_of,
     tidy,
-    where,
 )
 from ..data.source import follows, is_action
 from ..data.staged import LOG, SAMPLE_EVERY, Staged
 from ..data.storage import durable, mp4
-from ..data.storage.films import Reel, cut, reel, whole_frames
+from ..data.storage.films import cut, whole_frames
 from ..data.storage.tables import read_json
 from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh
-from .features import BROKEN, mended_features
-from .film_checks import Shown, examine_films
+from .features import BROKEN, mended_features, schemas_of
+from .footage import Footage
 from .footers import rebuild
 from .pieces import Piece, RowReader, Table, pieces_of, read_table, runs, short, uncovered
 from .stream_mending import StreamMender, possible
-from .survey import Survey, survey
-from .tables import open_parquet
+from .survey import Survey, cameras_of, survey
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read
 _MOST_PIECES = 8  # episodes that a repair may make beside two of each without asking
-
-
-class _Refused(DatasetError):
-    """Most would be lost, and nobody allowed it."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +88,6 @@ class _Mender:
     def __init__(self, found: Survey, out: Path, keep: Collection[int] | None, progress, allow_loss):
         self.found, self.out, self.only, self.progress, self.allow_loss = found, out, keep, progress, allow_loss
         self.said: list[str] = []
-        self.reels: dict[str, Reel | None] = {}
         self.kept: dict[int, list[tuple[int, int]]] = {}
         self.why: dict[int, str] = {}
 
@@ -112,8 +103,8 @@ class _Mender:
         if not pieces and self.staged is None:
             raise DatasetError(f"nothing in {found.root} is whole; restore it from a copy.")
         self.tasks = _sentences(found, pieces, self.said)
-        self.films = self._films(pieces)
-        self._ask(pieces, [end - begin for piece in pieces for begin, end in runs(self._shown(piece, False))])
+        self.footage = Footage(found, cameras_of(self.features), pieces, self.said, self.why)
+        self._ask(pieces, [end - begin for piece in pieces for begin, end in runs(self.footage.shown(piece))])
         self.writer = Writer(self.out, self._layout())
         self.reader = RowReader(self.features)
         self.stream_mender = StreamMender(found, self.features, self.streams, fresh(self.writer.staging), self.said)
@@ -130,9 +121,6 @@ class _Mender:
                 raise DatasetError(
                     f"nothing of {found.root} could be kept: {'; '.join(self.said) or 'it has no rows'}."
                 )
-        except _Refused as refused:
-            shutil.rmtree(self.out)
-            raise DatasetError(str(refused)) from None
         finally:
             self.writer.close()
             for folder in (self.writer.staging, self.out / _REBUILT, self.out / _INTERRUPTED):
@@ -159,7 +147,8 @@ class _Mender:
         why = next(iter(self.why.values()), "others are damaged")
         sentence = f"of {of} rows in {episodes} episodes only {rows} would be kept, in {len(kept)} pieces ({why})"
         if not callable(self.allow_loss) or not self.allow_loss(f"{sentence}."):
-            raise _Refused(
+            shutil.rmtree(self.out, ignore_errors=True)
+            raise DatasetError(
                 f"{sentence}; mend what the doctor names first, or allow the loss (--yes, in Python allow_loss=True)."
             )
         self.allow_loss = True
@@ -207,89 +196,22 @@ class _Mender:
         except BROKEN as error:
             try:
                 copy = self.out / _REBUILT / file
-                rows = rebuild(path, self._form(), self.features, copy)
+                form = next(schemas_of(self.found.root, self.found.data), None) or schema(self.features)
+                rows = rebuild(path, form, self.features, copy)
                 table = read_table(self.found, file, copy, self.features)
             except (DatasetError, ValueError, pa.ArrowException):
                 raise error from None
             self.said.append(f"{file} has no footer that can be read: {rows} rows were found by its pages")
             return table
 
-    def _form(self) -> pa.Schema:
-        """The columns of a data file, as another one has them; where all are damaged, as they should be."""
-        for file in self.found.data:
-            try:
-                with open_parquet(self.found.path(file)) as opened:
-                    return opened.schema_arrow
-            except BROKEN:
-                continue
-        return schema(self.features)
-
-    # -- videos -------------------------------------------------------------------------------------------------
-
-    def _cameras(self) -> list[str]:
-        return [name for name, feature in self.features.items() if feature["dtype"] == "video"]
-
-    def _reel(self, file: str) -> Reel | None:
-        """The packets of a video; None where it cannot be read."""
-        if file not in self.reels:
-            try:
-                self.reels[file] = reel(self.found.path(file), self.found.fps)
-            except BROKEN as error:
-                self.said.append(f"{file} cannot be read ({short(error)})")
-                self.reels[file] = None
-        return self.reels[file]
-
-    def _films(self, pieces: list[Piece]) -> dict[tuple[int, str], Film]:
-        """(episode, camera) -> where its pictures lie: as meta/episodes tells, or by counting frames where it does not."""
-        listed = {
-            (n, camera): film for n, episode in self.found.episodes.items() for camera, film in episode.videos.items()
-        }
-        shown = Shown()
-        for _ in examine_films(self.found, shown, False):
-            pass
-        films = {key: listed[key] for key in listed} | {of: listed[key] for key, of in shown.exchanged.items()}
-        for (n, camera), (other, of) in shown.exchanged.items():
-            self.said.append(f"the video {listed[n, camera].file} shows episode {other} ({of}), and is put there")
-        lengths: dict[int, int] = {}
-        for piece in pieces:
-            lengths[piece.number] = max(lengths.get(piece.number, 0), piece.frame + piece.count)
-        for camera in self._cameras():
-            unknown = [number for number in lengths if (number, camera) not in films]
-            if unknown:
-                films |= self._placed(camera, lengths, unknown)
-        return films
-
-    def _placed(self, camera: str, lengths: Mapping[int, int], unknown: list[int]) -> dict[tuple[int, str], Film]:
-        """Of episodes that meta/episodes does not tell of: files of their own by their number, else one after another."""
-        own = {n: fill(self.found.video_path, video_key=camera, **where(n)) for n in lengths}
-        files = [file for file in self.found.films if f"/{camera}/" in f"/{file}"]
-        if self.found.ours or set(files) >= set(own.values()):
-            return {(n, camera): Film(own[n], 0) for n in unknown if own[n] in files}
-        placed, rest = {}, sorted(lengths)
-        for file in files:
-            opened = self._reel(file)
-            room, first = (opened.count if opened else 0), 0
-            while rest and first + lengths[rest[0]] <= room:
-                placed[rest[0], camera] = Film(file, first)
-                first += lengths[rest.pop(0)]
-            if first != room:
-                self.said.append(
-                    f"{file} has {room} frames, {first} of them of whole episodes: what follows cannot be listed apart"
-                )
-                break
-        found = {(n, camera): placed[n, camera] for n in unknown if (n, camera) in placed}
-        if found:
-            self.said.append(f"{len(found)} episodes were found in the videos of {camera} by counting frames")
-        return found
-
     # -- one piece ----------------------------------------------------------------------------------------------
 
     def _put(self, piece: Piece) -> None:
         """Makes episodes of the rows of a piece that all cameras show."""
-        for begin, end in runs(self._shown(piece, False)):
+        for begin, end in runs(self.footage.shown(piece)):
             part = piece.part(begin, end)
             if not self._tried(part):  # a frame that is there cannot be decoded: all are tried
-                for a, b in runs(self._shown(part, True)):
+                for a, b in runs(self.footage.shown(part, strict=True)):
                     self._tried(part.part(a, b))
 
     def _tried(self, piece: Piece) -> bool:
@@ -305,29 +227,12 @@ class _Mender:
         self.kept.setdefault(piece.number, []).append((piece.frame, piece.frame + piece.count))
         return True
 
-    def _shown(self, piece: Piece, strict: bool) -> np.ndarray:
-        """bool [count]: rows that all cameras show; strict: every frame is decoded."""
-        shown = np.ones(piece.count, bool)
-        for camera in self._cameras():
-            film = self.films.get((piece.number, camera))
-            opened = self._reel(film.file) if film else None
-            there = np.zeros(piece.count, bool)
-            if film and opened:
-                first = film.first + piece.frame
-                there = np.isin(first + np.arange(piece.count), opened.frames[~opened.zeroed])
-                if strict:
-                    there &= whole_frames(self.found.path(film.file), first, piece.count, self.found.fps)
-            if not there.all():
-                self.why[piece.number] = f"{film.file if film else f'no video of {camera}'} shows no more"
-            shown &= there
-        return shown
-
     def _draft(self, piece: Piece) -> tuple[Draft, list[str]]:
         """(what the writer takes, cameras whose video was encoded again); DatasetError where a frame cannot be decoded."""
         staging, videos, pictures, anew = self.writer.staging, {}, {}, []
-        for camera in self._cameras():
-            film, videos[camera] = self.films[piece.number, camera], staging / f"{camera}.mp4"
-            opened = self._reel(film.file)
+        for camera in cameras_of(self.features):
+            film, videos[camera] = self.footage.films[piece.number, camera], staging / f"{camera}.mp4"
+            opened = self.footage.reel(film.file)
             if opened is None:
                 raise DatasetError(f"{film.file} cannot be read")
             first, path = film.first + piece.frame, self.found.path(film.file)
@@ -443,12 +348,12 @@ class _Mender:
 
     def _keep_facts(self) -> None:
         """What else meta/info.json said stays."""
-        listed = read_json(self.out / INFO)
-        if isinstance(listed, dict) and self.found.info:
-            kept = {key: value for key, value in self.found.info.items() if key not in listed}
-            if self.found.info.get("total_episodes") == listed["total_episodes"] and "splits" in self.found.info:
+        info = read_json(self.out / INFO)
+        if isinstance(info, dict) and self.found.info:
+            kept = {key: value for key, value in self.found.info.items() if key not in info}
+            if self.found.info.get("total_episodes") == info["total_episodes"] and "splits" in self.found.info:
                 kept["splits"] = self.found.info["splits"]
-            durable.write_json(self.out / INFO, json.loads(json.dumps({**listed, **kept}).replace("NaN", "null")))
+            durable.write_json(self.out / INFO, json.loads(json.dumps({**info, **kept}).replace("NaN", "null")))
 
 
 def _staged(found: Survey) -> int | None:

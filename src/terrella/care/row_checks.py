@@ -12,9 +12,10 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.format import ACTION, ACTION_VALID, DONE, STATE, TASKS, schema, to_numpy
+from ..data.storage.tables import open_parquet
 from .pieces import whole_pictures
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey
-from .tables import batches, open_parquet
+from .tables import batches
 
 _LEAVE_OUT = "let --repair split the episode around such rows, or leave it out of training"
 _COUNT_ANEW = "let --repair count anew"

@@ -10,11 +10,11 @@ import numpy as np
 from ..data.format import STREAM_PATH, TIME, where
 from ..data.source import Sensor
 from ..data.storage.films import cut, reel, whole_frames
+from ..data.storage.tables import read_whole
 from ..data.writer import NAME
 from .features import BROKEN
 from .pieces import Piece, RowReader, short
 from .survey import Survey
-from .tables import read_whole
 
 
 class StreamMender:

@@ -17,10 +17,9 @@ from ..data.dataset import checked_features
 from ..data.episodes import Episode, EpisodeTable
 from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, inside, sensor_from_json
 from ..data.source import Sensor
-from ..data.storage.tables import read_json
+from ..data.storage.tables import open_parquet, read_json, read_whole
 from .features import BROKEN, features_without_info
 from .rates import film_rate_fault, true_rate
-from .tables import open_parquet, read_whole
 
 RESTORE = "restore the file from a copy, or let --repair make a dataset of what is whole"
 LEFTOVER = "it was being committed when the recorder was killed: record into the folder again, or delete the file"

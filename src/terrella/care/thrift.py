@@ -5,8 +5,6 @@ A struct is a dict: field number -> (type, value). A list is (type of its items,
 
 from __future__ import annotations
 
-import struct
-
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 _DEEPEST, _LONGEST = 32, 1_000_000  # nesting, items of a list; more is damage
 
@@ -40,14 +38,12 @@ def _read(kind: int, data: bytes | memoryview, at: int, depth: int) -> tuple[obj
         raise ValueError("it is nested too deeply")
     if kind in (BYTE, TRUE, FALSE):  # an item of a list of booleans is a byte
         return data[at], at + 1
-    if kind == DOUBLE:
-        return struct.unpack_from("<d", data, at)[0], at + 8
     if kind == BINARY:
         size, at = _varint(data, at)
         if size > len(data) - at:
             raise IndexError("a text ends after its file")
         return bytes(data[at : at + size]), at + size
-    if kind in (LIST, SET):
+    if kind == LIST:
         head, at = data[at], at + 1
         count, item = head >> 4, head & 15
         if count == 15:
@@ -104,11 +100,9 @@ def _write(kind: int, value) -> bytes:
         return _put_varint((value << 1) ^ (value >> 63))
     if kind in (BYTE, TRUE, FALSE):
         return bytes([value])
-    if kind == DOUBLE:
-        return struct.pack("<d", value)
     if kind == BINARY:
         return _put_varint(len(value)) + value
-    if kind in (LIST, SET):
+    if kind == LIST:
         item, items = value
         head = bytes([len(items) << 4 | item]) if len(items) < 15 else bytes([15 << 4 | item]) + _put_varint(len(items))
         return head + b"".join(_write(item, each) for each in items)

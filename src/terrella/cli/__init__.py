@@ -16,8 +16,8 @@ COMMANDS = {
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train estimator": ("train:estimator", "learn to estimate depth and camera motion from pictures"),
-    "train senses": ("train:senses", "add the estimator and the uncertainty to a trained world"),
-    "train objects": ("train:things", "learn what moving objects do, from another recording"),
+    "train uncertainty": ("train:uncertainty", "add an estimator and an uncertainty to a trained world"),
+    "train objects": ("train:objects", "learn what moving objects do, from another recording"),
     "train latent-actions": ("train:latent_actions", "learn actions from pictures alone"),
     "train distil": ("train:few_steps", "make a slow world draw a frame in one or two steps"),
     "train dreams": ("train:dreams", "go on training a world on its own rollouts"),
@@ -31,7 +31,12 @@ COMMANDS = {
     "data view": ("data:view", "look through a recording in the browser"),
 }
 # what older releases called commands and options
-RENAMED = {"train eye": "train estimator", "train things": "train objects", "--eye": "--estimator"}
+RENAMED = {
+    "train eye": "train estimator",
+    "train things": "train objects",
+    "train senses": "train uncertainty",
+    "--eye": "--estimator",
+}
 
 _THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
 _DRAWING = ("mujoco", "glfw", "OpenGL", "EGL", "gladLoadGL", "GLFW")  # in the errors of a renderer without a display

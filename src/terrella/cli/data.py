@@ -114,7 +114,7 @@ def merge(
         dry: Write the guessed mapping alone.
     """
     from ..exchange.convert import open_source
-    from ..exchange.merging.merge import merge_into
+    from ..exchange.merging.write import merge_into
 
     found = {path: open_source(path) for path in sources}
     with _whole_or_nothing(out), progress.shown("merging") as report:
@@ -175,12 +175,15 @@ def label(
         labelled: Recording with real actions, by which keys are mapped to codes.
         frames: How many of its frames are looked at.
     """
-    from ..learn.latent_codes import label as write
-    from ..learn.latent_codes import map_keys
+    from ..exchange import write_source
+    from ..exchange.formats.lerobot import Rows
+    from ..learn import latent_codes
 
     with progress.shown("labelling") as report:
-        keys = map_keys(run, labelled, report, frames, seed=seed) if labelled else None
-        facts = write(run, folder, out, report, keys)
+        keys = latent_codes.map_keys(run, labelled, report, frames, seed=seed) if labelled else None
+        labels = latent_codes.labelled(run, folder, report, keys)
+        pictures = "png" if labels.exact else "video"  # exact ones stay exact
+        facts = {**labels.facts, "notes": write_source(labels.source, out, "lerobot", Rows(pictures=pictures))}
     if keys:
         facts |= {"key_accuracy": keys.accuracy, "commonest_action": keys.commonest, "labelled_frames": keys.used}
     result({"dataset": str(out), **facts}, json)

@@ -1,21 +1,28 @@
-"""The command `terrella score`: a world's predictions compared with a recording."""
+"""The command `terrella score`: is a world better than copying the last frame, and how far can it be trusted?"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from .. import progress
+from .. import __version__, progress
 from .named import Device, Fast, device_of, load_named
 from .say import Json, Seed, result, say
 
 if TYPE_CHECKING:
     from ..core.world import World
+    from ..measure import Exam, ExamConfig, Scorecard
 
-CONTEXT = 10  # frames that a world is shown before it dreams, when it is scored: longer than a key's history counts
+CONTEXT = 10  # frames that a world is shown before it predicts: longer than the effect of a key lasts
+DRIFT_STEPS, DRIFT_CLIPS = 256, 24
+QUICK_CLIPS, QUICK_HORIZONS, HORIZONS = 6, (1, 8, 32), (1, 8, 32, 64)
+
+Quick = Annotated[bool, arg(help="An answer in about a minute: few clips, short horizons, one setting of the world.")]
 
 
 def score(
@@ -23,17 +30,20 @@ def score(
     data: Path,
     new: Path | None = None,
     fresh: bool = False,
+    quick: Quick = False,
     out: Path = Path("scores"),
-    clips: int = 50,
-    horizons: tuple[int, ...] = (1, 8, 32, 64),
-    long_steps: int = 1000,
+    clips: int | None = None,
+    horizons: tuple[int, ...] = (),
+    long_steps: int | None = None,
     drift: int | None = None,
     device: Device = "auto",
     fast: Fast = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Hold a learned world's dreams against what really happened, with its memory and without.
+    """Compare a world's predictions with a recording: pictures, states, poses, rewards, memory, speed.
+
+    What was measured is kept in the folder as it comes; the same command goes on where it was stopped.
 
     Args:
         name: What `terrella list` shows, or the path of a checkpoint.
@@ -41,109 +51,145 @@ def score(
         fresh: `data` is another recording, of which training saw nothing: every episode is used.
         new: A recording of places that it never saw; without one, the part of the map that training kept out.
         out: Folder for scorecard.json and scorecard.html.
-        clips: Clips of each kind of place; intervals want 50 or more.
-        horizons: Steps after which figures are given; a clip is as long as the largest.
-        long_steps: Length of the long dream; 0 leaves it out.
+        clips: Clips of each kind of place, 50 unless said; intervals want 50 or more.
+        horizons: Steps after which figures are given, 1 8 32 64 unless said; a clip is as long as the largest.
+        long_steps: Length of the long rollouts, 1000 unless said; 0 leaves them out.
         drift: Steps of the drift curves, on clips of their own (at most 24); 0 leaves them out. Unless said, 256 where the
             recordings have clips that long.
     """
-    from .. import library
-    from ..core.errors import DatasetError, TerrellaError
-    from ..core.world import make_rng
-    from ..data import split
-    from ..measure import (
-        Album,
-        ExamConfig,
-        ScoreConfig,
-        as_dict,
-        bars,
-        clips_from_cache,
-        examine,
-        in_box,
-        out_of_sight,
-        write_report,
-    )
-    from ..measure.bars import summary
+    from ..core.errors import TerrellaError
+    from ..measure import ExamConfig, as_dict, examine, verdict, write_report
 
-    if min(horizons, default=0) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100) or (drift or 0) < 0:
+    horizons = tuple(sorted(horizons or (QUICK_HORIZONS if quick else HORIZONS)))
+    clips = clips if clips is not None else QUICK_CLIPS if quick else 50
+    long_steps = long_steps if long_steps is not None else 0 if quick else 1000
+    drift = 0 if quick and drift is None else drift
+    if min(horizons) < 1 or clips < 1 or (long_steps != 0 and long_steps < 100) or (drift or 0) < 0:
         raise TerrellaError(
             "--horizons and --clips are whole numbers from 1 up, --drift from 0 up, --long-steps is 0 or at least 100."
         )
-    world, rng, steps = load_named(name, device, fast=fast), make_rng(seed), max(horizons)
-    arms = {"memory": world, "no memory": load_named(name, device, memory=False, fast=fast)}
-    if "pose" not in world.spec.observes:  # it lives on history alone: there is no memory to leave out
-        arms = {"history": world}
+    config = ExamConfig.quick(horizons) if quick else ExamConfig(horizons=horizons, long_steps=long_steps)
+    arms, closing = _arms(name, device, fast, quick)
+    exam, identity = _exam(arms, closing, data, new, fresh, clips, drift, config, seed)
+    identity += _files_of(name) + f" fast={fast} device={device_of(device)}"
+    with progress.shown("scoring") as report:
+        tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
+        card = examine(exam, out / "parts", identity, tell)
+    files = write_report(card, (), out, f"{next(iter(card.worlds.values()))}: the scorecard")
+    shutil.rmtree(out / "parts", ignore_errors=True)
+    facts = {**as_dict(card), "files": [str(file) for file in files]}
+    result(facts, json, "\n".join([*verdict(card), *_lines(card), f"the page: {files[1]}"]))
+
+
+def _arms(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
+    """The world, with its memory and without where it has one; and more of which only memory is asked."""
+    from .. import library
+
+    world = load_named(name, device, fast=fast)
+    if library.is_truth(name) or "pose" not in world.spec.observes:
+        return {"world": world}, {}
+    if quick:
+        return {"memory": world}, {}
+    bare = library.load(name, device=device_of(device), memory=False, memory_mb=0)  # keeps nothing but its last frame
+    return {"memory": world, "no memory": load_named(name, device, memory=False, fast=fast)}, {"last frame only": bare}
+
+
+def _exam(
+    arms: Mapping[str, World],
+    closing: Mapping[str, World],
+    data: Path,
+    new: Path | None,
+    fresh: bool,
+    clips: int,
+    drift: int | None,
+    config: ExamConfig,
+    seed: int,
+) -> tuple[Exam, str]:
+    """Clips of the recordings, of ground that training saw and of ground that it did not."""
+    from ..core.errors import DatasetError
+    from ..core.world import make_rng
+    from ..data import split
+    from ..measure import CLIPS, ENDINGS, LONG, Album, Exam, clips_from_cache, in_box, out_of_sight, passages
+
+    world = next(iter(arms.values()))
     cache = _cache(data, world)
+    box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
     every = range(len(cache.episodes))
     held_out = every if fresh else split(len(every))[1]
-    box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
-    known = out_of_sight(*box) if box else None
-    sources: dict[str, tuple] = {"recorded": (cache, held_out, known)}
+    if not held_out:
+        raise DatasetError(
+            f"{data} has one episode, so none was kept out of training; record more, or say --fresh if training never saw it."
+        )
+    sources: dict[str, tuple] = {"recorded": (cache, held_out, out_of_sight(*box) if box else None)}
     if new is not None:
         unseen = _cache(new, world)
         sources["new"] = (unseen, range(len(unseen.episodes)), None)
     elif box:
         sources["new"] = (cache, every, in_box(*box))
-
-    def draw(place: str, horizon: int, count: int, chance) -> Any:
-        source, episodes, where = sources[place]
-        return clips_from_cache(source, episodes, CONTEXT, horizon, count, chance, where)
-
-    places = {place: draw(place, steps, clips, rng) for place in sources}
-    long_clips, chance = {}, make_rng(seed + 1)  # the other figures do not depend on whether drift is measured
-    for place in sources if drift != 0 else ():
+    sets: dict[str, dict] = {CLIPS: {}, LONG: {}, ENDINGS: {}}
+    going, rng = {}, make_rng(seed)
+    for place, (source, episodes, where) in sources.items():
+        asked = source, episodes, CONTEXT
+        sets[CLIPS][place] = clips_from_cache(*asked, max(config.horizons), clips, rng, where)
+        chance = make_rng(seed + 1)  # the other figures do not depend on whether drift is measured
         try:
-            long_clips[place] = draw(place, drift or 256, min(clips, 24), chance)
+            if drift != 0:
+                count = min(clips, DRIFT_CLIPS)
+                sets[LONG][place] = clips_from_cache(*asked, drift or DRIFT_STEPS, count, chance, where)
         except DatasetError:
             if drift:
                 raise
             say(
                 f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
-    obeying = tuple(step for step in ScoreConfig().control_horizons if step <= steps) or (steps,)
-    scoring = ScoreConfig(horizons=tuple(sorted(horizons)), control_horizons=obeying)
-    config = ExamConfig(score=scoring, long_steps=long_steps)
-    album = None if cache.pose is None else Album.of_cache(cache)
-    closing = {}  # what is seen again by a world that keeps nothing but its last frame
-    if len(arms) > 1:
-        closing = {"last frame only": library.load(name, device=device_of(device), memory=False, memory_mb=0)}
-    with progress.shown("scoring") as report:
-        tell = lambda share, words: report(share, 1, words)  # noqa: E731
-        card = examine(arms, places, rng, config, album, tell, long_clips, closing)
-    card = replace(card, fates=_fates(arms, sources, scoring.horizons, clips, make_rng(seed + 2)))
-    found = bars(card, next(iter(arms)))
-    files = write_report(card, found, out, f"{world.spec.name}: the scorecard")
-    lines = [
-        f"{bar.status:>6}  {bar.name}, {bar.place}: {bar.figure} {bar.unit} (bar: {bar.target})"
-        for bar in found
-        if bar.figure and not bar.side
-    ]
-    for row in card.drifts:
-        within = f"within twice its first error for {row.usable} of {row.steps} steps"
-        lines.append(f" drift  {row.arm}{row.motion and f', {row.motion} motion'}, {row.place}: {within}")
-    facts = {**as_dict(card, found), "files": [str(file) for file in files]}
-    result(facts, json, "\n".join([*lines, summary(found), f"the page: {files[1]}"]))
-
-
-def _fates(arms: dict[str, World], sources: dict[str, tuple], horizons: tuple[int, ...], clips: int, rng) -> list:
-    """What the arms' dreams tell of rewards, vitals and ends, where world and recordings have vitals."""
-    from ..measure.outcomes import fates, passages
-
-    spec, found = next(iter(arms.values())).spec, []
-    for place, (cache, episodes, where) in sources.items():
-        if set(cache.vitals) & set(spec.channels):
-            shown = passages(cache, episodes, CONTEXT, max(horizons), clips, rng, where)
-            found += fates(arms, place, shown, horizons, rng)
-    return found
+        shown = passages(*asked, max(config.horizons), clips, make_rng(seed + 2), where)
+        sets[ENDINGS][place] = [passage.clip for passage in shown]
+        going[place] = [passage.real for passage in shown]
+    album = None if cache.pose is None or cache.rgb is None else Album.of_cache(cache)
+    paths = " ".join(str(source.path) for source, _, _ in sources.values())
+    return Exam(arms, sets, config, seed, going, album, closing), f"{__version__} {paths} "
 
 
 def _cache(data: Path, world: World) -> Any:
-    """The recording's ClipCache at the size that the world shows."""
-    from ..core.errors import TerrellaError
+    """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
     from ..data import ClipCache
+    from ..measure import check_recording
 
-    if "rgb" not in world.spec.channels:
-        raise TerrellaError(f"{world.spec.name} shows no pictures, so it cannot be scored; score a learned world.")
-    height, width = world.spec.channels["rgb"].shape[:2]
+    picture = world.spec.channels.get("rgb")
+    size: dict[str, Any] = {"size": tuple(picture.shape[:2])} if picture is not None and picture.shape else {}
     with progress.shown(f"reading {data}") as report:
-        return ClipCache.open(data, size=(height, width), progress=report)
+        cache = ClipCache.open(data, progress=report, **size)
+    check_recording(cache, world.spec)
+    return cache
+
+
+def _files_of(name: str) -> str:
+    """A digest of a learned world's files: other weights are another world."""
+    from .. import library
+    from ..core.errors import TerrellaError
+
+    try:
+        folder = library.folder_of(name)
+    except TerrellaError:  # a simulator
+        return name
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _lines(card: Scorecard) -> list[str]:
+    """The first arm's figures at its longest horizon, and what was not applicable."""
+    arm = next(iter(card.worlds))
+    rows = [row for row in card.rows if row.arm == arm and row.motion != "true" and not row.void]
+    last: dict[tuple, Any] = {}
+    for row in rows:
+        last[row.probe, row.channel, row.what, row.place] = row
+    lines = []
+    for row in last.values():
+        beside = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
+        steps = f" after {row.horizon} steps" if row.horizon else ""
+        about = " ".join(part for part in (row.channel, row.what) if part)
+        lines.append(f"{row.probe:>12}  {about}, {row.place}{steps}: {row.figure} {row.unit}{beside}")
+    gone = [f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm]
+    return [*lines, *gone]

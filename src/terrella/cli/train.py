@@ -2,133 +2,142 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tyro.conf import Positional
 
 from .. import progress
-from ..learn.distil import DistilConfig, distil
-from ..learn.estimator import EstimatorTraining, train_eye
-from ..learn.latent_actions import LatentConfig, train_latent_actions
-from ..learn.objects import ThingsConfig, train_things
-from ..learn.self_forcing import DreamsConfig, train_dreams
-from ..learn.senses import SensesConfig, train_senses
-from ..learn.train_video import TrainConfig, train_video
+from ..learn.recipes.distillation import DistilConfig, distil
+from ..learn.recipes.dreams import DreamsConfig, train_dreams
+from ..learn.recipes.estimator import EstimatorTraining, train_estimator
+from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
+from ..learn.recipes.objects import ObjectsTraining, train_objects
+from ..learn.recipes.uncertainty import SensesConfig, train_uncertainty
+from ..learn.recipes.video import TrainConfig, train_video
+from ..learn.trainer import device_named
 from ..library import folder_of
-from .named import Device, load_named
+from ..worlds.folder import load_world
+from ..worlds.learned import LearnedWorld
+from .named import Device
 from .say import Json, result
 
-VIDEO, EYE, SENSES, LATENT, DISTIL, DREAMS, THINGS = (
+VIDEO, ESTIMATOR, UNCERTAINTY, LATENT, DISTIL, DREAMS, OBJECTS = (
     TrainConfig(),
     EstimatorTraining(),
     SensesConfig(),
     LatentConfig(),
     DistilConfig(),
     DreamsConfig(),
-    ThingsConfig(),
+    ObjectsTraining(),
 )
 
 
-def video(data: Positional[Path], out: Path, config: TrainConfig = VIDEO, json: Json = False) -> None:
-    """Train a world of pictures on a recording; the same command goes on where it was stopped.
+def video(data: Positional[str], out: str, config: TrainConfig = VIDEO, json: Json = False) -> None:
+    """Train a playable world on a recording. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
-        data: Folder of the dataset.
-        out: Folder of the run: checkpoint, log, and pictures of truth against dream.
+        data: The recording: a folder, or an address (hf://..., s3://...).
+        out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
     with progress.shown("training") as report:
         facts = train_video(data, out, config, report)
-    result({"run": str(out), **(facts or {})}, json)
+    result({"run": out, **facts}, json)
 
 
-def estimator(data: Positional[Path], out: Path, config: EstimatorTraining = EYE, json: Json = False) -> None:
-    """Train an eye that sees depth in one picture, and motion between two, on any recording with depth and poses.
+def estimator(data: Positional[str], out: str, config: EstimatorTraining = ESTIMATOR, json: Json = False) -> None:
+    """Train a depth and odometry estimator on a recording with depth and poses. It reads depth off one picture, and motion
+    off two.
 
     Args:
-        data: Folder of the dataset.
-        out: Folder for eye.safetensors and eye.json, its errors on the episodes kept out.
+        data: The recording: a folder, or an address.
+        out: Folder for estimator.safetensors, and estimator.json with its errors on held-out episodes.
     """
     with progress.shown("training") as report:
-        facts = train_eye(data, out, config, report)
+        facts = train_estimator(data, out, config, report)
     result(facts, json)
 
 
-def senses(name: Positional[str], data: Path, out: Path, config: SensesConfig = SENSES, json: Json = False) -> None:
-    """Give a trained world an eye for lone pictures and a doubt that says when it invents (train video ends with them).
+def uncertainty(
+    name: Positional[str], data: str, out: str, config: SensesConfig = UNCERTAINTY, json: Json = False
+) -> None:
+    """Train a world's estimator, so that it can begin with a single picture, and its uncertainty, so that it says when it
+    invents. `train video` ends with both.
 
     Args:
-        name: What `terrella list` shows, or the path of a checkpoint.
+        name: The world: a name that `terrella list` shows, or a folder.
         data: The recording that it was trained on.
-        out: Folder for the world with its senses.
+        out: Folder of the run; the world is in OUT/world.
     """
     with progress.shown("training") as report:
-        facts = train_senses(folder_of(name), data, out, config, report)
+        facts = train_uncertainty(folder_of(name), data, out, config, report)
     result(facts, json)
 
 
-def things(name: Positional[str], data: Path, out: Path, config: ThingsConfig = THINGS, json: Json = False) -> None:
-    """Teach a trained world what its things do from another recording: more fights make better monsters in minutes.
+def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining = OBJECTS, json: Json = False) -> None:
+    """Train a world's objects on another recording: how they look, move, change and vanish. Takes minutes.
 
     Args:
-        name: What `terrella list` shows, or the path of a checkpoint.
-        data: Folder of a recording of the same game that tells things apart.
-        out: Folder for the world with its new cast.
+        name: The world: a name that `terrella list` shows, or a folder.
+        data: A recording of the same game that tells objects apart.
+        out: Folder of the run; the world is in OUT/world.
     """
     with progress.shown("training") as report:
-        facts = train_things(folder_of(name), data, out, config, report)
+        facts = train_objects(folder_of(name), data, out, config, report)
     result(facts, json)
 
 
-def latent_actions(data: Positional[Path], out: Path, config: LatentConfig = LATENT, json: Json = False) -> None:
-    """Learn a few actions from pictures alone; `terrella data label` then writes them into a recording.
+def latent_actions(data: Positional[str], out: str, config: LatentConfig = LATENT, json: Json = False) -> None:
+    """Learn a few actions from pictures alone. `terrella data label` then writes them into a recording.
 
     Args:
-        data: Folder of the dataset; its own actions, if it has any, are not looked at.
-        out: Folder of the run: checkpoint, log, and pictures of truth, inferred and random actions.
+        data: The recording: a folder, or an address. Its own actions, if it has any, are not used.
+        out: Folder of the run: checkpoint, log, and pictures of true, inferred and random actions.
     """
     with progress.shown("training") as report:
         facts = train_latent_actions(data, out, config, report)
-    result({"run": str(out), **(facts or {})}, json)
+    result(facts, json)
 
 
 def few_steps(
     name: Positional[str],
-    data: Path,
-    out: Path,
+    data: str,
+    out: str,
     config: DistilConfig = DISTIL,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Teach a world that draws a frame in many steps (`train video --flow-steps 8`) to draw it in one or two.
+    """Distil a world that draws a frame in many steps (`train video --flow-steps 8`) into one that needs one or two.
 
     Args:
-        name: The world that teaches: what `terrella list` shows, or a path.
-        data: Folder of a recording of the same game.
-        out: Folder of the run: checkpoint, log, and pictures of truth against dream.
+        name: The teacher: a name that `terrella list` shows, or a folder.
+        data: A recording of the same game.
+        out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
     with progress.shown("training") as report:
-        facts = distil(load_named(name, device), data, out, config, report)
-    result({"run": str(out), **facts}, json)
+        facts = distil(_learned(name, device), data, out, config, report)
+    result({"run": out, **facts}, json)
 
 
 def dreams(
     name: Positional[str],
-    data: Path,
-    out: Path,
+    data: str,
+    out: str,
     config: DreamsConfig = DREAMS,
     teacher: str | None = None,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Go on training a world inside its own dreams, so that long play drifts less.
+    """Continue training a world on its own predictions (self forcing), so that long play drifts less.
 
     Args:
-        name: The world: what `terrella list` shows, or a path.
-        data: Folder of a recording of the same game.
-        out: Folder of the run: checkpoint, log, and pictures of truth, the old dream and the new.
-        teacher: A world that draws a frame in many steps, of which the dreams should be as sharp: see `train distil`.
+        name: The world: a name that `terrella list` shows, or a folder.
+        data: A recording of the same game.
+        out: Folder of the run: the world, a log, and pictures of truth, the old prediction and the new.
+        teacher: A world that draws a frame in many steps, whose sharpness the predictions should reach; see `train distil`.
     """
-    master = None if teacher is None else load_named(teacher, device)
+    master = None if teacher is None else _learned(teacher, device)
     with progress.shown("training") as report:
-        facts = train_dreams(load_named(name, device), data, out, config, report, master)
-    result({"run": str(out), **facts}, json)
+        facts = train_dreams(_learned(name, device), data, out, config, report, master)
+    result({"run": out, **facts}, json)
+
+
+def _learned(name: str, device: str) -> LearnedWorld:
+    return load_world(folder_of(name), device=str(device_named(device)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ _OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
 
 Report = Callable[[int, int], None]  # (episodes done, episodes in all)
-Export = Callable[[Path, Sequence[int], Report], None]
+Export = Callable[[Path, Sequence[int], Report], object]
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Browse:
             "robot": source.robot,
             "fps": source.fps,
             "notes": list(source.notes),
-            "sensors": [_describe(source.sensors[name]) for name in self._names() if name not in self._texts],
+            "sensors": [_describe(source, source.sensors[name]) for name in self._names() if name not in self._texts],
             "can_export": self._export is not None,
         }
 
@@ -312,7 +312,7 @@ class _Walk:
         raise DatasetError(f"{self._source.name} has no episode {number} any more; open it again.")
 
 
-def _describe(sensor: Sensor) -> dict:
+def _describe(source: Source, sensor: Sensor) -> dict:
     label = re.sub(r"^(observation|next)\.((images|points)\.)?", "", sensor.name) or sensor.name
     count = (
         int(np.prod(sensor.shape)) if sensor.kind == "vector" else sensor.shape[-1] if sensor.kind == "points" else 0
@@ -328,8 +328,18 @@ def _describe(sensor: Sensor) -> dict:
         "units": [str(sensor.units.get(name, "")) for name in names],
         "frame": sensor.frame,
         "rate_hz": sensor.rate_hz,
+        "camera": _camera(source, sensor),
         "pose": None if sensor.kind != "vector" or sensor.name == "action" else pose_columns(sensor),
     }
+
+
+def _camera(source: Source, sensor: Sensor) -> dict | None:
+    """What the recorded world says of a camera: intrinsics, size, pose (the channel that it is mounted on) and mount."""
+    world = source.facts.get("world")
+    cameras = world.get("cameras") if isinstance(world, Mapping) else None
+    suffix = sensor.name.removeprefix("observation.images.")
+    found = cameras.get("rgb" if suffix == "rgb" else f"rgb.{suffix}") if isinstance(cameras, Mapping) else None
+    return dict(found) if sensor.kind == "image" and isinstance(found, Mapping) else None
 
 
 def _language(take: Take) -> list[list]:

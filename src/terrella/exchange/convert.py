@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -23,31 +22,47 @@ _SENSOR_FACTS = ("names", "units", "frame", "facts")
 class _Kind:
     """One format: what people call it, where its code is, and which of a take's and sensors' facts it has a place for.
 
-    leaf:  module of `formats`, imported when it is used.
-    read:  its function read(path, fps) -> Source; write: its function write(source, path, progress) -> sentences.
-    keeps: "text" (string features), "task", "language", "start_ns", "facts" (of takes), "sensors" (their names, units, …).
+    read:  "leaf.function" of `formats`, imported when it is used: (path, fps) -> Source; write: (source, path, progress)
+           -> sentences.
+    keeps: "text" (string features), "task", "language", "start_ns", "sensors" (their names, units, facts), "facts" (of
+           takes), or single facts of takes by name.
     """
 
     name: str
-    leaf: str
+    read: str
+    write: str
     suffixes: frozenset[str] = frozenset()
     keeps: frozenset[str] = frozenset()
-    read: str = "read"
-    write: str = "write"
 
-    def call(self, function: str, *given: Any, **more: Any) -> Any:
-        return getattr(import_module(f".formats.{self.leaf}", __package__), function)(*given, **more)
+
+def _call(function: str, *given: Any, **more: Any) -> Any:
+    leaf, _, name = function.partition(".")
+    return getattr(import_module(f".formats.{leaf}", __package__), name)(*given, **more)
 
 
 _ALL = frozenset({"text", "task", "language", "start_ns", "facts", "sensors"})
 _KINDS: dict[str, _Kind] = {
-    "lerobot": _Kind("LeRobot v3", "lerobot", keeps=_ALL),  # its writer says itself which facts it leaves out
-    "mcap": _Kind("MCAP", "mcap", frozenset({".mcap"}), _ALL - {"text"}),
-    "minari": _Kind("Minari", "minari", keeps=frozenset({"task", "start_ns", "sensors"})),
-    "robomimic": _Kind("HDF5", "hdf5", frozenset({".hdf5", ".h5", ".hdf"}), frozenset({"task", "sensors"})),
-    "rollouts": _Kind("npz rollouts", "rollouts", frozenset({".npz"}), frozenset({"task", "start_ns", "sensors"})),
-    "videos": _Kind("videos", "pictures", VIDEOS, read="read_videos", write="write_videos"),
-    "images": _Kind("images", "pictures", IMAGES, read="read_images", write="write_images"),
+    "lerobot": _Kind("LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL),  # it says which facts it leaves out
+    "mcap": _Kind("MCAP", "mcap.read", "mcap_write.write", frozenset({".mcap"}), _ALL - {"text"}),
+    "minari": _Kind(
+        "Minari", "minari.read", "minari.write", keeps=frozenset({"task", "start_ns", "sensors", "minari", "texts"})
+    ),
+    "robomimic": _Kind(
+        "HDF5",
+        "hdf5.read",
+        "hdf5.write",
+        frozenset({".hdf5", ".h5", ".hdf"}),
+        frozenset({"task", "sensors", "robomimic"}),
+    ),
+    "rollouts": _Kind(
+        "npz rollouts",
+        "rollouts.read",
+        "rollouts.write",
+        frozenset({".npz"}),
+        frozenset({"task", "start_ns", "sensors"}),
+    ),
+    "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS),
+    "images": _Kind("images", "images.read", "images.write", IMAGES),
 }
 _READ = ", ".join(kind.name for kind in _KINDS.values())
 
@@ -67,7 +82,7 @@ def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, 
 
         return environments.from_env(name.removeprefix("gym:"), episodes=episodes, seed=seed, fps=fps)
     kind = _KINDS["lerobot" if "://" in name else _kind(Path(path))]
-    return kind.call(kind.read, name if "://" in name else Path(path), fps=fps)
+    return _call(kind.read, name if "://" in name else Path(path), fps=fps)
 
 
 def _kind(path: Path) -> str:
@@ -120,15 +135,12 @@ def write_source(
         raise DatasetError(f"there is no format '{chosen}' to write; choose {', '.join(get_args(Format))}.")
     if chosen != "lerobot" and path.exists() and (path.is_file() or any(path.iterdir())):
         raise DatasetError(f"{path} is there already; convert into a new one.")
-    more = {"rows": rows} if rows and chosen == "lerobot" else {}
+    more = {"how": rows} if rows and chosen == "lerobot" else {}
     kind, said = _KINDS[chosen], dict.fromkeys(source.notes)
     kept = _without_text(source, said, kind) if "text" not in kind.keeps else source
     lost: dict[str, None] = {}
     counted = replace(kept, takes=lambda: _seen(kept, kind, lost))
-    try:
-        notes = kind.call(kind.write, counted, path, progress=progress, **more)
-    except OSError as error:
-        raise DatasetError(f"{path} was not written ({error.strerror}); free some space or choose another.") from error
+    notes = _call(kind.write, counted, path, progress=progress, **more)
     if "sensors" not in kind.keeps:
         bare = Sensor("", "image", ())
         for name, sensor in kept.sensors.items():
@@ -160,9 +172,9 @@ def _seen(source: Source, kind: _Kind, lost: dict[str, None]) -> Iterator[Take]:
             if there and what not in kind.keeps:
                 lost[_WORDS[what]] = None
         if "facts" not in kind.keeps:
-            for name, value in take.facts.items():
-                if name not in ("language", kind.leaf, "robomimic" if kind.leaf == "hdf5" else "texts"):
-                    lost[f"the fact '{name}' of takes ({json.dumps(value, default=str)[:60]})"] = None
+            for name in take.facts:
+                if name != "language" and name not in kind.keeps:
+                    lost[f"the fact '{name}' of takes"] = None
         yield take
 
 

@@ -26,9 +26,8 @@ class Live:
     sensors: name -> Sensor, all that will be logged.
     image:   how pictures are sent: "jpeg", "png" or "raw".
 
-    `log` never raises and never waits: errors are told in `notes`, readings that nobody got are counted in `dropped`
-    (one that two slow watchers missed counts twice). DatasetError, from the constructor alone, where the target cannot
-    be used.
+    `log` never raises and never waits: errors are told in `notes`, readings that were lost are counted in `dropped`.
+    DatasetError, from the constructor alone, where the target cannot be used.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class Live:
         self.start_ns = time.time_ns() if start_ns is None else start_ns
         self._sensors = dict(sensors)
         self._notes: list[str] = []
-        self._lost = 0  # by this object; a server has its own
+        self._lost = 0
         self._waiting: deque[tuple[str, int, np.ndarray]] = deque()
         self._bytes, self._closing, self._broken = 0, False, False
         self._wake = threading.Condition()
@@ -56,8 +55,8 @@ class Live:
 
     @property
     def dropped(self) -> int:
-        """Readings lost so far, to slow watchers, a full disk or too slow a machine."""
-        return self._lost + getattr(self._out, "dropped", 0)
+        """Readings lost so far, to a full disk or too slow a machine; what a slow watcher misses is not counted."""
+        return self._lost
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -162,7 +161,7 @@ def _open(target: str, sensors: Mapping[str, Sensor], name: str, image: str, tas
         return LiveServer(int(target), sensors, name, image)
     if not target.endswith(".mcap"):
         raise DatasetError(f"'{target}' is neither a port nor a file ending in .mcap; name one of these.")
-    from .formats.mcap import Recording
+    from .formats.mcap_write import Recording
 
     source = Source(name, sensors, lambda: iter(()))
     about = Take({}, task, start_ns)

@@ -1,5 +1,4 @@
-"""What frames are held against while a generator learns: the truth, and a critic that knows blur from detail; in half
-precision where that is native."""
+"""What frames are held against while a generator learns: the truth, and a critic that knows blur from detail."""
 
 from __future__ import annotations
 
@@ -8,6 +7,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..space.keyframes import Glimpse, merge
+from .batches import Batch
+from .trainer import Learner, half_precision
 
 
 class Critic(nn.Module):
@@ -48,7 +49,7 @@ def frame_losses(
 ) -> dict[str, torch.Tensor]:
     """Mean absolute errors of frames [B, 4, H, W] in the generator's code: colour, depth, and colour's steps (edges).
 
-    Where pixels count by `weight` [B, 1, H, W] (lessons.changing), colour's squared errors are added: absolute ones alone
+    Where pixels count by `weight` [B, 1, H, W] (history_batches.changing), colour's squared errors are added: absolute ones alone
     are least where nothing ever changes, for most pixels do not.
     """
     losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
@@ -71,12 +72,27 @@ def _l1(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return (a - b).abs().mean()
 
 
-def half_precision(device: torch.device):
-    """bfloat16 where the device computes it natively."""
-    native = device.type == "cuda" or torch.backends.cpu.get_cpu_capability() == "AVX512" and _cpu_has_bf16()
-    return torch.autocast(device.type, torch.bfloat16, enabled=native)
+def truth_losses(clean: torch.Tensor, batch: Batch) -> dict[str, torch.Tensor]:
+    """See `frame_losses`; pixels count as the batch says. Where things move, where they are counts too."""
+    counts = 1.0 if batch.weight is None else batch.weight
+    losses = frame_losses(clean[:, :4] * counts, batch.truth[:, :4] * counts)
+    if clean.shape[1] > 4:
+        losses["things"] = F.binary_cross_entropy_with_logits(clean[:, 4], batch.truth[:, 4])
+    return losses
 
 
-def _cpu_has_bf16() -> bool:
-    """In hardware: where oneDNN only emulates it, it is 2.7 times slower than float32."""
-    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+def total(losses: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Their sum as generators weigh them."""
+    weights = {"rgb": 1.0, "depth": 0.5, "edges": 0.5, "things": 0.2}
+    return torch.stack([weights[name] * loss for name, loss in losses.items()]).sum()
+
+
+def critic_loss(critic: Critic, fake: torch.Tensor, shown: Glimpse, real: torch.Tensor, led: Glimpse) -> torch.Tensor:
+    """Hinge loss on drawn frames and what was `shown`, and on true ones and what `led` to them; frames [B, 3 or more, H, W]."""
+    with half_precision(fake.device):
+        true, drawn = critic(real[:, :3], led), critic(fake.detach()[:, :3], shown)
+        return F.relu(1 - true).mean() + F.relu(1 + drawn).mean()
+
+
+def critic_learner(critic: Critic) -> Learner:
+    return Learner(torch.optim.Adam(critic.parameters(), 3e-4, (0.0, 0.99)), (critic,))

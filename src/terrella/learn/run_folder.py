@@ -1,21 +1,29 @@
-"""A training run on disk: what is needed to go on exactly where it stopped, replaced whole at every save."""
+"""A training run on disk: what is needed to go on exactly where it stopped, replaced whole at every save; and its log."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import TrainingError
 
-STATE = "resume.safetensors"
+LOG = "log.jsonl"
+
+
+def resume_file(folder: Path, stage: str) -> Path:
+    return folder / f"resume-{stage}.safetensors"
 
 
 def save_run(
-    folder: Path, modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer], facts: dict
+    path: Path,
+    modules: Mapping[str, torch.nn.Module],
+    optimisers: Mapping[str, torch.optim.Optimizer],
+    facts: dict,
 ) -> None:
     """Modules, optimisers and `facts` (JSON) in one file; a kill while saving leaves the last save in place."""
     tensors = {f"{name}/{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
@@ -24,27 +32,24 @@ def save_run(
             tensors |= {f"{name}/{number}/{slot}": torch.as_tensor(value) for slot, value in slots.items()}
     whole = {key: value.detach().cpu().clone().contiguous() for key, value in tensors.items()}
     try:
-        save_file(whole, folder / f"{STATE}.partial", metadata={"facts": json.dumps(facts)})
-        (folder / f"{STATE}.partial").replace(folder / STATE)
+        save_file(whole, path.with_name(f"{path.name}.partial"), metadata={"facts": json.dumps(facts)})
+        path.with_name(f"{path.name}.partial").replace(path)
     except (OSError, SafetensorError) as error:
         raise TrainingError(
-            f"{folder} cannot be written ({error}); free some space and run the same command again."
+            f"{path.parent} cannot be written ({error}); free some space and run the same command again."
         ) from error
 
 
 def load_run(
-    folder: Path, modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer]
+    path: Path,
+    modules: Mapping[str, torch.nn.Module],
+    optimisers: Mapping[str, torch.optim.Optimizer],
 ) -> dict | None:
-    """Restores what `save_run` wrote and returns its facts; None where the folder holds no run yet."""
-    path = folder / STATE
+    """Restores what `save_run` wrote and returns its facts; None where there is no such file yet."""
     if not path.exists():
         return None
     try:
-        from safetensors import safe_open
-
-        tensors = load_file(path)
-        with safe_open(path, "pt") as file:
-            facts = json.loads(file.metadata()["facts"])
+        tensors, facts = load_file(path), _facts(path)
         for name, module in modules.items():
             module.load_state_dict({k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")})
         for name, optimiser in optimisers.items():
@@ -60,3 +65,33 @@ def load_run(
         raise TrainingError(
             f"{path} is not a run of this recipe ({first}); give another --out, or delete it."
         ) from error
+
+
+def _facts(path: Path) -> dict:
+    with safe_open(path, "pt") as file:
+        return json.loads(file.metadata()["facts"])
+
+
+def write_log(folder: Path, line: Mapping[str, object]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOG, "a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def trim_log(folder: Path, stage: str, step: int) -> None:
+    """Drops what the log says of `stage` beyond `step`, the last that was saved: those steps are done again."""
+    path = folder / LOG
+    if not path.exists():
+        return
+    kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _before(line, stage, step)]
+    partial = path.with_name(f"{LOG}.partial")
+    partial.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    partial.replace(path)
+
+
+def _before(line: str, stage: str, step: int) -> bool:
+    try:
+        told = json.loads(line)
+        return told.get("stage") != stage or told["step"] <= step
+    except (ValueError, KeyError, AttributeError):
+        return False  # a line that was cut by a kill

@@ -10,13 +10,13 @@ import torch
 from PIL import Image
 
 from ..core.world import make_rng
-from ..worlds.folder import Learned
-from .samples import Recording
+from ..worlds.learned import LearnedWorld
+from .recording import Recording
 
 
-def draw_strip(worlds: Sequence[Learned], recording: Recording, held_out: list[int], path: Path) -> None:
-    """64 steps of the first of the episodes `held_out`, every 8th frame: the truth above a dream of each world."""
-    first, last = recording.cache.episodes[(held_out or [0])[0]]
+def draw_strip(worlds: Sequence[LearnedWorld], recording: Recording, path: Path) -> None:
+    """64 steps of the first episode that training does not see, every 8th frame: the truth above a dream of each world."""
+    first, last = recording.cache.episodes[(recording.held_out or (0,))[0]]
     rows = np.arange(max(first, min(first + 40, last - 65)), last)[:65]
     lines = [recording.rgb(rows[::8]), *(_dream(world, recording, rows) for world in worlds)]
     write_lines(lines, path)
@@ -28,7 +28,8 @@ def write_lines(lines: Sequence[torch.Tensor], path: Path) -> None:
     Image.fromarray(picture).save(path)
 
 
-def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
+@torch.inference_mode()
+def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch.Tensor:
     """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
     move, the recorded actions."""
     rng, config = make_rng(1), world.config

@@ -1,54 +1,50 @@
-"""The scorecard: asks any World what its dreams are worth, and writes the answer as JSON and as a page."""
+"""The scorecard: asks any World what its predictions are worth, and writes the answer as JSON and as a page."""
 
 from .album import Album
-from .bars import Bar, bars
-from .clips import Clip, clips_from_cache, in_box, out_of_sight
-from .closure import Closure, closure, key_way, walk_way, yaw_way
-from .drift import Drift, drift
+from .clips import Clip, check_recording, clips_from_cache, in_box, out_of_sight
 from .encoder import FrameEncoder, frame_features, shipped_encoder
-from .endurance import Endurance, long_rollout
-from .examine import ExamConfig, examine, write_report
+from .exam import CLIPS, ENDINGS, LONG, Exam, ExamConfig, Probe
+from .examine import PROBES, examine, write_report
 from .frechet import clip_features, frechet, frechet_interval
+from .outcomes import Passage, passages
 from .page import page
-from .scorecard import Scorecard, ScoreConfig, as_dict, score, to_json
-from .speed import Speed, speed
+from .scorecard import Bar, Row, Scorecard, as_dict, to_json, worst_of
 from .statistics import Figure
 from .strip import strip
+from .verdict import verdict
 
 __all__ = [
+    "CLIPS",
+    "ENDINGS",
+    "LONG",
+    "PROBES",
     "Album",
     "Bar",
     "Clip",
-    "Closure",
-    "Drift",
-    "Endurance",
+    "Exam",
     "ExamConfig",
     "Figure",
     "FrameEncoder",
-    "ScoreConfig",
+    "Passage",
+    "Probe",
+    "Row",
     "Scorecard",
-    "Speed",
     "as_dict",
-    "bars",
+    "check_recording",
     "clip_features",
     "clips_from_cache",
-    "closure",
-    "drift",
     "examine",
     "frame_features",
     "frechet",
     "frechet_interval",
     "in_box",
-    "key_way",
-    "long_rollout",
     "out_of_sight",
     "page",
-    "score",
+    "passages",
     "shipped_encoder",
-    "speed",
     "strip",
     "to_json",
-    "walk_way",
+    "verdict",
+    "worst_of",
     "write_report",
-    "yaw_way",
 ]

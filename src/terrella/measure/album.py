@@ -28,7 +28,7 @@ class Album:
 
     @staticmethod
     def of_clips(clips: Sequence[Clip]) -> Album:
-        return Album([(clip.rgb, clip.pose, clip.episode) for clip in clips if clip.pose is not None])
+        return Album([(clip.channels["rgb"], clip.pose, clip.episode) for clip in clips if clip.pose is not None])
 
     @staticmethod
     def of_cache(cache) -> Album:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,37 +23,68 @@ Where = Callable[
 class Clip:
     """T = context + horizon rows of one episode; row t's action led from observation t to t + 1.
 
-    rgb uint8 [T, H, W, 3]; depth [T, h, w] metres or None; pose float32 [T, 7] or None; action [T, A]; reward [T] and
-    done [T] are what followed each action; `further` has what else was recorded [T, ...], by channel. The first `context`
-    frames are shown to a world, the rest are the truth. Arrays may be views of a memory-mapped file.
+    channels: what was recorded, by the world's names, [T, ...] each: rgb and rgb.wrist uint8 [T, H, W, 3], depth metres,
+    pose float32 [T, 7], reward [T] and done [T] (what followed each action), vectors. action [T, A]. The first `context`
+    rows are shown to a world, the rest are the truth. Arrays may be views of a memory-mapped file.
     """
 
-    rgb: np.ndarray
-    depth: np.ndarray | None
-    pose: np.ndarray | None
+    channels: Mapping[str, np.ndarray]
     action: np.ndarray
-    reward: np.ndarray | None
-    done: np.ndarray | None
     context: int
     episode: int
     start: int
-    further: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def horizon(self) -> int:
-        return len(self.rgb) - self.context
+        return len(self.action) - self.context
 
-    def walked_m(self) -> np.ndarray:
-        """Length of the true path from the last context frame to each later frame: metres, float64 [horizon]."""
-        places = np.asarray(self.pose, np.float64)[self.context - 1 :, :3]
+    @property
+    def pose(self) -> np.ndarray | None:
+        return self.channels.get("pose")
+
+    def walked_m(self, channel: str = "pose") -> np.ndarray:
+        """Length of the true path from the last context row to each later one: metres, float64 [horizon]."""
+        places = np.asarray(self.channels[channel], np.float64)[self.context - 1 :, :3]
         return np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()
 
     def moves(self) -> bool:
-        """True where the player walks more than half a metre or turns more than 20 degrees after the context."""
+        """True where the camera goes more than half a metre or turns more than 20 degrees after the context, or, without
+        poses, where anything changes."""
         if self.pose is None:
-            return bool((self.rgb[self.context :] != self.rgb[self.context - 1]).any())
+            main = next(iter(self.channels.values()))
+            return bool((main[self.context :] != main[self.context - 1]).any())
         turned = 2 * np.arccos(np.clip(np.abs(self.pose[self.context :, 3:] @ self.pose[self.context - 1, 3:]), 0, 1))
         return bool(self.walked_m()[-1] > 0.5 or turned.max() > np.deg2rad(20))
+
+
+def recorded_channels(cache) -> dict[str, np.ndarray]:
+    """A clip cache's arrays by the names of the world's channels."""
+    named = {name: getattr(cache, name, None) for name in ("rgb", "depth", "pose", "reward", "done")}
+    return {**{name: array for name, array in named.items() if array is not None}, **cache.further}
+
+
+def check_recording(cache, spec: Spec) -> None:
+    """DatasetError in one sentence where the recording is of another game, or lacks what the world observes."""
+    width = int(np.prod(spec.action.shape or (1,)))
+    if cache.action.shape[1:] != (width,):
+        names = getattr(cache, "action_names", ()) or [str(cache.action.shape[-1]), "numbers"]
+        raise DatasetError(
+            f"the recording's actions ({', '.join(names)}) are not those of {spec.name} ({spec.action}): "
+            "score a world on recordings of its own game."
+        )
+    low, high = spec.action_limits
+    held = np.asarray(cache.action[:: max(1, len(cache.action) // 10000)]).reshape(-1, *(spec.action.shape or ()))
+    if (held < low - 1e-3).any() or (held > high + 1e-3).any():
+        raise DatasetError(
+            f"the recording holds actions outside of {spec.name}'s {spec.action}: it is of another game."
+        )
+    there = recorded_channels(cache)
+    lacking = [name for name in spec.observes if name not in there]
+    if lacking:
+        raise DatasetError(
+            f"{spec.name} observes {' and '.join(lacking)}, and the recording holds only {', '.join(there)}: "
+            "score it on a recording of its own game."
+        )
 
 
 def in_box(*box: float) -> Where:
@@ -119,7 +150,7 @@ def check_clips(place: str, clips: Sequence[Clip], steps: int) -> None:
     """DatasetError unless there are clips of `place`, all of one shape, with `steps` steps or more to dream."""
     if not clips:
         raise DatasetError(f"there are no clips of {place} places; draw some, or leave the place out.")
-    if len({(clip.context, len(clip.rgb)) for clip in clips}) != 1:
+    if len({(clip.context, clip.horizon) for clip in clips}) != 1:
         raise DatasetError(f"the clips of {place} places differ in length; draw them with one context and one horizon.")
     if clips[0].horizon < steps:
         raise DatasetError(
@@ -133,8 +164,7 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
     ObservationError where it cannot."""
     seen = {}
     for name in (*spec.observes, *spec.may_observe):
-        told = [getattr(clip, name, None) if hasattr(clip, name) else clip.further.get(name) for clip in clips]
-        arrays = [array for array in told if array is not None]
+        arrays = [clip.channels[name] for clip in clips if name in clip.channels]
         if len(arrays) < len(clips) and name in spec.may_observe:
             continue
         if len(arrays) < len(clips):
@@ -176,19 +206,5 @@ def _runs(cache, first: int, stop: int, where: Where | None):
 
 def _cut(cache, start: tuple[int, int], length: int, context: int) -> Clip:
     episode, row = start
-
-    def part(array):
-        return None if array is None else array[row : row + length]
-
-    return Clip(
-        rgb=cache.rgb[row : row + length],
-        depth=part(cache.depth),
-        pose=part(cache.pose),
-        action=cache.action[row : row + length],
-        reward=part(cache.reward),
-        done=part(cache.done),
-        context=context,
-        episode=episode,
-        start=row,
-        further={name: array[row : row + length] for name, array in cache.further.items()},
-    )
+    channels = {name: array[row : row + length] for name, array in recorded_channels(cache).items()}
+    return Clip(channels, cache.action[row : row + length], context, episode, row)

@@ -4,53 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
-import numpy as np
 import torch
 
 from ..core.errors import ObservationError
-from ..core.world import World, make_rng
+from ..core.policy import Replay
+from ..core.world import World
 from .clips import Clip
+from .exam import Exam, Found, Probe, batches
 from .fidelity import psnr
-from .roll import fold_context, poses_at
-from .statistics import Figure, mean_interval
+from .roll import Results, Tick, fold_context, poses_at
+from .scorecard import PREDICTED, TRUE, Picture, Report, Row
+from .statistics import mean_interval
+from .turning import turns
+from .work import Unit
 
 STATIC_DB = 20.0  # a far view this like the first one means that the picture hardly changed at all
 WALKED_M = 1.0  # who goes less far does not leave
-
-
-@dataclass(frozen=True)
-class Closure:
-    """There and back, and there again. closed: PSNR of the frame after coming back against the first; far: of the view at
-    the far end against the first; again: of the far view, mostly dreamt, when it is come to a second time against the first
-    time. void: the far views are not different (far >= 20 dB), so `closed` proves nothing; void_again: the frames after
-    coming back are like the far ones, so `again` proves nothing (fog looks alike wherever it is drawn). acted: gone by keys,
-    not along poses; far_deg and far_m: how far the way leads, the latter a mean over clips; steps: there and back. `picture`
-    holds the first clip's frames, uint8 [6, H, W, 3]: first, half way out, far, half way back, back, far again."""
-
-    arm: str
-    place: str
-    way: str
-    acted: bool
-    far_deg: float
-    far_m: float
-    steps: int
-    closed: Figure
-    far: Figure
-    again: Figure
-    void: bool
-    void_again: bool
-    picture: np.ndarray = field(repr=False, compare=False)
+LEAD = (
+    "The camera goes away and back in small steps, and away once more. Back again, the picture should be the first one (PSNR, "
+    "dB); the far view, which the world drew itself, is seen a second time against the first time. Where the view never "
+    "changed on the way, that proves nothing and is called void."
+)
 
 
 @dataclass(frozen=True)
 class Way:
-    """There and back. `steps(clips, pose)`: 2n tensors that lead away from the first poses [B, 7] (None for a world that
-    shows none) and to them again, each a pose [B, 7] to be observed or, where `acted`, an action [B, A] to be played."""
+    """There and back. `steps(clips, pose)`: 2n poses [B, 7] to be observed, that lead away from the first poses (None for a
+    world that shows none) and to them again; or, where `acted`, 2n actions [A]."""
 
     name: str
-    steps: Callable[[Sequence[Clip], torch.Tensor | None], list[torch.Tensor]]
+    steps: Callable[[Sequence[Clip], torch.Tensor | None], list]
     far_deg: float = 0.0
     acted: bool = False
 
@@ -74,77 +61,144 @@ def walk_way(steps: int = 100) -> Way:
     return Way(f"walk of {2 * half} steps", path)
 
 
-def key_way(there: torch.Tensor, back: torch.Tensor, name: str, steps: int) -> Way:
-    """Holds the action `there` [A] for half of the steps, then `back`: for worlds that take no poses."""
+def turn_way(there: torch.Tensor, back: torch.Tensor, name: str, steps: int, far_deg: float = 0.0) -> Way:
+    """Holds the action `there` for half of the steps, then `back`: for worlds that take no poses."""
     half = steps // 2
-
-    def path(clips: Sequence[Clip], pose: torch.Tensor | None) -> list[torch.Tensor]:
-        return [action.expand(len(clips), *action.shape) for action in (*[there] * half, *[back] * half)]
-
-    return Way(name, path, acted=True)
+    return Way(name, lambda clips, pose: [*[there] * half, *[back] * half], far_deg, True)
 
 
-def closure(
-    world: World,
-    clips: Sequence[Clip],
-    rng: torch.Generator,
-    way: Way,
-    arm: str = "",
-    place: str = "",
-    batch: int = 8,
-) -> Closure:
+def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick: Tick = lambda done: None) -> Results:
     """Goes the way from each clip's context on, there and back, and there again.
 
-    The first frame is what the world shows after its context (for most worlds the observed frame itself), so the last,
-    dreamt frame is held against the strictest reference. ObservationError where the way is one of poses and the world
-    takes none.
+    closed, far, again, alike [B] dB: back against the first frame, the far view against it, the far view seen again against
+    itself, and back against far; went [B] m; frames uint8 [B, 6, H, W, 3]: first, half way out, far, half way back, back, far
+    again. The first frame is what the world shows after its context. ObservationError where the way is one of poses and the
+    world takes none.
     """
     if not way.acted and "pose" not in world.spec.observes:
         raise ObservationError(f"{world.spec.name} does not observe 'pose', so nothing can move its camera.")
-    size, seed = min(batch, world.spec.max_batch or batch), int(torch.randint(2**31 - 1, (1,), generator=rng).item())
-    shows = ("rgb", "pose") if "pose" in world.spec.channels else ("rgb",)
-    closed, away, again, alike, picture, went, count = [], [], [], [], [], [], 0
-    for start in range(0, len(clips), size):
-        own, some = make_rng(seed + start), clips[start : start + size]
-        state = fold_context(world, some, own)
-        seen = world.render(state, shows)
-        first, pose = seen["rgb"].cpu(), seen.get("pose")
-        steps = way.steps(some, pose)
-        count = len(steps)
-        half, shown, frame, far_frame = count // 2, [first[0]], first, first
-        for number, step in enumerate([*steps, *steps[: count // 2]], start=1):
-            state = world.imagine(state, step, own) if way.acted else world.observe({"pose": step}, state, own)
-            if number in (half // 2, half, count - half // 2, count, count + half):
-                frame = world.render(state, ("rgb",))["rgb"].cpu()
-                shown.append(frame[0])
-            if number == count:
-                closed.append(psnr(frame, first))
-                alike.append(psnr(frame, far_frame))
-            if number == half:
-                far_frame = frame
-                away.append(psnr(frame, first))
-                if pose is not None:
-                    went.append((world.render(state, ("pose",))["pose"] - pose)[:, :3].norm(dim=1).cpu())
-        again.append(psnr(frame, far_frame))
-        picture = picture or shown
-    back, there, twice = (mean_interval(torch.cat(values), rng) for values in (closed, away, again))
-    far_m = float(torch.cat(went).mean()) if went else 0.0
-    void, void_again = (bool(torch.cat(values).mean() >= STATIC_DB) for values in (away, alike))
-    return Closure(
-        arm,
-        place,
-        way.name,
-        way.acted,
-        way.far_deg,
-        far_m,
-        count,
-        back,
-        there,
-        twice,
-        void,
-        void_again,
-        torch.stack(picture).numpy(),
+    state = fold_context(world, clips, rng)
+    tick(len(clips) * clips[0].context)
+    seen = world.render(state, ("rgb", "pose") if "pose" in world.spec.channels else ("rgb",))
+    pose, frames, went = seen.get("pose"), [seen["rgb"].cpu()], torch.zeros(len(clips))
+    steps = way.steps(clips, pose)
+    count, half = len(steps), len(steps) // 2
+    looked = (half // 2, half, count - half // 2, count, count + half)
+    twice = [*steps, *steps[:half]]
+    held = [step.expand(len(clips), *step.shape) for step in twice] if way.acted else []
+    policy = Replay(torch.stack(held)) if held else None
+    memory: Any = policy.begin(len(clips), rng) if policy else None
+    for number, step in enumerate(twice, start=1):
+        if policy:
+            action, memory = policy.act({}, memory, rng)
+            state = world.imagine(state, action, rng)
+        else:
+            state = world.observe({"pose": step}, state, rng)
+        frames += [world.render(state, ("rgb",))["rgb"].cpu()] * looked.count(number)
+        if number == half and pose is not None:
+            went = (world.render(state, ("pose",))["pose"] - pose)[:, :3].norm(dim=1).cpu()
+        tick(len(clips))
+    first, _, far, _, back, again = frames
+    pairs = {"closed": (back, first), "far": (far, first), "again": (again, far), "alike": (back, far)}
+    found = {name: psnr(*pair) for name, pair in pairs.items()}
+    return {**found, "went": went, "frames": torch.stack(frames, 1), "steps": torch.full((len(clips),), count)}
+
+
+def ways_of(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[Way, Sequence[Clip]]]:
+    """Along poses where the world takes them, else by actions that undo each other."""
+    config, clips = exam.config, clips[: exam.config.closure_clips]
+    if exam.follows_poses(world):
+        ways = [(yaw_way(far, config.closure_step_deg), clips) for far in config.closure_deg]
+        afoot = walkers(clips, config.closure_walk) if config.closure_walk else []
+        return ways + ([(walk_way(config.closure_walk), afoot)] if afoot else [])
+    found = _turns(exam, world) if config.closure_deg else None
+    if found is None:
+        return []
+    left, right, name, speed = found
+    halves = {far: min(100, max(5, round(math.radians(far) / speed))) for far in config.closure_deg}
+    return [
+        (turn_way(left, right, f"turning by {name}, {2 * half} steps", 2 * half, math.degrees(half * speed)), clips)
+        for half in dict.fromkeys(halves.values())
+    ]
+
+
+def _asked(exam: Exam) -> list[tuple[str, World, str, int, Way, Sequence[Clip]]]:
+    return [
+        (arm, world, place, number, way, some)
+        for arm, world in {**exam.arms, **exam.closing}.items()
+        if not _missing(exam, world)
+        for place, clips in exam.places.items()
+        for number, (way, some) in enumerate(ways_of(exam, world, clips))
+    ]
+
+
+def _units(exam: Exam) -> list[Unit]:
+    units = []
+    for arm, world, place, which, way, clips in _asked(exam):
+        verb = "imagine" if way.acted else "pose"
+        for number, (first, some) in enumerate(batches(exam, world, clips)):
+            steps = len(way.steps(some, poses_at(some, 0) if some[0].pose is not None else None))
+            calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * (steps + steps // 2)}
+            run = partial(_go, exam, world, some, way, first)
+            units.append(
+                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {place} places: {way.name}", calls, run)
+            )
+    return units
+
+
+def _go(exam: Exam, world: World, clips: Sequence[Clip], way: Way, first: int, tick: Tick) -> Results:
+    found = go(world, clips, way, exam.rng(3000 + first), tick)
+    return {**found, "frames": found["frames"][: 1 if first == 0 else 0]}  # one is looked at
+
+
+def rows_of(where: tuple, way: Way, gone: Results, rng: Callable[[], torch.Generator]) -> list[Row]:
+    """closed and again, with the far view against the first, and whether they prove anything."""
+    back, far, again = (mean_interval(gone[name], rng()) for name in ("closed", "far", "again"))
+    away = float(gone["went"].double().mean())
+    void, void_again = far.value >= STATIC_DB, float(gone["alike"].mean()) >= STATIC_DB
+    note = f"{away:.1f} m away" if away > 0.1 else f"{way.far_deg:.0f} degrees away" if way.far_deg else ""
+    note += ", the far view is like the first: void" if void else ""
+    motion, steps = PREDICTED if way.acted else TRUE, int(gone["steps"][0])
+    place, arm = where
+    head, tail = ("memory", "rgb"), ("dB", place, arm, motion, steps)
+    return [
+        Row(*head, way.name, *tail, back, 1, {"far view": far}, void=void, note=note),
+        Row(*head, f"{way.name}: far view again", *tail, again, 1, void=void or void_again),
+    ]
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    whole, strips = Report(), {}
+    for arm, _, place, which, way, _ in _asked(exam):
+        if gone := found.joined(f"memory|{arm}|{place}|{which}"):
+            rows = rows_of((place, arm), way, gone, exam.rng)
+            whole.rows += rows
+            strips.setdefault(f"{way.name}, {place} places", {})[_words(arm, rows)] = gone["frames"][0].numpy()
+    columns = ["first", "on the way", "far", "on the way back", "back", "far again"]
+    whole.pictures = [Picture("memory", title, columns, rows) for title, rows in strips.items()]
+    return whole
+
+
+def _words(arm: str, rows: Sequence[Row]) -> str:
+    back, again = rows
+    return (
+        f"{arm}: void"
+        if back.void
+        else f"{arm}: back {back.figure.value:.1f} dB, far again {again.figure.value:.1f} dB"
     )
+
+
+def _turns(exam: Exam, world: World):
+    clips = next(iter(exam.places.values()))
+    return exam.once(f"turns {id(world)}", lambda: turns(world, clips, exam.rng(2)))
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if "rgb" not in exam.shared(world, "rgb") or not world.spec.observes:
+        return "needs rgb"
+    if exam.follows_poses(world):
+        return ""
+    return "" if _turns(exam, world) else "needs actions that turn a camera whose pose is shown or recorded"
 
 
 def walkers(clips: Sequence[Clip], steps: int) -> list[Clip]:
@@ -160,3 +214,6 @@ def turned(pose: torch.Tensor, angle_rad: float) -> torch.Tensor:
     w, x, y, z = pose[:, 3:].unbind(-1)
     around = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
     return torch.cat([pose[:, :3], around], -1)
+
+
+MEMORY = Probe("memory", "Does it remember?", LEAD, _missing, _report, units=_units)

@@ -1,84 +1,74 @@
-"""The whole examination in one call: score, closures, endurance and speed of every arm."""
+"""The whole examination in one call: every probe asks every arm, and what was done is kept as it is done."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from gymnasium import spaces
 
 from ..core.errors import TerrellaError
-from ..core.world import World
-from .album import Album
-from .bars import Bar
-from .clips import Clip
-from .closure import Closure, Way, closure, key_way, walk_way, walkers, yaw_way
-from .drift import drift
-from .endurance import long_rollout
+from .clips import Clip, check_clips
+from .closure import MEMORY
+from .endurance import ENDURANCE
+from .exam import CLIPS, LONG, Exam, Found, Probe, dreams
+from .likeness import drift_probe
+from .outcomes import OUTCOMES
 from .page import page
-from .scorecard import Progress, Scorecard, ScoreConfig, score, to_json
-from .speed import speed
+from .pixels import PIXELS
+from .pixels import series as pixel_series
+from .poses import POSES
+from .poses import series as pose_series
+from .risk import CALIBRATION
+from .scorecard import Bar, Missing, Place, Scorecard, to_json
+from .speed import SPEED
+from .states import STATES
+from .states import series as state_series
+from .work import Clock, Progress, Store, prices_of, run_all
+
+DRIFT = drift_probe((pixel_series, state_series, pose_series))
+PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, ENDURANCE, SPEED)
 
 
-@dataclass(frozen=True)
-class ExamConfig:
-    """closure_deg: how far the camera turns before it comes back; closure_walk: steps of the walk there and back, 0 for
-    none; long_steps 0 leaves long rollout and speed out."""
-
-    score: ScoreConfig = field(default_factory=ScoreConfig)
-    closure_deg: tuple[float, ...] = (90.0, 180.0)
-    closure_step_deg: float = 3.0
-    closure_walk: int = 100
-    closure_clips: int = 50
-    long_steps: int = 1000
-    stories: int = 8
-
-
+@torch.inference_mode()
 def examine(
-    arms: Mapping[str, World],
-    clips_by_place: Mapping[str, Sequence[Clip]],
-    rng: torch.Generator,
-    config: ExamConfig | None = None,
-    album: Album | None = None,
-    progress: Progress | None = None,
-    long_clips: Mapping[str, Sequence[Clip]] | None = None,
-    closing: Mapping[str, World] | None = None,
+    exam: Exam,
+    folder: Path | None = None,
+    identity: str = "",
+    progress: Progress = lambda share, words, left_s: None,
+    clock: Clock = time.monotonic,
+    probes: Sequence[Probe] = PROBES,
 ) -> Scorecard:
-    """Everything the scorecard holds. Endurance and speed start from the clips of the first place.
+    """Everything that can be measured of the arms. The same seed gives the same card, speeds excepted.
 
-    `closing`: more arms, of which only closure is asked.
-
-    `long_clips`, by place, are those whose whole length the drift curves span; without any there are no such curves.
-
-    Give an `album` of all recordings to hold long dreams against real views of wherever they lead; without one the
-    clips themselves are the album, and fewer dreamt frames find a counterpart.
+    folder: results are kept there as they come, and those of an exam that was stopped are not measured again; `identity`
+    says what else must be the same for that (the files of world and recording). What an arm lacks for a probe is listed.
     """
-    config = config or ExamConfig()
-    tell = progress or (lambda share, words: None)
-    scored = 0.4 if long_clips else 0.7
-    card = score(arms, clips_by_place, rng, config.score, lambda share, words: tell(share * scored, words))
-    clips = next(iter(clips_by_place.values()))
-    closures, endurance, speeds = [], [], []
-    for number, (arm, world) in enumerate(arms.items()):
-        tell(scored + 0.3 * number / len(arms), f"closure and {config.long_steps} steps, {arm}")
-        for place, shown in clips_by_place.items():
-            closures += _closures(world, shown[: config.closure_clips], rng, arm, place, config)
-        if config.long_steps:
-            endurance.append(long_rollout(world, clips, rng, arm, config.long_steps, config.stories, album=album))
-            speeds.append(speed(world, clips, rng, arm, config.long_steps))
-    for arm, world in (closing or {}).items():
-        for place, shown in clips_by_place.items():
-            closures += _closures(world, shown[: config.closure_clips], rng, arm, place, config)
-    drifts = []
-    if long_clips:
-        steps = min(clip.horizon for shown in long_clips.values() for clip in shown)
-        later = lambda share, words: tell(0.7 + 0.3 * share, words)  # noqa: E731
-        drifts = drift(arms, long_clips, rng, steps, config.score.batch, later)
-    tell(1.0, "examined")
-    return dataclasses.replace(card, closures=closures, endurance=endurance, speeds=speeds, drifts=drifts)
+    config, first = exam.config, next(iter(exam.arms.values()))
+    for place, clips in exam.places.items():
+        check_clips(place, clips, max(config.horizons))
+    for place, clips in exam.sets.get(LONG, {}).items():
+        check_clips(place, clips, 1)
+    store = Store(folder, exam.fingerprint(identity))
+    some = next(iter(exam.places.values()))
+    prices = {}
+    progress(0.0, "measuring how fast the worlds are", 0.0)
+    for arm, world in {**exam.arms, **exam.closing}.items():
+        prices |= prices_of(arm, world, some[: min(config.batch, world.spec.max_batch or config.batch)], clock)
+    prices["recording", "compare"] = 3e-3
+    units = dreams(exam, probes) + [unit for probe in probes for unit in probe.units(exam)]
+    found = Found(run_all(units, store, prices, clock, progress))
+    card = Scorecard({arm: world.spec.name for arm, world in exam.arms.items()}, first.spec.dt_s, _places(exam))
+    for probe in probes:
+        for arm, world in exam.arms.items():
+            if why := probe.missing(exam, world):
+                card.missing.append(Missing(probe.name, arm, why))
+        report = probe.report(exam, found)
+        card.rows.extend(report.rows)
+        card.curves.extend(report.curves)
+        card.pictures.extend(report.pictures)
+    return card
 
 
 def write_report(card: Scorecard, bars: Sequence[Bar], folder: str | Path, title: str) -> tuple[Path, Path]:
@@ -87,28 +77,15 @@ def write_report(card: Scorecard, bars: Sequence[Bar], folder: str | Path, title
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scorecard.json").write_text(to_json(card, bars) + "\n", encoding="utf-8")
-        (folder / "scorecard.html").write_text(page(card, bars, title), encoding="utf-8")
+        (folder / "scorecard.html").write_text(page(card, bars, title, PROBES), encoding="utf-8")
     except OSError as error:
         raise TerrellaError(f"cannot write the report to {folder} ({error}); choose another folder.") from error
     return folder / "scorecard.json", folder / "scorecard.html"
 
 
-def _closures(world: World, clips: Sequence[Clip], rng, arm: str, place: str, config: ExamConfig) -> list[Closure]:
-    """The closures that the world can be asked for: along poses where it takes them, else by keys that undo each other."""
-    ways: list[tuple[Way, Sequence[Clip]]] = []
-    if "pose" in world.spec.observes:
-        ways = [(yaw_way(far, config.closure_step_deg), clips) for far in config.closure_deg]
-        afoot = walkers(clips, config.closure_walk) if config.closure_walk else []
-        ways += [(walk_way(config.closure_walk), afoot)] if afoot else []
-    elif config.closure_deg:
-        ways = [(way, clips) for way in _key_ways(world)]
-    return [closure(world, some, rng, way, arm, place, config.score.batch) for way, some in ways]
+def _places(exam: Exam) -> list[Place]:
+    def described(name: str, clips: Sequence[Clip]) -> Place:
+        moving = sum(clip.moves() for clip in clips) / len(clips)
+        return Place(name, len(clips), moving, clips[0].context, clips[0].horizon)
 
-
-def _key_ways(world: World) -> list[Way]:
-    """Left and right again, for a world with such buttons."""
-    names = [name.upper() for name in world.spec.action_names]
-    if not (isinstance(world.spec.action, spaces.MultiBinary) and {"TURN_LEFT", "TURN_RIGHT"} <= set(names)):
-        return []
-    left, right = (torch.tensor([int(name == turn) for name in names]) for turn in ("TURN_LEFT", "TURN_RIGHT"))
-    return [key_way(left, right, f"turning left and right, {steps} steps", steps) for steps in (50, 100)]
+    return [described(name, clips) for name, clips in exam.sets[CLIPS].items()]

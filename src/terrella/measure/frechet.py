@@ -91,7 +91,9 @@ def _moments(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 def _root(matrix: torch.Tensor) -> torch.Tensor:
     values, vectors = torch.linalg.eigh(matrix)
-    return (vectors * values.clamp_min(0).sqrt()[..., None, :]) @ vectors.mT
+    rounding = values.amax(-1, keepdim=True) * matrix.shape[-1] * torch.finfo(matrix.dtype).eps
+    values = values.where(values > rounding, 0)  # the root of what rounding left would be large
+    return (vectors * values.sqrt()[..., None, :]) @ vectors.mT
 
 
 def _joined(groups: torch.Tensor, seed: int, most: int = 50) -> torch.Tensor:

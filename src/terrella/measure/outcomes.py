@@ -2,42 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ..core.errors import DatasetError
-from ..core.world import World, make_rng
-from .clips import Clip, Where
-from .roll import actions_at, fold_context
+from ..core.world import World
+from .clips import Clip, Where, recorded_channels
+from .exam import ENDINGS, Exam, Found, Probe
+from .roll import Results, Watch
+from .scorecard import COPY_LAST, PREDICTED, Report, Row
 from .statistics import Figure, mean_interval
 
-
-@dataclass(frozen=True)
-class Fate:
-    """One arm after `horizon` steps: mean absolute errors, each beside that of a copy.
-
-    reward: of the sum over the horizon; reward_usual: of a world that always pays the recording's median; reward_auc: how
-    well the dreamt sum tells clips that paid more than usual from those that did not (area under the ROC curve, 0.5 is
-    chance, NaN where all or none did); paid: clips that did. vitals and vitals_copied: of each vital at the end, dreamt, and
-    left as it last was. done_auc: likewise, how well the time that a dream has been over tells clips whose episode ended;
-    ended: clips whose episode did.
-    """
-
-    place: str
-    arm: str
-    horizon: int
-    seconds: float
-    reward: Figure
-    reward_usual: Figure
-    vitals: dict[str, Figure] = field(default_factory=dict)
-    vitals_copied: dict[str, Figure] = field(default_factory=dict)
-    reward_auc: float = float("nan")
-    paid: int = 0
-    done_auc: float = float("nan")
-    ended: int = 0
+LEAD = (
+    "What dreams say of rewards, of numbers such as health, and of the end: the mean absolute error of the reward summed over "
+    "the steps, and its correlation with the recorded sum; how well the dreamt sum tells stretches that paid more than usual, "
+    "and the dream's end tells stretches that ended (area under the ROC curve: 1 always, 0.5 by chance). Half of the stretches "
+    "are taken from shortly before an end, where there are ends."
+)
+USUAL = "the usual reward"
 
 
 @dataclass(frozen=True)
@@ -77,57 +63,57 @@ def passages(
     return found
 
 
-def fates(
-    arms: Mapping[str, World],
-    place: str,
-    shown: Sequence[Passage],
-    horizons: Sequence[int],
-    rng: torch.Generator,
-    batch: int = 8,
-) -> list[Fate]:
-    """Every arm dreams on from each passage's context under its actions, the same for all."""
+def outcomes(
+    place: str, arm: str, shown: Sequence[Passage], dreamt: Results, horizons: Sequence[int], rng
+) -> list[Row]:
+    """Figures of reward, of single numbers, and of the end, of passages that a world dreamt on from their context; rng():
+    a generator for each figure."""
     context = shown[0].clip.context
-    if any(len(passage.real) < context + max(horizons) for passage in shown):
-        raise DatasetError(f"these passages are shorter than {max(horizons)} steps; draw longer ones.")
-    reward = np.stack([passage.clip.reward * passage.real for passage in shown])
-    usual = float(np.median(np.concatenate([passage.clip.reward[passage.real] for passage in shown])))
-    done = np.stack([passage.clip.done & passage.real for passage in shown])
-    going = np.stack([passage.real for passage in shown])
+    going = torch.from_numpy(np.stack([passage.real for passage in shown]))
+    channels = {name: np.stack([passage.clip.channels[name] for passage in shown]) for name in dreamt}
+    truth = {name: torch.from_numpy(array.reshape(*array.shape[:2])).double() for name, array in channels.items()}
     rows = []
-    for arm, world in arms.items():
-        told = [
-            _follow(world, shown[at : at + batch], max(horizons), make_rng(at)) for at in range(0, len(shown), batch)
-        ]
-        dreamt = {name: torch.cat([part[name] for part in told]).double() for name in told[0]}
-        for horizon in horizons:
-            part = slice(context - 1, context - 1 + horizon)
-            true_sum = torch.from_numpy(reward[:, part].sum(1)).double()
-            paid = usual * torch.from_numpy(going[:, part].sum(1)).double()
-            vitals, copied = {}, {}
-            for name in (name for name in dreamt if name not in ("reward", "done")):
-                truth = np.stack([passage.clip.further[name].reshape(-1) for passage in shown])
-                now, then = (torch.from_numpy(truth[:, row]).double() for row in (context - 1, context - 1 + horizon))
-                vitals[name] = mean_interval((dreamt[name][:, horizon - 1] - then).abs(), rng)
-                copied[name] = mean_interval((now - then).abs(), rng)
-            more = true_sum > paid + 1e-6
-            ended = torch.from_numpy(done[:, part].any(1))
-            rows.append(
-                Fate(
-                    place,
-                    arm,
-                    horizon,
-                    horizon * world.spec.dt_s,
-                    mean_interval((dreamt["reward"][:, :horizon].sum(1) - true_sum).abs(), rng),
-                    mean_interval((paid - true_sum).abs(), rng),
-                    vitals,
-                    copied,
-                    auc(dreamt["reward"][:, :horizon].sum(1), more),
-                    int(more.sum()),
-                    auc(dreamt["done"][:, :horizon].sum(1), ended),
-                    int(ended.sum()),
-                )
-            )
+    for step in horizons:
+        part = slice(context - 1, context - 1 + step)
+        live, where = going[:, part], ("outcomes", "reward")
+        tail = place, arm, PREDICTED, step
+        if "reward" in dreamt:
+            usual = float((truth["reward"][going]).median())
+            true, mine = (truth["reward"][:, part] * live).sum(1), dreamt["reward"][:, :step].double().sum(1)
+            plain = usual * live.double().sum(1)
+            beside = {USUAL: mean_interval((plain - true).abs(), rng())}
+            error, gain = (mine - true).abs(), mean_interval((plain - true).abs() - (mine - true).abs(), rng())
+            rows.append(Row(*where, "return error", "", *tail, mean_interval(error, rng()), -1, beside, gain))
+            rows.append(Row(*where, "return correlation", "", *tail, correlation(mine, true), 1))
+            more = true > plain + 1e-6
+            note = f"{int(more.sum())} of {len(shown)} stretches paid more"
+            rows.append(Row(*where, "pays: AUC", "", *tail, _plain(auc(mine, more), len(shown)), 1, note=note))
+        if "done" in dreamt:
+            ended = (truth["done"][:, part].bool() & live).any(1)
+            note = f"{int(ended.sum())} of {len(shown)} stretches ended"
+            figure = _plain(auc(dreamt["done"][:, :step].double().sum(1), ended), len(shown))
+            rows.append(Row("outcomes", "done", "ends: AUC", "", *tail, figure, 1, note=note))
+        for name in (name for name in dreamt if name not in ("reward", "done")):
+            now, then = truth[name][:, context - 1], truth[name][:, context - 1 + step]
+            error, copied = (dreamt[name][:, step - 1].double() - then).abs(), (now - then).abs()
+            figures = mean_interval(error, rng()), -1, {COPY_LAST: mean_interval(copied, rng())}
+            rows.append(Row("outcomes", name, "error", "", *tail, *figures, mean_interval(copied - error, rng())))
     return rows
+
+
+def correlation(first: torch.Tensor, second: torch.Tensor) -> Figure:
+    """Pearson's, of [n] each, with the interval of Fisher's z (1921); NaN where one of them never changes."""
+    a, b = first - first.mean(), second - second.mean()
+    size = float(a.norm() * b.norm())
+    if size < 1e-9 or len(a) < 4:
+        return _plain(float(a @ b) / size if size >= 1e-9 else math.nan, len(a))
+    value = max(-1.0, min(1.0, float(a @ b) / size))
+    z, wide = math.atanh(max(-1 + 1e-9, min(1 - 1e-9, value))), 1.96 / math.sqrt(len(a) - 3)
+    return Figure(value, math.tanh(z - wide), math.tanh(z + wide), len(a))
+
+
+def _plain(value: float, count: int) -> Figure:
+    return Figure(value, math.nan, math.nan, count)
 
 
 def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
@@ -139,20 +125,40 @@ def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
     return float(above.mean())
 
 
-def _follow(world: World, shown: Sequence[Passage], steps: int, rng: torch.Generator) -> dict[str, torch.Tensor]:
-    """reward, done and the vitals that both the world and the passages tell, after each step: float [B, steps]."""
-    clips = [passage.clip for passage in shown]
-    numbers = [name for name, array in clips[0].further.items() if array[0].size == 1]
-    vitals = [name for name in numbers if name in world.spec.channels]
-    told = [name for name in ("reward", "done") if name in world.spec.channels] + vitals
-    state, context = fold_context(world, clips, rng), clips[0].context
-    found: dict[str, list[torch.Tensor]] = {name: [] for name in ("reward", "done", *vitals)}
-    for step in range(steps):
-        state = world.imagine(state, actions_at(world, clips, context - 1 + step), rng)
-        now = world.render(state, told)
-        for name, values in found.items():
-            values.append(now[name].float().cpu() if name in now else torch.zeros(len(clips)))
-    return {name: torch.stack(values, 1) for name, values in found.items()}
+def _told(exam: Exam, world: World) -> list[str]:
+    """reward, done, and the single numbers that both the world and the passages say."""
+    shown = next(iter(exam.sets.get(ENDINGS, {}).values()), None)
+    if not shown or not world.spec.observes:
+        return []
+    single = [name for name, array in shown[0].channels.items() if array[0].size == 1 and name in world.spec.channels]
+    return [name for name in single if not name.startswith("uncertainty")]
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+    names = _told(exam, world) if of == ENDINGS else []
+    flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
+    return [Watch(tuple(names), flat)] if names else []
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    whole = Report()
+    for place, clips in exam.sets.get(ENDINGS, {}).items():
+        shown = [Passage(clip, real) for clip, real in zip(clips, exam.going[place])]
+        for arm in exam.arms:
+            if dreamt := found.dreamt(ENDINGS, arm, place, PREDICTED):
+                whole.rows += outcomes(place, arm, shown, dreamt, exam.config.horizons, exam.rng)
+    return whole
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if not world.spec.observes:
+        return "needs a world that takes evidence"
+    return (
+        "" if _told(exam, world) else "needs reward, done or a number such as health, of the world and of the recording"
+    )
+
+
+OUTCOMES = Probe("outcomes", "Rewards, numbers and ends", LEAD, _missing, _report, _watch)
 
 
 def _allowed(cache, first: int, stop: int, where: Where | None) -> list[tuple[int, int]]:
@@ -168,17 +174,9 @@ def _passage(cache, start: int, stop: int, context: int, horizon: int) -> Passag
     wanted = start + np.arange(context + horizon)
     rows, real = np.minimum(wanted, stop - 1), wanted < stop - 1
 
-    def part(array):
-        return None if array is None else np.asarray(array[rows])
-
-    zeros = np.zeros(len(rows), np.float32)
-    reward, done = part(cache.reward), part(cache.done)
     action = np.asarray(cache.action[rows]) * real.reshape(-1, *[1] * (np.ndim(cache.action) - 1))
-    clip = Clip(
-        np.asarray(cache.rgb[rows]), part(cache.depth), part(cache.pose), action, zeros if reward is None else reward,
-        zeros.astype(bool) if done is None else done, context, 0, start,
-        {name: np.asarray(array[rows]) for name, array in cache.further.items()},
-    )  # fmt: skip
+    channels = {name: np.asarray(array[rows]) for name, array in recorded_channels(cache).items()}
+    clip = Clip(channels, action, context, 0, start)
     return Passage(clip, real)
 
 

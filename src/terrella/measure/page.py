@@ -1,37 +1,32 @@
-"""One self-contained HTML page of a scorecard: bars, curves, strips of truth against dream, and how it was measured."""
+"""One self-contained HTML page of a scorecard: the verdict, then each probe's curves, pictures and figures, and the method."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from .bars import Bar, summary
-from .page_conduct import closures, control, endurance, fates, position, risk
-from .page_likeness import drift, looks, psnr, sharpness, strips
-from .page_parts import figure_text, section, table_of
-from .roll import PREDICTED
-from .scorecard import Scorecard
+from .page_parts import bar_table, charts_of, figure_table, picture_of, section
+from .scorecard import Bar, Scorecard
+from .verdict import verdict
+
+if TYPE_CHECKING:
+    from .exam import Probe
 
 _HERE = Path(__file__).parent
 
 
-def page(card: Scorecard, bars: Sequence[Bar], title: str) -> str:
-    """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it."""
+def page(card: Scorecard, bars: Sequence[Bar], title: str, probes: Sequence[Probe]) -> str:
+    """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it. A section a probe that found something."""
     style = (_HERE / "page.css").read_text(encoding="utf-8")
     sections = [
+        _verdict(card),
         _bars(bars),
-        strips(card),
-        psnr(card),
-        sharpness(card),
-        drift(card),
-        risk(card),
-        fates(card),
-        looks(card),
-        control(card),
-        position(card),
+        *(_section(card, probe) for probe in probes),
+        _missing(card),
+        _method(card),
     ]
-    sections += [closures(card), endurance(card), _speeds(card), _method(card)]
     places = " &middot; ".join(
         f"{place.clips} clips of {escape(place.name)} places ({place.moving_share:.0%} moving)" for place in card.places
     )
@@ -44,48 +39,43 @@ def page(card: Scorecard, bars: Sequence[Bar], title: str) -> str:
     )
 
 
+def _verdict(card: Scorecard) -> str:
+    first, *further = verdict(card)
+    lines = "".join(f"<li>{escape(line)}</li>" for line in further)
+    return f"<section class=verdict><h2>{escape(first)}</h2>{f'<ul>{lines}</ul>' if lines else ''}</section>"
+
+
 def _bars(bars: Sequence[Bar]) -> str:
     if not bars:
         return ""
-    mine = [bar for bar in bars if not bar.side and (bar.motion == PREDICTED or bar.name.startswith("closure"))]
-    others = {
-        "The same pictures at the true poses": [bar for bar in bars if not bar.side and bar not in mine],
-        "Over the same seconds as 8 and 32 steps at frame-skip 4": [bar for bar in bars if bar.side],
-    }
-    inside = _bar_table(mine)
-    for heading, rest in others.items():
-        inside += f"<details><summary>{heading}</summary>{_bar_table(rest)}</details>" if rest else ""
-    lead = f"{summary(mine)}. An outlined status means that the 95% interval reaches over the target."
-    return section("Bars", lead[0].upper() + lead[1:], inside)
+    counts = [
+        (status, sum(bar.status == status for bar in bars)) for status in ("met", "missed", "void", "not measured")
+    ]
+    words = ", ".join(f"{count} {status}" for status, count in counts if count)
+    return section(
+        "Targets", f"{words}. An outlined status means that the 95% interval reaches over it.", bar_table(bars)
+    )
 
 
-def _bar_table(bars: Sequence[Bar]) -> str:
-    rows = []
-    for bar in bars:
-        where = [f"{bar.place} places", "motion given" if bar.motion == "true" else "motion predicted"]
-        if bar.horizon and bar.seconds is not None:
-            where.append(f"{bar.horizon:,} steps, {bar.seconds:.2f} s")
-        words = [escape(" \N{MIDDLE DOT} ".join(where)), *([escape(bar.note)] if bar.note else [])]
-        kind = bar.status.replace(" ", "-") + ("" if bar.sure else " unsure")
-        rows.append(
-            f"<tr><td>{escape(bar.name[0].upper() + bar.name[1:])}{''.join(f'<small>{line}</small>' for line in words)}</td>"
-            f"<td class=n>{figure_text(bar.figure, unit=bar.unit)}</td><td class=n>{escape(bar.target)}</td>"
-            f"<td><span class='status {kind}'>{bar.status}</span></td></tr>"
-        )
-    head = "<tr><th>bar</th><th class=n>measured</th><th class=n>target</th><th></th></tr>"
-    return f"<table class=bars><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
+def _section(card: Scorecard, probe: Probe) -> str:
+    rows = [row for row in card.rows if row.probe == probe.name]
+    control = [row for row in card.rows if row.probe == "control"] if probe.name == "drift" else []
+    pictures = "".join(picture_of(picture) for picture in card.pictures if picture.probe == probe.name)
+    inside = charts_of(card, probe.name) + figure_table(rows, card.dt_s, open_=len(rows) <= 40)
+    whole = section(probe.question, escape(probe.lead), inside + pictures)
+    if not control:
+        return whole
+    lead = (
+        "By how much a dream under the true actions is nearer to the truth than one under other actions, clip by clip."
+    )
+    return section("Does it obey?", lead, figure_table(control, card.dt_s)) + whole
 
 
-def _speeds(card: Scorecard) -> str:
-    if not card.speeds:
+def _missing(card: Scorecard) -> str:
+    if not card.missing:
         return ""
-    rows = []
-    for run in card.speeds:
-        times = [f"{value:.1f}" for value in (run.median_ms, run.p95_ms, run.first_ms, run.last_ms)]
-        rows.append([escape(run.arm), *times, f"{run.growth:+.1%}", str(run.threads)])
-    heads = ("arm", "median", "95%", "first tenth", "last tenth", "growth", "threads")
-    lead = f"Milliseconds for one imagined and drawn step of one story, over {card.speeds[0].steps:,} steps on end."
-    return section("Speed", lead, table_of(heads, rows))
+    lines = "".join(f"<li>{escape(gone.probe)}, {escape(gone.arm)}: {escape(gone.why)}</li>" for gone in card.missing)
+    return section("Not applicable", "What could not be asked, and what it would need.", f"<ul>{lines}</ul>")
 
 
 def _method(card: Scorecard) -> str:

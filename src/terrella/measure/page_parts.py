@@ -1,4 +1,4 @@
-"""What the page of a scorecard is put together from: sections, tables, figures in words, charts and pictures."""
+"""What the page of a scorecard is put together from: sections, charts, tables of figures, pictures."""
 
 from __future__ import annotations
 
@@ -9,110 +9,150 @@ from html import escape
 
 import numpy as np
 
-from .drift import COPY_LAST
 from .plot import Line, line_chart, y_span
-from .roll import PREDICTED
-from .scorecard import Curve, Picture, Scorecard
-from .statistics import Band, Figure
+from .scorecard import COPY_LAST, TRUE, Bar, Curve, Picture, Row, Scorecard
+from .statistics import Figure
 from .strip import join_row, jpeg
 
 COLOURS = ("#6fd3c1", "#e3a857", "#8ea6ff", "#e07a9b", "#b6d36f")
 QUIET = "#8b93a3"
+_WIDE_FROM = 100  # steps from which a chart has the width of the page
 
 
 def section(heading: str, lead: str, inside: str) -> str:
     return f"<section><h2>{escape(heading)}</h2><p>{lead}</p>{inside}</section>" if inside else ""
 
 
-def figure_text(figure: Figure | None, digits: int = 2, unit: str = "") -> str:
-    if figure is None or not math.isfinite(figure.value):
+def number(value: float) -> str:
+    """Three figures, as people write them."""
+    if not math.isfinite(value):
         return "&ndash;"
-    value = f"{figure.value:.{digits}f} {escape(unit)}".rstrip()
+    if value == 0 or abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def figure_text(figure: Figure, unit: str = "") -> str:
+    value = f"{number(figure.value)} {escape(unit)}".rstrip()
     if not math.isfinite(figure.low):
         return value
-    return f"{value}<small>{figure.low:.{digits}f} to {figure.high:.{digits}f}</small>"
-
-
-def values(band: Band) -> list[float]:
-    return [*band.value, *band.low, *band.high]
+    return f"{value}<small>{number(figure.low)} to {number(figure.high)}</small>"
 
 
 def named(arm: str, motion: str) -> str:
-    return f"{arm}, {motion} motion" if motion else arm
+    return f"{arm}, true motion" if motion == TRUE else arm
 
 
-def points_line(label: str, points: Sequence[tuple[int, Figure]], colour: str, dash: str) -> Line:
-    x, figures = [step for step, _ in points], [figure for _, figure in points]
-    y, low, high = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
-    return Line(label, x, y, low, high, colour, dash)
-
-
-def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> str:
-    """A table of ready-made cells; the first `texts` columns are words, the others numbers set to the right."""
+def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of ready-made cells; the first column is words, the others numbers set to the right."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
-        return "".join(f"<{tag}{'' if k < texts else ' class=n'}>{cell}</{tag}>" for k, cell in enumerate(row))
+        return "".join(f"<{tag}{' class=n' if place else ''}>{cell}</{tag}>" for place, cell in enumerate(row))
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return f"<div class=scroll><table><thead><tr>{cells('th', heads)}</tr></thead><tbody>{body}</tbody></table></div>"
 
 
-def steps_text(horizon: int, seconds: float) -> str:
-    return f"{horizon}<small>{seconds:.2f} s</small>"
+def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
+    """A table a place: a line for each figure and arm, a column for each horizon, baselines below each figure."""
+    tables = ""
+    for place in dict.fromkeys(row.place for row in rows):
+        mine = [row for row in rows if row.place == place]
+        steps = sorted({row.horizon for row in mine})
+        lines = []
+        for kind in dict.fromkeys((row.channel, row.what, row.unit, row.arm, row.motion) for row in mine):
+            found = {row.horizon: row for row in mine if kind == (row.channel, row.what, row.unit, row.arm, row.motion)}
+            channel, what, unit, arm, motion = kind
+            about = [named(arm, motion), *([channel] if channel else [])]
+            words = f"{escape(f'{what}, {unit}' if unit else what)}<small>{escape(', '.join(about))}</small>"
+            lines.append([words, *(_cell(found[step]) if step in found else "" for step in steps)])
+        heads = [f"{escape(place)} places", *(f"{step:,} steps<small>{step * dt_s:.2f} s</small>" for step in steps)]
+        inside = table_of(heads, lines)
+        folded = f"<details><summary>All figures, {escape(place)} places</summary>{inside}</details>"
+        tables += inside if open_ else folded
+    return tables
 
 
-def percent(figure: Figure) -> str:
-    return figure_text(Figure(figure.value * 100, figure.low * 100, figure.high * 100, figure.count), 1)
+def _cell(row: Row) -> str:
+    beside = "".join(f"<small>{escape(name)} {number(fig.value)}</small>" for name, fig in row.baselines.items())
+    note = f"<small>{escape(row.note)}</small>" if row.note else ""
+    return ("void" if row.void else figure_text(row.figure)) + beside + note
 
 
-def hundredths(figure: Figure) -> str:
-    words = f"{100 * figure.value:.2f}"
-    if not math.isfinite(figure.low):
-        return words
-    return f"{words}<small>{100 * figure.low:.2f} to {100 * figure.high:.2f}</small>"
+def bar_table(bars: Sequence[Bar]) -> str:
+    lines = []
+    for bar in bars:
+        kind, row = bar.status.replace(" ", "-") + ("" if bar.sure else " unsure"), bar.row
+        words = (
+            ""
+            if row is None
+            else f"{row.place} places \N{MIDDLE DOT} {row.horizon:,} steps"
+            + (f" \N{MIDDLE DOT} {row.note}" if row.note else "")
+        )
+        figure = figure_text(row.figure, row.unit) if row and not row.void else "&ndash;"
+        lines.append(
+            f"<tr><td>{escape(bar.name)}<small>{escape(words)}</small></td><td class=n>{figure}</td>"
+            f"<td class=n>{escape(bar.target)}</td><td><span class='status {kind}'>{bar.status}</span></td></tr>"
+        )
+    head = "<tr><th>target</th><th class=n>measured</th><th class=n>wanted</th><th></th></tr>"
+    return f"<table class=bars><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
-def charts_of(card: Scorecard, what: str, y_label: str, guides: Sequence[float] = ()) -> str:
-    """One chart of every arm and motion for each place, all on one scale."""
-    curves = [curve for curve in card.curves if curve.what == what]
-    if not curves:
-        return ""
-    span = y_span([value for curve in curves for value in values(curve.band)] + list(guides))
-    steps = sorted({row.horizon for row in card.fidelity})
-    boxes = []
-    for place in card.places:
-        lines = [_line(card, curve) for curve in curves if curve.place == place.name]
-        svg = line_chart(lines, [(s, str(s)) for s in steps], "steps", y_label, True, span, guides)
-        boxes.append(figure_box(f"{place.name} places", svg, lines))
-    return f"<div class=charts>{''.join(boxes)}</div>"
+def charts_of(card: Scorecard, probe: str) -> str:
+    """One chart of all arms for each place and figure, those of one figure on one scale."""
+    curves = [curve for curve in card.curves if curve.probe == probe]
+    groups: dict[tuple, list[Curve]] = {}
+    for curve in curves:
+        groups.setdefault((curve.channel, curve.what, curve.unit), []).append(curve)
+    boxes = ""
+    for (channel, what, unit), some in groups.items():
+        guides = some[0].guides
+        span = y_span([v for c in some for v in (*c.band.value, *c.band.low, *c.band.high)] + list(guides))
+        for place in dict.fromkeys(curve.place for curve in some):
+            mine = [curve for curve in some if curve.place == place]
+            lines = [_line(card, curve) for curve in sorted(mine, key=lambda curve: curve.arm == COPY_LAST)]
+            long = max(len(curve.x) for curve in mine) >= _WIDE_FROM
+            x_label, log = ("% kept, the surest first", False) if probe == "calibration" else ("steps", True)
+            label = f"{what}, {unit}" if unit else what
+            svg = line_chart(lines, _ticks(mine, log), x_label, label, log, span, guides, named=long)
+            title = f"{place} places, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
+            boxes += _box(title, svg, [] if long else lines, "wide" if long else "")
+    return f"<div class=charts>{boxes}</div>" if boxes else ""
+
+
+def _ticks(curves: Sequence[Curve], log: bool) -> list[tuple[float, str]]:
+    first, last = min(min(curve.x) for curve in curves), max(max(curve.x) for curve in curves)
+    if not log:
+        return [(share, f"{share}%") for share in range(0, 101, 25) if first <= share <= last]
+    powers = [2**k for k in range(12) if first <= 2**k <= last]
+    return [(step, str(step)) for step in (powers if len(powers) < 10 else powers[::2])] or [(first, str(first))]
 
 
 def _line(card: Scorecard, curve: Curve) -> Line:
-    dash = "" if curve.motion == PREDICTED else "5 4" if curve.motion else "2 3"
-    x = list(range(1, len(curve.band.value) + 1))
-    return Line(
-        named(curve.arm, curve.motion),
-        x,
-        curve.band.value,
-        curve.band.low,
-        curve.band.high,
-        colour_of(card, curve.arm),
-        dash,
+    copied = curve.arm == COPY_LAST
+    arm = curve.arm.partition(",")[0]
+    colour = QUIET if copied else COLOURS[list(card.worlds).index(arm) % len(COLOURS)]
+    dash = (
+        "2 3"
+        if copied or curve.arm.endswith("oracle")
+        else "5 4"
+        if curve.motion == TRUE or "chance" in curve.arm
+        else ""
     )
+    band = curve.band
+    label = named(curve.arm, curve.motion)
+    return Line(label, list(curve.x), band.value, band.low, band.high, colour, dash, curve.mark)
 
 
-def figure_box(title: str, svg: str, lines: Sequence[Line]) -> str:
+def _box(title: str, svg: str, lines: Sequence[Line], kind: str) -> str:
     keys = "".join(
         f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{line.colour}" stroke-width="2.5"'
         + (f' stroke-dasharray="{line.dash}"' if line.dash else "")
         + f"/></svg>{escape(line.label)}</span>"
         for line in lines
     )
-    return f"<figure><h3>{escape(title)}</h3>{svg}<figcaption>{keys}</figcaption></figure>"
-
-
-def colour_of(card: Scorecard, arm: str) -> str:
-    return QUIET if arm == COPY_LAST else COLOURS[list(card.worlds).index(arm) % len(COLOURS)]
+    inside = f"<div class=scroll>{svg}</div>" if kind else svg
+    return f"<figure class='{kind}'><h3>{escape(title)}</h3>{inside}<figcaption>{keys}</figcaption></figure>"
 
 
 def picture_of(picture: Picture) -> str:

@@ -8,82 +8,100 @@ by chance it is the mean error; by the error itself, as an oracle would, it is t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 
-from .statistics import Figure
+from ..core.world import World
+from .clips import Clip
+from .exam import CLIPS, Exam, Found, Probe
+from .roll import Results, Watch, rows_at
+from .scorecard import PREDICTED, TRUE, Curve, Report, Row
+from .statistics import Band, Figure
 
 RESAMPLES = 400
 POINTS, BINS = 50, 8
-
-
-@dataclass(frozen=True)
-class Risk:
-    """One arm's frames of every step up to `steps`; errors are mean absolute, intensities 0 to 1.
-
-    aurc, random, oracle: the area under the curve by the world's own order, by chance, by the errors; closed: how much of
-    the way from random to oracle its order goes (1: an oracle, 0: chance). expected: the mean of its uncertainty, beside
-    `random`, which is the mean error; off: the mean distance between both in BINS equal bins of uncertainty (expected
-    calibration error). coverage, risk and best: the curve and the oracle's; reliability: (expected, found) of each bin.
-    Intervals are over clips.
-    """
-
-    place: str
-    arm: str
-    motion: str
-    steps: int
-    aurc: Figure
-    random: Figure
-    oracle: Figure
-    closed: Figure
-    expected: Figure
-    off: Figure
-    coverage: list[float]
-    risk: list[float]
-    best: list[float]
-    reliability: list[tuple[float, float]]
+LEAD = (
+    "Each frame comes with the error that the world expects of it. If the least certain frames are set aside, how large is "
+    "the mean absolute error of the rest (in % of full brightness)? AURC is the area under that curve; by chance it would be "
+    "the mean error, an oracle knows the errors. The calibration error is the mean distance between the errors expected and "
+    "found in eight equal bins."
+)
+_ORDERS = ("by its own order", "by an oracle", "by chance")
 
 
 def risk(
     place: str, arm: str, motion: str, error: torch.Tensor, uncertainty: torch.Tensor, rng: torch.Generator
-) -> Risk:
-    """Of errors and uncertainties [n, T] of the frames of n clips."""
+) -> Report:
+    """Of errors (mean absolute, intensities 0 to 1) and uncertainties [n, T] of the frames of n clips; in %, intervals over
+    clips. `order worth`: how much of the way from chance to the oracle its order goes."""
     clips, steps = error.shape
-    wrong, doubt = error.flatten().double(), uncertainty.flatten().double()
+    wrong, doubt = 100 * error.flatten().double(), 100 * uncertainty.flatten().double()
     clip = torch.arange(clips).repeat_interleave(steps)
     picks = torch.randint(clips, (RESAMPLES, clips), generator=rng)
     weights = torch.zeros(RESAMPLES + 1, clips, dtype=torch.float64)
     weights[0] = 1  # the clips as they are
     weights[1:].scatter_add_(1, picks, torch.ones(RESAMPLES, clips, dtype=torch.float64))
-    by_doubt, by_error = doubt.argsort(stable=True), wrong.argsort(stable=True)
-    areas, least = (_area(weights[:, clip[order]], wrong[order]) for order in (by_doubt, by_error))
+    orders = [by.argsort(stable=True) for by in (doubt, wrong)]
+    areas, least = (_area(weights[:, clip[order]], wrong[order]) for order in orders)
     shares = weights / weights.sum(1, keepdim=True) / steps
-    chance = shares[:, clip] @ wrong
-    bins = [part for part in by_doubt.tensor_split(BINS) if len(part)]
+    chance, expected = shares[:, clip] @ wrong, shares[:, clip] @ doubt
     off = torch.zeros(len(weights), dtype=torch.float64)
-    for part in bins:
+    for part in orders[0].tensor_split(BINS):
         off += (shares[:, clip[part]] @ (wrong[part] - doubt[part])).abs()
+    where, found = ("calibration", "rgb"), Report()
+    beside = {"by chance": _figure(chance, clips), "by an oracle": _figure(least, clips)}
+    closed = 100 * (chance - areas) / (chance - least).clamp_min(1e-12)
+    for what, values, better, baselines in (
+        ("AURC", areas, -1, beside),
+        ("order worth", closed, 1, {}),
+        ("error expected", expected, 0, {"error found": _figure(chance, clips)}),
+        ("calibration error", off, -1, {}),
+    ):
+        figure = _figure(values, clips)
+        found.rows.append(Row(*where, what, "%", place, arm, motion, steps, figure, better, baselines))
     at = [max(1, round(len(wrong) * (k + 1) / POINTS)) - 1 for k in range(POINTS)]
-    return Risk(
-        place, arm, motion, steps,
-        aurc=_figure(areas, clips),
-        random=_figure(chance, clips),
-        oracle=_figure(least, clips),
-        closed=_figure((chance - areas) / (chance - least).clamp_min(1e-12), clips),
-        expected=_figure(shares[:, clip] @ doubt, clips),
-        off=_figure(off, clips),
-        coverage=[(k + 1) / len(wrong) for k in at],
-        risk=_running(wrong[by_doubt])[at].tolist(),
-        best=_running(wrong[by_error])[at].tolist(),
-        reliability=[(float(doubt[part].mean()), float(wrong[part].mean())) for part in bins],
-    )  # fmt: skip
+    x = [100 * (k + 1) / len(wrong) for k in at]
+    running = [_running(wrong[order])[at].tolist() for order in orders] + [[float(chance[0])] * POINTS]
+    for name, y in zip(_ORDERS, running):
+        band = Band(y, y, y, clips)
+        found.curves.append(Curve(*where, "mean error of the surest", "%", place, f"{arm}, {name}", motion, x, band))
+    return found
 
 
-def pooled(parts: Sequence[tuple[torch.Tensor, torch.Tensor]], arm: str, motion: str, rng: torch.Generator) -> Risk:
-    """The same over the clips of all places together: can it tell the known from the invented?"""
-    error, uncertainty = (torch.cat([part[which] for part in parts]) for which in (0, 1))
-    return risk("all", arm, motion, error, uncertainty, rng)
+def _see(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
+    away = (seen["rgb"].float() - rows_at(clips, "rgb", row).float()).abs().mean((1, 2, 3)) / 255
+    return {"error": away, "uncertainty": seen["uncertainty"]}
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+    asked = of == CLIPS and not _missing(exam, world)
+    return [Watch(("rgb", "uncertainty"), _see)] if asked else []
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    """Each place by itself, and all together: can it tell the known from the invented?"""
+    whole = Report()
+    for arm in exam.arms:
+        for motion in (PREDICTED, TRUE):
+            parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
+            told = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
+            if len(told) > 1:
+                pairs = list(told.values())
+                told["all"] = torch.cat([error for error, _ in pairs]), torch.cat([doubt for _, doubt in pairs])
+            for place, (error, uncertainty) in told.items():
+                one = risk(place, arm, motion, error, uncertainty, exam.rng())
+                whole.rows += one.rows
+                whole.curves += one.curves if motion == PREDICTED else []
+    return whole
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if "uncertainty" not in world.spec.channels:
+        return "needs uncertainty, a channel of the world"
+    return "" if "rgb" in exam.shared(world, "rgb") and world.spec.observes else "needs rgb"
+
+
+CALIBRATION = Probe("calibration", "Does it know when it invents?", LEAD, _missing, _report, _watch)
 
 
 def _area(weights: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

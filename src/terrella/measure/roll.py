@@ -1,57 +1,38 @@
-"""Shows clips to a world and lets it dream on: predicted motion (actions only) or true motion (poses only)."""
+"""Shows clips to a world and lets it go on, under a policy (actions alone) or along true poses, while others watch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ..core.errors import DatasetError, ObservationError
+from ..core.policy import Idle, Policy, Replay, act
+from ..core.spec import Spec
 from ..core.state import State
-from ..core.world import World, make_rng
+from ..core.world import Observation, World
 from .clips import Clip, evidence
-from .fidelity import gradient_energy, psnr, ssim
+from .scorecard import IDLE, OTHERS, TRUE
 
-PREDICTED, TRUE = "predicted", "true"
+Tick = Callable[[float], None]  # steps x clips that were done since the last call
+Results = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Dream:
-    """What came of B clips over T steps: psnr and energy [B, T]; ssim [B, K] and frames uint8 [B, K, H, W, 3] at the
-    K horizons; pose [B, T, 7], or None for a world that shows none; error (mean absolute, intensities 0 to 1) and
-    uncertainty [B, T], or None for a world that does not say what error it expects."""
+class Watch:
+    """What is kept of a rollout. channels: what must be rendered; see(observation, clips, row, step) -> name -> [B, ...]."""
 
-    psnr: torch.Tensor
-    energy: torch.Tensor
-    ssim: torch.Tensor
-    frames: torch.Tensor
-    pose: torch.Tensor | None
-    error: torch.Tensor | None = None
-    uncertainty: torch.Tensor | None = None
-
-    @staticmethod
-    def join(dreams: Sequence[Dream]) -> Dream:
-        """Batches of clips as one."""
-        poses = [part.pose for part in dreams if part.pose is not None]
-        errors = [part.error for part in dreams if part.error is not None]
-        doubts = [part.uncertainty for part in dreams if part.uncertainty is not None]
-        return Dream(
-            psnr=torch.cat([part.psnr for part in dreams]),
-            energy=torch.cat([part.energy for part in dreams]),
-            ssim=torch.cat([part.ssim for part in dreams]),
-            frames=torch.cat([part.frames for part in dreams]),
-            pose=torch.cat(poses) if poses else None,
-            error=torch.cat(errors) if errors else None,
-            uncertainty=torch.cat(doubts) if doubts else None,
-        )
+    channels: tuple[str, ...]
+    see: Callable[[Observation, Sequence[Clip], int, int], Mapping[str, torch.Tensor]]
 
 
 def fold_context(world: World, clips: Sequence[Clip], rng: torch.Generator) -> State:
-    """The state after the context frames: each is evidence upon what the world imagined from the one before."""
+    """The state after the context frames: each is evidence upon what the world imagined from the one before. A world that
+    takes no evidence just starts."""
     if not world.spec.observes:
-        raise ObservationError(f"{world.spec.name} takes no evidence, so it cannot go on from a recording.")
+        return world.start(len(clips), rng)
     state = world.observe(evidence(clips, world.spec, 0), None, rng)
     for row in range(1, clips[0].context):
         state = world.imagine(state, actions_at(world, clips, row - 1), rng)
@@ -63,6 +44,22 @@ def actions_at(world: World, clips: Sequence[Clip], row: int) -> torch.Tensor:
     """The recorded action of row `row` of each clip: [B, *spec.action.shape]."""
     actions = torch.from_numpy(np.stack([np.asarray(clip.action[row]) for clip in clips]))
     return actions.reshape(len(clips), *(world.spec.action.shape or ()))
+
+
+def can_idle(spec: Spec) -> bool:
+    """Whether there is an action that does nothing; a choice must be named so."""
+    names = {name.lower() for name in spec.action_names}
+    return spec.action_mode != "choice" or bool(names & {"noop", "no-op", "idle", "none", "stay"})
+
+
+def policy_of(
+    world: World, clips: Sequence[Clip], motion: str, steps: int, others: Sequence[Clip] | None = None
+) -> Policy:
+    """Who acts from the context on: the recorded player, that of `others`, or nobody."""
+    if motion == IDLE:
+        return Idle(world.spec)
+    hands, first = (others or clips) if motion == OTHERS else clips, clips[0].context - 1
+    return Replay(torch.stack([actions_at(world, hands, first + step) for step in range(steps)]))
 
 
 def true_motion_works(world: World, clip: Clip, rng: torch.Generator) -> bool:
@@ -80,85 +77,44 @@ def dream(
     world: World,
     clips: Sequence[Clip],
     motion: str,
-    horizons: Sequence[int],
+    steps: int,
     rng: torch.Generator,
+    watches: Sequence[Watch],
     others: Sequence[Clip] | None = None,
-) -> Dream:
-    """Rolls clips (one batch) to the largest horizon and compares each frame with the truth.
-
-    `others`: clips whose actions are played instead of the true ones ("another player's hands").
-    """
+    tick: Tick = lambda done: None,
+) -> Results:
+    """Rolls clips (one batch) `steps` steps from their context; what each watch names, [B, T, ...], T the steps at which it
+    was named."""
     state = fold_context(world, clips, rng)
-    context, last = clips[0].context, max(horizons)
-    shows_pose = "pose" in world.spec.channels
-    doubts = "uncertainty" in world.spec.channels
-    channels = ("rgb", *(("pose",) if shows_pose else ()), *(("uncertainty",) if doubts else ()))
-    likeness, energy, structure, kept, poses, errors, doubted = [], [], [], [], [], [], []
-    for step in range(1, last + 1):
+    context = clips[0].context
+    tick(len(clips) * context)
+    policy = None if motion == TRUE else policy_of(world, clips, motion, steps, others)
+    memory = policy.begin(len(clips), rng) if policy else None
+    channels = tuple(dict.fromkeys(name for watch in watches for name in watch.channels))
+    kept: dict[str, list[torch.Tensor]] = {}
+    seen: Observation = {}
+    for step in range(1, steps + 1):
         row = context - 1 + step
-        if motion == TRUE:
+        if policy is None:
             state = world.observe({"pose": poses_at(clips, row)}, state, rng)
         else:
-            state = world.imagine(state, actions_at(world, others or clips, row - 1), rng)
+            action, memory = act(policy, seen, memory, len(clips), world.spec, rng)
+            state = world.imagine(state, action, rng)
         seen = {name: tensor.cpu() for name, tensor in world.render(state, channels).items()}
-        truth = frames_at(clips, row)
-        likeness.append(psnr(seen["rgb"], truth))
-        energy.append(gradient_energy(seen["rgb"]))
-        if shows_pose:
-            poses.append(seen["pose"])
-        if doubts:
-            errors.append((seen["rgb"].float() - truth.float()).abs().mean((1, 2, 3)) / 255)
-            doubted.append(seen["uncertainty"])
-        if step in horizons:
-            structure.append(ssim(seen["rgb"], truth))
-            kept.append(seen["rgb"])
-    return Dream(
-        psnr=torch.stack(likeness, 1),
-        energy=torch.stack(energy, 1),
-        ssim=torch.stack(structure, 1),
-        frames=torch.stack(kept, 1),
-        pose=torch.stack(poses, 1) if poses else None,
-        error=torch.stack(errors, 1) if doubts else None,
-        uncertainty=torch.stack(doubted, 1) if doubts else None,
-    )
+        for watch in watches:
+            for name, value in watch.see(seen, clips, row, step).items():
+                kept.setdefault(name, []).append(value)
+        tick(len(clips))
+    return {name: torch.stack(values, 1) for name, values in kept.items()}
 
 
-def dream_all(
-    world: World,
-    clips: Sequence[Clip],
-    motion: str,
-    horizons: Sequence[int],
-    batch: int,
-    seed: int,
-    others: Sequence[Clip] | None = None,
-) -> Dream:
-    """`dream` of any number of clips, `batch` of them at a time or as many as the world takes; the same seed, the same."""
-    size = min(batch, world.spec.max_batch or batch)
-    parts = []
-    for start in range(0, len(clips), size):
-        hands = others[start : start + size] if others else None
-        parts.append(dream(world, clips[start : start + size], motion, horizons, make_rng(seed + start), hands))
-    return Dream.join(parts)
-
-
-def stand_still(clips: Sequence[Clip], steps: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Copy-last: PSNR of each clip's last context frame against each of the `steps` after it; and the gradient energy
-    of these true frames: two [n, steps]."""
-    last = frames_at(clips, clips[0].context - 1)
-    truth = [frames_at(clips, clips[0].context + step) for step in range(steps)]
-    likeness = torch.stack([psnr(last, frames) for frames in truth], 1)
-    return likeness, torch.stack([gradient_energy(frames) for frames in truth], 1)
-
-
-def frames_at(clips: Sequence[Clip], row: int) -> torch.Tensor:
-    """The recorded frame of row `row` of each clip: uint8 [B, H, W, 3]."""
-    return torch.from_numpy(np.stack([np.asarray(clip.rgb[row]) for clip in clips]))
+def rows_at(clips: Sequence[Clip], channel: str, row: int) -> torch.Tensor:
+    """What was recorded of a channel in row `row` of each clip: [B, ...]."""
+    return torch.from_numpy(np.stack([np.asarray(clip.channels[channel][row]) for clip in clips]))
 
 
 def poses_at(clips: Sequence[Clip], row: int) -> torch.Tensor:
     """The recorded pose of row `row` of each clip: float32 [B, 7]; DatasetError where a clip has none."""
     if any(clip.pose is None for clip in clips):
         raise DatasetError("these clips hold no poses; record them, or leave true motion out.")
-    return torch.from_numpy(
-        np.stack([np.asarray(clip.pose[row], np.float32) for clip in clips if clip.pose is not None])
-    )
+    return rows_at(clips, "pose", row).float()

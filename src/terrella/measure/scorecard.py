@@ -1,53 +1,88 @@
-"""The scorecard: what a world's dreams are worth beside the truth, as figures with 95% intervals."""
+"""The scorecard as data: figures with 95% intervals beside what knows nothing, curves, pictures, and what was not asked."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-import torch
 
-from ..core.world import World, make_rng
-from .clips import Clip, check_clips
-from .closure import Closure
-from .drift import COPY_LAST, Drift
-from .encoder import MIN_SIDE, frame_features
-from .endurance import Endurance
-from .fidelity import blurred
-from .frechet import frechet_interval
-from .outcomes import Fate
-from .risk import Risk, pooled, risk
-from .roll import PREDICTED, TRUE, Dream, dream_all, frames_at, poses_at, stand_still, true_motion_works
-from .speed import Speed
-from .statistics import Band, Figure, mean_band, mean_interval, median_interval, ratio_band, ratio_interval
+from .statistics import Band, Figure
 
-Progress = Callable[[float, str], None]  # share done in 0..1, what is being done
+PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alone; or at each step the true pose
+OTHERS, IDLE = "other actions", "no action"  # actions of another clip; the action at rest, held
+COPY_LAST = "copy last"
 
 
 @dataclass(frozen=True)
-class ScoreConfig:
-    """horizons: steps at which figures are given; control_horizons: where true actions are set against another
-    player's; batch: clips rolled together; strips: clips of each place whose pictures are kept; walked_m: clips that
-    walked less have no position error; drop: PSNR at the first horizon less that at the second; frechet: compare looks
-    through the fixed encoder, where frames are at least MIN_SIDE a side."""
+class Row:
+    """One figure of one probe.
 
-    horizons: tuple[int, ...] = (1, 8, 32, 64, 128)
-    control_horizons: tuple[int, ...] = (8, 32, 128)
-    position_horizons: tuple[int, ...] = (32, 64, 128)
-    drop: tuple[int, int] = (8, 64)
-    batch: int = 8
-    strips: int = 3
-    walked_m: float = 0.5
-    frechet: bool = True
+    channel: of which channel ("rgb.wrist"), "" for none; what: its name, unit: that of the figure; better: +1 where more
+    is better, -1 where less is, 0 where 1 or nothing in particular is best; horizon: after how many steps, 0 for none;
+    baselines: the same figure of those who know nothing; gain: over copying the last frame, clip by clip, positive is
+    better; void: it was measured and proves nothing, `note` says why.
+    """
+
+    probe: str
+    channel: str
+    what: str
+    unit: str
+    place: str
+    arm: str
+    motion: str
+    horizon: int
+    figure: Figure
+    better: int = 0
+    baselines: Mapping[str, Figure] = field(default_factory=dict)
+    gain: Figure | None = None
+    void: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A figure along x (steps from 1, or shares); arm COPY_LAST for the last frame copied. mark: an x worth a dot."""
+
+    probe: str
+    channel: str
+    what: str
+    unit: str
+    place: str
+    arm: str
+    motion: str
+    x: Sequence[float]
+    band: Band
+    mark: float | None = None
+    guides: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Rows of frames uint8 [K, H, W, 3] to look at: label -> frames, one column label for each frame."""
+
+    probe: str
+    title: str
+    columns: list[str]
+    rows: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A probe that was not applicable to an arm, and what it needs: "needs pose"."""
+
+    probe: str
+    arm: str
+    why: str
 
 
 @dataclass(frozen=True)
 class Place:
-    """What was shown: how many clips, the share of them in which the player moves, their lengths in steps."""
+    """What was shown: how many clips, the share of them in which anything moves, their lengths in steps."""
 
     name: str
     clips: int
@@ -56,300 +91,98 @@ class Place:
     horizon: int
 
 
-@dataclass(frozen=True)
-class Fidelity:
-    """One arm at one horizon. gain: psnr - copy_last, paired; sharpness: gradient energy of dreams over the game's;
-    frechet: distance of the dreams' looks from the game's (frechet.py), None where it was not asked for or frames are
-    too small."""
+@dataclass
+class Report:
+    """What one probe found."""
 
-    place: str
-    arm: str
-    motion: str
-    horizon: int
-    seconds: float
-    psnr: Figure
-    ssim: Figure
-    copy_last: Figure
-    gain: Figure
-    sharpness: Figure
-    frechet: Figure | None = None
+    rows: list[Row] = field(default_factory=list)
+    curves: list[Curve] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class Looks:
-    """What a Frechet distance is worth at one horizon: copy_last: that of real frames of other moments (the last shown
-    of each clip); blurred: that of the game's own frames behind a Gaussian blur of one pixel."""
+class Bar:
+    """A target beside its figure: low <= figure <= high. `sure`: its whole interval lies on the same side."""
 
-    place: str
-    horizon: int
-    seconds: float
-    copy_last: Figure
-    blurred: Figure
+    name: str
+    row: Row | None
+    low: float = -math.inf
+    high: float = math.inf
 
+    @property
+    def status(self) -> str:
+        if self.row is None or not math.isfinite(self.row.figure.value):
+            return "not measured"
+        if self.row.void:
+            return "void"
+        return "met" if self.low <= self.row.figure.value <= self.high else "missed"
 
-@dataclass(frozen=True)
-class Control:
-    """PSNR under the true actions, under those of another clip, and their paired difference: does it obey?"""
+    @property
+    def sure(self) -> bool:
+        if self.row is None or self.status not in ("met", "missed"):
+            return False
+        inside = self.low <= self.row.figure.low and self.row.figure.high <= self.high
+        outside = self.row.figure.high < self.low or self.row.figure.low > self.high
+        return inside if self.status == "met" else outside
 
-    place: str
-    arm: str
-    horizon: int
-    seconds: float
-    true_actions: Figure
-    other_actions: Figure
-    difference: Figure
-
-
-@dataclass(frozen=True)
-class Position:
-    """Predicted against true place after `horizon` steps, as a share of the distance walked; heading in degrees."""
-
-    place: str
-    arm: str
-    horizon: int
-    seconds: float
-    mean_share: Figure
-    median_share: Figure
-    heading_deg: Figure
-
-
-@dataclass(frozen=True)
-class Drop:
-    """PSNR at `first` steps less PSNR at `last` steps of the same clips, dB: how much a longer dream loses."""
-
-    place: str
-    arm: str
-    motion: str
-    first: int
-    last: int
-    loss: Figure
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A figure at each step from 1: what is "psnr", "sharpness" or "position" (error in metres)."""
-
-    what: str
-    place: str
-    arm: str
-    motion: str
-    band: Band
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Rows of frames uint8 [K, H, W, 3] to look at: label -> frames, one column label for each frame."""
-
-    title: str
-    columns: list[str]
-    rows: dict[str, np.ndarray]
+    @property
+    def target(self) -> str:
+        unit = f" {self.row.unit}" if self.row and self.row.unit else ""
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            return f"{self.low:g} to {self.high:g}{unit}"
+        return f"\u2265 {self.low:g}{unit}" if math.isfinite(self.low) else f"\u2264 {self.high:g}{unit}"
 
 
 @dataclass(frozen=True)
 class Scorecard:
-    """Everything measured, as data; `pictures` are for the page and stay out of the JSON."""
+    """Everything measured, as data; `pictures` are for the page and stay out of the JSON. worlds: arm -> its world."""
 
     worlds: dict[str, str]
     dt_s: float
     places: list[Place]
-    fidelity: list[Fidelity] = field(default_factory=list)
-    control: list[Control] = field(default_factory=list)
-    position: list[Position] = field(default_factory=list)
-    looks: list[Looks] = field(default_factory=list)
-    drops: list[Drop] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
-    drifts: list[Drift] = field(default_factory=list)
-    risks: list[Risk] = field(default_factory=list)
-    fates: list[Fate] = field(default_factory=list)
-    closures: list[Closure] = field(default_factory=list)
-    endurance: list[Endurance] = field(default_factory=list)
-    speeds: list[Speed] = field(default_factory=list)
+    missing: list[Missing] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
 
-
-def score(
-    arms: Mapping[str, World],
-    clips_by_place: Mapping[str, Sequence[Clip]],
-    rng: torch.Generator,
-    config: ScoreConfig | None = None,
-    progress: Progress | None = None,
-) -> Scorecard:
-    """Dreams every clip of every place in every arm, with predicted motion and, where the world can, true motion.
-
-    Each arm sees the same clips, the same random numbers and the same "other" actions, so differences are paired.
-    The same generator seed gives the same scorecard.
-    """
-    config = config or ScoreConfig()
-    tell = progress or (lambda share, words: None)
-    first = next(iter(arms.values()))
-    card = Scorecard({name: world.spec.name for name, world in arms.items()}, first.spec.dt_s, [])
-    total, done = len(arms) * len(clips_by_place), 0
-    doubted: dict[tuple[str, str], list[tuple[torch.Tensor, torch.Tensor]]] = {}
-    for place, clips in clips_by_place.items():
-        check_clips(place, clips, max(config.horizons))
-        seed, order = _seed(rng), torch.randperm(len(clips), generator=rng).tolist()
-        others = [clips[order[(order.index(number) + 1) % len(clips)]] for number in range(len(clips))]
-        card.places.append(_describe(place, clips))
-        truth = _truth(clips, config)
-        _add_copy_last(card, place, truth, rng)
-        _add_looks(card, place, clips, truth, config)
-        rows: list[dict[str, np.ndarray]] = [{"truth": _kept(clip, config.horizons)} for clip in clips[: config.strips]]
-        for arm, world in arms.items():
-            tell(done / total, f"{place} places, {arm}")
-            dreams = {PREDICTED: dream_all(world, clips, PREDICTED, config.horizons, config.batch, seed)}
-            if true_motion_works(world, clips[0], make_rng(seed)):
-                dreams[TRUE] = dream_all(world, clips, TRUE, config.horizons, config.batch, seed)
-            for motion, dreamt in dreams.items():
-                _add_fidelity(card, place, arm, motion, dreamt, truth, config, rng)
-                if dreamt.error is not None and dreamt.uncertainty is not None:
-                    doubted.setdefault((arm, motion), []).append((dreamt.error, dreamt.uncertainty))
-                    chance = make_rng(seed)  # of its own: the other figures are those of a world that does not doubt
-                    card.risks.append(risk(place, arm, motion, dreamt.error, dreamt.uncertainty, chance))
-                for picture, clip, frames in zip(rows, clips, dreamt.frames):
-                    picture[f"{arm}, {motion} motion"] = _with_context(clip, frames)
-            steps = [step for step in config.control_horizons if step <= max(config.horizons)]
-            if len(clips) > 1 and steps:
-                wrong = dream_all(world, clips, PREDICTED, steps, config.batch, seed, others)
-                _add_control(card, place, arm, dreams[PREDICTED], wrong, steps, rng)
-            _add_position(card, place, arm, dreams[PREDICTED], clips, config, rng)
-            done += 1
-        columns = ["now", *(f"{step} step{'s'[: step > 1]}, {step * card.dt_s:.2f} s" for step in config.horizons)]
-        card.pictures.extend(
-            Picture(f"{place} place, clip {number + 1}", columns, row) for number, row in enumerate(rows)
-        )
-    for (arm, motion), parts in doubted.items():
-        if len(parts) > 1:
-            card.risks.append(pooled(parts, arm, motion, make_rng(len(card.risks))))
-    tell(1.0, "scored")
-    return card
+    def find(self, probe: str, what: str, **wanted) -> list[Row]:
+        """The rows of a probe by name, and by whichever other fields are given."""
+        return [
+            row
+            for row in self.rows
+            if (row.probe, row.what) == (probe, what) and all(getattr(row, key) == wanted[key] for key in wanted)
+        ]
 
 
-def to_json(card: Scorecard, bars: Sequence = ()) -> str:
+def worst_of(rows: Sequence[Row]) -> Row | None:
+    """Of ratios that should be 1, the one farthest from it; what could not be measured is never the worst."""
+    known = [row for row in rows if math.isfinite(row.figure.value)]
+    return max(known, key=lambda row: abs(row.figure.value - 1), default=None)
+
+
+def to_json(card: Scorecard, bars: Sequence[Bar] = ()) -> str:
     """The scorecard, and bars where given, as one strict JSON document: no pictures, NaN as null, six digits."""
     return json.dumps(as_dict(card, bars), indent=1, allow_nan=False)
 
 
-def as_dict(card: Scorecard, bars: Sequence = ()) -> dict:
-    """What `to_json` writes, as plain data."""
-    fields = {
-        name.name: _plain(getattr(card, name.name)) for name in dataclasses.fields(card) if name.name != "pictures"
+def as_dict(card: Scorecard, bars: Sequence[Bar] = ()) -> dict:
+    """What `to_json` writes, as plain data; the verdict comes first."""
+    from .verdict import verdict
+
+    parts = {
+        part.name: _plain(getattr(card, part.name)) for part in dataclasses.fields(card) if part.name != "pictures"
     }
-    return {**fields, "bars": _plain(list(bars))}
+    judged = [_plain(bar) | {"status": bar.status, "sure": bar.sure, "target": bar.target} for bar in bars]
+    return {"verdict": verdict(card), **parts, "bars": judged}
 
 
-def _plain(value):
+def _plain(value) -> Any:
     if dataclasses.is_dataclass(value):
-        names = (name.name for name in dataclasses.fields(value))
-        return {name: _plain(getattr(value, name)) for name in names if name != "picture"}
+        return {part.name: _plain(getattr(value, part.name)) for part in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, (list, tuple, range)):
         return [_plain(inner) for inner in value]
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     return value
-
-
-@dataclass(frozen=True)
-class _Truth:
-    """Of the recording, [n, T]: PSNR of the last context frame against each later one, and gradient energy; features
-    of the frames at the horizons [n, K, D], or None where looks are not compared."""
-
-    copy_last: torch.Tensor
-    energy: torch.Tensor
-    features: torch.Tensor | None
-
-
-def _seed(rng: torch.Generator) -> int:
-    return int(torch.randint(2**31 - 1, (1,), generator=rng).item())
-
-
-def _describe(place: str, clips: Sequence[Clip]) -> Place:
-    moving = sum(clip.moves() for clip in clips) / len(clips)
-    return Place(place, len(clips), moving, clips[0].context, clips[0].horizon)
-
-
-def _truth(clips: Sequence[Clip], config: ScoreConfig) -> _Truth:
-    context, steps = clips[0].context, max(config.horizons)
-    copied, energy = stand_still(clips, steps)
-    features = None
-    if config.frechet and min(clips[0].rgb.shape[1:3]) >= MIN_SIDE:
-        features = torch.stack([frame_features(frames_at(clips, context - 1 + step)) for step in config.horizons], 1)
-    return _Truth(copied, energy, features)
-
-
-def _kept(clip: Clip, horizons: Sequence[int]) -> np.ndarray:
-    return np.stack([np.asarray(clip.rgb[clip.context - 1 + step]) for step in (0, *horizons)])
-
-
-def _with_context(clip: Clip, frames: torch.Tensor) -> np.ndarray:
-    return np.concatenate([np.asarray(clip.rgb[clip.context - 1])[None], frames.numpy()])
-
-
-def _add_copy_last(card: Scorecard, place: str, truth: _Truth, rng: torch.Generator) -> None:
-    card.curves.append(Curve("psnr", place, COPY_LAST, "", mean_band(truth.copy_last, rng)))
-
-
-def _add_looks(card: Scorecard, place: str, clips: Sequence[Clip], truth: _Truth, config: ScoreConfig) -> None:
-    if truth.features is None:
-        return
-    context = clips[0].context
-    last = frame_features(frames_at(clips, context - 1))
-    for number, step in enumerate(config.horizons):
-        soft = frame_features(blurred(frames_at(clips, context - 1 + step)))
-        figures = [frechet_interval(truth.features[:, number], seen) for seen in (last, soft)]
-        card.looks.append(Looks(place, step, step * card.dt_s, *figures))
-
-
-def _add_fidelity(card, place, arm, motion, dreamt: Dream, truth: _Truth, config: ScoreConfig, rng) -> None:
-    seen = None if truth.features is None else frame_features(dreamt.frames)
-    for number, step in enumerate(config.horizons):
-        at = step - 1
-        card.fidelity.append(
-            Fidelity(
-                place=place,
-                arm=arm,
-                motion=motion,
-                horizon=step,
-                seconds=step * card.dt_s,
-                psnr=mean_interval(dreamt.psnr[:, at], rng),
-                ssim=mean_interval(dreamt.ssim[:, number], rng),
-                copy_last=mean_interval(truth.copy_last[:, at], rng),
-                gain=mean_interval(dreamt.psnr[:, at] - truth.copy_last[:, at], rng),
-                sharpness=ratio_interval(dreamt.energy[:, at], truth.energy[:, at], rng),
-                frechet=None if seen is None else frechet_interval(truth.features[:, number], seen[:, number]),
-            )
-        )
-    first, last = config.drop
-    if last <= max(config.horizons):
-        loss = dreamt.psnr[:, first - 1] - dreamt.psnr[:, last - 1]
-        card.drops.append(Drop(place, arm, motion, first, last, mean_interval(loss, rng)))
-    card.curves.append(Curve("psnr", place, arm, motion, mean_band(dreamt.psnr, rng)))
-    card.curves.append(Curve("sharpness", place, arm, motion, ratio_band(dreamt.energy, truth.energy, rng)))
-
-
-def _add_control(card, place, arm, right: Dream, wrong: Dream, steps: Sequence[int], rng) -> None:
-    for step in steps:
-        mine, theirs = right.psnr[:, step - 1], wrong.psnr[:, step - 1]
-        figures = [mean_interval(values, rng) for values in (mine, theirs, mine - theirs)]
-        card.control.append(Control(place, arm, step, step * card.dt_s, *figures))
-
-
-def _add_position(card, place, arm, dreamt: Dream, clips: Sequence[Clip], config: ScoreConfig, rng) -> None:
-    if dreamt.pose is None or clips[0].pose is None:
-        return
-    steps = dreamt.pose.shape[1]
-    context = clips[0].context
-    truth = torch.stack([poses_at(clips, context + step) for step in range(steps)], 1).double()
-    walked = torch.from_numpy(np.stack([clip.walked_m()[:steps] for clip in clips]))
-    away = (dreamt.pose[..., :3].double() - truth[..., :3]).norm(dim=-1)
-    alike = (dreamt.pose[..., 3:].double() * truth[..., 3:]).sum(-1).abs().clamp(max=1)
-    turned = torch.rad2deg(2 * torch.arccos(alike))
-    card.curves.append(Curve("position", place, arm, PREDICTED, mean_band(away, rng)))
-    for step in (step for step in config.position_horizons if step <= steps):
-        went = walked[:, step - 1] > config.walked_m
-        if not went.any():
-            continue
-        share = away[went, step - 1] / walked[went, step - 1]
-        figures = mean_interval(share, rng), median_interval(share, rng), mean_interval(turned[:, step - 1], rng)
-        card.position.append(Position(place, arm, step, step * card.dt_s, *figures))

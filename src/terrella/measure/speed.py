@@ -1,47 +1,79 @@
-"""Speed: milliseconds for one imagined and rendered step of one story, and whether the cost grows with time."""
+"""Speed: milliseconds for one imagined and rendered step of one rollout, and whether the cost grows with time."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 
-from ..core.world import World, make_rng
+from ..core.policy import Replay
+from ..core.world import World
 from .clips import Clip
-from .endurance import recorded_hands
-from .roll import fold_context
+from .endurance import recorded_actions
+from .exam import Exam, Found, Probe
+from .roll import Results, Tick, fold_context
+from .scorecard import PREDICTED, Report, Row
+from .statistics import Figure
+from .work import Unit
+
+LEAD = (
+    "One imagined and drawn step of one rollout, in milliseconds. It depends on the machine and on what else it does."
+)
+_WARM = 10
 
 
-@dataclass(frozen=True)
-class Speed:
-    """imagine + render of rgb at batch 1: median and 95th percentile in ms, of the first and the last tenth of the
-    steps, and growth = last / first - 1. Depends on the machine: `threads` are those torch was given."""
-
-    arm: str
-    steps: int
-    threads: int
-    median_ms: float
-    p95_ms: float
-    first_ms: float
-    last_ms: float
-    growth: float
-
-
-def speed(world: World, clips: Sequence[Clip], rng: torch.Generator, arm: str = "", steps: int = 1000) -> Speed:
-    """Times `steps` steps from the first clip's context under recorded actions, after ten untimed ones."""
-    own = make_rng(int(torch.randint(2**31 - 1, (1,), generator=rng).item()))
-    state = fold_context(world, clips[:1], own)
-    actions = recorded_hands(world, clips, 1, steps + 10, own)
-    times = []
-    for action in actions:
+def speed(
+    world: World, clips: Sequence[Clip], rng: torch.Generator, steps: int = 400, tick: Tick = lambda done: None
+) -> Results:
+    """ms [steps] from the first clip's context under recorded actions, after ten untimed ones; `threads` of torch."""
+    state = fold_context(world, clips[:1], rng)
+    shown = tuple(name for name in world.spec.channels if name.partition(".")[0] == "rgb") or tuple(world.spec.channels)
+    policy = Replay(recorded_actions(world, clips, 1, steps + _WARM, rng))
+    memory, times = policy.begin(1, rng), []
+    for _ in range(steps + _WARM):
         began = time.perf_counter()
-        state = world.imagine(state, action, own)
-        world.render(state, ("rgb",))["rgb"].cpu()
+        action, memory = policy.act({}, memory, rng)
+        state = world.imagine(state, action, rng)
+        for tensor in world.render(state, shown).values():
+            tensor.cpu()
         times.append((time.perf_counter() - began) * 1e3)
-    took = torch.tensor(times[10:], dtype=torch.float64)
-    tenth = max(1, steps // 10)
+        tick(1)
+    took = torch.tensor(times[_WARM:], dtype=torch.float64)
+    return {"ms": took, "threads": torch.tensor([torch.get_num_threads()])}
+
+
+def _units(exam: Exam) -> list[Unit]:
+    clips, steps = next(iter(exam.places.values())), exam.config.speed_steps
+    return [
+        Unit(
+            f"speed|{arm}|0", f"{arm}: speed", {(arm, "alone"): float(steps + _WARM)},
+            lambda tick, world=world: speed(world, clips, exam.rng(5), steps, tick),
+        )
+        for arm, world in exam.arms.items()
+        if steps
+    ]  # fmt: skip
+
+
+def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
+    """The median and the 95th percentile, and how much dearer the last tenth is than the first."""
+    took = timed["ms"]
+    steps, tenth = len(took), max(1, len(took) // 10)
     first, last = float(took[:tenth].median()), float(took[-tenth:].median())
     median, late = took.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
-    return Speed(arm, steps, torch.get_num_threads(), median, late, first, last, last / first - 1)
+    figures = {"median": (median, "ms"), "95th percentile": (late, "ms"), "growth": (100 * (last / first - 1), "%")}
+    note = f"{int(timed['threads'][0])} threads"
+    return [
+        Row("speed", "", what, unit, place, arm, PREDICTED, steps, Figure(value, math.nan, math.nan, 1), -1, note=note)
+        for what, (value, unit) in figures.items()
+    ]
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    place = next(iter(exam.places))
+    timed = {arm: found.results.get(f"speed|{arm}|0") for arm in exam.arms}
+    return Report([row for arm, one in timed.items() if one for row in rows_of(one, arm, place)])
+
+
+SPEED = Probe("speed", "Speed", LEAD, lambda exam, world: "", _report, units=_units)

@@ -1,7 +1,8 @@
 """Serving: any World played in a browser, over one WebSocket."""
 
 from .picture import read_picture
+from .recording import SinkFactory
 from .server import ServeConfig, serve
-from .story import SinkFactory, StoryConfig
+from .timeline import TimelineConfig
 
-__all__ = ["ServeConfig", "SinkFactory", "StoryConfig", "read_picture", "serve"]
+__all__ = ["ServeConfig", "SinkFactory", "TimelineConfig", "read_picture", "serve"]

@@ -1,4 +1,4 @@
-"""Keys held in a browser to one action of a world."""
+"""What a person does at the page, as actions of a world: keys that are held, and axes of sticks, mouse and sliders."""
 
 from __future__ import annotations
 
@@ -8,30 +8,81 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from ..core.spec import Spec
+from ..core.spec import Spec, dtype_of, neutral_action
+from ..core.world import Observation
+
+MAX_AXES = 64  # that a page shows; an action's others rest
+_UNLIMITED = 1e6  # limits beyond this are none
 
 
-def action_of_keys(spec: Spec, held: Sequence[str]) -> torch.Tensor:
-    """The action [1, *spec.action.shape] of the keys held, oldest first; codes the world does not know count as nothing.
+def axes_of(spec: Spec) -> list[dict]:
+    """Name, unit, low, high, neutral and whole (whether it takes whole numbers only) of each axis, for the page's sliders.
 
-    Buttons combine by element-wise maximum. An axis (Box) takes the held value that is furthest from rest, so that
-    a negative direction is not lost to a zero; a choice (Discrete) is the key pressed last. With no key: zeros,
-    brought into the space.
+    Only a Box has axes. An axis without limits goes as far as its keys do, or from -1 to 1.
+    """
+    space = spec.action
+    if not isinstance(space, spaces.Box):
+        return []
+    rest, axes = neutral_action(spec).ravel(), []
+    table = [np.abs(np.asarray(value, np.float64)) for value in spec.keys.values()]
+    for at in range(min(rest.size, MAX_AXES)):
+        reach = max([float(row[at]) for row in table], default=0.0) or 1.0
+        low, high = float(space.low.flat[at]), float(space.high.flat[at])
+        axes.append(
+            {
+                "name": spec.action_names[at] if at < len(spec.action_names) else f"axis {at + 1}",
+                "unit": spec.action_units[at] if at < len(spec.action_units) else "",
+                "low": low if abs(low) < _UNLIMITED else -reach,
+                "high": high if abs(high) < _UNLIMITED else reach,
+                "neutral": float(rest[at]),
+                "whole": dtype_of(space).kind in "iu",
+            }
+        )
+    return axes
+
+
+def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) -> torch.Tensor:
+    """The action [1, *spec.action.shape] of the keys held, oldest first, and of the values of the axes, in their units.
+
+    Buttons combine by element-wise maximum. A choice (Discrete) is the key pressed last. An axis (Box) has the value given,
+    or that of the held key which is furthest from rest, so that a negative direction is not lost to a zero. Without any:
+    the neutral action. Keys that the world does not know count as nothing, values beyond its limits as the limit.
     """
     space = spec.action
     rows = [np.asarray(spec.keys[code], np.float64) for code in held if code in spec.keys]
-    flat = np.zeros(int(np.prod(space.shape or ())) or 1)
-    if rows and isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        flat = rows[-1]
-    elif rows and isinstance(space, spaces.Box):
-        table = np.stack(rows)
-        table = table[np.argsort(-table.max(axis=1), kind="stable")]  # of two opposites, the positive
-        flat = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
-    elif rows:
-        flat = np.max(rows, axis=0)
-    action = flat.reshape(space.shape or ())
+    flat = neutral_action(spec).ravel().astype(np.float64)
     if isinstance(space, spaces.Box):
-        action = np.clip(action, space.low, space.high)
-    elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        action = np.maximum(action, space.start)
-    return torch.as_tensor(np.asarray(action, dtype=space.dtype))[None]
+        given = np.asarray(axes, np.float64)[: flat.size]
+        flat[: given.size] = given
+        if rows:
+            table = np.stack(rows)
+            table = table[np.argsort(-table.max(axis=1), kind="stable")]  # of two opposites, the positive
+            pressed = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
+            flat = np.where(pressed != 0, pressed, flat)
+        flat = np.clip(flat, space.low.ravel(), space.high.ravel())
+        flat = flat.round() if dtype_of(space).kind in "iu" else flat
+    elif rows:
+        flat = np.max(rows, axis=0) if isinstance(space, spaces.MultiBinary) else rows[-1]
+    return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
+
+
+class Person:
+    """The Policy of whoever sits at the page: it acts by what is held there, and needs no observation."""
+
+    def __init__(self, spec: Spec):
+        self._spec, self._held, self._axes = spec, (), ()
+
+    def hold(self, held: Sequence[str], axes: Sequence[float]) -> None:
+        """From now on these keys and values of the axes."""
+        self._held, self._axes = tuple(held), tuple(axes)
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is held that the world knows."""
+        return not torch.equal(action_of(self._spec, self._held, self._axes), action_of(self._spec))
+
+    def begin(self, batch: int, rng: torch.Generator) -> None:
+        return None
+
+    def act(self, observation: Observation, memory: None, rng: torch.Generator) -> tuple[torch.Tensor, None]:
+        return action_of(self._spec, self._held, self._axes), memory

@@ -1,7 +1,7 @@
 """What a world remembers, for the page: the map of its keyframes, and its pictures with what it invented tinted.
 
 It knows no kind of world: a world with the channels `pose` and `keyframes` [N, 4] (x, y in metres, heading in radians, kind:
-0 empty, 1 recorded, 2 observed, 3 dreamt) is drawn as a map, one with `known` [H, W] in 0..1 can be tinted.
+0 empty, 1 recorded, 2 observed, 3 imagined) is drawn as a map, one with `known` [H, W] in 0..1 can be tinted.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ def mapped(spec: Spec) -> bool:
     return {"pose", "keyframes"} <= set(spec.channels)
 
 
-def tells_known(spec: Spec) -> bool:
+def knows_share(spec: Spec) -> bool:
     return "known" in spec.channels
 
 
 @dataclass(frozen=True)
 class Chart:
-    """One moment's map: where the eye is [x, y, heading], what share of the picture memory knew (None where the world does
+    """One moment's map: where the camera is [x, y, heading], what share of the picture memory knew (None where the world does
     not say), and its keyframes [n, 4] without the empty slots."""
 
-    eye: list[float]
+    camera: list[float]
     known: float | None
     keyframes: torch.Tensor
 
     def body(self, before: Chart | None) -> dict:
         """As the page gets it: numbers to the centimetre and half a degree, and keyframes only if they are not those of
         `before`."""
-        body: dict = {"eye": [round(number, 3) for number in self.eye], "known": self.known}
+        body: dict = {"camera": [round(number, 3) for number in self.camera], "known": self.known}
         if before is None or not torch.equal(before.keyframes, self.keyframes):
             body["keyframes"] = [round(number, 2) for number in self.keyframes.flatten().tolist()]
         return body
 
 
 def chart(world: World, state: State) -> Chart:
-    """The map of the first story of `state`."""
-    wanted = ["pose", "keyframes", *(["known"] if tells_known(world.spec) else [])]
+    """The map of the first entry of `state`."""
+    wanted = ["pose", "keyframes", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     x, y, _, w, qx, qy, z = seen["pose"].tolist()
     heading = math.atan2(2 * (w * z + qx * qy), 1 - 2 * (qy * qy + z * z))

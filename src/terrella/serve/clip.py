@@ -14,13 +14,13 @@ MIN_HEIGHT = 480
 
 
 def make_clip(pictures: Sequence[tuple[bytes, ...]], dt_s: float) -> bytes:
-    """An H.264 MP4 of `pictures` (JPEGs per moment, one for each world), one frame each `dt_s` seconds."""
+    """An H.264 MP4 of `pictures` (JPEGs per moment, of each world and camera), one frame each `dt_s` seconds."""
     rate = Fraction(1 / dt_s).limit_denominator(1000)
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as file:
         stream = None
         for images in pictures:
-            frame = _beside([simplejpeg.decode_jpeg(image, colorspace="RGB") for image in images])
+            frame = _side_by_side([simplejpeg.decode_jpeg(image, colorspace="RGB") for image in images])
             if stream is None:
                 stream = file.add_stream("libx264", rate=rate, options={"crf": "18", "preset": "veryfast"})
                 stream.height, stream.width = frame.shape[:2]
@@ -32,7 +32,7 @@ def make_clip(pictures: Sequence[tuple[bytes, ...]], dt_s: float) -> bytes:
     return buffer.getvalue()
 
 
-def _beside(images: list[np.ndarray]) -> np.ndarray:
+def _side_by_side(images: list[np.ndarray]) -> np.ndarray:
     height = max(image.shape[0] for image in images)
     images = [_enlarge(image, max(1, height // image.shape[0])) for image in images]
     height = min(image.shape[0] for image in images)

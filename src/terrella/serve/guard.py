@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import hmac
 import ipaddress
 import time
-from urllib.parse import urlsplit
+from collections.abc import Collection
+from urllib.parse import parse_qs, urlsplit
 
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -65,15 +68,23 @@ class RateLimit:
         return True
 
 
-class SafeHeaders:
-    """ASGI middleware: `HEADERS` on every answer, and no answer at all to a foreign Host or Origin."""
+class Guard:
+    """ASGI middleware: refuses whom `refusal` refuses, and puts `HEADERS` on every answer. The files that make up a page need
+    no token: there is nothing secret in them."""
 
-    def __init__(self, app: ASGIApp, host: str):
-        self._app, self._host = app, host
+    def __init__(self, app: ASGIApp, host: str, token: str | None, files: Collection[str]):
+        self._app, self._host, self._token, self._files = app, host, token, files
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        why = refusal(headers, self._host, None if scope["path"] in self._files else self._token, given)
+        answer = PlainTextResponse(why, 403) if why else self._app
+        if scope["type"] == "websocket":
+            await answer(scope, receive, send)
+            return await _gone(receive) if why else None
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -81,7 +92,14 @@ class SafeHeaders:
                 message = {**message, "headers": [*message["headers"], *extra]}
             await send(message)
 
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        why = refusal(headers, self._host, None, None)
-        answer = PlainTextResponse(why, 403) if why else self._app
         await answer(scope, receive, send_with_headers)
+
+
+async def _gone(receive: Receive) -> None:
+    """Waits until a refused WebSocket's connection is closed, as uvicorn's second message says (the first says that it will
+    be): it reports a handshake that ends sooner as an error of ours."""
+    left = 2
+    with contextlib.suppress(asyncio.TimeoutError):
+        async with asyncio.timeout(10):
+            while left:
+                left -= (await receive())["type"] == "websocket.disconnect"

@@ -1,25 +1,34 @@
-"""The recent past of a session: pictures for the eye and states to go back to, within fixed budgets."""
+"""The recent past of a session: pictures to show and states to go back to, within fixed budgets."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
 from ..core.state import State
 
 
+class Image(NamedTuple):
+    """A picture as the page gets it: of which world and through which of its cameras (by their places), and its JPEG."""
+
+    world: int
+    camera: int
+    jpeg: bytes
+
+
 @dataclass(frozen=True)
 class Moment:
-    """One step: its JPEGs (one per world) and, where the worlds can fork, all that is needed to go on from it."""
+    """One step: its pictures and, where the worlds can fork, all that is needed to go on from it."""
 
     step: int
-    images: tuple[bytes, ...]
+    images: tuple[Image, ...]
     flags: int = 0
     episode_return: float = 0.0
     states: tuple[State, ...] | None = None
-    rng: torch.Tensor | None = None  # the generator's state after this step
+    rngs: tuple[torch.Tensor, ...] | None = None  # the generators' states after this step
     uncertainty: float = -1.0  # the error to expect of the last image, -1 where its world does not say
     vitals: tuple[float, ...] = ()  # of the first world's player
 
@@ -51,7 +60,7 @@ class History:
         """The oldest step that can be returned to; the newest one where no states are kept."""
         return self._stateful[0].step if self._stateful else self.newest.step
 
-    def pictures(self) -> list[tuple[bytes, ...]]:
+    def pictures(self) -> list[tuple[Image, ...]]:
         return [moment.images for moment in self._pictures]
 
     def push(self, moment: Moment) -> None:
@@ -92,7 +101,7 @@ class History:
         self._count(gone, -1)
         if self._pictures and self._pictures[0].step <= gone.step:  # the picture stays, without its state
             index = gone.step - self._pictures[0].step
-            self._pictures[index] = replace(gone, states=None, rng=None)
+            self._pictures[index] = replace(gone, states=None, rngs=None)
 
     def _count(self, moment: Moment, sign: int) -> None:
         seen = {}

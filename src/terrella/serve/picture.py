@@ -68,19 +68,19 @@ def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS
         ) from error
 
 
-def doubtful(spec: Spec) -> tuple[float, float] | None:
+def uncertainty_levels(spec: Spec) -> tuple[float, float] | None:
     """For a world that has the channel `uncertainty`: the value that is usual for it, and from which it invents."""
     if "uncertainty" not in spec.channels:
         return None
-    told = spec.card.get("uncertainty")
-    known = told if isinstance(told, dict) else {}
+    said = spec.card.get("uncertainty")
+    known = said if isinstance(said, dict) else {}
     sure, invents = (_share(known.get(name), usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
     return sure, max(invents, 1.01 * sure)
 
 
-def _share(told: object, usual: float) -> float:
-    """What a stranger's card tells, if it is a share of full brightness."""
-    return float(told) if isinstance(told, int | float) and 0 < told <= 1 else usual
+def _share(value: object, usual: float) -> float:
+    """What a stranger's card says, if it is a share of full brightness."""
+    return float(value) if isinstance(value, int | float) and 0 < value <= 1 else usual
 
 
 def _plain(image: Image.Image) -> Image.Image:

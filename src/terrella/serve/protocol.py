@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ..core.errors import ProtocolError
+from .actions import MAX_AXES
+from .history import Image
 
-VERSION = 2
+VERSION = 3
 MAX_MESSAGE = 4096  # bytes of one message from a page
 MAX_PICTURE = (
     2**16 - 256
 )  # bytes of a picture from a page: what it sends as bytes is one, what it sends as text is JSON
 MAX_HELD = 16  # keys held at once
+MAX_CAMERAS = 16  # shown at once
 U32 = 2**32 - 1
 
 # flags of a frame
@@ -26,7 +29,7 @@ REPLAY = 4  # a frame out of the history: the session stands in the past
 # version u8, flags u8, images u16, seq u32, step u32, oldest u32, newest u32, action id u32,
 # generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32; little endian
 _HEADER = struct.Struct("<BBHIIIIIffddf")
-_LENGTH = struct.Struct("<I")
+_IMAGE = struct.Struct("<BBHI")  # world, camera, 0, bytes
 
 
 @dataclass(frozen=True)
@@ -34,16 +37,16 @@ class Frame:
     """One moment as the page gets it.
 
     seq counts messages (the page acknowledges it); step is the world's; oldest..newest is what can be rewound to;
-    action_id and client_ms echo the latest keys message that this step obeyed; images are JPEGs, one per world;
-    uncertainty is the error to expect of the last of them, -1 where its world does not say; vitals are the numbers of the
-    player (health) that the first world tells, in the order of hello.
+    action_id and client_ms echo the latest controls message that this step obeyed; images: see history.Image; uncertainty
+    is the error to expect of the last world's, -1 where it does not say; vitals are the numbers of the first world's
+    player (health), in the order of hello.
     """
 
     seq: int
     step: int
     oldest: int
     newest: int
-    images: tuple[bytes, ...]
+    images: tuple[Image, ...]
     flags: int = 0
     action_id: int = 0
     generation_ms: float = 0.0
@@ -62,7 +65,7 @@ def encode_frame(frame: Frame) -> bytes:
         )
     ]  # fmt: skip
     for image in frame.images:
-        parts += [_LENGTH.pack(len(image)), image]
+        parts += [_IMAGE.pack(image.world, image.camera, 0, len(image.jpeg)), image.jpeg]
     return b"".join([*parts, struct.pack(f"<{len(frame.vitals)}f", *frame.vitals)])
 
 
@@ -70,31 +73,37 @@ def decode_frame(data: bytes) -> Frame:
     """What `encode_frame` wrote; ProtocolError where the bytes are cut short or of another version."""
     try:
         fields = _HEADER.unpack_from(data)
-        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, doubt = fields
+        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, uncertainty = fields
         if version != VERSION:
             raise ProtocolError(
                 f"a frame of protocol version {version} came, this side speaks {VERSION}; reload the page."
             )
         images, at = [], _HEADER.size
         for _ in range(count):
-            (length,) = _LENGTH.unpack_from(data, at)
-            at += _LENGTH.size
-            images.append(data[at : at + length])
+            world, camera, _, length = _IMAGE.unpack_from(data, at)
+            at += _IMAGE.size
+            images.append(Image(world, camera, data[at : at + length]))
             at += length
         vitals = struct.unpack(f"<{max(len(data) - at, 0) // 4}f", data[at:])
     except struct.error as error:
         raise ProtocolError(f"a frame of {len(data)} bytes is cut short; reload the page.") from error
     if at > len(data):
         raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
-    return Frame(seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, doubt, vitals)
+    return Frame(
+        seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, uncertainty, vitals
+    )
 
 
 @dataclass(frozen=True)
-class Keys:
-    """The keys held from now on, in the order they were pressed; `id` grows with each message, `t` is the page's clock."""
+class Controls:
+    """What is held from now on: keys in the order they were pressed, and the value of each axis in the world's units.
+
+    `id` grows with each message, `t` is the page's clock.
+    """
 
     id: int
-    held: tuple[str, ...]
+    held: tuple[str, ...] = ()
+    axes: tuple[float, ...] = ()
     t: float = 0.0
 
 
@@ -115,7 +124,7 @@ class Resume:
 
 @dataclass(frozen=True)
 class Restart:
-    """A new episode; with a seed, the story of that seed."""
+    """A new episode; with a seed, that of the seed."""
 
     seed: int | None = None
 
@@ -141,7 +150,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Sync:
-    """Beside a truth, the dream looks at the truth again."""
+    """The dream observes the game beside it."""
 
 
 @dataclass(frozen=True)
@@ -150,11 +159,20 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Drive:
+    """Whether the policy acts while nobody touches the controls."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
 class Show:
-    """What the page shows of memory from now on: `map` asks for chart events, `invented` for tinted pictures."""
+    """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures; cameras are picture
+    channels, none for the main one."""
 
     map: bool
     invented: bool
+    cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -164,7 +182,7 @@ class Picture:
     data: bytes
 
 
-Message = Keys | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record | Show | Picture
+Message = Controls | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record | Drive | Show | Picture
 
 
 def parse_message(data: str | bytes) -> Message:
@@ -182,41 +200,37 @@ def parse_message(data: str | bytes) -> Message:
     if not isinstance(body, dict):
         raise ProtocolError("a message must be a JSON object with a 'type'.")
     kind = body.get("type")
-    match kind:
-        case "keys":
-            held = body.get("held")
-            if (
-                not isinstance(held, list)
-                or len(held) > MAX_HELD
-                or not all(isinstance(k, str) and len(k) <= 32 for k in held)
-            ):
-                raise ProtocolError(f"'held' must be a list of at most {MAX_HELD} key codes.")
-            return Keys(_integer(body, "id", 0, U32), tuple(held), _number(body, "t"))
-        case "ack":
-            return Ack(_integer(body, "seq", 0, U32))
-        case "pause":
-            return Pause()
-        case "resume":
-            return Resume()
-        case "restart":
-            return Restart(None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1))
-        case "rewind":
-            return Rewind(_integer(body, "steps", -U32, U32))
-        case "seek":
-            return Seek(_integer(body, "step", 0, U32))
-        case "branch":
-            return Branch()
-        case "sync":
-            return Sync()
-        case "record":
-            if not isinstance(body.get("on"), bool):
-                raise ProtocolError("'on' must be true or false.")
-            return Record(body["on"])
-        case "show":
-            if not (isinstance(body.get("map"), bool) and isinstance(body.get("invented"), bool)):
-                raise ProtocolError("'map' and 'invented' must be true or false.")
-            return Show(body["map"], body["invented"])
-    raise ProtocolError(f"no message is called {str(kind)[:40]!r}.")
+    read = _READERS.get(kind) if isinstance(kind, str) else None
+    if read is None:
+        raise ProtocolError(f"no message is called {str(kind)[:40]!r}.")
+    return read(body)
+
+
+def _controls(body: dict) -> Controls:
+    axes = body.get("axes", [])
+    if not isinstance(axes, list) or len(axes) > MAX_AXES:
+        raise ProtocolError(f"'axes' must be a list of at most {MAX_AXES} numbers.")
+    held = _names(body, "held", MAX_HELD, "key codes")
+    numbers = tuple(_finite(value, "axes") for value in axes)
+    return Controls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
+
+
+_READERS: dict[str, Callable[[dict], Message]] = {
+    "controls": _controls,
+    "ack": lambda body: Ack(_integer(body, "seq", 0, U32)),
+    "pause": lambda body: Pause(),
+    "resume": lambda body: Resume(),
+    "restart": lambda body: Restart(None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1)),
+    "rewind": lambda body: Rewind(_integer(body, "steps", -U32, U32)),
+    "seek": lambda body: Seek(_integer(body, "step", 0, U32)),
+    "branch": lambda body: Branch(),
+    "sync": lambda body: Sync(),
+    "record": lambda body: Record(_switch(body, "on")),
+    "drive": lambda body: Drive(_switch(body, "on")),
+    "show": lambda body: Show(
+        _switch(body, "map"), _switch(body, "invented"), _names(body, "cameras", MAX_CAMERAS, "picture channels")
+    ),
+}
 
 
 def _integer(body: dict, name: str, low: int, high: int) -> int:
@@ -226,19 +240,33 @@ def _integer(body: dict, name: str, low: int, high: int) -> int:
     return value
 
 
-def _number(body: dict, name: str) -> float:
-    value = body.get(name, 0.0)
+def _finite(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e15:
         raise ProtocolError(f"'{name}' must be a finite number.")
     return float(value)
 
 
+def _switch(body: dict, name: str) -> bool:
+    value = body.get(name)
+    if not isinstance(value, bool):
+        raise ProtocolError(f"'{name}' must be true or false.")
+    return value
+
+
+def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
+    """A list of short strings, () where there is none."""
+    value = body.get(name, [])
+    if not isinstance(value, list) or len(value) > most or not all(isinstance(k, str) and len(k) <= 64 for k in value):
+        raise ProtocolError(f"'{name}' must be a list of at most {most} {what}.")
+    return tuple(value)
+
+
 def encode_event(kind: str, **body) -> str:
     """A JSON message to the page: hello, status, error, or chart: the map of a moment.
 
-    chart: world (its number on the page), step, eye [x, y in metres, heading in radians], known (the share of its picture
+    chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
     that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind
-    (1 recorded, 2 observed, 3 dreamt) of each, in one flat list.
+    (1 recorded, 2 observed, 3 imagined) of each, in one flat list.
     """
     return json.dumps({"type": kind, **body}, allow_nan=False)
 

@@ -26,27 +26,26 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ..core.errors import ProtocolError, ServeError
+from ..core.policy import Policy
+from ..core.spec import suffix_of
 from ..core.world import World
 from . import protocol
-from .chart import mapped, tells_known
+from .actions import axes_of
+from .chart import knows_share, mapped
 from .clip import make_clip
-from .guard import RateLimit, SafeHeaders, is_loopback, refusal
-from .picture import doubtful
+from .door import quiet_accepting, settings
+from .guard import Guard, RateLimit, is_loopback
+from .picture import uncertainty_levels
+from .recording import SinkFactory
 from .session import Session
-from .story import SinkFactory, Story, StoryConfig, check_playable, vitals
+from .timeline import Timeline, TimelineConfig, check_playable, vitals
 
+_SCRIPTS = ("app", "axes", "card", "controls", "keycaps", "link", "map", "picture", "screens", "uncertainty")
 _FILES = {
     "/": ("index.html", "text/html"),
     "/style.css": ("style.css", "text/css"),
-    "/app.js": ("app.js", "text/javascript"),
-    "/link.js": ("link.js", "text/javascript"),
-    "/controls.js": ("controls.js", "text/javascript"),
-    "/card.js": ("card.js", "text/javascript"),
-    "/keycaps.js": ("keycaps.js", "text/javascript"),
-    "/map.js": ("map.js", "text/javascript"),
-    "/doubt.js": ("doubt.js", "text/javascript"),
-    "/picture.js": ("picture.js", "text/javascript"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
+    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in _SCRIPTS},
 }
 
 
@@ -61,7 +60,7 @@ class ServeConfig:
     per_s: float = 240.0
     burst: float = 480.0
     faults: int = 20
-    story: StoryConfig = StoryConfig()
+    timeline: TimelineConfig = TimelineConfig()
 
 
 class Sessions:
@@ -74,8 +73,10 @@ class Sessions:
         sink_factory: SinkFactory | None,
         config: ServeConfig,
         picture: torch.Tensor | None = None,
+        policy: Policy | None = None,
     ):
-        self.worlds, self.seed, self.config, self.picture = tuple(worlds), seed, config, picture
+        self.worlds, self.seed, self.config = tuple(worlds), seed, config
+        self.picture, self.policy = picture, policy
         self._sink_factory = sink_factory
         self._seats = config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
@@ -94,7 +95,7 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self._tell_story, self._worker)
+        session = Session(self._make_timeline, self._worker)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -118,8 +119,8 @@ class Sessions:
         self._ended.add(task)
         task.add_done_callback(self._ended.discard)
 
-    def _tell_story(self) -> Story:
-        return Story(self.worlds, self.seed, self._sink_factory, self.config.story, self.picture)
+    def _make_timeline(self) -> Timeline:
+        return Timeline(self.worlds, self.seed, self._sink_factory, self.config.timeline, self.picture, self.policy)
 
     def hello(self, session: Session, resumed: bool) -> str:
         """All that the page needs to know about the worlds."""
@@ -132,7 +133,8 @@ class Sessions:
             resumed=resumed,
             worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
             no_rewind=f"{fixed} is a running game: it cannot go back in time." if fixed else "",
-            no_record="" if self._sink_factory else "start the server with a folder to record to: --record DIR",
+            no_record="" if self._sink_factory else "start the server with --record FOLDER.",
+            driver=type(self.policy).__name__ if self.policy else "",
         )
 
 
@@ -141,17 +143,23 @@ def _describe(world: World, label: str) -> dict:
     return {
         "name": spec.name,
         "label": label,
-        "size": list(spec.channels["rgb"].shape[:2]),
+        "cameras": [
+            {"channel": name, "name": suffix_of(name) or "main", "size": spec.channels[name].shape[:2]}
+            for name in spec.kinds("rgb")
+        ],
         "dt_s": spec.dt_s,
         "forkable": spec.forkable,
         "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
         "action_names": list(spec.action_names),
+        "action_mode": spec.action_mode,
+        "action_frame": spec.action_frame,
+        "axes": axes_of(spec),
         "action_kind": type(spec.action).__name__,
         "scored": "reward" in spec.channels,
         "vitals": vitals(spec),
-        "doubtful": doubtful(spec),
+        "uncertainty": uncertainty_levels(spec),
         "mapped": mapped(spec),
-        "tells_known": tells_known(spec),
+        "knows_share": knows_share(spec),
         "card": protocol.plain(dict(spec.card)),
     }
 
@@ -165,6 +173,7 @@ def build_app(
     config: ServeConfig | None = None,
     on_ready: Callable[[], None] | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> Starlette:
     """The ASGI application; `host` is the address it is bound to, which decides what Host headers it answers to."""
     check_playable(worlds)
@@ -174,7 +183,8 @@ def build_app(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture)
+        quiet_accepting(asyncio.get_running_loop())
+        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture, policy)
         sweeper = asyncio.create_task(_sweep(sessions))
         if on_ready:
             on_ready()
@@ -189,13 +199,9 @@ def build_app(
         return Response(content, media_type=kind)
 
     def check(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        return PlainTextResponse(why, 403) if why else PlainTextResponse("ok")
+        return PlainTextResponse("ok")
 
     async def clip(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        if why:
-            return PlainTextResponse(why, 403)
         session = request.app.state.sessions.get(request.path_params["session"])
         pictures = await session.pictures() if session else []
         if not pictures:
@@ -207,15 +213,13 @@ def build_app(
         return Response(content, media_type="video/mp4", headers=disposition)
 
     async def play(websocket: WebSocket) -> None:
-        why = refusal(dict(websocket.headers), host, token, websocket.query_params.get("token"))
-        if why:
-            await websocket.send_denial_response(PlainTextResponse(why, 403))
-        else:
-            await _play(websocket, websocket.app.state.sessions)
+        await _play(websocket, websocket.app.state.sessions)
 
     routes = [Route(path, show) for path in files]
     routes += [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
-    return Starlette(routes=routes, lifespan=lifespan, middleware=[Middleware(SafeHeaders, host=host)])
+    return Starlette(
+        routes=routes, lifespan=lifespan, middleware=[Middleware(Guard, host=host, token=token, files=files)]
+    )
 
 
 async def _sweep(sessions: Sessions) -> None:
@@ -303,9 +307,11 @@ def serve(
     seed: int = 0,
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
-    Stories begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given.
+    Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
+    touches the controls.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
@@ -317,7 +323,7 @@ def serve(
         token = secrets.token_urlsafe(16)
     listener = open_port(host, port)
     with contextlib.closing(listener):
-        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture)
+        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture, policy)
         with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
             server.run(sockets=[listener])
 
@@ -345,16 +351,13 @@ def make_server(
     seed: int = 0,
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
+    policy: Policy | None = None,
 ) -> uvicorn.Server:
     """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
     ready = (lambda: on_ready(url)) if on_ready else None
-    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture)
-    settings = uvicorn.Config(
-        app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=2**16, ws_max_queue=64,
-        ws_per_message_deflate=False, timeout_graceful_shutdown=2, server_header=False, proxy_headers=False,
-    )  # fmt: skip
-    return uvicorn.Server(settings)
+    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture, policy)
+    return uvicorn.Server(settings(app, websockets=True))
 
 
 def page_address(host: str, port: int, token: str | None) -> str:

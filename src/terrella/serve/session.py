@@ -1,4 +1,4 @@
-"""A session: one person's story, paced by the world's clock and by what their browser has acknowledged."""
+"""A session: one person's timeline, paced by the world's clock and by what their browser has acknowledged."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from .history import Moment
 from .protocol import (
     Ack,
     Branch,
+    Controls,
+    Drive,
     Frame,
-    Keys,
     Message,
     Pause,
     Picture,
@@ -33,7 +34,7 @@ from .protocol import (
     Show,
     Sync,
 )
-from .story import Story
+from .timeline import Timeline
 
 MAX_UNACKED = 2
 CHART_S = 0.1  # between two maps
@@ -50,26 +51,27 @@ class Socket(Protocol):
 
 
 class Session:
-    """Steps its story only while fewer than `MAX_UNACKED` frames are on their way; the latest keys win.
+    """Steps its timeline only while fewer than `MAX_UNACKED` frames are on their way; the latest controls win.
 
-    `run` is its one task. Messages other than keys and acknowledgements are obeyed in order between steps, so the
-    story is never touched by two verbs at once. Without a socket it stands still and waits to be attached again.
+    `run` is its one task. Messages other than controls and acknowledgements are obeyed in order between steps, so the
+    timeline is never touched by two verbs at once. Without a socket it stands still and waits to be attached again; what
+    it was recording is closed then, for another page may want to record.
     """
 
-    def __init__(self, make_story: Callable[[], Story], worker: Executor):
+    def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor):
         self.id = secrets.token_urlsafe(16)
-        self.story: Story | None = None
+        self.timeline: Timeline | None = None
         self.detached_at: float | None = time.monotonic()
         self.heard_at = time.monotonic()
-        self._make_story, self._worker = make_story, worker
+        self._make_timeline, self._worker = make_timeline, worker
         self._socket: Socket | None = None
-        self._keys = Keys(0, ())
+        self._controls = Controls(0)
         self._commands: deque[Message] = deque()
         self._wake = asyncio.Event()
         self._sent = self._acked = 0
         self._paused = self._closed = False
         self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
-        self._error = self._told = ""
+        self._error = self._status_sent = ""
         self._show = Show(map=False, invented=False)
         self._charted: Chart | None = None  # what the page has on its map
         self._chart_due = 0.0
@@ -88,19 +90,21 @@ class Session:
     def attach(self, socket: Socket) -> Socket | None:
         """Plays on through `socket`; gives the socket that was attached until now."""
         before, self._socket = self._socket, socket
-        self.detached_at, self._acked, self._told = None, self._sent, "hello"
-        self._keys = Keys(0, ())  # a new page counts its messages anew
+        self.detached_at, self._acked, self._status_sent = None, self._sent, "hello"
+        self._controls = Controls(0)  # a new page counts its messages anew
         self._show = Show(map=False, invented=False)
         self.heard_at = time.monotonic()
-        self._unseen = self.story.shown if self.story else None
+        self._unseen = self.timeline.shown if self.timeline else None
         self._wake.set()
         return before
 
     def detach(self, socket: Socket) -> None:
-        """The socket is gone; the story waits."""
+        """The socket is gone; the timeline waits, and its recording is closed."""
         if self._socket is socket:
+            self._commands.append(Record(False))
+            self._wake.set()
             self._socket = None
-            self._keys = replace(self._keys, held=())
+            self._controls = replace(self._controls, held=(), axes=())
             self.detached_at = time.monotonic()
 
     def hear(self, message: Message, socket: Socket | None = None) -> None:
@@ -108,9 +112,9 @@ class Session:
         if socket is not None and socket is not self._socket:
             return
         self.heard_at = time.monotonic()
-        if isinstance(message, Keys):
-            if message.id >= self._keys.id:
-                self._keys = message
+        if isinstance(message, Controls):
+            if message.id >= self._controls.id:
+                self._controls = message
         elif isinstance(message, Ack):
             if self._acked < message.seq <= self._sent:
                 self._acked = message.seq
@@ -126,7 +130,7 @@ class Session:
 
     async def pictures(self) -> list[tuple[bytes, ...]]:
         """The JPEGs of the recent past; none before the world has started."""
-        return await self._work(self.story.pictures) if self.story else []
+        return await self._work(self.timeline.pictures) if self.timeline else []
 
     def close(self) -> None:
         self._closed = True
@@ -140,8 +144,8 @@ class Session:
             while not self._closed:
                 await self._turn()
         finally:
-            if self.story:
-                await asyncio.shield(self._work(self.story.close))
+            if self.timeline:
+                await asyncio.shield(self._work(self.timeline.close))
             if self._socket is not None:
                 await self._event(
                     protocol.encode_event("error", text="this session has ended; reload the page to begin anew.")
@@ -149,8 +153,8 @@ class Session:
 
     async def _begin(self) -> None:
         try:
-            self.story = await self._work(self._make_story)
-            self._unseen = self.story.shown
+            self.timeline = await self._work(self._make_timeline)
+            self._unseen = self.timeline.shown
         except TerrellaError as error:
             self._error = str(error)
         except Exception as error:  # a world is a stranger's code: the server outlives it
@@ -159,73 +163,76 @@ class Session:
 
     async def _turn(self) -> None:
         self._wake.clear()
-        while self._commands and self.story:
-            await self._obey(self._commands.popleft(), self.story)
-        story = self.story
-        if self._told != self._status():
-            await self._tell()
-        if self._socket is None or story is None or self.unacked >= MAX_UNACKED:
+        while self._commands and self.timeline:
+            await self._obey(self._commands.popleft(), self.timeline)
+        timeline = self.timeline
+        if self._status_sent != self._status():
+            await self._send_status()
+        if self._socket is None or timeline is None or self.unacked >= MAX_UNACKED:
             await self._wake.wait()
         elif self._unseen is not None:
-            await self._send(self._unseen, story, 0.0, self._keys)
-        elif self._paused or self._error or story.rewound:
+            await self._send(self._unseen, timeline, 0.0, self._controls)
+        elif self._paused or self._error or timeline.rewound:
             await self._wake.wait()
         else:
-            await self._step_when_due(story)
+            await self._step_when_due(timeline)
 
-    async def _step_when_due(self, story: Story) -> None:
+    async def _step_when_due(self, timeline: Timeline) -> None:
         loop, now = asyncio.get_running_loop(), time.perf_counter()
         if self._due - now > 0.0005:
             alarm = loop.call_later(self._due - now, self._wake.set)
             await self._wake.wait()
             alarm.cancel()
             return
-        dt_s = story.spec.dt_s
+        dt_s = timeline.spec.dt_s
         self._due = max(self._due + dt_s, now - dt_s)  # a late step is caught up, a long wait is not
         try:
-            keys, moment, made_ms = await self._work(self._step, story)
+            controls, moment, made_ms = await self._work(self._step, timeline)
         except Exception as error:  # a world is a stranger's code: the server outlives it
             if not isinstance(error, TerrellaError):
                 traceback.print_exc(file=sys.stderr)
             self._error = f"the world stopped: {error} Restart to go on."
             return
-        await self._send(moment, story, made_ms, keys)
+        await self._send(moment, timeline, made_ms, controls)
 
-    def _step(self, story: Story) -> tuple[Keys, Moment, float]:
-        """In the worker: the keys are read as late as can be."""
-        begun, keys = time.perf_counter(), self._keys
-        moment = story.step(keys.held)
-        return keys, moment, (time.perf_counter() - begun) * 1e3
+    def _step(self, timeline: Timeline) -> tuple[Controls, Moment, float]:
+        """In the worker: the controls are read as late as can be."""
+        begun, controls = time.perf_counter(), self._controls
+        moment = timeline.step(controls.held, controls.axes)
+        return controls, moment, (time.perf_counter() - begun) * 1e3
 
-    async def _obey(self, message: Message, story: Story) -> None:
+    async def _obey(self, message: Message, timeline: Timeline) -> None:
         try:
             match message:
                 case Pause():
                     self._paused = True
                 case Resume():
-                    self._unseen = await self._work(story.to_newest) if story.rewound else self._unseen
+                    self._unseen = await self._work(timeline.to_newest) if timeline.rewound else self._unseen
                     self._paused, self._error = False, ""
                 case Restart(seed):
                     new = secrets.randbelow(2**31) if seed is None else seed
-                    self._unseen = await self._work(story.restart, new, seed is not None)
+                    self._unseen = await self._work(timeline.restart, new, seed is not None)
                     self._paused, self._error = False, ""
                 case Rewind(steps):
-                    self._unseen = await self._work(story.stand_at, story.shown.step - steps)
+                    self._unseen = await self._work(timeline.stand_at, timeline.shown.step - steps)
                 case Seek(step):
-                    self._unseen = await self._work(story.stand_at, step)
+                    self._unseen = await self._work(timeline.stand_at, step)
                 case Branch():
-                    self._unseen = await self._work(story.branch)
+                    self._unseen = await self._work(timeline.branch)
                     self._paused, self._error = False, ""
                 case Picture(data):
-                    self._unseen = await self._work(story.enter, data)
+                    self._unseen = await self._work(timeline.enter, data)
                     self._paused, self._error = False, ""
                 case Sync():
-                    self._unseen = await self._work(story.sync)
+                    self._unseen = await self._work(timeline.sync)
                 case Record(on):
-                    await self._work(story.record, on)
+                    await self._work(timeline.record, on)
+                case Drive(on):
+                    timeline.driving = on
                 case Show():
                     self._show, self._charted, self._chart_due = message, None, 0.0
-                    self._unseen = self._unseen or story.shown
+                    timeline.look(message.cameras)
+                    self._unseen = self._unseen or timeline.shown
         except TerrellaError as error:
             await self._event(protocol.encode_event("error", text=str(error)))
         except Exception as error:  # a world is a stranger's code: the server outlives it
@@ -236,28 +243,30 @@ class Session:
         return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
 
     def _status(self) -> str:
-        story = self.story
-        if story is None:
+        timeline = self.timeline
+        if timeline is None:
             return protocol.encode_event("status", text=self._error) if self._error else "hello"
         return protocol.encode_event(
-            "status", paused=self._paused, rewound=story.rewound, recording=story.recording, seed=story.seed,
-            notice=story.notice, text=self._error,
+            "status", paused=self._paused, rewound=timeline.rewound, recording=timeline.recording, driving=timeline.driving,
+            seed=timeline.seed, notice=timeline.notice, text=self._error,
         )  # fmt: skip
 
-    async def _tell(self) -> None:
+    async def _send_status(self) -> None:
         status = self._status()
         if self._socket is not None and status != "hello":
             await self._event(status)
-            self._told = status
+            self._status_sent = status
 
-    async def _send(self, moment: Moment, story: Story, made_ms: float, keys: Keys) -> None:
+    async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: Controls) -> None:
         self._unseen = None
-        flags = moment.flags | protocol.REPLAY * story.rewound
-        images = (await self._beside(story.tinted, moment) if self._show.invented else None) or moment.images
+        flags = moment.flags | protocol.REPLAY * timeline.rewound
+        images = moment.images
+        if self._show.invented or not made_ms:
+            images = await self._extra(timeline.images, moment, self._show.invented) or images
         self._sent += 1
         frame = Frame(
-            self._sent, moment.step, story.oldest_step, story.newest_step, images, flags,
-            keys.id, made_ms, moment.episode_return, keys.t, time.time(), moment.uncertainty,
+            self._sent, moment.step, timeline.oldest_step, timeline.newest_step, images, flags,
+            controls.id, made_ms, moment.episode_return, controls.t, time.time(), moment.uncertainty,
             moment.vitals,
         )  # fmt: skip
         socket = self._socket
@@ -265,27 +274,27 @@ class Session:
             return
         try:
             await socket.send_bytes(protocol.encode_frame(frame))
-        except Exception:  # however a connection breaks, the story waits for the next
+        except Exception:  # however a connection breaks, the timeline waits for the next
             self.detach(socket)
-        if self._show.map and (time.perf_counter() >= self._chart_due or story.rewound):
-            await self._chart(story)
+        if self._show.map and (time.perf_counter() >= self._chart_due or timeline.rewound):
+            await self._chart(timeline)
 
-    async def _chart(self, story: Story) -> None:
+    async def _chart(self, timeline: Timeline) -> None:
         self._chart_due = time.perf_counter() + CHART_S
-        text = await self._beside(self._charted_text, story)
+        text = await self._extra(self._charted_text, timeline)
         if text is not None:
             await self._event(text)
 
-    def _charted_text(self, story: Story) -> str | None:
-        found = story.chart()
+    def _charted_text(self, timeline: Timeline) -> str | None:
+        found = timeline.chart()
         if found is None:
             return None
         number, chart = found
         before, self._charted = self._charted, chart
-        return protocol.encode_event("chart", world=number, step=story.shown.step, **chart.body(before))
+        return protocol.encode_event("chart", world=number, step=timeline.shown.step, **chart.body(before))
 
-    async def _beside(self, function: Callable, *arguments):
-        """What the story says of memory; None, and no more of it, where its world cannot."""
+    async def _extra(self, function: Callable, *arguments):
+        """What is shown beyond the step itself; None, and no more of it, where the world fails."""
         try:
             return await self._work(function, *arguments)
         except Exception:  # a world is a stranger's code: play goes on without

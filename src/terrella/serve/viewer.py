@@ -25,7 +25,8 @@ from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .guard import SafeHeaders, is_loopback, refusal
+from .door import quiet_accepting, settings
+from .guard import Guard, is_loopback
 from .server import open_port, page_address
 
 _SCRIPTS = ("app", "library", "tiles", "depth", "points", "map", "tracks", "colours")
@@ -49,8 +50,9 @@ class Viewable(Protocol):
 
     def about(self) -> dict:
         """JSON: name, robot, fps (or None), notes (sentences), can_export, and sensors, a list of: name, label, kind,
-        shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), and pose:
-        None, or the columns of x and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
+        shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), camera
+        (None, or its intrinsics, size, pose and mount as the world declares them), and pose: None, or the columns of x
+        and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
         ...
 
     def listing(self) -> list[dict]:
@@ -129,7 +131,7 @@ class Exporting:
             self.status = {**self.status, "state": "done", "text": words, "done": len(keep), "of": len(keep)}
         except (TerrellaError, OSError) as error:
             self.status = {**self.status, "state": "failed", "text": str(error)}
-        except Exception as error:  # told to the page; the trace goes to the terminal
+        except Exception as error:  # shown by the page; the trace goes to the terminal
             self.status = {**self.status, "state": "failed", "text": f"{type(error).__name__}: {error}"}
             raise
 
@@ -197,7 +199,7 @@ class _Desk:
             looks = sorted({(2 * part + 1) * count // 10 for part in range(5)})
             samples = []
             for at in looks:
-                with contextlib.suppress(TerrellaError):  # a broken one is told where it is shown
+                with contextlib.suppress(TerrellaError):  # a broken one is named where it is shown
                     samples.append(self._viewable.reading(number, sensor, at)[::4, ::4])
             if len(self._spans) > 256:
                 self._spans.clear()
@@ -239,6 +241,7 @@ def build_viewer(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        quiet_accepting(asyncio.get_running_loop())
         if on_ready:
             on_ready()
         try:
@@ -259,15 +262,11 @@ def build_viewer(
 
     def asks(method: Callable[[Request], Response]) -> Callable:
         async def route(request: Request) -> Response:
-            why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-            return PlainTextResponse(why, 403) if why else await answered(request, method, request)
+            return await answered(request, method, request)
 
         return route
 
     async def mark(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        if why:
-            return PlainTextResponse(why, 403)
         try:
             body = await _message(request)
             number, bad = body["episode"], body["bad"]
@@ -278,9 +277,6 @@ def build_viewer(
         return await answered(request, desk.mark, number, bad)
 
     async def export(request: Request) -> Response:
-        why = refusal(dict(request.headers), host, token, request.query_params.get("token"))
-        if why:
-            return PlainTextResponse(why, 403)
         return _json(exporting.status) if request.method == "GET" else await answered(request, desk.export)
 
     routes = [Route(path, show) for path in files]
@@ -293,7 +289,9 @@ def build_viewer(
         Route("/mark", mark, methods=["POST"]),
         Route("/export", export, methods=["GET", "POST"]),
     ]
-    app = Starlette(routes=routes, lifespan=lifespan, middleware=[Middleware(SafeHeaders, host=host)])
+    app = Starlette(
+        routes=routes, lifespan=lifespan, middleware=[Middleware(Guard, host=host, token=token, files=files)]
+    )
     app.state.exporting = exporting
     return app
 
@@ -322,11 +320,7 @@ def make_viewer(
     """The server behind `view`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
     app = build_viewer(viewable, host, token, export_to, (lambda: on_ready(url)) if on_ready else None)
-    settings = uvicorn.Config(
-        app, log_level="warning", access_log=False, ws="none", timeout_graceful_shutdown=2, server_header=False,
-        proxy_headers=False,
-    )  # fmt: skip
-    return uvicorn.Server(settings)
+    return uvicorn.Server(settings(app, websockets=False))
 
 
 def view(

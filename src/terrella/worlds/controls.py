@@ -35,7 +35,9 @@ class Controls:
         """Those of a world with this spec; ContractError for axes without limits and for actions that are no plain list."""
         low, high = (np.asarray(limit, np.float64).ravel() for limit in spec.action_limits)
         if len(shape_of(spec.action)) > 1 or not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise ContractError(f"{spec.name} has actions in {spec.action}; buttons, one choice or limited axes can be learned.")
+            raise ContractError(
+                f"{spec.name} has actions in {spec.action}; buttons, one choice or limited axes can be learned."
+            )
         kind = spec.action_mode if spec.action_mode in (BUTTONS, CHOICE) else AXES
         meaning = spec.action_mode if kind == AXES else "", tuple(spec.action_units), spec.action_frame
         return Controls(kind, tuple(low.tolist()), tuple(high.tolist()), *meaning)

@@ -47,10 +47,15 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
     """What world.json of version 3 says of such a world."""
     config = _config(about["config"])
     usual, ending = about["rewards"]
-    outcome: dict[str, Any] = {"kind": "constant", "config": {"usual": usual, "ending": ending if config.geometry else 0.0}}
+    outcome: dict[str, Any] = {
+        "kind": "constant",
+        "config": {"usual": usual, "ending": ending if config.geometry else 0.0},
+    }
     if about.get("outcome"):
         begins = list(config.vitals)
-        if not config.geometry and "starts.vitals" in starts:  # such worlds took those that recordings usually begin with
+        if (
+            not config.geometry and "starts.vitals" in starts
+        ):  # such worlds took those that recordings usually begin with
             begins = starts["starts.vitals"].median(0).values.tolist()
         outcome = {"kind": "frames", "config": {**about["outcome"], "begins": begins}}
     posed = config.geometry
@@ -65,9 +70,15 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
         "uncertainty": {"kind": "network", "config": about["doubt"]} if about.get("doubt") else _absent(),
         "estimator": {"kind": "network", "config": about["eye"]} if about.get("eye") else _absent(),
     }
-    controls = about.get("controls") or {"kind": "buttons", "low": [0.0] * config.actions, "high": [1.0] * config.actions}
+    controls = about.get("controls") or {
+        "kind": "buttons",
+        "low": [0.0] * config.actions,
+        "high": [1.0] * config.actions,
+    }
     said = {name: about[name] for name in ("dt_s", "action_names", "keys")}
-    card = {{"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()}
+    card = {
+        {"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()
+    }
     return {
         "kind": KIND,
         "version": VERSION,

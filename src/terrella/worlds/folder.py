@@ -63,7 +63,9 @@ KINDS: dict[str, dict[str, Callable[[dict, Tensors, Tensors], Any]]] = {
     },
     "uncertainty": {
         "none": lambda config, weights, remembered: NoUncertainty(),
-        "network": lambda config, weights, remembered: _network(Uncertainty, _settings(UncertaintyConfig, config), weights),
+        "network": lambda config, weights, remembered: _network(
+            Uncertainty, _settings(UncertaintyConfig, config), weights
+        ),
     },
     "estimator": {
         "none": lambda config, weights, remembered: NoEstimator(),
@@ -74,7 +76,11 @@ HALVED = ("uncertainty", "estimator")  # what these learned by descent is stored
 
 
 def save_world(
-    world: LearnedWorld, path: str | Path, card: Mapping | None = None, quality: int = 92, remembered: str | Path | None = None
+    world: LearnedWorld,
+    path: str | Path,
+    card: Mapping | None = None,
+    quality: int = 92,
+    remembered: str | Path | None = None,
 ) -> None:
     """Writes the folder; each file is replaced whole. card: its facts, in place of the world's own. remembered: the folder that
     the world was loaded from, whose pictures stay as they are: packed again they would lose a little.
@@ -82,7 +88,9 @@ def save_world(
     CheckpointError where it cannot be written (a full disk): the old files stay.
     """
     path, about = Path(path), world.about
-    weights = {f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()}
+    weights = {
+        f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()
+    }
     told = {
         "kind": KIND,
         "version": VERSION,
@@ -113,7 +121,9 @@ def write_folder(path: Path, about: dict, weights: Tensors, remembered: Tensors 
     _replace(path / WORLD_FILE, lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
 
 
-def load_world(path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None) -> LearnedWorld:
+def load_world(
+    path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
+) -> LearnedWorld:
     """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); `memory_mb` is the
     budget of an episode's own memory, where it is not to be the saved one; `device`: where all of it runs.
 
@@ -190,7 +200,9 @@ def _plain(config: Any) -> dict | None:
 
 def _network(kind: type, config: Any, weights: Tensors) -> nn.Module:
     network = kind(config)
-    network.load_state_dict({name: value.float() if value.dtype == torch.half else value for name, value in weights.items()})
+    network.load_state_dict(
+        {name: value.float() if value.dtype == torch.half else value for name, value in weights.items()}
+    )
     return network
 
 
@@ -227,7 +239,9 @@ def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, 
         parts = {"memory": scene.recorded, "starts": scene.starts}
         return {f"{name}.{key}": value for name, keys in parts.items() for key, value in _pack(keys, quality).items()}
     starts: Any = scene.starts
-    packed = {f"starts.{key}": value for key, value in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()}
+    packed = {
+        f"starts.{key}": value for key, value in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()
+    }
     return {**packed, "starts.actions": starts.actions, "starts.vitals": starts.vitals}
 
 
@@ -236,7 +250,9 @@ def _below(tensors: Tensors, name: str) -> dict[str, torch.Tensor]:
 
 
 def _pack(keys: Keyframes, quality: int) -> dict[str, torch.Tensor]:
-    depths = [zlib.compress((d * 1000).round().clamp(0, 65535).cpu().numpy().astype("<u2").tobytes(), 9) for d in keys.depth]
+    depths = [
+        zlib.compress((d * 1000).round().clamp(0, 65535).cpu().numpy().astype("<u2").tobytes(), 9) for d in keys.depth
+    ]
     about = {"pose": keys.pose, "depth_size": torch.tensor(keys.depth.shape[-2:])}
     return {**about, **_pack_frames(keys.rgb, quality), **_pack_parts("depth", depths)}
 

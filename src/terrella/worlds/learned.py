@@ -110,17 +110,23 @@ class LearnedWorld:
         drawn, posed = self.generator.config, self.scene.posed
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
-        settings |= {} if not self.body else {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
+        settings |= (
+            {} if not self.body else {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
+        )
         settings |= {"vitals": self.outcome.begins, "actions": self.controls.numbers}
         return VideoConfig(**settings, geometry=posed, objects=bool(self.objects))
 
-    def replaced(self, *, steps: int | None = None, card: Mapping[str, object] | None = None, **parts: Any) -> LearnedWorld:
+    def replaced(
+        self, *, steps: int | None = None, card: Mapping[str, object] | None = None, **parts: Any
+    ) -> LearnedWorld:
         """The same world with other parts; a part that is None is taken out. steps: in which it draws a frame; card: facts that
         are added to its card, or with None taken from it."""
         facts = {**self.about.card, **(card or {})}
         about = replace(self.about, card={name: fact for name, fact in facts.items() if fact is not None})
         if unknown := set(parts) - set(self.parts):
-            raise ContractError(f"a learned world has no part {', '.join(sorted(unknown))}; it has {', '.join(self.parts)}.")
+            raise ContractError(
+                f"a learned world has no part {', '.join(sorted(unknown))}; it has {', '.join(self.parts)}."
+            )
         whole = {**self.parts, **parts}
         if steps is not None:
             whole["generator"] = copy.deepcopy(whole["generator"])
@@ -129,7 +135,9 @@ class LearnedWorld:
 
     def to(self, device: torch.device | str) -> LearnedWorld:
         """The same world on another device: its networks, its memory and its geometry."""
-        moved = {name: copy.deepcopy(part) if isinstance(part, nn.Module) else part for name, part in self.parts.items()}
+        moved = {
+            name: copy.deepcopy(part) if isinstance(part, nn.Module) else part for name, part in self.parts.items()
+        }
         return LearnedWorld(self.about, **{name: part.to(device) for name, part in moved.items()})
 
     def with_memory(self, memory: Keyframes) -> LearnedWorld:
@@ -250,7 +258,9 @@ class LearnedWorld:
         begins = prior is None
         prior = self._blank(evidence) if prior is None else prior
         body, outcome = self.body.observed(prior, evidence.pose), self.outcome.observed(prior, evidence, observation)
-        state = prior.replace(**body, **outcome, gone=torch.zeros_like(prior["gone"]) if evidence.seen else prior["gone"])
+        state = prior.replace(
+            **body, **outcome, gone=torch.zeros_like(prior["gone"]) if evidence.seen else prior["gone"]
+        )
         if not evidence.seen:
             return state
         state = self.scene.pictured(state, evidence)

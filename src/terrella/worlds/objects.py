@@ -130,7 +130,9 @@ class Objects(nn.Module):
                 f"objects is finite float [B, {self.config.rows}, 4] and instances uint8 [B, h, w]; got "
                 f"{tuple(listed.shape)} and {instances.dtype} {tuple(instances.shape)}."
             )
-        named = F.pad((listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows))  # a pixel of nobody is nobody's
+        named = F.pad(
+            (listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows)
+        )  # a pixel of nobody is nobody's
         instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
         cut = cut_out(seen["rgb"], instances, depth, listed[..., 1:], seen["pose"], camera)
@@ -174,9 +176,7 @@ class Objects(nn.Module):
         ]  # fmt: skip
         look, before = ((billboards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
         age, rested = (billboards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        aimed = (
-            torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]
-        )  # how straight it is looked at now
+        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # how straight it is looked at now
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
@@ -221,7 +221,9 @@ class Objects(nn.Module):
         reach = self.solid[billboards[..., LOOK].long().clamp_min(0)]
         apart = (billboards[..., PLACE] - position).abs()
         level = apart[..., 2] < STOREY_M
-        stops = known & level & (reach > half_m) & (apart[..., :2].amax(-1) >= reach - 0.02)  # who stands in one may leave
+        stops = (
+            known & level & (reach > half_m) & (apart[..., :2].amax(-1) >= reach - 0.02)
+        )  # who stands in one may leave
         (x, y), half = billboards[..., PLACE][..., :2].unbind(-1), reach - half_m
         left, right, low, high = x - half, x + half, y - half, y + half
         sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
@@ -245,8 +247,12 @@ class Objects(nn.Module):
         was = torch.where(known, old[..., LOOK].long(), NONE)
         look = torch.where(whole, likest(off, was), NONE)
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
-        look = torch.where(look == NONE, guess, look)  # seen in part, or like none, it looks as it did, or else as it may
-        now = torch.where(known[..., None], noted(old, listed[..., 1:], look.float()), fresh(number, listed[..., 1:], look))
+        look = torch.where(
+            look == NONE, guess, look
+        )  # seen in part, or like none, it looks as it did, or else as it may
+        now = torch.where(
+            known[..., None], noted(old, listed[..., 1:], look.float()), fresh(number, listed[..., 1:], look)
+        )
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
         lit = (look != NONE) & (~known | whole)
         now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)
@@ -314,7 +320,12 @@ def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor 
     """Billboards [..., COLUMNS] that are seen for the first time: number and look [...], place [..., 3]."""
     billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
     billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
-    billboards[..., BEFORE], billboards[..., AGE], billboards[..., RESTED], billboards[..., LIGHT] = NONE, AGES, AGES, 1.0
+    billboards[..., BEFORE], billboards[..., AGE], billboards[..., RESTED], billboards[..., LIGHT] = (
+        NONE,
+        AGES,
+        AGES,
+        1.0,
+    )
     return billboards
 
 

@@ -54,7 +54,9 @@ class Constant:
         """Reward and end of a step that `ends` [B] or does not."""
         return {"done": before["done"] | ends, "reward": self.config.usual + self.config.ending * ends.float()}
 
-    def followed(self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor) -> State:
+    def followed(
+        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
+    ) -> State:
         return after
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
@@ -156,7 +158,9 @@ class Outcome(nn.Module):
     def placed(self, before: State, ends: torch.Tensor) -> dict[str, torch.Tensor]:
         return {}
 
-    def followed(self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor) -> State:
+    def followed(
+        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
+    ) -> State:
         """`after`, the step from `before`, with the reward, end and vitals that are read off the two frames."""
         found = self(frame(before), frame(after), action, before["vitals"], before["hidden"], seeds)
         return after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=found.done > 0)

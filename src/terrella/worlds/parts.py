@@ -11,7 +11,14 @@ from gymnasium import spaces
 
 from ..core.errors import ObservationError
 
-NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = 1, 2, 11, 12, 13, 20  # streams of chance (core/chance.py); CHANGES one a vital
+NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = (
+    1,
+    2,
+    11,
+    12,
+    13,
+    20,
+)  # streams of chance (core/chance.py); CHANGES one a vital
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,9 @@ def picture_of(observation: Mapping[str, torch.Tensor], size: tuple[int, int], d
     """The rgb of an observation as uint8 [B, 3, H, W]; ObservationError where it is none of this size."""
     rgb = torch.as_tensor(observation["rgb"])
     if rgb.ndim != 4 or rgb.shape[1:] != (*size, 3) or rgb.dtype != torch.uint8:
-        raise ObservationError(f"rgb is uint8 [B, {size[0]}, {size[1]}, 3], 0 to 255; got {rgb.dtype} {tuple(rgb.shape)}.")
+        raise ObservationError(
+            f"rgb is uint8 [B, {size[0]}, {size[1]}, 3], 0 to 255; got {rgb.dtype} {tuple(rgb.shape)}."
+        )
     return rgb.to(device).permute(0, 3, 1, 2).contiguous()
 
 

@@ -28,7 +28,13 @@ from .generator import Conditioning, context_thumbnail, decode_depth, pixels
 from .moving import Frame, carry_frames, covering, still
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
 
-SEEN = ("rgb", "depth", "things", "pose", "instances")  # of a frame that is still needed two steps later, where things move
+SEEN = (
+    "rgb",
+    "depth",
+    "things",
+    "pose",
+    "instances",
+)  # of a frame that is still needed two steps later, where things move
 NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
 CELL_M = 0.25  # side of the cells of the map in which that is looked up
 EXACTLY = "donot_use_mm_for_euclid_dist"
@@ -124,7 +130,9 @@ class KeyframeScene:
         if "pose" not in observation:
             alone = ", a picture alone" if estimator else ""
             blind = "" if estimator else " For a picture alone it needs an estimator of depth: `terrella train senses`."
-            raise ObservationError(f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}")
+            raise ObservationError(
+                f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
+            )
         pose = torch.as_tensor(observation["pose"]).float().to(self.device)
         batch = len(pose)
         if pose.shape != (batch, 7) or not torch.isfinite(pose).all():
@@ -133,15 +141,21 @@ class KeyframeScene:
             check_prior(prior.batch, batch)
         if not {"rgb", "depth"} <= set(observation):
             if prior is None:
-                raise ObservationError("a pose alone says nothing of what is seen there: give rgb and depth, or a prior.")
+                raise ObservationError(
+                    "a pose alone says nothing of what is seen there: give rgb and depth, or a prior."
+                )
             return Evidence(batch, self.device, pose)
         rgb, depth = picture_of(observation, self.config.size, self.device), torch.as_tensor(observation["depth"])
         depth = depth.to(self.device).float()
         if depth.shape != (batch, *self.config.size) or len(rgb) != batch:
-            raise ObservationError(f"depth is [B, {self.config.size[0]}, {self.config.size[1]}]; got {tuple(depth.shape)}.")
+            raise ObservationError(
+                f"depth is [B, {self.config.size[0]}, {self.config.size[1]}]; got {tuple(depth.shape)}."
+            )
         if not (torch.isfinite(depth).all() and (depth > 0).all()):
             raise ObservationError("depth must be finite and above 0 metres.")
-        return Evidence(batch, self.device, pose, {"rgb": rgb, "depth": depth, **self._things(observation, prior, depth)}, lone)
+        return Evidence(
+            batch, self.device, pose, {"rgb": rgb, "depth": depth, **self._things(observation, prior, depth)}, lone
+        )
 
     def _things(self, observation: Mapping, prior: State | None, depth: torch.Tensor) -> dict[str, torch.Tensor]:
         """Where things are: as the evidence says, else where they were dreamt."""

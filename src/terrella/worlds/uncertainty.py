@@ -25,7 +25,9 @@ from .parts import Channels
 # Of an episode: steps since a picture was seen, the way and the turns since a pose was, whether it began with a lone picture
 # of elsewhere, and how strange that was (0..1).
 GONE = ("steps", "metres", "radians", "lone", "strange")
-SITUATION = len(GONE) - 1 + 2  # these but the last, how far the next recorded keyframe is, and how many of its own it holds
+SITUATION = (
+    len(GONE) - 1 + 2
+)  # these but the last, how far the next recorded keyframe is, and how many of its own it holds
 CLUES = 15  # maps of `clues`
 CELLS = 4  # pixels a side of one of its cells; the error is expected in cells of twice that
 KNOTS = 17

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +16,7 @@ from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
 from ...data.source import Readings, Sensor, Source, Take, follows
-from ...data.storage import durable
+from . import rows
 
 
 def read(root: str | Path, fps: float | None = None) -> Source:
@@ -46,7 +43,7 @@ class Rows:
 
 
 def write(
-    source: Source, root: str | Path, progress: Callable[[int, int], None] | None = None, rows: Rows = Rows()
+    source: Source, root: str | Path, progress: Callable[[int, int], None] | None = None, how: Rows = Rows()
 ) -> list[str]:
     """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
 
@@ -59,45 +56,27 @@ def write(
     first = next(iter(source.takes()), None)
     if first is None:
         raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
-    lead = _lead(source, first, rows)
-    layout, notes = _layout(source, first, lead, rows)
-    try:
-        root.parent.mkdir(parents=True, exist_ok=True)
-        staged = Path(tempfile.mkdtemp(prefix=f".{root.name}.", dir=root.parent))
-        staged.chmod(0o755)
-    except OSError as error:
-        raise DatasetError(f"{root} cannot be written ({error}); choose another place.") from error
-    try:
-        notes += _write(source, layout, staged, lead, rows, progress)
-        if root.exists():
-            root.rmdir()
-        durable.move_into_place(staged, root)
-    except DatasetError as error:
-        if not isinstance(error.__cause__, OSError):
-            raise
-        raise _unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with the staged folder
-    except OSError as error:
-        raise _unwritten(root, error) from error
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
-    return notes
+    lead = _lead(source, first, how)
+    layout, notes = _layout(source, first, lead, how)
+    with rows.fresh(root) as staged:
+        try:
+            return notes + _write(source, layout, staged, lead, how, progress)
+        except DatasetError as error:
+            if not isinstance(error.__cause__, OSError):
+                raise
+            raise rows.unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
 
 
-def _unwritten(root: Path, error: OSError) -> DatasetError:
-    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-    return DatasetError(f"{root} was not written: {why}; free some space, or choose another place, and convert again.")
-
-
-def _write(source: Source, layout: Layout, root: Path, lead: str, rows: Rows, progress) -> list[str]:
+def _write(source: Source, layout: Layout, root: Path, lead: str, how: Rows, progress) -> list[str]:
     left_out, notes = [], dict[str, None]()  # each note once, in order
     with Recorder(root, layout, interrupted="discard") as recorder:
         for number, take in enumerate(source.takes()):
-            at = _times(take, layout, lead, rows)
+            at = _times(take, layout, lead, how)
             if len(at) < 2:
                 left_out.append(f"take {number} was left out: it has {len(at)} row{'s' * (len(at) != 1)}")
                 continue
             try:
-                notes |= dict.fromkeys(_write_take(recorder, take, at, source.fps is not None, rows))
+                notes |= dict.fromkeys(_write_take(recorder, take, at, source.fps is not None, how))
             except NotFinite as error:
                 recorder.drop_episode()
                 left_out.append(f"take {number} was left out: {str(error).rstrip('.')}")
@@ -108,11 +87,11 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, rows: Rows, pr
     return [*left_out, *notes]
 
 
-def _lead(source: Source, first: Take, rows: Rows) -> str:
-    if rows.lead is not None:
-        if rows.lead not in source.sensors:
-            raise DatasetError(f"{source.name} has no sensor '{rows.lead}'; it has {', '.join(source.sensors)}.")
-        return rows.lead
+def _lead(source: Source, first: Take, how: Rows) -> str:
+    if how.lead is not None:
+        if how.lead not in source.sensors:
+            raise DatasetError(f"{source.name} has no sensor '{how.lead}'; it has {', '.join(source.sensors)}.")
+        return how.lead
     there = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
     if not there:
         raise DatasetError(f"the first take of {source.name} has no readings at all.")
@@ -124,15 +103,15 @@ def _lead(source: Source, first: Take, rows: Rows) -> str:
 _NONE = Readings(np.zeros(0), [])
 
 
-def _layout(source: Source, first: Take, lead: str, rows: Rows) -> tuple[Layout, list[str]]:
+def _layout(source: Source, first: Take, lead: str, how: Rows) -> tuple[Layout, list[str]]:
     at, notes = first.readings[lead].time_s, []
-    rate = rows.fps or source.fps or source.sensors[lead].rate_hz
+    rate = how.fps or source.fps or source.sensors[lead].rate_hz
     if rate is None:
         if len(at) < 2 or at[-1] <= at[0]:
             raise DatasetError(f"{source.name} does not say how many frames a second it has; give --fps.")
         rate = float(f"{(len(at) - 1) / (at[-1] - at[0]):.6g}")
-    own_clocks = source.fps is None or (rows.fps is not None and rows.fps != source.fps)
-    sensors, streams, pictures = {}, {}, rows.pictures
+    own_clocks = source.fps is None or (how.fps is not None and how.fps != source.fps)
+    sensors, streams, pictures = {}, {}, how.pictures
     for name, sensor in source.sensors.items():
         if name in (*AUTOMATIC, ACTION_VALID, TIME):
             continue
@@ -146,7 +125,7 @@ def _layout(source: Source, first: Take, lead: str, rows: Rows) -> tuple[Layout,
             sensors[name] = sensor
         if sensor.dtype == "string":
             continue  # text that has a clock of its own is for the rows alone
-        if sensor.kind == "points" or (own_clocks or reserved) and (name != lead or rows.fps):
+        if sensor.kind == "points" or (own_clocks or reserved) and (name != lead or how.fps):
             streams[name] = sensor
     if not sensors:
         raise DatasetError(f"{source.name} has nothing but points, which no row can hold; add a camera or a pose.")
@@ -160,7 +139,7 @@ def _layout(source: Source, first: Take, lead: str, rows: Rows) -> tuple[Layout,
         pictures=pictures,
         robot=source.robot or "unknown",
         world=world if isinstance(world, Mapping) else {},
-        facts={**facts, "rows": {"lead": lead, "policy": rows.policy, "fps_asked": rows.fps}},
+        facts={**facts, "rows": {"lead": lead, "policy": how.policy, "fps_asked": how.fps}},
     )
     films = {name for name, sensor in streams.items() if sensor.kind == "image" and pictures == "png"}
     if films:
@@ -169,12 +148,12 @@ def _layout(source: Source, first: Take, lead: str, rows: Rows) -> tuple[Layout,
     return layout, notes
 
 
-def _times(take: Take, layout: Layout, lead: str, rows: Rows) -> np.ndarray:
+def _times(take: Take, layout: Layout, lead: str, how: Rows) -> np.ndarray:
     """float64 [T]: the times of a take's rows."""
-    return take.readings.get(lead, _NONE).time_s if rows.fps is None else row_times(take, layout.sensors, rows.fps)
+    return take.readings.get(lead, _NONE).time_s if how.fps is None else row_times(take, layout.sensors, how.fps)
 
 
-def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, rows: Rows) -> list[str]:
+def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, how: Rows) -> list[str]:
     layout, notes = recorder.layout, []
     recorder.task = take.task
     columns, exact = {}, set()
@@ -185,7 +164,7 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
         if len(readings.time_s) and place is not None and (not apart or (follows(name) and has_rows)):
             columns[name], _ = (readings.values, place), exact.add(name)
             continue
-        columns[name] = _resampled(readings, sensor, at, rows.policy)
+        columns[name] = _resampled(readings, sensor, at, how.policy)
         if len(readings.time_s) and not follows(name) and columns[name][1][0] < 0:
             notes.append(f"rows before the first reading of {name} hold that first reading")
     said = [(float(when), str(words)) for when, words in take.facts.get("language", ())]  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Reads and writes MCAP, the file format of robot logs: https://mcap.dev, with the messages that Foxglove knows.
+"""Reads MCAP, the file format of robot logs: https://mcap.dev, with the messages that Foxglove knows.
 
 One file is one take, a folder of files one take each. What MCAP has no place for (sensor declarations, task, robot, the
 exact zero of time) stands in the file's metadata records "terrella.source", "terrella.sensors" and "terrella.take";
@@ -7,10 +7,8 @@ a file without them is read all the same. Foxglove has no message for an IMU: it
 
 from __future__ import annotations
 
-import errno
 import json
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -21,38 +19,32 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
-from ...data.storage import durable
-from . import foxglove
-from .mcap_index import Index, Schema
+from . import messages
+from .films import VideoDecoder, decodable
+from .mcap_index import Index, Metadata, Schema
 
-try:
-    from mcap.writer import Writer
-except ImportError as error:
-    raise DatasetError("MCAP needs packages that are not installed: pip install 'terrella[mcap]'.") from error
-
-_SOURCE, _SENSORS, _TAKE = "terrella.source", "terrella.sensors", "terrella.take"
-_CALIBRATION_TOPIC = "/calibration"  # beneath the topic of its camera
+SOURCE, SENSORS, TAKE = "terrella.source", "terrella.sensors", "terrella.take"
 _KEYS = {"image": "observation.images", "depth": "observation.depth", "points": "observation.points"}
 _READERS = {  # the kinds that a message can be declared as
     "foxglove.CompressedImage": ("image", "depth"),
     "foxglove.RawImage": ("image", "depth"),
-    foxglove.VIDEO: ("image",),
+    messages.VIDEO: ("image",),
     "foxglove.PointCloud": ("points",),
 }
+_NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 _MOST_FRAMES = 256  # coordinate frames that one topic of transforms is split into
-_CHUNK = 2**20
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read(path: str | Path, verify: bool = True, fps: float | None = None) -> Source:
+def read(path: str | Path, fps: float | None = None) -> Source:
     """An .mcap file as one take, or a folder of them as one take each, in the order of their names.
 
-    Values are read and decoded when they are looked at; only where they lie is kept in memory (24 bytes a message).
-    Time is the log time, in seconds from the first message of the file. A file that was cut is read as far as it is
-    whole. What is not understood, cut or damaged is told in `notes`. With `verify` every chunk's check sum is tested
-    first, and damaged ones are left out; without it they raise DatasetError when their values are looked at.
+    Values are decoded when they are looked at; only where they lie is kept in memory (24 bytes a message). Time is the
+    log time, in seconds from the first message of the file; `fps` is not asked for. A file that was cut is read as far as
+    it is whole, and of a damaged one all but the damaged chunks; of video, what cannot be decoded without them is left
+    out, too. What is not understood, cut or damaged is told in `notes`.
 
     DatasetError where nothing there is MCAP, or nothing in it is understood.
     """
@@ -66,7 +58,7 @@ def read(path: str | Path, verify: bool = True, fps: float | None = None) -> Sou
     usable: list[Path] = []
     for file in files:
         try:
-            found = _File(file, verify)
+            found = _File(file)
         except DatasetError as error:
             if len(files) == 1:
                 raise
@@ -86,7 +78,7 @@ def read(path: str | Path, verify: bool = True, fps: float | None = None) -> Sou
 
     def takes() -> Iterator[Take]:
         for file in usable:
-            yield _File(file, verify).take(sensors)
+            yield _File(file).take(sensors)
 
     return Source(
         name=about.get("name", path.stem),
@@ -123,6 +115,7 @@ class _Group:
     log_ns: np.ndarray
     channel: np.ndarray
     number: np.ndarray
+    after_gap: np.ndarray  # bool: whether a damaged chunk lies just before the message
 
     def fields(self, i: int) -> dict[str, Any]:
         data = self.index.data(int(self.channel[i]), int(self.number[i]))
@@ -145,13 +138,12 @@ class _File:
     """What one file holds: `sensors`, `notes`, `about` (the recording) and its take."""
 
     path: Path
-    verify: bool = False
     notes: list[str] = field(default_factory=list)
     about: dict[str, Any] = field(default_factory=dict)
     streams: dict[str, _Stream] = field(default_factory=dict)
 
     def __post_init__(self):
-        index = Index(self.path, self.verify)
+        index = Index(self.path)
         self.notes += index.notes
         self._declared, self._take = self._metadata(index.metadata)
         if not index.messages and not self._declared:
@@ -180,22 +172,22 @@ class _File:
         start_ns = self._take["start_ns"] if "start_ns" in self._take else zero_ns or None
         return Take(readings, self._take.get("task", ""), start_ns, self._take.get("facts", {}))
 
-    def _metadata(self, records: list[tuple[str, dict[str, str]]]) -> tuple[dict[str, Sensor], dict[str, Any]]:
+    def _metadata(self, records: list[Metadata]) -> tuple[dict[str, Sensor], dict[str, Any]]:
         """(topic -> declared sensor, what is known of the take); what is broken is noted and left out."""
         declared: dict[str, Sensor] = {}
         take: dict[str, Any] = {}
-        for name, record in records:
-            if name not in (_SOURCE, _SENSORS, _TAKE):
+        for name, record in ((it.name, it.metadata) for it in records):
+            if name not in (SOURCE, SENSORS, TAKE):
                 self.notes.append(f"{self.path.name}: the metadata record '{name}' is not carried over.")
                 continue
             for key, text in record.items():
                 try:
                     value = json.loads(text)
-                    if name == _SENSORS:
+                    if name == SENSORS:
                         sensor = _sensor(key, value)
                         declared[str(value["topic"])] = sensor
                     elif isinstance(value, _ABOUT.get(key, ())):
-                        (self.about if name == _SOURCE else take)[key] = value
+                        (self.about if name == SOURCE else take)[key] = value
                     else:
                         raise ValueError(f"{type(value).__name__} is none of its types")
                 except (ValueError, TypeError, KeyError, RecursionError) as error:
@@ -208,25 +200,27 @@ class _File:
     def _groups(self, index: Index) -> Iterator[_Group]:
         members: dict[tuple[str, str, str], list[int]] = {}
         for number, channel in index.channels.items():
-            schema = index.schemas.get(channel.schema_id, Schema("", "", b""))
-            members.setdefault((channel.topic, schema.name, channel.encoding), []).append(number)
+            schema = index.schemas.get(channel.schema_id, _NO_SCHEMA)
+            members.setdefault((channel.topic, schema.name, channel.message_encoding), []).append(number)
         for (topic, name, encoding), numbers in members.items():
-            schema = index.schemas.get(index.channels[numbers[0]].schema_id, Schema("", "", b""))
-            read = [(number, index.messages[number]) for number in numbers if number in index.messages]
-            if not read and topic not in self._declared:
-                if name != foxglove.CALIBRATION:
+            schema = index.schemas.get(index.channels[numbers[0]].schema_id, _NO_SCHEMA)
+            there = {number: index.messages[number] for number in numbers if number in index.messages}
+            if not there and topic not in self._declared:
+                if name != messages.CALIBRATION:
                     self._note(topic, "it has no messages")
                 continue
             try:
-                unpack = foxglove.foreign(name, schema.encoding, schema.data, encoding)
+                unpack = messages.foreign(name, schema.encoding, schema.data, encoding)
             except DatasetError as error:
-                self._note(topic, str(error))
+                self._note(topic, f"its {sum(len(it.log_ns) for it in there.values())} messages are left out: {error}")
                 continue
-            log_ns = np.concatenate([np.zeros(0, np.uint64), *(messages.log_ns for _, messages in read)])
-            channel = np.concatenate([np.zeros(0, np.uint16), *(np.full(len(m.log_ns), n, np.uint16) for n, m in read)])
-            number = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(m.log_ns)) for _, m in read)])
-            order = np.argsort(log_ns, kind="stable")
-            yield _Group(index, topic, schema, unpack, log_ns[order], channel[order], number[order])
+            columns = [np.zeros(0, kind) for kind in (np.uint64, np.uint16, np.int64, bool)]
+            for number, it in there.items():
+                size = len(it.log_ns)
+                parts = it.log_ns, np.full(size, number, np.uint16), np.arange(size), it.after_gap
+                columns = [np.concatenate(pair) for pair in zip(columns, parts)]
+            order = np.argsort(columns[0], kind="stable")
+            yield _Group(index, topic, schema, unpack, *(column[order] for column in columns))
 
     def _streams_of(self, group: _Group) -> list[tuple[str, _Stream]]:
         """(topic, stream) for each sensor in a group; what cannot be understood is noted."""
@@ -234,12 +228,15 @@ class _File:
             sensor = self._declared_for(group)
             return [(group.topic, _Stream(sensor, group.log_ns, lambda i: np.zeros(0)))] if sensor else []
         try:
-            if group.schema.name == foxglove.CALIBRATION:
-                self._calibrations.append((group.topic, foxglove.calibration_of(group.fields(0))))
+            if group.schema.name == messages.CALIBRATION:
+                first, last = (messages.calibration_of(group.fields(i)) for i in (0, len(group.log_ns) - 1))
+                self._calibrations.append((group.topic, first))
+                if first != last:
+                    self._note(group.topic, "the calibration changes on the way; only the first is carried over")
                 return []
-            if group.schema.name in (foxglove.TRANSFORM, foxglove.TRANSFORMS):
+            if group.schema.name in (messages.TRANSFORM, messages.TRANSFORMS):
                 return self._transforms(group)
-            if group.schema.name == foxglove.VIDEO:
+            if group.schema.name == messages.VIDEO:
                 return self._video(group)
             return self._plain(group)
         except DatasetError as error:
@@ -249,23 +246,23 @@ class _File:
     def _plain(self, group: _Group) -> list[tuple[str, _Stream]]:
         name = group.schema.name
 
-        def reading(i: int) -> foxglove.Reading:
+        def reading(i: int) -> messages.Reading:
             fields = group.fields(i)
             with _telling(group, i):
-                return foxglove.decode(name, fields)
+                return messages.decode(name, fields)
 
         sensor = self._declared_for(group) or _sensed(self._sample(group, reading))
 
         def value(i: int) -> np.ndarray:
             found = reading(i)
             with _telling(group, i):
-                return foxglove.fit(found, sensor)
+                return messages.fit(found, sensor)
 
         return [(group.topic, _Stream(sensor, group.log_ns, value))]
 
-    def _sample(self, group: _Group, reading: Callable[[int], foxglove.Reading]) -> foxglove.Reading:
+    def _sample(self, group: _Group, reading: Callable[[int], messages.Reading]) -> messages.Reading:
         """What the first message of a group shows, or a later one if it is broken; noted where others show else."""
-        found: list[foxglove.Reading] = []
+        found: list[messages.Reading] = []
         broken: list[DatasetError] = []
         for i in sorted({0, len(group.log_ns) // 2, len(group.log_ns) - 1}):
             try:
@@ -282,26 +279,30 @@ class _File:
         return found[0]
 
     def _video(self, group: _Group) -> list[tuple[str, _Stream]]:
-        sensor, count = self._declared_for(group), len(group.log_ns)
-        fields = group.fields(0)
-        decoder = foxglove.VideoDecoder(
-            lambda i: foxglove.video_of(group.fields(i))[1], count, foxglove.video_of(fields)[0]
-        )
-        key = decoder.first_key()
-        if key is None:
+        first, said = group.fields(0), messages.video_of
+
+        def data(i: int) -> bytes:
+            return said(group.fields(i))[1]
+
+        format, count = said(first)[0], len(group.log_ns)
+        good = decodable(data, group.after_gap, format)
+        if not len(good):
             raise DatasetError("its video has no keyframe to start from")
-        if key:
-            self._note(group.topic, f"its first {key} frames come before any keyframe and are left out")
+        if begin := int(good[0]):
+            self._note(group.topic, f"its first {begin} frames come before any keyframe and are left out")
+        if lost := count - begin - len(good):
+            self._note(group.topic, f"{lost} frames that follow a damaged chunk cannot be decoded and are left out")
+        decoder = VideoDecoder(lambda i: data(int(good[i])), len(good), format)
+        sensor = self._declared_for(group)
         if sensor is None:
-            frame = str(fields.get("frame_id") or "")
-            sensor = Sensor("", "image", decoder(key).shape, "uint8", frame=frame)
+            sensor = Sensor("", "image", decoder(0).shape, "uint8", frame=str(first.get("frame_id") or ""))
         chosen = sensor
 
         def value(i: int) -> np.ndarray:
-            with _telling(group, i + key):
-                return foxglove.fit(foxglove.Reading("image", decoder(i + key)), chosen)
+            with _telling(group, int(good[i])):
+                return messages.fit(messages.Reading("image", decoder(i)), chosen)
 
-        return [(group.topic, _Stream(sensor, group.log_ns[key:], value))]
+        return [(group.topic, _Stream(sensor, group.log_ns[good], value))]
 
     def _transforms(self, group: _Group) -> list[tuple[str, _Stream]]:
         """A stream for each child frame: one topic mostly carries them all."""
@@ -309,7 +310,7 @@ class _File:
         broken: list[DatasetError] = []
         for i, log_ns in enumerate(group.log_ns.tolist()):
             try:
-                found = list(foxglove.transforms_of(group.schema.name, group.fields(i)))
+                found = list(messages.transforms_of(group.schema.name, group.fields(i)))
             except DatasetError as error:
                 broken.append(error)
                 continue
@@ -325,7 +326,7 @@ class _File:
             return [(group.topic, _joined(declared, *values.values()))]
         streams = []
         for (parent, child), pairs in values.items():
-            first = foxglove.Reading("vector", pairs[0][1], foxglove.POSE_NAMES, parent, {"child_frame": child})
+            first = messages.Reading("vector", pairs[0][1], messages.POSE_NAMES, parent, {"child_frame": child})
             streams.append((f"{group.topic}/{child}", _joined(_sensed(first), pairs)))
         return streams
 
@@ -366,11 +367,11 @@ class _File:
         self.notes.append(f"{self.path.name}: '{topic}': {what.rstrip('.')}.")
 
 
-def _sensed(reading: foxglove.Reading) -> Sensor:
+def _sensed(reading: messages.Reading) -> Sensor:
     """A sensor, as yet without a name, of what its first message shows."""
     shape = (0, reading.value.shape[1]) if reading.kind == "points" else reading.value.shape
     dtype = "float32" if reading.kind in ("depth", "points") else str(reading.value.dtype)
-    units = {"x_m": "m", "y_m": "m", "z_m": "m"} if reading.names == foxglove.POSE_NAMES else {}
+    units = {"x_m": "m", "y_m": "m", "z_m": "m"} if reading.names == messages.POSE_NAMES else {}
     return Sensor("", reading.kind, shape, dtype, reading.names, units, reading.frame, facts=reading.facts)
 
 
@@ -382,6 +383,17 @@ def _joined(sensor: Sensor, pairs: list[tuple[int, np.ndarray]]) -> _Stream:
 def topic_of(name: str) -> str:
     """The topic of a sensor: "observation.images.front" -> "/observation/images/front"."""
     return "/" + name.replace(".", "/")
+
+
+def topics(sensors: Mapping[str, Sensor]) -> dict[str, str]:
+    """A topic for each sensor; names that differ only in "." and "/" still get topics of their own."""
+    found: dict[str, str] = {}
+    for name in sensors:
+        topic, number = topic_of(name), 2
+        while topic in found.values():
+            topic, number = f"{topic_of(name)}_{number}", number + 1
+        found[name] = topic
+    return found
 
 
 def key_of(topic: str, sensor: Sensor) -> str:
@@ -440,203 +452,3 @@ def _sensor(name: str, value: Mapping[str, Any]) -> Sensor:
         None if rate is None else float(rate),
         value["facts"],
     )
-
-
-# -- writing -----------------------------------------------------------------------------------------------------------
-
-
-def write(
-    source: Source,
-    path: str | Path,
-    encoding: str = "protobuf",
-    progress: Callable[[int, int], None] | None = None,
-    image: str = "png",
-) -> list[str]:
-    """Writes a source as `path`: a file if it ends in .mcap (one take), else a folder of take-000000.mcap and so on.
-
-    encoding: "protobuf" or "json". image: "png" or "raw" (both exact), "jpeg", or "h264".
-    `progress(messages, of_this_take)` is called as it goes. Nothing stands at `path` until all of it does.
-    Returns notes on what is not exact. DatasetError where the path is taken, the disk is full, or a reading is not what
-    its sensor declares.
-    """
-    path = Path(path)
-    if not path.parent.is_dir() and path.parent.exists():
-        raise DatasetError(f"'{path}' cannot be written: '{path.parent}' is no folder; choose another place.")
-    if path.exists() and not (path.is_dir() and path.suffix != ".mcap" and not any(path.iterdir())):
-        raise DatasetError(f"'{path}' exists already; choose another place.")
-    staged = path.with_name(f".{path.name}.new")
-    _remove(staged)
-    notes: list[str] = []
-    try:
-        count = 0
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for take in source.takes():
-            if path.suffix == ".mcap":
-                if count:
-                    raise DatasetError(
-                        f"'{source.name}' has more than one take, and '{path}' is one file; name a folder."
-                    )
-                target = staged
-            else:
-                staged.mkdir(exist_ok=True)
-                target = staged / f"take-{count:06d}.mcap"
-            for note in _write_take(source, take, target, encoding, image, progress):
-                if note not in notes:
-                    notes.append(note)
-            durable.sync_file(target)
-            count += 1
-        if not count:
-            raise DatasetError(f"'{source.name}' has no takes; there is nothing to write.")
-        durable.move_into_place(staged, path)
-    except OSError as error:
-        what = "the disk is full" if error.errno == errno.ENOSPC else error.strerror
-        raise DatasetError(f"'{path}' cannot be written: {what}; free some space or choose another place.") from error
-    finally:
-        _remove(staged)
-    return notes
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _write_take(source: Source, take: Take, path: Path, encoding: str, image: str, progress) -> list[str]:
-    names = list(take.readings)
-    for name in names:
-        if name not in source.sensors:
-            raise DatasetError(f"A take has readings of '{name}', which the source does not declare; declare it.")
-    times = [_nanoseconds(name, take.readings[name]) for name in names]
-    first = min((int(time_ns.min()) for time_ns in times if len(time_ns)), default=0)
-    zero_ns = take.start_ns if take.start_ns is not None else max(0, -first)
-    if not 0 <= zero_ns + first < 2**63:
-        raise DatasetError(
-            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot tell; mend its start."
-        )
-    whose = np.concatenate([np.full(len(time_ns), i) for i, time_ns in enumerate(times)] or [np.zeros(0, int)])
-    which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
-    order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
-    sensors = {name: source.sensors[name] for name in names}
-    with Recording(path, sensors, source, take, zero_ns, encoding, image) as recording:
-        for done, at in enumerate(order.tolist()):
-            name, i = names[whose[at]], int(which[at])
-            value = np.asarray(take.readings[name].values[i])
-            recording.add(name, zero_ns + int(times[whose[at]][i]), value)
-            if progress:
-                progress(done + 1, len(order))
-    return recording.notes
-
-
-def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
-    time_s = np.asarray(readings.time_s, np.float64)
-    if time_s.shape != (len(readings.values),) or not np.isfinite(time_s).all() or (np.abs(time_s) > 2**62 / 1e9).any():
-        what = f"'{name}' has times {list(time_s.shape)} for {len(readings.values)} values, or times that are none"
-        raise DatasetError(f"{what}; mend them.")
-    return np.rint(time_s * 1e9).astype(np.int64)
-
-
-class Recording:
-    """An MCAP file in the making: every sensor is declared first, then readings come in any order of sensors.
-
-    What was added before a `flush` is found by `read` even if nothing is written after it. The file must be new.
-    zero_ns: the log time of the take's second 0, nanoseconds. Of `take` its start_ns, task and facts are kept, and of
-    `source` all but its sensors.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        sensors: Mapping[str, Sensor],
-        source: Source,
-        take: Take,
-        zero_ns: int,
-        encoding: str = "protobuf",
-        image: str = "png",
-    ):
-        self._sensors, self._encoding = sensors, encoding
-        self._encoders = {name: foxglove.Encoder(sensor, encoding, image) for name, sensor in sensors.items()}
-        self.notes = [encoder.note for encoder in self._encoders.values() if encoder.note]
-        self._file = open(path, "xb")
-        self._writer = Writer(self._file, chunk_size=_CHUNK)
-        self._writer.start(library="terrella")
-        topic = topics(sensors)
-        about = {"name": source.name, "fps": source.fps, "robot": source.robot, "notes": list(source.notes)}
-        self._add_metadata(_SOURCE, {**about, "facts": dict(source.facts)})
-        self._add_metadata(_SENSORS, {name: {**_plain(sensors[name]), "topic": topic[name]} for name in sensors})
-        told = {"start_ns": take.start_ns, "task": take.task}
-        self._add_metadata(_TAKE, {**told, "facts": dict(take.facts), "zero_ns": zero_ns})
-        self._schemas: dict[str, int] = {}
-        self._channels = {name: self._channel(topic[name], self._encoders[name].codec) for name in sensors}
-        self._calibrations = {
-            name: self._channel(topic[name] + _CALIBRATION_TOPIC, foxglove.codec(foxglove.CALIBRATION, encoding))
-            for name in sensors
-            if foxglove.calibration_message(sensors[name].facts.get("calibration"), "", 0, encoding)
-        }
-
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(self, kind, error, trace) -> None:
-        self.close() if kind is None else self.abandon()
-
-    def add(self, name: str, log_ns: int, value: np.ndarray) -> None:
-        """One reading at a log time; DatasetError where it is not what its sensor declares, OSError from the disk."""
-        if name in self._calibrations:  # once, with the first picture
-            sensor = self._sensors[name]
-            facts = sensor.facts["calibration"]
-            data = foxglove.calibration_message(facts, sensor.frame, log_ns, self._encoding) or b""
-            self._writer.add_message(self._calibrations.pop(name), log_ns, data, log_ns)
-        data = self._encoders[name](value, log_ns)
-        self._writer.add_message(self._channels[name], log_ns, data, log_ns)
-
-    def flush(self) -> None:
-        """Ends the chunk and hands all bytes to the system."""
-        self._writer.flush()
-
-    def close(self) -> None:
-        """Writes the index and ends the file; OSError from the disk."""
-        try:
-            self._writer.finish()
-            self._file.close()
-        finally:
-            self.abandon()
-
-    def abandon(self) -> None:
-        """Lets go of the file as it stands: nothing is written after a chunk that may not be whole."""
-        try:
-            self._file.close()
-        except OSError:
-            pass
-
-    def _channel(self, topic: str, codec: foxglove.Codec) -> int:
-        if codec.schema_name not in self._schemas:
-            number = self._writer.register_schema(codec.schema_name, codec.schema_encoding, codec.schema)
-            self._schemas[codec.schema_name] = number
-        return self._writer.register_channel(topic, codec.message_encoding, self._schemas[codec.schema_name])
-
-    def _add_metadata(self, name: str, values: Mapping[str, Any]) -> None:
-        try:
-            self._writer.add_metadata(name, {key: json.dumps(value) for key, value in values.items()})
-        except (TypeError, ValueError) as error:
-            self._file.close()
-            raise DatasetError(
-                f"The facts of a source, take or sensor are no JSON ({error}); leave them out."
-            ) from error
-
-
-def _plain(sensor: Sensor) -> dict[str, Any]:
-    fields = {**sensor.__dict__, "units": dict(sensor.units), "facts": dict(sensor.facts)}
-    return {key: value for key, value in fields.items() if key != "name"}
-
-
-def topics(sensors: Mapping[str, Sensor]) -> dict[str, str]:
-    """A topic for each sensor; names that differ only in "." and "/" still get topics of their own."""
-    found: dict[str, str] = {}
-    for name in sensors:
-        topic, number = topic_of(name), 2
-        while topic in found.values():
-            topic, number = f"{topic_of(name)}_{number}", number + 1
-        found[name] = topic
-    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import re
@@ -296,20 +297,34 @@ def json_or_none(value: object) -> object:
 
 @contextmanager
 def fresh(path: str | Path) -> Iterator[Path]:
-    """A hidden neighbour of `path` (a folder to be made, or a file), renamed to `path` when all went well."""
+    """A hidden neighbour of `path` (a folder to be made, or a file), renamed to `path` when all went well.
+
+    However it ends, nothing half-written stays. DatasetError where something is at `path`, or the disk is full or fails.
+    """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise DatasetError(f"{path} exists already; write to another path, or remove it first.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(f".{path.name}.new")
-    _remove(staged)
+    try:
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise DatasetError(f"{path} exists already; write to another path, or remove it first.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staged = path.with_name(f".{path.name}.new")
+        _remove(staged)
+    except OSError as error:
+        raise unwritten(path, error) from error
     try:
         yield staged
         if path.is_dir():
             path.rmdir()
         move_into_place(staged, path)
+    except OSError as error:
+        raise unwritten(path, error) from error
     finally:
         _remove(staged)
+
+
+def unwritten(path: Path, error: OSError) -> DatasetError:
+    """What to raise where a conversion failed on the disk: nothing of it is kept."""
+    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+    return DatasetError(f"{path} was not written: {why}; free some space, or choose another place, and convert again.")
 
 
 def _remove(path: Path) -> None:

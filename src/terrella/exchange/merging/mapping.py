@@ -1,14 +1,11 @@
-"""The mapping file of a merge: which number of which robot fills which named number of the merged set, for a person to edit."""
+"""The mapping of a merge: which number of which robot fills which named number of the merged set, and what must hold of it."""
 
 from __future__ import annotations
 
-import json
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal
 
 from ...core.errors import DatasetError
 from ...data.resample import Policy
@@ -141,243 +138,7 @@ def affine(number: Number, dimension: Dimension) -> tuple[float, float]:
     return scale, offset + number.offset
 
 
-def write_mapping(mapping: MergeMapping, path: str | Path) -> None:
-    """Writes the file with a comment on each part; `read_mapping` gives the same back."""
-    try:
-        Path(path).write_text(to_toml(mapping), encoding="utf-8", newline="\n")
-    except (OSError, UnicodeEncodeError) as error:
-        raise DatasetError(f"cannot write the mapping {path} ({error}); name another place.") from error
-
-
-def to_toml(mapping: MergeMapping) -> str:
-    """The text of the mapping file."""
-    rows, gap = mapping.rows, mapping.rows.max_gap_s
-    lines = [
-        "# Which number of which robot goes where in the merged recording. Edit it and merge again with this file.",
-        "",
-        "[rows]",
-        f"fps = {_value(rows.fps)}  # rows a second of the merged recording",
-        f"images = {_value(rows.images)}  # images, depth, points: previous (the newest not later than the row) or nearest",
-        f"continuous = {_value(rows.continuous)}  # observed numbers: linear (between two readings), previous or nearest",
-        f"actions = {_value(rows.actions)}  # actions: previous (what was being done), nearest or linear",
-        "# Longer silences of a sensor, in seconds, are masked; without this line none are.",
-        *([f"max_gap_s = {_value(gap)}"] if gap is not None else ["# max_gap_s = 1.0"]),
-        "",
-        "# The merged numbers, in order. A robot that lacks one has 0 there and False in the mask.",
-        *_dimensions("action", mapping.action),
-        "",
-        *_dimensions("state", mapping.state),
-        "",
-        '# The merged cameras: kind "image" or "depth"; pictures are fitted into height x width pixels, aspect kept.',
-        "[cameras]",
-        *(
-            f"{_key(name)} = {{ kind = {_value(camera.kind)}, height = {camera.height}, width = {camera.width} }}"
-            for name, camera in mapping.cameras.items()
-        ),
-    ]
-    for source in mapping.sources:
-        lines += ["", *_source(mapping, source)]
-    return "\n".join(lines) + "\n"
-
-
-def _dimensions(table: str, dimensions: Mapping[str, Dimension]) -> list[str]:
-    return [
-        f"[{table}]",
-        *(f"{_key(name)} = {_inline(unit=it.unit, frame=it.frame)}" for name, it in dimensions.items()),
-    ]
-
-
-def _source(mapping: MergeMapping, source: SourceMapping) -> list[str]:
-    lines = [
-        "[[source]]",
-        f"path = {_value(source.path)}",
-        f"embodiment = {_value(source.embodiment)}  # sources of one embodiment share their statistics",
-        *([f"fps = {_value(source.fps)}  # its own rows a second"] if source.fps is not None else []),
-    ]
-    if source.notes:
-        lines += ["notes = [  # look at these", *(f"  {_value(note)}," for note in source.notes), "]"]
-    if source.cameras:
-        lines += ["", "[source.cameras]  # its camera = merged camera", *_pairs(source.cameras)]
-    if source.keep:
-        lines += ["", "[source.keep]  # kept whole: its sensor = merged sensor", *_pairs(source.keep)]
-    if source.out:
-        lines += ["", "[source.out]  # left out: its sensor = why", *_pairs(source.out)]
-    for name, vector in source.vectors.items():
-        lines += [
-            "",
-            "# One entry per number, in the sensor's order: `to` a merged number, or `out` and why. Units are converted;",
-            "# for anything else give scale and offset: merged = scale * number + offset.",
-            f"[source.vectors.{_key(name)}]",
-            *([f"frame = {_value(vector.frame)}"] if vector.frame else []),
-            "numbers = [",
-            *(f"  {_number(number, mapping.dimensions(name))}" for number in vector.numbers),
-            "]",
-        ]
-    return lines
-
-
-def _number(number: Number, dimensions: Mapping[str, Dimension]) -> str:
-    scaling = {} if number.scale is None else {"scale": number.scale}
-    scaling |= {"offset": number.offset} if number.offset else {}
-    text = _inline(name=number.name, unit=number.unit, to=number.to, **scaling, out=number.out) + ","
-    unit = dimensions[number.to].unit if number.to in dimensions else ""
-    if number.scale is None and number.unit and unit and number.unit != unit:
-        return text + f"  # converted to {_value(unit)}"
-    return text
-
-
-def _pairs(table: Mapping[str, str]) -> list[str]:
-    return [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
-
-
-def _inline(**values: object) -> str:
-    shown = ", ".join(f"{key} = {_value(value)}" for key, value in values.items() if value != "")
-    return f"{{ {shown} }}" if shown else "{}"
-
-
-def _key(name: str) -> str:
-    return name if name and name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _value(name)
-
-
-def _value(value: object) -> str:
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, float) and not isinstance(value, bool):
-        return repr(float(value))
-    return str(value)
-
-
-def read_mapping(path: str | Path) -> MergeMapping:
-    """Reads a mapping file. DatasetError names the place of whatever is wrong in it: a slip of TOML by its line, else by
-    key: an unknown or missing one, a value of the wrong type, a number mapped twice or to a dimension that does not
-    exist, units or frames that do not agree. What it says of the sources is compared with them by `check_mapping`.
-    """
-    try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"there is no mapping to read at {path} ({error.strerror}).") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DatasetError(f"{path} is not TOML ({error}); mend it there.") from error
-    try:
-        mapping = _mapping(tables)
-        _check_inside(mapping)
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error}") from error
-    return mapping
-
-
-_NUMBER = (int, float)
-
-
-def _mapping(tables: dict) -> MergeMapping:
-    _only(tables, "the file", rows=dict, action=dict, state=dict, cameras=dict, source=list)
-    rows = _table(tables, "rows", "the file")
-    allowed = {"fps": _NUMBER, "images": str, "continuous": str, "actions": str, "max_gap_s": _NUMBER}
-    _only(rows, "[rows]", **allowed)
-    _need(rows, "[rows]", "fps")
-    choices = {"images": ("previous", "nearest"), "continuous": get_args(Policy), "actions": get_args(Policy)}
-    for key, policies in choices.items():
-        if rows.get(key, "previous") not in policies:
-            raise DatasetError(f"[rows] {key} = '{rows[key]}' is no policy; choose {', '.join(policies)}.")
-    for key in ("fps", "max_gap_s"):
-        if key in rows and not 0 < rows[key] < float("inf"):
-            raise DatasetError(f"[rows] {key} = {rows[key]} must be positive and finite.")
-    sources = tables.get("source", [])
-    if not sources or not all(isinstance(source, dict) for source in sources):
-        raise DatasetError("it has no [[source]]; add one for each recording to merge.")
-    return MergeMapping(
-        rows=Rows(**{"max_gap_s": None, **rows, "fps": float(rows["fps"])}),
-        action=_read_dimensions(tables, "action"),
-        state=_read_dimensions(tables, "state"),
-        cameras={name: _read_camera(name, camera) for name, camera in tables.get("cameras", {}).items()},
-        sources=tuple(_read_source(source, f"source {i}") for i, source in enumerate(sources, 1)),
-    )
-
-
-def _read_dimensions(tables: dict, table: str) -> dict[str, Dimension]:
-    found = {}
-    for name in _table(tables, table, "the file"):
-        values, where = _table(tables[table], name, f"[{table}]"), f"[{table}] '{name}'"
-        _only(values, where, unit=str, frame=str)
-        found[name] = Dimension(**values)
-    return found
-
-
-def _read_camera(name: str, values: Any) -> Camera:
-    where = f"[cameras] '{name}'"
-    if not isinstance(values, dict):
-        raise DatasetError(f"{where} must be a table {{ kind, height, width }}.")
-    _only(values, where, kind=str, height=int, width=int)
-    _need(values, where, "kind", "height", "width")
-    if values["kind"] not in ("image", "depth"):
-        raise DatasetError(f"{where} has kind '{values['kind']}'; choose image or depth.")
-    if not (0 < values["height"] <= 16384 and 0 < values["width"] <= 16384):
-        raise DatasetError(f"{where} is {values['height']} x {values['width']}; give 1 to 16384 pixels each way.")
-    return Camera(**values)
-
-
-def _read_source(values: dict, where: str) -> SourceMapping:
-    allowed = {"path": str, "embodiment": str, "fps": _NUMBER, "notes": list}
-    _only(values, where, **allowed, cameras=dict, keep=dict, out=dict, vectors=dict)
-    _need(values, where, "path", "embodiment")
-    where = f"{where} ({values['embodiment']})"
-    if "fps" in values and not 0 < values["fps"] < float("inf"):
-        raise DatasetError(f"{where} fps = {values['fps']} must be positive and finite.")
-    for table in ("cameras", "keep", "out"):
-        _only(values.get(table, {}), f"{where} {table}", **dict.fromkeys(values.get(table, {}), str))
-    notes = tuple(values.get("notes", ()))
-    if not all(isinstance(note, str) for note in notes):
-        raise DatasetError(f"{where} notes must be a list of sentences.")
-    vectors = {}
-    for name in values.get("vectors", {}):
-        place, vector = f"{where} vectors '{name}'", _table(values["vectors"], name, f"{where} vectors")
-        _only(vector, place, frame=str, numbers=list)
-        _need(vector, place, "numbers")
-        numbers = tuple(_read_number(number, f"{place} number {i}") for i, number in enumerate(vector["numbers"]))
-        vectors[name] = Vector(numbers, vector.get("frame", ""))
-    rest = {table: values.get(table, {}) for table in ("cameras", "keep", "out")}
-    fps = float(values["fps"]) if "fps" in values else None
-    return SourceMapping(values["path"], values["embodiment"], fps, vectors, **rest, notes=notes)
-
-
-def _read_number(values: Any, where: str) -> Number:
-    if not isinstance(values, dict):
-        raise DatasetError(f"{where} must be a table {{ name, unit, to }} or {{ name, out }}.")
-    _only(values, where, name=str, to=str, unit=str, scale=_NUMBER, offset=_NUMBER, out=str)
-    for key in ("scale", "offset"):
-        if abs(values.get(key, 0)) == float("inf") or values.get(key, 0) != values.get(key, 0):
-            raise DatasetError(f"{where} {key} = {values[key]} must be finite.")
-        if key in values:
-            values[key] = float(values[key])
-    if values.get("scale") == 0:
-        raise DatasetError(f"{where} has scale 0, which keeps nothing of it; give `out` and why instead.")
-    return Number(**values)
-
-
-def _table(values: dict, key: str, where: str) -> dict:
-    found = values.get(key, {})
-    if not isinstance(found, dict):
-        raise DatasetError(f"{where}: '{key}' must be a table.")
-    return found
-
-
-def _only(values: dict, where: str, **allowed: Any) -> None:
-    for key, value in values.items():
-        if key not in allowed:
-            raise DatasetError(f"{where} has an unknown key '{key}'; it may have {', '.join(allowed) or 'none'}.")
-        if not isinstance(value, allowed[key]) or (isinstance(value, bool) and allowed[key] is not bool):
-            kinds = allowed[key] if isinstance(allowed[key], tuple) else (allowed[key],)
-            wanted = " or ".join(kind.__name__ for kind in kinds)
-            raise DatasetError(f"{where} has {key} = {value!r}, which should be of type {wanted}.")
-
-
-def _need(values: dict, where: str, *keys: str) -> None:
-    for key in keys:
-        if key not in values:
-            raise DatasetError(f"{where} lacks '{key}'; add it.")
-
-
-def _check_inside(mapping: MergeMapping) -> None:
+def check_inside(mapping: MergeMapping) -> None:
     """What must hold whatever the sources are."""
     taken = set(MADE) | set(mapping.cameras)
     for name in mapping.cameras:
@@ -447,7 +208,7 @@ def check_mapping(mapping: MergeMapping, sources: Mapping[str, Source]) -> None:
     """DatasetError where the mapping speaks of what the sources do not have (a path, a sensor, a number, another kind), or
     not of a source at all.
     """
-    _check_inside(mapping)
+    check_inside(mapping)
     kept: dict[str, tuple] = {}
     for count, source in enumerate(mapping.sources, 1):
         where = f"source {count} ({source.embodiment})"

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from ...core.errors import DatasetError
-from ...data.format import WORLD
 from ...data.resample import SAME_TIME_S, blank, clock_of, pick, resample, row_times, stacked
 from ...data.source import Lazy, Readings, Sensor, Source, Take
-from ...data.storage import durable
-from ..formats import lerobot
 from .mapping import (
     ACTION,
     CAMERAS_MASK,
@@ -29,10 +24,7 @@ from .mapping import (
     affine,
     check_mapping,
     mask_of,
-    read_mapping,
-    write_mapping,
 )
-from .propose import propose
 from .report import Report, SensorCount, SourceCount
 
 
@@ -408,58 +400,3 @@ def _count(source: SourceMapping, origin: Source, mapping: MergeMapping) -> Sour
             f"(deltas) need their scale multiplied by {ratio:g}; positions and speeds do not."
         )
     return SourceCount(source.path, source.embodiment, notes=notes, left_out=_left_out(source, origin))
-
-
-def merge_into(
-    sources: Mapping[str, Source],
-    out: str | Path,
-    mapping: str | Path | None = None,
-    fps: float | None = None,
-    dry: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[dict, str]:
-    """Merges the sources (path -> Source) into a new LeRobot v3 folder; returns (facts, the same for a person).
-
-    mapping: the file to merge by; None to guess one and write it to OUT.toml, which must not be there yet.
-    fps:     rows a second, before what the mapping says.
-    dry:     stop when the mapping is written.
-
-    Beside the rows lie meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
-    "embodiments", each robot's statistics.
-    """
-    out = Path(out)
-    path = out.parent / f"{out.name}.toml" if mapping is None else Path(mapping)
-    if mapping is None:
-        if path.exists():
-            raise DatasetError(f"{path} is there already: merge by it (--mapping {path}), or move it away.")
-        found = propose(sources, fps)
-        write_mapping(found, path)
-    else:
-        found = read_mapping(path)
-        found = replace(found, rows=replace(found.rows, fps=float(fps))) if fps is not None else found
-    check_mapping(found, sources)
-    if dry:
-        notes = {source.path: list(source.notes) for source in found.sources}
-        said = [f"{source}: {note}" for source, some in notes.items() for note in some]
-        return {"mapping": str(path), "notes": notes}, "\n".join(
-            [*said, f"the mapping is {path}: edit it, then merge by it"]
-        )
-    report = Report()
-    terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
-    merged = merge(sources, found, report, out.name, terminal)
-    notes = lerobot.write(merged, out, progress=progress)
-    about = json.loads((out / WORLD).read_text(encoding="utf-8"))
-    durable.write_json(out / WORLD, {**about, "embodiments": report.embodiments()})
-    durable.write_json(out / "meta" / "merge.json", {**report.to_json(), "notes": notes})
-    write_mapping(found, out / "meta" / "merge.toml")
-    new, notes = [f"note: {note}" for note in notes], [*merged.notes, *notes]
-    text = "\n".join([report.text().rstrip(), *new, f"{len(sources)} recordings are now {out}, merged by {path}"])
-    return {"out": str(out), "mapping": str(path), "notes": notes, **report.to_json()}, text
-
-
-def _ends_without_action(origin: Source, source: SourceMapping, mapping: MergeMapping) -> bool:
-    """Whether nothing was done in the last row of its first take (which stands for all)."""
-    take = next(iter(merge({source.path: origin}, replace(mapping, sources=(source,))).takes()), None)
-    if take is None or ACTION not in take.readings:
-        return True
-    return len(take.readings[ACTION].time_s) < len(take.readings[EMBODIMENT].time_s)

@@ -5,38 +5,38 @@ import { Controls } from './controls.js';
 import { drawKeycaps, keyLabel, keyMeaning } from './keycaps.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { MemoryMap } from './map.js';
-import { Doubt } from './doubt.js';
 import { takePictures } from './picture.js';
+import { Screens } from './screens.js';
+import { Uncertainty } from './uncertainty.js';
 
 const $ = (id) => document.getElementById(id);
-const app = $('app'), glow = $('glow').getContext('2d', { alpha: false });
-const KEPT = 8192;
-const shade = glow.createRadialGradient(16, 10, 3, 16, 10, 17);
-shade.addColorStop(0, '#0b0c0f70');
-shade.addColorStop(1, '#0b0c0f');
+const app = $('app'), KEPT = 8192;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
-let worlds = [], screens = [], light = () => {}, status = {}, noRewind = '', noRecord = '';
-let pending = null, keysId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
+let worlds = [], light = () => {}, status = {}, noRewind = '', noRecord = '', driver = '';
+let pending = null, controlsId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
 let state = 'connecting';
 
 // -- the connection -------------------------------------------------------------------------------------------------
 
-const doubt = new Doubt($('doubt'), $('doubt-fill'));
-const map = new MemoryMap($('map')), show = { map: false, invented: false };
+const uncertainty = new Uncertainty($('uncertainty'), $('uncertainty-fill'));
+const screens = new Screens($('screens'), $('over'), $('stage'), $('glow'));
+const map = new MemoryMap($('map')), show = { map: false, invented: false, cameras: [] };
 const link = new Link({ frame: onFrame, event: onEvent, state: showState });
 const controls = new Controls((held, time) => {
   light(held);
-  if (held.length) $('hint').classList.remove('show');
-  if (held.length && status.rewound && rewinding === null) link.send({ type: 'branch' });
-  if (held.length && status.paused && !status.rewound) link.send({ type: 'resume' });
-  sendKeys(time);
-});
+  if (controls.active) {
+    $('hint').classList.remove('show');
+    if (status.rewound && rewinding === null) link.send({ type: 'branch' });
+    if (status.paused && !status.rewound) link.send({ type: 'resume' });
+  }
+  sendControls(time);
+}, $('axes'));
 
-function sendKeys(time) {
-  keysId += 1;
-  link.send({ type: 'keys', id: keysId, t: time, held: controls.held });
+function sendControls(time) {
+  controlsId += 1;
+  link.send({ type: 'controls', id: controlsId, t: time, held: controls.held, axes: controls.axes.values });
 }
 
 function onEvent(body) {
@@ -46,14 +46,15 @@ function onEvent(body) {
   if (body.type === 'error') toast(body.text);
 }
 
-/** Shows or hides the map, or the tint of what is invented, and asks the server for what is shown alone. */
+/** Shows or hides the map, the tint of what is invented, or cameras, and asks the server for what is shown alone. */
 function showMemory(change) {
   Object.assign(show, change);
   show.map &&= worlds.some((world) => world.mapped);
-  show.invented &&= worlds.some((world) => world.tells_known);
+  show.invented &&= worlds.some((world) => world.knows_share);
   $('map').hidden = !show.map;
   $('map-open').setAttribute('aria-pressed', show.map);
   $('tint').setAttribute('aria-pressed', show.invented);
+  for (const chip of $('cameras').children) chip.setAttribute('aria-pressed', chip.value === (show.cameras.length > 1 ? 'all' : show.cameras[0]));
   link.send({ type: 'show', ...show });
 }
 
@@ -63,21 +64,37 @@ function toggleMap() {
   localStorage.setItem('terrella-map', show.map ? 'open' : 'closed');
 }
 
+/** The next camera, and after the last one all of them. */
+function nextCamera() {
+  const chips = [...$('cameras').children], at = chips.findIndex((chip) => chip.ariaPressed === 'true');
+  if (chips.length) chips[(at + 1) % chips.length].click();
+}
+
+function drawCameras() {
+  const { cameras } = screens, chip = (value, textContent) => Object.assign(document.createElement('button'), { value, textContent });
+  show.cameras = [cameras[0].channel];
+  $('cameras').replaceChildren(...(cameras.length < 2 ? [] : [...cameras.map(({ channel, name }) => chip(channel, name)), chip('all', 'all')]));
+  for (const button of $('cameras').children) button.onclick = () => {
+    showMemory({ cameras: button.value === 'all' ? cameras.map(({ channel }) => channel) : [button.value] });
+    button.blur();
+  };
+}
+
 function toggleTint() {
   if (!$('tint').hidden) showMemory({ invented: !show.invented });
 }
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
-  ({ worlds, no_rewind: noRewind, no_record: noRecord } = body);
+  ({ worlds, no_rewind: noRewind, no_record: noRecord, driver } = body);
   if (!same) build();
   if (!body.resumed) map.clear();
   $('map-open').hidden = !worlds.some((world) => world.mapped);
-  $('tint').hidden = !worlds.some((world) => world.tells_known);
+  $('tint').hidden = !worlds.some((world) => world.knows_share);
   const wish = localStorage.getItem('terrella-map'), open = worlds.length === 1 ? wish !== 'closed' : wish === 'open';
   showMemory(same ? {} : { map: open && innerWidth > 1000 });
-  now.actionId = keysId;
-  sendKeys(performance.now());
+  now.actionId = controlsId;
+  sendControls(performance.now());
   showState('starting');
 }
 
@@ -87,6 +104,7 @@ function onStatus(body) {
   status = body;
   app.classList.toggle('recording', !!body.recording);
   $('record').setAttribute('aria-pressed', !!body.recording);
+  $('drive').setAttribute('aria-pressed', !!body.driving);
   if (body.seed !== undefined && document.activeElement !== $('seed')) $('seed').value = body.seed;
   const paused = body.paused || body.rewound;
   $('pause').querySelector('use').setAttribute('href', paused ? '#i-play' : '#i-pause');
@@ -110,11 +128,7 @@ function onFrame(frame, bitmaps) {
 function paint(time) {
   const { frame, bitmaps } = pending;
   pending = null;
-  bitmaps.forEach((bitmap, index) => {
-    const screen = screens[index];
-    if (screen) screen.drawImage(bitmap, 0, 0);
-    bitmap.close();
-  });
+  screens.paint(frame.images, bitmaps);
   const live = !(frame.flags & REPLAY), at = performance.now();
   if (frame.actionId > now.actionId && live) {
     keep(seen.latencies, at - frame.clientMs);
@@ -123,11 +137,11 @@ function paint(time) {
   if (frame.step < now.oldest || frame.newest < now.newest) ticks = ticks.filter((step) => step <= frame.newest);
   if (frame.flags & FRESH && frame.step > 0 && live) {
     ticks.push(frame.step);
-    flash();
+    screens.flash();
   }
   Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
-  doubt.show(frame.doubt, !!(frame.flags & FRESH) || !live);
+  uncertainty.show(frame.uncertainty, !!(frame.flags & FRESH) || !live);
   seen.painted += 1;
   keep(seen.times, time);
   keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });
@@ -146,17 +160,10 @@ function build() {
   $('name').textContent = worlds.map((world) => world.name).join('  ·  ');
   document.title = `${worlds[0].name} · Terrella`;
   $('what').textContent = worlds[worlds.length - 1].card.what ?? '';
-  $('screens').replaceChildren();
-  screens = worlds.map((world) => {
-    const figure = document.createElement('figure'), canvas = document.createElement('canvas');
-    [canvas.height, canvas.width] = world.size;
-    figure.append(canvas);
-    if (world.label) figure.append(Object.assign(document.createElement('figcaption'), { textContent: world.label }));
-    $('screens').append(figure);
-    return canvas.getContext('2d', { alpha: false });
-  });
+  screens.setWorlds(worlds);
+  drawCameras();
   light = drawKeycaps($('keys'), worlds[0]);
-  controls.setKeys(worlds[0].keys);
+  controls.setWorld(worlds[0]);
   drawTouch();
   drawCard($('facts'), worlds);
   $('score-cell').hidden = !worlds[0].scored;
@@ -167,15 +174,17 @@ function build() {
     cell.append(Object.assign(document.createElement('dd'), { id: `vital-${name}`, textContent: '–' }));
     $('score-cell').after(cell);
   }
-  doubt.levels = worlds[worlds.length - 1].doubtful;
+  uncertainty.levels = worlds[worlds.length - 1].uncertainty;
+  $('drive').hidden = !driver;
+  $('drive').title = `Let the policy act (G): ${driver}`;
   $('sync').hidden = worlds.length < 2;
   app.classList.toggle('no-rewind', !!noRewind);
   able($('rewind'), noRewind, 'Hold to rewind (Backspace)');
   $('timeline').title = noRewind || '';
   able($('record'), noRecord, 'Record to a dataset');
-  able($('sync'), '', 'The dream looks at the game again');
+  able($('sync'), '', 'Set the dream to what the game shows now');
   hint();
-  layout();
+  screens.layout();
 }
 
 function able(button, why, title) {
@@ -186,40 +195,14 @@ function able(button, why, title) {
 function hint() {
   const caps = Object.keys(worlds[0].keys).filter((code) => !/^Arrow(Up|Down)/.test(code) || !('KeyW' in worlds[0].keys)).slice(0, 6);
   const parts = caps.flatMap((code) => [Object.assign(document.createElement('kbd'), { textContent: keyLabel(code) }), ' ']);
-  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : ['Press ', ...parts, 'to step inside']));
-  $('hint').classList.toggle('show', caps.length > 0);
+  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : caps.length ? ['Press ', ...parts, 'to move'] : ['Move a slider, or click the picture and move the mouse']));
+  $('hint').classList.toggle('show', caps.length + worlds[0].axes.length > 0);
   setTimeout(() => $('hint').classList.remove('show'), 9000);
 }
 
-/** The largest size that fits, in whole screen pixels per picture pixel where that costs little; side by side or stacked. */
-function layout() {
-  if (!worlds.length) return;
-  const box = $('stage').getBoundingClientRect(), count = worlds.length;
-  const width = Math.max(...worlds.map((world) => world.size[1])), height = Math.max(...worlds.map((world) => world.size[0]));
-  const margin = innerWidth > 700 ? 20 : 0, beside = Math.min((box.width - 2 * margin - 14 * (count - 1)) / (count * width), box.height / height);
-  const stacked = Math.min((box.width - 2 * margin) / width, (box.height - 8 * (count - 1)) / (count * height));
-  $('screens').classList.toggle('stacked', stacked > beside);
-  let scale = Math.max(beside, stacked);
-  const whole = Math.floor(scale * devicePixelRatio) / devicePixelRatio;
-  if (whole / scale > 0.88) scale = whole;
-  const figures = [...$('screens').children];
-  figures.forEach((figure) => { figure.style.width = `${width * scale}px`; figure.style.height = `${height * scale}px`; });
-  const across = stacked > beside ? 1 : count, down = stacked > beside ? count : 1;
-  $('over').style.width = `${across * width * scale + 14 * (across - 1)}px`;
-  $('over').style.height = `${down * height * scale + 8 * (down - 1)}px`;
-}
-
-function flash() {
-  $('screens').querySelectorAll('figure').forEach((figure) => {
-    figure.classList.remove('flash');
-    void figure.offsetWidth;
-    figure.classList.add('flash');
-  });
-}
-
 const STATES = {
-  connecting: ['Connecting', ''], starting: ['Waking the world', ''], playing: ['', ''], paused: ['', ''], rewound: ['', ''],
-  reconnecting: ['Reconnecting', 'The world waits for you.'], elsewhere: ['Playing elsewhere', '', 'Play here'],
+  connecting: ['Connecting', ''], starting: ['Starting the world', ''], playing: ['', ''], paused: ['', ''], rewound: ['', ''],
+  reconnecting: ['Reconnecting', 'The world is paused.'], elsewhere: ['Open in another page', '', 'Play here'],
   refused: ['Not connected', '', 'Try again'], failed: ['The world stopped', '', 'Restart'],
 };
 
@@ -270,18 +253,6 @@ function drawFigures() {
     write('rec-time', `${Math.floor(s / 60)}:${String(s % 60).padStart(2, '0')}`);
   }
   if (dirtyTimeline) drawTimeline();
-}
-
-/** The picture's light on the wall behind it: few pixels, shaded here, for a mask or a blur in CSS costs every frame. */
-function drawGlow() {
-  if (!screens.length || state !== 'playing') return;
-  const { width, height } = glow.canvas;
-  glow.imageSmoothingQuality = 'high';
-  glow.globalAlpha = 0.3;
-  glow.drawImage(screens[screens.length - 1].canvas, 0, 0, width, height);
-  glow.globalAlpha = 1;
-  glow.fillStyle = shade;
-  glow.fillRect(0, 0, width, height);
 }
 
 function drawTimeline() {
@@ -346,7 +317,7 @@ function restartTyped() {
 
 async function clip() {
   $('clip').setAttribute('aria-busy', 'true');
-  toast('Making a film of the last seconds.');
+  toast('Making a video of the last seconds.');
   try {
     const answer = await fetch(link.clipAddress());
     if (!answer.ok) throw new Error(await answer.text());
@@ -356,7 +327,7 @@ async function clip() {
     setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
     toast(`Saved ${name}.`);
   } catch (error) {
-    toast(`No film: ${error.message}`);
+    toast(`No video: ${error.message}`);
   }
   $('clip').removeAttribute('aria-busy');
 }
@@ -368,9 +339,10 @@ function record() {
 
 function drawTouch() {
   const { stick, turn, extra } = controls.plan;
-  $('stick').hidden = !Object.values(stick).some(Boolean);
-  $('turn').hidden = !turn;
-  $('extra').replaceChildren(...extra.map((code) => {
+  const { plan } = controls.axes;
+  $('stick').hidden = !Object.values(stick).some(Boolean) && !plan.lx && !plan.ly;
+  $('turn').hidden = !turn && !plan.rx;
+  $('extra').replaceChildren(...(worlds[0].axes.length ? [] : extra).map((code) => {
     const button = Object.assign(document.createElement('button'), { textContent: keyMeaning(worlds[0], code) });
     controls.bindButton(button, code);
     return button;
@@ -379,7 +351,8 @@ function drawTouch() {
 
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
-const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const drive = () => driver && link.send({ type: 'drive', on: !status.driving });
+const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyC: nextCamera, KeyG: drive, KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 function fullscreen() {
   return document.fullscreenElement ? document.exitFullscreen() : app.requestFullscreen?.();
@@ -402,6 +375,7 @@ $('restart').onclick = restartTyped;
 $('dice').onclick = () => restart(null);
 $('seed').onkeydown = (event) => { if (event.code === 'Enter') { restartTyped(); $('seed').blur(); } if (event.code === 'Escape') $('seed').blur(); };
 $('record').onclick = record;
+$('drive').onclick = drive;
 $('clip').onclick = clip;
 $('sync').onclick = () => link.send({ type: 'sync' });
 $('full').onclick = fullscreen;
@@ -428,17 +402,18 @@ $('timeline').onpointerdown = (event) => { if (noRewind) return; scrubbing = tru
 $('timeline').onpointermove = (event) => { if (scrubbing) scrub(event); };
 $('timeline').onpointerup = $('timeline').onpointercancel = (event) => { if (scrubbing && event.type === 'pointerup') { scrubbed = 0; scrub(event); } scrubbing = false; };
 
-takePictures($('app'), $('picture'), () => worlds[0]?.size, (bytes) => link.sendPicture(bytes), toast);
-controls.bindPad($('stick'), 'stick', (x, y) => controls.axes(x, y));
-controls.bindPad($('turn'), 'turn', (x) => controls.turns(x));
+takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes) => link.sendPicture(bytes), toast);
+controls.bindPad($('stick'), 'stick');
+controls.bindPad($('turn'), 'turn');
+controls.axes.bindMouse($('screens'));
 const coarse = matchMedia('(pointer: coarse)');
-const touchable = () => { app.classList.toggle('touchable', coarse.matches); layout(); };
+const touchable = () => { app.classList.toggle('touchable', coarse.matches); screens.layout(); };
 coarse.addEventListener('change', touchable);
-addEventListener('touchstart', () => { app.classList.add('touchable'); layout(); }, { once: true, passive: true });
+addEventListener('touchstart', () => { app.classList.add('touchable'); screens.layout(); }, { once: true, passive: true });
 touchable();
 
-new ResizeObserver(layout).observe($('stage'));
-let leaving = false;  // a page that is closed or reloaded is hidden too, but its story goes on
+new ResizeObserver(() => screens.layout()).observe($('stage'));
+let leaving = false;  // a page that is closed or reloaded is hidden too, but its timeline goes on
 addEventListener('pagehide', () => { leaving = true; });
 addEventListener('pageshow', () => { leaving = false; });
 document.addEventListener('visibilitychange', () => {
@@ -446,7 +421,7 @@ document.addEventListener('visibilitychange', () => {
   if (!document.hidden && autoPaused) { autoPaused = false; link.send({ type: 'resume' }); }
 });
 setInterval(drawFigures, 250);
-setInterval(drawGlow, 500);
+setInterval(() => { if (state === 'playing') screens.drawGlow(); }, 500);
 
 /** Read-only figures for tests and benchmarks. */
 window.terrella = Object.freeze({
@@ -463,9 +438,11 @@ window.terrella = Object.freeze({
   get held() { return [...controls.held]; },
   get recording() { return !!status.recording; },
   get seed() { return status.seed; },
-  get doubt() { return doubt.value; },
-  get doubtful() { return doubt.level; },
-  get map() { return { shown: show.map, step: map.step, eye: map.eye, keyframes: map.keys.length, path: map.path.length }; },
+  get axes() { return [...controls.axes.values]; },
+  get driving() { return !!status.driving; },
+  get uncertainty() { return uncertainty.value; },
+  get uncertaintyLevel() { return uncertainty.level; },
+  get map() { return { shown: show.map, step: map.step, camera: map.camera, keyframes: map.keys.length, path: map.path.length }; },
   get done() { return !!(now.flags & DONE); },
   get latencies() { return [...seen.latencies]; },
   get latencyCount() { return seen.latencyCount; },

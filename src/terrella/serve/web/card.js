@@ -26,7 +26,7 @@ export function drawCard(root, worlds) {
     const { what: words = '', ...facts } = world.card;
     title.textContent = world.label ? `${world.name}, the ${world.label}` : world.name;
     what.textContent = words;
-    fill(list, '', { picture: `${world.size[1]} × ${world.size[0]}`, pace: `${Math.round(1 / world.dt_s)} steps/s`, ...facts });
+    fill(list, '', { ...Object.fromEntries(world.cameras.map(({ name, size }) => [world.cameras.length > 1 ? `picture, ${name}` : 'picture', `${size[1]} × ${size[0]}`])), pace: `${Math.round(1 / world.dt_s)} steps/s`, ...facts });
     root.append(title, what, list);
   }
 }

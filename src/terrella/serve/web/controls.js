@@ -1,7 +1,9 @@
-// Keyboard, touch and gamepad, all turned into the keys that the world's spec names.
+// Keyboard, touch and gamepad: keys and buttons as the world's spec names them, sticks as its axes where it has some.
+
+import { Axes } from './axes.js';
 
 const UP = ['KeyW', 'ArrowUp'], DOWN = ['KeyS', 'ArrowDown'], LEFT = ['KeyA', 'ArrowLeft'], RIGHT = ['KeyD', 'ArrowRight'];
-const DEAD = 0.35;
+const PRESSED = 0.35;  // deflection of a stick that counts as a key, in a world with buttons
 
 /** The keys that a stick, a turn pad and buttons stand for in this world. */
 export function plan(keys) {
@@ -16,9 +18,10 @@ export function plan(keys) {
 }
 
 export class Controls {
-  /** `changed(held, time)` is called with the ordered list of held codes whenever it changes. */
-  constructor(changed) {
+  /** `changed(held, time)` is called with the ordered list of held codes whenever it, or a value of the axes, changes. */
+  constructor(changed, sliders) {
     this.changed = changed;
+    this.axes = new Axes(sliders, (time) => changed(this.held, time));
     this.keys = {};
     this.sources = { keyboard: [], stick: [], turn: [], extra: [], pad: [] };
     this.held = [];
@@ -27,14 +30,20 @@ export class Controls {
     addEventListener('gamepadconnected', () => this.pollGamepad());
   }
 
-  setKeys(keys) {
-    this.keys = keys;
-    this.plan = plan(keys);
+  setWorld(world) {
+    this.keys = world.keys;
+    this.plan = plan(world.keys);
+    const { stick, turn } = this.plan;
+    this.axes.setWorld(world, { ...stick, turnLeft: turn?.left, turnRight: turn?.right });
     this.release();
   }
 
+  /** Whether anything is asked of the world. */
+  get active() { return this.held.length > 0 || this.axes.active; }
+
   release() {
     for (const name of Object.keys(this.sources)) this.sources[name] = [];
+    for (const source of Object.keys(this.axes.inputs)) this.axes.push(source, null, performance.now());
     this.merge(performance.now());
   }
 
@@ -60,21 +69,28 @@ export class Controls {
     const next = [...kept, ...all.filter((code) => !kept.includes(code))];
     if (next.length === this.held.length && next.every((code, index) => code === this.held[index])) return;
     this.held = next;
+    this.axes.draw(next);
     this.changed(next, time);
   }
 
-  axes(x, y) {
+  /** A stick or pad moved to x (right) and y (down), -1..1; a world with axes takes it as it is, another as keys. */
+  deflect(source, x, y, time) {
+    if (this.axes.axes.length) return this.axes.push(source, source === 'turn' ? { rx: x } : { lx: x, ly: -y }, time);
+    this.set(source, source === 'turn' ? this.turns(x) : this.moves(x, y), time);
+  }
+
+  moves(x, y) {
     const { up, down, left, right } = this.plan.stick;
-    return [y < -DEAD && up, y > DEAD && down, x < -DEAD && left, x > DEAD && right];
+    return [y < -PRESSED && up, y > PRESSED && down, x < -PRESSED && left, x > PRESSED && right];
   }
 
   turns(x) {
     const turn = this.plan.turn;
-    return turn ? [x < -DEAD && turn.left, x > DEAD && turn.right] : [];
+    return turn ? [x < -PRESSED && turn.left, x > PRESSED && turn.right] : [];
   }
 
   /** A round stick or a turn rail: `element` has a `.nub` that follows the finger. */
-  bindPad(element, source, codes) {
+  bindPad(element, source) {
     const nub = element.querySelector('.nub');
     let finger = null;
     const move = (event) => {
@@ -84,7 +100,7 @@ export class Controls {
       const far = Math.hypot(x, y), cap = source === 'turn' ? box.width / box.height - 0.4 : 1;
       if (far > cap) { x *= cap / far; y *= cap / far; }
       nub.style.transform = `translate(${x * reach * 0.62}px, ${y * reach * 0.62}px)`;
-      this.set(source, codes(x, y), event.timeStamp);
+      this.deflect(source, x, y, event.timeStamp);
     };
     element.addEventListener('pointerdown', (event) => {
       event.preventDefault();
@@ -99,7 +115,7 @@ export class Controls {
       finger = null;
       element.classList.remove('on');
       nub.style.transform = '';
-      this.set(source, [], event.timeStamp);
+      this.deflect(source, 0, 0, event.timeStamp);
     };
     for (const name of ['pointerup', 'pointercancel', 'lostpointercapture']) element.addEventListener(name, end);
   }
@@ -119,12 +135,14 @@ export class Controls {
       if (!pad) {
         this.polling = false;
         this.set('pad', [], performance.now());
+        this.axes.push('pad', null, performance.now());
         return;
       }
       const down = (index) => (pad.buttons[index]?.pressed ? 1 : 0);
       const x = (pad.axes[0] ?? 0) + down(15) - down(14), y = (pad.axes[1] ?? 0) + down(13) - down(12);
       const buttons = this.plan.extra.slice(0, 4).map((code, index) => down(index) && code);
-      this.set('pad', [...this.axes(x, y), ...this.turns(pad.axes[2] ?? 0), ...buttons], performance.now());
+      if (this.axes.axes.length) this.axes.push('pad', { lx: x, ly: -y, rx: pad.axes[2] ?? 0, ry: -(pad.axes[3] ?? 0) }, performance.now());
+      else this.set('pad', [...this.moves(x, y), ...this.turns(pad.axes[2] ?? 0), ...buttons], performance.now());
       requestAnimationFrame(poll);
     };
     requestAnimationFrame(poll);

@@ -1,6 +1,6 @@
 // The connection: one WebSocket, frames decoded off the main thread, acknowledged, and reconnection.
 
-const VERSION = 2, HEADER = 52;
+const VERSION = 3, HEADER = 52;
 export const DONE = 1, FRESH = 2, REPLAY = 4;
 
 /** A frame message (see serve/protocol.py) as its numbers and its JPEG bytes. */
@@ -10,13 +10,13 @@ export function readFrame(buffer) {
   const frame = {
     flags: view.getUint8(1), seq: view.getUint32(4, true), step: view.getUint32(8, true), oldest: view.getUint32(12, true),
     newest: view.getUint32(16, true), actionId: view.getUint32(20, true), generationMs: view.getFloat32(24, true),
-    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), doubt: view.getFloat32(48, true), images: [],
+    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), uncertainty: view.getFloat32(48, true), images: [],
   };
   let at = HEADER;
   for (let left = view.getUint16(2, true); left > 0; left--) {
-    const length = view.getUint32(at, true);
-    frame.images.push(new Uint8Array(buffer, at + 4, length));
-    at += 4 + length;
+    const length = view.getUint32(at + 4, true);
+    frame.images.push({ world: view.getUint8(at), camera: view.getUint8(at + 1), jpeg: new Uint8Array(buffer, at + 8, length) });
+    at += 8 + length;
   }
   frame.vitals = [];
   for (; at + 4 <= buffer.byteLength; at += 4) frame.vitals.push(view.getFloat32(at, true));
@@ -73,7 +73,7 @@ export class Link {
     this.bytes += buffer.byteLength;
     let bitmaps = null;
     try {
-      bitmaps = await Promise.all(frame.images.map((bytes) => createImageBitmap(new Blob([bytes], { type: 'image/jpeg' }))));
+      bitmaps = await Promise.all(frame.images.map(({ jpeg }) => createImageBitmap(new Blob([jpeg], { type: 'image/jpeg' }))));
     } catch (error) {
       console.error('a frame could not be decoded', error);
     }

@@ -1,6 +1,6 @@
-// What the world remembers, from above: its keyframes as small cones of sight, where the eye is, and the way that it came.
+// The map of what a world remembers: its keyframes as small cones of sight, where the camera is, and its path.
 
-const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274'], NAMES = ['', 'recorded', 'observed', 'dreamt'];
+const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274'], NAMES = ['', 'recorded', 'observed', 'imagined'];
 const NEAR_M = 40, LONGEST = 6000, STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20];
 
 export class MemoryMap {
@@ -11,18 +11,18 @@ export class MemoryMap {
   }
 
   clear() {
-    Object.assign(this, { keys: [], path: [], eye: null, box: null, layer: null, step: -1 });
+    Object.assign(this, { keys: [], path: [], camera: null, box: null, layer: null, step: -1 });
   }
 
   /** A chart event (see serve/protocol.py); `length` is how many steps are remembered of the way. */
-  show({ step, eye, known, keyframes }) {
+  show({ step, camera, known, keyframes }) {
     if (keyframes) this.take(keyframes);
     if (step < this.step) this.path = this.path.filter((place) => place.step <= step);
     const last = this.path[this.path.length - 1];
-    const jumped = last && Math.hypot(eye[0] - last.x, eye[1] - last.y) > 3;  // a new story, or the eye was set elsewhere
-    if (!last || Math.hypot(eye[0] - last.x, eye[1] - last.y) > 0.05) this.path.push({ step, x: eye[0], y: eye[1], jumped });
+    const jumped = last && Math.hypot(camera[0] - last.x, camera[1] - last.y) > 3;  // a new episode, or it was set elsewhere
+    if (!last || Math.hypot(camera[0] - last.x, camera[1] - last.y) > 0.05) this.path.push({ step, x: camera[0], y: camera[1], jumped });
     if (this.path.length > LONGEST) this.path.splice(0, LONGEST / 4);
-    this.eye = eye;
+    this.camera = camera;
     this.step = step;
     this.tell(known);
     this.draw();
@@ -39,14 +39,14 @@ export class MemoryMap {
   }
 
   tell(known) {
-    const text = known === null ? '' : known > 0.995 ? 'all remembered' : known < 0.005 ? 'all invented' : `${Math.round(100 * known)}% remembered`;
+    const text = known === null ? '' : `${Math.round(100 * known)}% from memory`;
     const node = document.getElementById('map-known');
     if (node.textContent !== text) node.textContent = text;
   }
 
-  /** The part of the world that the map shows: all keyframes near the eye, and the eye. */
+  /** The part of the world that the map shows: all keyframes near the camera, and the camera. */
   fit(width, height, ratio) {
-    const [x, y] = this.eye;
+    const [x, y] = this.camera;
     let [x0, x1, y0, y1] = [x - 2, x + 2, y - 2, y + 2];
     for (const key of this.keys) {
       if (Math.hypot(key.x - x, key.y - y) > NEAR_M) continue;
@@ -95,7 +95,7 @@ export class MemoryMap {
 
   draw() {
     const ratio = Math.min(2, devicePixelRatio || 1), width = Math.round(this.canvas.clientWidth * ratio), height = Math.round(this.canvas.clientHeight * ratio);
-    if (!this.eye || !width || !height) return;
+    if (!this.camera || !width || !height) return;
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     this.fit(width, height, ratio);
     if (!this.layer || this.layer.width !== width) this.drawLayer(width, height, ratio);
@@ -109,10 +109,10 @@ export class MemoryMap {
     for (const { x, y, jumped } of this.path) context[jumped ? 'moveTo' : 'lineTo'](...this.at(x, y));
     context.stroke();
     context.globalAlpha = 1;
-    const [u, v] = this.at(this.eye[0], this.eye[1]), size = 6.5 * ratio;
+    const [u, v] = this.at(this.camera[0], this.camera[1]), size = 6.5 * ratio;
     context.save();
     context.translate(u, v);
-    context.rotate(-this.eye[2]);
+    context.rotate(-this.camera[2]);
     const sight = context.createRadialGradient(0, 0, 0, 0, 0, size * 7);
     sight.addColorStop(0, '#ffffff66');
     sight.addColorStop(1, '#ffffff00');

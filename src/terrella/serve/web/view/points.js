@@ -6,7 +6,7 @@ import { metres } from './depth.js';
 const RINGS_M = [1, 2, 5, 10, 20, 50, 100];
 
 export function makePoints(figure, canvas) {
-  const eye = { turn: -2.36, tilt: 0.62, away: 0 };  // seen from behind and the right; the sensor looks along x
+  const orbit = { turn: -2.36, tilt: 0.62, away: 0 };  // seen from behind and the right; the sensor looks along x
   let cloud = null, span = null, reach = 0, buffer = null;
   const scale = Object.assign(document.createElement('div'), { className: 'scale', hidden: true });
   const top = document.createElement('span'), foot = document.createElement('span'), bar = document.createElement('canvas');
@@ -43,10 +43,10 @@ export function makePoints(figure, canvas) {
   }
 
   function project(width, height) {
-    const [ct, st, cp, sp] = [Math.cos(eye.turn), Math.sin(eye.turn), Math.cos(eye.tilt), Math.sin(eye.tilt)];
-    const away = reach * 2.2 * Math.exp(eye.away), focal = 0.95 * Math.min(width, height * 1.3);
+    const [ct, st, cp, sp] = [Math.cos(orbit.turn), Math.sin(orbit.turn), Math.cos(orbit.tilt), Math.sin(orbit.tilt)];
+    const away = reach * 2.2 * Math.exp(orbit.away), focal = 0.95 * Math.min(width, height * 1.3);
     return (x, y, z) => {
-      const along = -(x * ct + y * st), beside = -x * st + y * ct;  // the eye stands at angle `turn`, looking inwards
+      const along = -(x * ct + y * st), beside = -x * st + y * ct;  // the viewer stands at angle `turn`, looking inwards
       const far = along * cp - z * sp + away, up = along * sp + z * cp;
       return [width / 2 + (focal * beside) / far, height / 2 - (focal * up) / far, far];
     };
@@ -64,7 +64,7 @@ export function makePoints(figure, canvas) {
         if (far > 0.05) context.lineTo(x, y);
       }
       context.stroke();
-      const [x, y, far] = view(ring * Math.cos(eye.turn + .9), ring * Math.sin(eye.turn + .9), span[0]);
+      const [x, y, far] = view(ring * Math.cos(orbit.turn + .9), ring * Math.sin(orbit.turn + .9), span[0]);
       if (far > 0.05) context.fillText(`${ring} m`, x + 3 * ratio, y - 3 * ratio);
     }
     const [x0, y0] = view(0, 0, 0), [x1, y1] = view(reach * 0.12, 0, 0);  // where the sensor is, and looks
@@ -83,13 +83,13 @@ export function makePoints(figure, canvas) {
   canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
   canvas.onpointermove = (event) => {
     if (!canvas.hasPointerCapture(event.pointerId)) return;
-    eye.turn -= event.movementX * 0.008;
-    eye.tilt = Math.min(1.5, Math.max(-0.3, eye.tilt + event.movementY * 0.006));
+    orbit.turn -= event.movementX * 0.008;
+    orbit.tilt = Math.min(1.5, Math.max(-0.3, orbit.tilt + event.movementY * 0.006));
     draw();
   };
   canvas.addEventListener('wheel', (event) => {
     event.preventDefault();
-    eye.away = Math.min(1.5, Math.max(-2.5, eye.away + event.deltaY * 0.001));
+    orbit.away = Math.min(1.5, Math.max(-2.5, orbit.away + event.deltaY * 0.001));
     draw();
   }, { passive: false });
   new ResizeObserver(draw).observe(canvas);
@@ -110,6 +110,6 @@ export function makePoints(figure, canvas) {
     reach ||= 1;
     draw();
   };
-  paint.eye = eye;
+  paint.orbit = orbit;
   return paint;
 }

@@ -1,0 +1,167 @@
+"""Folders of images, without actions: read, and written as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from PIL import Image
+
+from ...core.errors import DatasetError
+from ...data.source import Lazy, Readings, Sensor, Source, Take
+from . import folders, rows
+from .suffixes import IMAGES
+
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
+_TURNS = {  # EXIF orientation -> what undoes it
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_ON_ITS_SIDE = {_TURNS[orientation] for orientation in (5, 6, 7, 8)}
+_MM = 1000.0
+
+
+def read(path: str | Path, fps: float | None = None) -> Source:
+    """A folder of images as a Source of pictures alone, `fps` a second (None: 10).
+
+    Images in the folder itself are one take of the camera "observation.images.rgb". Or each sub-folder is one take: with
+    images in it, or with a folder of images for each camera ("take_0/front/1.png": "observation.images.front"). Takes and
+    images are in natural order (2 before 10). EXIF orientation is applied, transparency and further frames are dropped.
+
+    Images of 16 bits are depth in millimetres, 0 where nothing was seen (inf): "observation.depth", or
+    "observation.depth.NAME" for the folder NAME or NAME_depth. DatasetError where there are no images, one is damaged, of
+    absurd size, or not of its camera's size and kind.
+    """
+    path, fps = Path(path), rows.FPS_UNKNOWN if fps is None else fps
+    rows.check_fps(fps, "a folder of images")
+    takes = folders.takes_of(path, IMAGES, "images", deep=True)
+    sensors: dict[str, Sensor] = {}
+    names: dict[str, str] = {}
+    for folder in takes.values():
+        for camera, files in folder.items():
+            if camera not in names:
+                kind, shape = _look(files[0])
+                names[camera] = f"{rows.IMAGES}{camera}" if kind == "image" else _depth_name(camera)
+                if names[camera] in sensors:
+                    raise DatasetError(f"{path} has two folders for '{names[camera]}'; rename '{camera}'.")
+                dtype = "uint8" if kind == "image" else "float32"
+                sensors[names[camera]] = Sensor(names[camera], kind, shape, dtype, rate_hz=float(fps))
+    return Source(
+        name=path.name,
+        sensors=sensors,
+        takes=lambda: (
+            Take(
+                {names[c]: _images(files, sensors[names[c]], fps) for c, files in folder.items()},
+                facts={"folder": name},
+            )
+            for name, folder in takes.items()
+        ),
+        fps=float(fps),
+    )
+
+
+def _depth_name(camera: str) -> str:
+    if camera in (rows.CAMERA, "depth"):
+        return rows.DEPTH
+    return f"{rows.DEPTH}.{camera.removesuffix('_depth') or camera}"
+
+
+def _images(files: list[Path], sensor: Sensor, fps: float) -> Readings:
+    for file in files:
+        kind, shape = _look(file)
+        if (kind, shape) != (sensor.kind, sensor.shape):
+            raise DatasetError(
+                f"{file} is {_said(kind, shape)} where the first of its camera is {_said(sensor.kind, sensor.shape)}; "
+                "scale it to the same size, or keep it in a folder of its own."
+            )
+    return Readings(np.arange(len(files)) / fps, Lazy(len(files), lambda i: _load(files[i], sensor)))
+
+
+def _said(kind: str, shape: tuple[int, ...]) -> str:
+    return f"{'depth' if kind == 'depth' else 'a picture'} of {shape[1]} x {shape[0]}"
+
+
+def _look(path: Path) -> tuple[Literal["image", "depth"], tuple[int, ...]]:
+    """Kind and shape of an image's readings, from its header."""
+    with _image(path) as picture:
+        height, width = picture.height, picture.width
+        if _turn(picture) in _ON_ITS_SIDE:
+            height, width = width, height
+        if picture.mode == "F":
+            raise DatasetError(f"{path} has numbers with fractions, of unknown unit; make it an 8-bit or 16-bit image.")
+        return ("depth", (height, width)) if picture.mode.startswith("I") else ("image", (height, width, 3))
+
+
+def _load(path: Path, sensor: Sensor) -> np.ndarray:
+    with _image(path) as picture:
+        turn = _turn(picture)
+        upright = picture if turn is None else picture.transpose(turn)
+        if sensor.kind == "depth":
+            depth_mm = np.asarray(upright).astype(np.float32)
+            found = np.where(depth_mm > 0, depth_mm / np.float32(_MM), np.float32(np.inf))
+        else:
+            found = np.asarray(upright.convert("RGB"))
+    if found.shape != sensor.shape:
+        raise DatasetError(f"{path} changed while it was read; read the folder anew.")
+    return np.array(found)
+
+
+def _turn(picture: Image.Image) -> Image.Transpose | None:
+    """What makes the image upright, by its EXIF orientation."""
+    exif = picture.getexif() if picture.format != "PNG" else Image.Exif()
+    if picture.format == "PNG":  # Pillow would decode the whole image to look behind it
+        exif.load(picture.info.get("exif", b""))
+    return _TURNS.get(exif.get(0x0112, 1))
+
+
+@contextmanager
+def _image(path: Path) -> Iterator[Image.Image]:
+    try:
+        with Image.open(path, formats=_FORMATS) as picture:
+            rows.check_size(picture.height, picture.width, f"the image {path}")
+            yield picture
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise DatasetError(
+            f"the image {path} is damaged or of an unknown kind ({error}); restore it from a copy."
+        ) from error
+
+
+def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
+    """Writes a source's pictures and depth as PNG files, as `read` reads them; returns what had no place in it.
+
+    take_0/000000.png, … where the only sensor is "observation.images.rgb", else take_0/CAMERA/000000.png. Pictures are
+    exact; depth is rounded to millimetres, and 0 where it is not a number or beyond 65.535 m. Times are not kept.
+    `progress(takes, 0)` is called after each take. DatasetError where there are no pictures, or `path` exists.
+    """
+    cameras, left_out = folders.cameras(source, ("image", "depth"), "images")
+    notes = dict.fromkeys(left_out)
+    with rows.fresh(path) as staged:
+        staged.mkdir()
+        for number, take in folders.numbered(source, cameras, progress):
+            for name, readings in take.readings.items():
+                folder = staged / f"take_{number}"
+                folder = folder if list(cameras) == [folders.CAMERA] else folder / cameras[name]
+                folder.mkdir(parents=True)
+                if not rows.even(readings.time_s, source.fps):
+                    notes[f"images keep no times: those of '{name}' were left out."] = None
+                row = 0
+                for part in rows.batches(readings.values, source.sensors[name], f"take {number}", size=8):
+                    for value in part:
+                        stored = value if source.sensors[name].kind == "image" else _millimetres(value)
+                        Image.fromarray(stored).save(folder / f"{row:06d}.png", compress_level=3)
+                        row += 1
+    return list(notes)
+
+
+def _millimetres(depth_m: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        depth_mm = np.rint(np.nan_to_num(depth_m, nan=0, posinf=0, neginf=0).astype(np.float64) * _MM)
+    return np.where((depth_mm > 0) & (depth_mm <= 65_535), depth_mm, 0).astype(np.uint16)

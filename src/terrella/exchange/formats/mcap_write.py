@@ -1,0 +1,174 @@
+"""Writes MCAP with the messages that Foxglove knows, a whole source or as readings come in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage import durable
+from . import encoder, rows
+from .encoder import Encoder
+from .mcap import SENSORS, SOURCE, TAKE, topics
+
+try:
+    from foxglove import Schema
+    from mcap.writer import Writer
+except ImportError as error:
+    raise DatasetError("MCAP needs packages that are not installed: pip install 'terrella[mcap]'.") from error
+
+CALIBRATION_TOPIC = "/calibration"  # beneath the topic of its camera
+_CHUNK = 2**20
+
+
+def write(
+    source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None, image: str = "png"
+) -> list[str]:
+    """Writes a source as `path`: a file if it ends in .mcap (one take), else a folder of take-000000.mcap and so on.
+
+    image: "png" or "raw" (both exact), "jpeg", or "h264". `progress(messages, of_this_take)` is called as it goes.
+    Nothing stands at `path` until all of it does. Returns notes on what is not exact. DatasetError where the path is
+    taken, the disk is full, or a reading is not what its sensor declares.
+    """
+    path, notes, count = Path(path), dict[str, None](), 0
+    with rows.fresh(path) as staged:
+        for count, take in enumerate(source.takes(), 1):
+            if path.suffix == ".mcap" and count > 1:
+                raise DatasetError(f"'{source.name}' has more than one take, and '{path}' is one file; name a folder.")
+            if path.suffix != ".mcap":
+                staged.mkdir(exist_ok=True)
+            target = staged if path.suffix == ".mcap" else staged / f"take-{count - 1:06d}.mcap"
+            notes |= dict.fromkeys(_write_take(source, take, target, image, progress))
+            durable.sync_file(target)
+        if not count:
+            raise DatasetError(f"'{source.name}' has no takes; there is nothing to write.")
+    return list(notes)
+
+
+def _write_take(source: Source, take: Take, path: Path, image: str, progress) -> list[str]:
+    names = list(take.readings)
+    for name in names:
+        if name not in source.sensors:
+            raise DatasetError(f"A take has readings of '{name}', which the source does not declare; declare it.")
+    times = [_nanoseconds(name, take.readings[name]) for name in names]
+    first = min((int(time_ns.min()) for time_ns in times if len(time_ns)), default=0)
+    zero_ns = take.start_ns if take.start_ns is not None else max(0, -first)
+    if not 0 <= zero_ns + first < 2**63:
+        raise DatasetError(
+            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot tell; mend its start."
+        )
+    whose = np.concatenate([np.full(len(time_ns), i) for i, time_ns in enumerate(times)] or [np.zeros(0, int)])
+    which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
+    order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
+    sensors = {name: source.sensors[name] for name in names}
+    with Recording(path, sensors, source, take, zero_ns, image) as recording:
+        for done, at in enumerate(order.tolist()):
+            name, i = names[whose[at]], int(which[at])
+            value = np.asarray(take.readings[name].values[i])
+            recording.add(name, zero_ns + int(times[whose[at]][i]), value)
+            if progress:
+                progress(done + 1, len(order))
+    return recording.notes
+
+
+def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
+    time_s = np.asarray(readings.time_s, np.float64)
+    if time_s.shape != (len(readings.values),) or not np.isfinite(time_s).all() or (np.abs(time_s) > 2**62 / 1e9).any():
+        what = f"'{name}' has times {list(time_s.shape)} for {len(readings.values)} values, or times that are none"
+        raise DatasetError(f"{what}; mend them.")
+    return np.rint(time_s * 1e9).astype(np.int64)
+
+
+class Recording:
+    """An MCAP file in the making: every sensor is declared first, then readings come in any order of sensors.
+
+    What was added before a `flush` is found by `read` even if nothing is written after it. The file must be new.
+    zero_ns: the log time of the take's second 0, nanoseconds. Of `take` its start_ns, task and facts are kept, and of
+    `source` all but its sensors.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        sensors: Mapping[str, Sensor],
+        source: Source,
+        take: Take,
+        zero_ns: int,
+        image: str = "png",
+    ):
+        self._sensors = sensors
+        self._encoders = {name: Encoder(sensor, image) for name, sensor in sensors.items()}
+        self.notes = [encoder.note for encoder in self._encoders.values() if encoder.note]
+        self._file = open(path, "xb")
+        self._writer = Writer(self._file, chunk_size=_CHUNK)
+        self._writer.start(library="terrella")
+        topic = topics(sensors)
+        about = {"name": source.name, "fps": source.fps, "robot": source.robot, "notes": list(source.notes)}
+        self._add_metadata(SOURCE, {**about, "facts": dict(source.facts)})
+        self._add_metadata(SENSORS, {name: {**_plain(sensors[name]), "topic": topic[name]} for name in sensors})
+        told = {"start_ns": take.start_ns, "task": take.task}
+        self._add_metadata(TAKE, {**told, "facts": dict(take.facts), "zero_ns": zero_ns})
+        self._schemas: dict[str, int] = {}
+        self._channels = {name: self._channel(topic[name], self._encoders[name].schema) for name in sensors}
+        self._calibrations = {
+            name: self._channel(topic[name] + CALIBRATION_TOPIC, encoder.calibration_schema())
+            for name, sensor in sensors.items()
+            if encoder.calibration(sensor, 0)
+        }
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.close() if kind is None else self.abandon()
+
+    def add(self, name: str, log_ns: int, value: np.ndarray) -> None:
+        """One reading at a log time; DatasetError where it is not what its sensor declares, OSError from the disk."""
+        if name in self._calibrations:  # once, with the first picture
+            data = encoder.calibration(self._sensors[name], log_ns) or b""
+            self._writer.add_message(self._calibrations.pop(name), log_ns, data, log_ns)
+        data = self._encoders[name](value, log_ns)
+        self._writer.add_message(self._channels[name], log_ns, data, log_ns)
+
+    def flush(self) -> None:
+        """Ends the chunk and hands all bytes to the system."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Writes the index and ends the file; OSError from the disk."""
+        try:
+            self._writer.finish()
+            self._file.close()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Lets go of the file as it stands: nothing is written after a chunk that may not be whole."""
+        try:
+            self._file.close()
+        except OSError:
+            pass
+
+    def _channel(self, topic: str, schema: Schema) -> int:
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        return self._writer.register_channel(topic, "protobuf", self._schemas[schema.name])
+
+    def _add_metadata(self, name: str, values: Mapping[str, Any]) -> None:
+        try:
+            self._writer.add_metadata(name, {key: json.dumps(value) for key, value in values.items()})
+        except (TypeError, ValueError) as error:
+            self._file.close()
+            raise DatasetError(
+                f"The facts of a source, take or sensor are no JSON ({error}); leave them out."
+            ) from error
+
+
+def _plain(sensor: Sensor) -> dict[str, Any]:
+    fields = {**sensor.__dict__, "units": dict(sensor.units), "facts": dict(sensor.facts)}
+    return {key: value for key, value in fields.items() if key != "name"}

@@ -1,0 +1,70 @@
+"""Feeds: what the trainer learns from. Rows drawn at random, or clips of a recording near or far."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from ..data import Clips
+from ..space.keyframes import Keyframes
+from ..worlds.config import VideoConfig
+from ..worlds.controls import Controls
+from .batches import Dream, place_batch
+from .history_batches import history_batch, history_clips
+from .moving_batches import moving_batch
+from .recording import Recording
+from .trainer import Feed, Now
+
+
+class Drawn:
+    """Batches that `draw` makes of a step's own randomness alone."""
+
+    def __init__(self, draw: Callable[[Now], Any]):
+        self.batch = draw
+
+    def state(self) -> dict:
+        return {}
+
+    def resume(self, state: Mapping) -> None:
+        pass
+
+
+class Streamed:
+    """Batches that `make(clips, now)` makes of clips of a recording, in the clips' own order; see data.Clips."""
+
+    def __init__(self, clips: Clips, make: Callable[[dict, Now], Any]):
+        self.clips, self.make = clips, make
+        self._given: Iterator[dict] | None = None
+
+    def batch(self, now: Now) -> Any:
+        self._given = self.clips.forever() if self._given is None else self._given
+        return self.make(next(self._given), now)
+
+    def state(self) -> dict:
+        return self.clips.state()
+
+    def resume(self, state: Mapping) -> None:
+        self.clips.resume(state)
+        self._given = None
+
+
+def frames_feed(
+    recording: Recording,
+    memory: Keyframes | None,
+    config: VideoConfig,
+    size: int,
+    seed: int,
+    dream: Dream | None,
+    far: Mapping[str, Any] | None = None,
+) -> Feed:
+    """Batches of `size` for a generator: of places, where things may move, with a `memory`; of clips without one.
+
+    far: the `source` of clips that lie far away, and how they are read (see data.Clips); None: the recording's cache.
+    """
+    if memory is not None:
+        of_place = moving_batch if config.moving else place_batch
+        return Drawn(lambda now: of_place(recording, memory, config, size, now, dream))
+    where = dict(far) if far else {"source": recording.cache, "episodes": recording.seen}
+    clips = history_clips(config=config, batch=size, seed=seed, **where)
+    controls = recording.controls or Controls.buttons(config.actions)
+    return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))

@@ -1,0 +1,359 @@
+"""Objects: the looks and moves that a recording's things have, and which follow which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ...core.errors import DatasetError
+from ...core.world import make_rng
+from ...data import ClipCache
+from ...space.billboards import cut_out
+from ...space.camera import Intrinsics, project
+from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, fresh, likest, marks, noted
+from ..feeds import Drawn
+from ..recording import INSTANCES, OBJECTS, Recording
+from ..trainer import Learner, Loss, Now, Report, Run, cosine
+
+CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
+FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
+TWICE = 2  # times that a look was seen to follow another, below which that was a mistake
+SELDOM = 4  # sightings below which a look is none
+UPRIGHT_M = 1.0  # height of what may stand in the way
+BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known to
+NEVER_M = 1e3  # boxes of looks that are not used
+WAITS = 300  # steps from an episode's beginning in which things are found that waited there
+SAME_M, OFTEN = 1.5, 0.08  # metres within which, and share of the episodes in which, it is one that waits there
+LASTS = 15  # steps in which a thing must have been seen to be one that waits
+CHUNK = 1.5e6  # pixels of frames that are cut at once
+WITHOUT = ", or train without (train video --objects-steps 0)"
+
+
+class Sightings(NamedTuple):
+    """The n cards that frames show: frame and row of its list [n]; marks [n, D] (worlds/cast.py) and box [n, 4]; share [n] of
+    the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their pictures
+    uint8 [m, 4, *PICTURE]."""
+
+    frame: np.ndarray
+    row: np.ndarray
+    marks: torch.Tensor
+    box: torch.Tensor
+    share: np.ndarray
+    whole: np.ndarray
+    clear: np.ndarray
+    picture: torch.Tensor
+
+
+class Tokens(NamedTuple):
+    """What was seen to follow what: cards [n, COLUMNS], and the pose [n, 7] from which they were seen a step later; their
+    next look [n] (NONE: not known) and move [n], and whether they were gone [n]; acts [n, history], rows of the last actions
+    (-1: none)."""
+
+    cards: torch.Tensor
+    pose: torch.Tensor
+    look: torch.Tensor
+    move: torch.Tensor
+    gone: torch.Tensor
+    acts: np.ndarray
+
+
+def learn_objects(
+    run: Run,
+    objects: Objects,
+    recording: Recording,
+    rgb: Callable[[np.ndarray], np.ndarray],
+    starts: torch.Tensor,
+    camera: Intrinsics,
+    steps: int,
+) -> dict:
+    """Trains `objects` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; an episode that
+    begins at one of the poses `starts` [S, 7] begins with the billboards that waited in the episodes that began there.
+    Returns facts."""
+    seed, report = run.seed, run.report
+    cache, rows = recording.cache, np.flatnonzero(recording.usable)
+    seen = _cut(cache, rgb, rows, camera, report)
+    if not len(seen.clear):
+        raise DatasetError(f"the recording shows no thing whole and near: record more of them{WITHOUT}.")
+    heads, off = _looks(seen, objects.config.looks, seed)
+    objects.pictures[: len(heads)] = seen.picture[heads]
+    objects.boxes[:] = NEVER_M
+    objects.boxes[: len(heads)] = seen.box[seen.clear[heads]]
+    moves = _moves(cache, rows, objects.config.moves, seed)
+    objects.moves[: len(moves)] = moves
+    known = _settled(off, seen, cache)
+    tokens, waiting = _followed(objects, recording, seen, known, camera)
+    objects.solid[:] = _reach(objects, tokens)
+    objects.follows[:] = _follows(objects, tokens)
+    begun = [first for first, _ in cache.episodes if recording.usable[first]]
+    for story, start in enumerate(starts if begun else []):
+        off = (recording.pose(begun) - start).norm(dim=1)
+        cards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
+        for row, card in enumerate(cards[: objects.config.rows]):
+            objects.begun[story, row] = card
+    objective = Next(objects, tokens, recording)
+    trainer = run.stage("objects", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
+    trainer.run(report)
+    objects.eval()
+    facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
+    return {**facts, "objects_steps": steps}
+
+
+def listed(cache: ClipCache) -> np.ndarray:
+    """float32 [N, K, 4]: number and place of each thing of each row."""
+    return np.asarray(cache.arrays[OBJECTS], np.float32).reshape(cache.length, -1, 4)
+
+
+def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Report) -> Sightings:
+    parts, chunk = [], max(1, int(CHUNK / np.prod(cache.arrays[INSTANCES].shape[1:])))
+    for first in range(0, len(rows), chunk):
+        some = rows[first : first + chunk]
+        frames = torch.from_numpy(np.ascontiguousarray(rgb(some))).permute(0, 3, 1, 2)
+        instances = torch.from_numpy(np.asarray(cache.arrays[INSTANCES][some]))
+        depth, pose = (torch.from_numpy(np.asarray(array[some], np.float32)) for array in (cache.depth, cache.pose))
+        cut = cut_out(frames, instances, depth, torch.from_numpy(listed(cache)[some, :, 1:]), pose, camera)
+        share = cut.pixels / (frames.shape[2] * frames.shape[3])
+        clear = cut.whole & (share >= LARGE)
+        picture = (cut.picture[clear] * 255).round().clamp(0, 255).byte()
+        frame = torch.from_numpy(some)[cut.view]
+        parts.append((frame, cut.row, marks(cut.picture, cut.box), cut.box, share, cut.whole, clear, picture))
+        if first // chunk % 16 == 0:
+            report(first / len(rows), 1.0, "cutting out what stands in the frames")
+    frame, row, marked, box, share, whole, clear, picture = map(torch.cat, zip(*parts))
+    numbers = frame.numpy(), row.numpy(), marked, box, share.numpy(), whole.numpy(), clear.numpy().nonzero()[0]
+    return Sightings(*numbers, picture)
+
+
+def _looks(seen: Sightings, count: int, seed: int) -> tuple[np.ndarray, torch.Tensor]:
+    """Which of the clear sightings [looks] show a look best, and how far from each every sighting is [n, looks]: k-means, each
+    look shown by the largest of its more typical half."""
+    rng, some = np.random.default_rng(seed), np.arange(len(seen.clear))
+    some = some if len(some) <= 12000 else np.sort(rng.choice(some, 12000, replace=False))
+    known = seen.marks[seen.clear[some]]
+    centres = _means(known, count, seed)
+    off, nearest = torch.cdist(known, centres).min(1)
+    heads = []
+    for look in range(len(centres)):
+        mine = (nearest == look).nonzero()[:, 0]
+        if len(mine) >= SELDOM:
+            typical = some[mine[off[mine].argsort()[: max(SELDOM, len(mine) // 2)]].numpy()]
+            heads.append(typical[seen.share[seen.clear[typical]].argmax()])
+    heads = np.array(heads if heads else some[:1])
+    shown = seen.marks[seen.clear[heads]]
+    return heads, torch.cat([torch.cdist(part, shown) for part in seen.marks.split(4096)])
+
+
+def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray:
+    """The look of each sighting [n], `off` [n, looks] being how far it is from each; NONE where it is like none or not seen
+    well."""
+    episode = np.searchsorted([first for first, _ in cache.episodes], seen.frame, side="right")
+    numbers, clear = listed(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
+    look, last = np.full(len(off), NONE), {}
+    for one in np.argsort(seen.frame, kind="stable"):
+        if not clear[one]:
+            continue
+        thing = episode[one], numbers[one]
+        before, was = last.get(thing, (NONE, NONE))
+        look[one] = likest(off[one], was if seen.frame[one] - before <= FORGETS else NONE)
+        if look[one] != NONE:
+            last[thing] = seen.frame[one], look[one]
+    return look
+
+
+def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
+    """bool [looks + 1, looks]: a look follows itself, and what it was seen to more than by mistake."""
+    looks, known = objects.config.looks, tokens.look != NONE
+    pair = (tokens.cards[known, LOOK].long() + 1) * looks + tokens.look[known]
+    seen = torch.bincount(pair, minlength=(looks + 1) * looks).view(looks + 1, looks) >= TWICE
+    seen[0] = objects.boxes[:, 3] < NEVER_M
+    return seen | torch.cat([torch.zeros(1, looks), torch.eye(looks)]).bool()
+
+
+def _reach(objects: Objects, tokens: Tokens) -> torch.Tensor:
+    """How near [looks], along x or y in metres, an eye can come to what looks upright: as near as it ever did (the nearest
+    few of a thousand left out); 0 for what is low, and for all where it came into them."""
+    look = tokens.cards[:, LOOK].long()
+    upright = (objects.boxes[:, 3] >= UPRIGHT_M) & (objects.boxes[:, 3] < NEVER_M)
+    near = (
+        (tokens.cards[:, PLACE] - tokens.pose[:, :3])[:, :2].abs().amax(1)[(look != NONE) & upright[look.clamp_min(0)]]
+    )
+    reach = float(near.quantile(0.002)) if len(near) >= FEWEST else 0.0
+    return torch.where(upright, reach if reach > BODY_M else 0.0, 0.0)
+
+
+def _moves(cache: ClipCache, rows: np.ndarray, count: int, seed: int) -> torch.Tensor:
+    """The moves [m, 3] that things make in a step, in metres, the first of them none: k-means."""
+    cards = listed(cache)
+    follows = rows[:-1][np.diff(rows) == 1]
+    follows = follows[~np.isin(follows + 1, [first for first, _ in cache.episodes])]
+    same = (cards[follows, :, None, 0] == cards[follows + 1, None, :, 0]) & (cards[follows, :, 0] > 0)[:, :, None]
+    index, slot, after = same.nonzero()
+    moved = cards[follows[index] + 1, after, 1:] - cards[follows[index], slot, 1:]
+    far = np.linalg.norm(moved, axis=1)
+    moved = torch.from_numpy(moved[(far > 1e-3) & (far < 2)])
+    none = torch.zeros(1, 3)
+    if not len(moved):
+        return none
+    moved = moved[torch.randperm(len(moved), generator=make_rng(seed))[:20000]]
+    return torch.cat([none, _means(moved, count - 1, seed)])
+
+
+def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
+    """k-means of [n, D], begun with points far from each other (k-means++): at most [count, D]."""
+    rng = make_rng(seed)
+    picks = [int(torch.randint(len(points), (1,), generator=rng))]
+    gap = (points - points[picks[0]]).square().sum(1)
+    while len(picks) < min(count, len(points)) and float(gap.max()) > 1e-9:
+        picks.append(int(torch.multinomial(gap, 1, generator=rng)))
+        gap = torch.minimum(gap, (points - points[picks[-1]]).square().sum(1))
+    centres = points[picks]
+    for _ in range(12):
+        nearest = torch.cdist(points, centres).argmin(1)
+        sums = torch.zeros_like(centres).index_add_(0, nearest, points)
+        counts = torch.bincount(nearest, minlength=len(centres))[:, None]
+        centres = torch.where(counts > 0, sums / counts.clamp_min(1), centres)
+    return centres
+
+
+def _followed(
+    objects: Objects, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
+) -> tuple[Tokens, dict[int, list[torch.Tensor]]]:
+    """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the cards that waited
+    in it. The recording is walked through as a dream is, card by card."""
+    cache, back = recording.cache, np.arange(objects.config.history)[::-1]
+    cards = torch.from_numpy(listed(cache).copy())
+    poses = torch.from_numpy(np.array(cache.pose, np.float32))
+    looks, share = torch.full(cards.shape[:2], float(NONE)), np.zeros(cards.shape[:2])
+    looks[seen.frame, seen.row] = torch.from_numpy(known).float()
+    share[seen.frame, seen.row] = seen.share
+    before, at, look, place, gone, acts = [], [], [], [], [], []
+    waiting: dict[int, list[torch.Tensor]] = {}
+    for first, stop in cache.episodes:
+        were: dict[float, torch.Tensor] = {}  # cards by number, and the row of the list in which each was
+        slots: dict[float, int] = {}
+        met: dict[float, _Met] = {}
+        for row in range(first, stop):
+            here = {}
+            if recording.usable[row]:
+                here = {float(number): slot for slot, number in enumerate(cards[row, :, 0]) if number > 0}
+                lost = [n for n in were if n not in here and share[row - 1, slots[n]] >= 2 * CLEAR]
+                led = np.where(row - 1 - back >= first, row - 1 - back, -1)
+                for number in (*(n for n in here if n in were), *_in_sight(lost, were, poses[row], camera)):
+                    slot = here.get(number)
+                    before.append(were[number])
+                    at.append(row)
+                    acts.append(led)
+                    gone.append(slot is None)
+                    look.append(float(NONE) if slot is None else looks[row, slot])
+                    place.append(were[number][PLACE] if slot is None else cards[row, slot, 1:])
+            now = {}
+            for number, slot in here.items():
+                old, seen_as = were.get(number), looks[row, slot]
+                if old is None:
+                    now[number] = fresh(number, cards[row, slot, 1:], seen_as)
+                else:
+                    kept = torch.where(seen_as == NONE, old[LOOK], seen_as)
+                    now[number] = noted(old[None], cards[row, slot, 1:][None], kept[None])[0]
+                if number not in met and row < first + WAITS:
+                    met[number] = _Met(now[number].clone(), row > first and _open(now[number], row - 1, cache, camera))
+                if number in met:
+                    met[number].again(seen_as)
+            were, slots = now, here
+        waiting[first] = [one.card for one in met.values() if one.waited]
+    if not before:
+        raise DatasetError(f"the recording shows no thing in two frames that follow each other{WITHOUT}.")
+    moved = torch.stack(place) - torch.stack(before)[:, PLACE]
+    move = torch.cdist(moved, objects.moves).argmin(1)
+    move[moved.norm(dim=1) <= 1e-3] = 0
+    parts = torch.stack(before), poses[at], torch.tensor(look).long(), move, torch.tensor(gone), np.stack(acts)
+    return Tokens(*parts), waiting
+
+
+class _Met:
+    """A thing of an episode: its card as it was first seen, and whether it was seen to come into being."""
+
+    def __init__(self, card: torch.Tensor, born: bool):
+        self.card, self.born, self.often = card, born, 0
+
+    def again(self, look: torch.Tensor) -> None:
+        self.often += 1
+        if self.card[LOOK] == NONE:
+            self.card[LOOK] = look
+
+    @property
+    def waited(self) -> bool:
+        return self.often >= LASTS and not self.born and bool(self.card[LOOK] != NONE)
+
+
+def _gathered(episodes: list[list[torch.Tensor]]) -> list[torch.Tensor]:
+    """The cards [COLUMNS] that waited in episodes which began alike, those of one place as one, the most frequent first: no
+    episode sees all of them."""
+    found: list[tuple[torch.Tensor, int]] = []
+    for card in (card for cards in episodes for card in cards):
+        same = [at for at, (other, _) in enumerate(found) if (other - card)[PLACE].norm() < SAME_M]
+        if same:
+            found[same[0]] = (found[same[0]][0], found[same[0]][1] + 1)
+        else:
+            found.append((card, 1))
+    often = sorted((one for one in found if one[1] >= OFTEN * len(episodes)), key=lambda one: -one[1])
+    for number, (card, _) in enumerate(often):
+        card[NUMBER] = number + 1
+    return [card.clone() for card, _ in often]
+
+
+def _in_sight(numbers: list[float], cards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
+    """Those of `numbers` whose cards should be well in sight from `pose` [7]."""
+    if not numbers:
+        return []
+    where, ahead = project(torch.stack([cards[number][PLACE] for number in numbers]), pose, camera)
+    seen = ((where[:, 0] - 0.5).abs() < 0.35) & (ahead > 0.5)
+    return [number for number, is_seen in zip(numbers, seen.tolist()) if is_seen]
+
+
+def _open(card: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
+    """Whether the eye of `row` saw as far as the place of `card`, a little above the ground."""
+    pose = torch.from_numpy(np.array(cache.pose[row], np.float32))
+    where, ahead = project(card[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
+    (u, v), far = where[0].tolist(), float(ahead[0])
+    if far < 0.3 or not (0 < u < 1 and 0 < v < 1):
+        return False
+    height, width = cache.depth.shape[1:]
+    return float(cache.depth[row, int(v * height), int(u * width)]) > far - 0.5
+
+
+class Next:
+    """What comes next of a thing: another look, a move, an end. Half of each batch are tokens in which something happens; each
+    counts by how much likelier than evenly it was drawn, so that what is rare stays as rare as it is."""
+
+    def __init__(self, objects: Objects, tokens: Tokens, recording: Recording, batch: int = 512):
+        self.objects, self.tokens, self.size = objects, tokens, batch
+        look = tokens.look
+        happens = ((look != NONE) & (look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
+        often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
+        self.often = often / often.sum()
+        self.actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
+        self.actions[torch.from_numpy(tokens.acts < 0)] = 0
+        optimiser = torch.optim.AdamW(objects.parameters(), 2e-3, weight_decay=1e-2)
+
+        def rate(now: Now) -> float:
+            return 2e-3 * min(1, (now.step + 1) / 100) * cosine(now.share, 0.02)
+
+        self.modules = {"objects": objects}
+        self.learners = {"objects": Learner(optimiser, (objects,), rate)}
+
+    def picked(self, now: Now) -> torch.Tensor:
+        return torch.multinomial(self.often, self.size, replacement=True, generator=now.noise)
+
+    def losses(self, batch: torch.Tensor, now: Now) -> Iterator[Loss]:
+        weight = 1 / len(self.often) / self.often[batch]
+        cards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
+        said = self.objects.foresee(cards, pose, self.actions[batch])
+        possible = (look != NONE) & self.objects.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
+        error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
+        error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
+        error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")
+        loss = (weight * error).mean()
+        yield Loss("objects", loss, {"objects": loss})

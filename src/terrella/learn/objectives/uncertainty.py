@@ -1,0 +1,297 @@
+"""Uncertainty: a trained world dreams recorded episodes again, and a network learns how wrong each frame came out.
+
+The generator stays as it is. Episodes are dreamt with the recordings' memory, with holes torn in it, without it, and from
+a lone picture, under the recorded actions or along the recorded poses; so invention is met without new recordings.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+
+from ...core.errors import DatasetError
+from ...core.state import State
+from ...core.world import Observation, make_rng
+from ...worlds.generator import Conditioning
+from ...worlds.learned import LearnedWorld
+from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyConfig, clues
+from ..feeds import Drawn
+from ..recording import Recording
+from ..run_folder import resume_file
+from ..trainer import Learner, Loss, Now, Report, Run, cosine
+
+MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
+ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
+SHOWN = (1, 3, 10)  # frames that a dream may be shown before it goes on alone
+DREAMT = "dreamt"  # the folder of the run that keeps them until the training is over
+_APART = 5  # one in so many episodes is for calibration
+_TENSORS = ("clues", "situation", "cells", "error", "episode", "arm")
+
+
+@dataclass(frozen=True)
+class Dreamt:
+    """N frames of dreams: their clues [N, CLUES, h, w] (half precision) and situations [N, S], how wrong they are in
+    cells [N, h / 2, w / 2] and on the whole [N], the number of their episode [N], and which of ARMS they are of [N]."""
+
+    clues: torch.Tensor
+    situation: torch.Tensor
+    cells: torch.Tensor
+    error: torch.Tensor
+    episode: torch.Tensor
+    arm: torch.Tensor
+
+    @staticmethod
+    def joined(parts: list[Dreamt]) -> Dreamt:
+        return Dreamt(*(torch.cat([vars(part)[name] for part in parts]) for name in _TENSORS))
+
+    def at(self, index: torch.Tensor) -> Dreamt:
+        return Dreamt(*(vars(self)[name][index] for name in _TENSORS))
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """How dreams are made: `frames` in all, `horizon` steps each, `batch` at a time; `seed` of everything random."""
+
+    frames: int = 12_000
+    horizon: int = 64
+    batch: int = 6
+    seed: int = 0
+
+    @property
+    def batches(self) -> int:
+        return max(2, math.ceil(self.frames / (self.batch * self.horizon)))
+
+
+def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frames: int) -> tuple[Uncertainty, dict]:
+    """The uncertainty of `world` and what is known of it: its `sure` and `invents` levels, and of episodes that neither
+    trained nor calibrated it the mean error and the mean that was expected."""
+    horizon = min(64, max(8, frames // 40), int(_ahead(recording).max()) - max(SHOWN))
+    if horizon < 8:
+        raise DatasetError(
+            f"no {max(SHOWN) + 8} rows in a row can be dreamt again to learn uncertainty from; record longer episodes."
+        )
+    seen = _kept(run.out / DREAMT, world, recording, Rollout(frames, horizon, seed=run.seed), run.report)
+    apart = seen.episode % _APART == 0
+    learned, others = seen.at((~apart).nonzero()[:, 0]), seen.at(apart.nonzero()[:, 0])
+    uncertainty = fit(run, learned, min(1500, max(20, frames // 6)))
+    half = others.episode // _APART % 2 == 0
+    if half.all() or not half.any():
+        half = torch.arange(len(half)) % 2 == 0
+    calibrate(uncertainty, others.at(half.nonzero()[:, 0]))
+    others = others.at((~half).nonzero()[:, 0])
+    expected = answers(uncertainty, others)
+    facts = {"sure": float(uncertainty.sure), "invents": float(uncertainty.invents), "frames": len(others.error)}
+    facts |= {"error": float(others.error.mean()), "expected": float(expected.mean())}
+    facts["rank_correlation"] = _rank_correlation(expected, others.error)
+    shutil.rmtree(run.out / DREAMT, ignore_errors=True)
+    return uncertainty, facts
+
+
+def forget(out: Path) -> None:
+    """Removes what a run has learned of its uncertainty so far."""
+    shutil.rmtree(out / DREAMT, ignore_errors=True)
+    resume_file(out, "uncertainty").unlink(missing_ok=True)
+
+
+def _kept(folder: Path, world: LearnedWorld, recording: Recording, rollout: Rollout, report: Report) -> Dreamt:
+    """All dreams, each batch kept in `folder` as soon as it is whole: a run that is stopped goes on with the next."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = []
+    for number in range(rollout.batches):
+        path = folder / f"{number:05d}.safetensors"
+        if not path.exists():
+            made = dream(world, recording, rollout, number)
+            save_file({name: vars(made)[name].contiguous() for name in _TENSORS}, path.with_suffix(".partial"))
+            path.with_suffix(".partial").replace(path)
+        parts.append(Dreamt(**load_file(path)))
+        report(
+            number + 1,
+            rollout.batches,
+            f"uncertainty: dreamt {(number + 1) * rollout.batch * rollout.horizon:,} frames",
+        )
+    return Dreamt.joined(parts)
+
+
+@torch.inference_mode()
+def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: int) -> Dreamt:
+    """One batch of episodes from the recording, dreamt again; the same seed and number give the same."""
+    rng = np.random.default_rng([rollout.seed, 7, number])
+    arms = ARMS if world.config.geometry else (MEMORY,)
+    arm = arms[number % len(arms)]
+    if arm == LONE and not world.estimator:
+        arm = NONE
+    alone, horizon = arm == LONE, rollout.horizon
+    shown = 1 if alone else int(rng.choice(SHOWN))
+    begins = _begins(recording, shown + horizon, rollout.batch, rng)
+    posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
+    noted: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def note(conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor) -> None:
+        noted.append((clues(conditioning, clean).half().cpu(), situation.cpu()))
+
+    dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=Asked(note))
+    chance = make_rng(int(rng.integers(2**62)))
+    state = dreamer.observe(_evidence(dreamer, recording, begins, alone), None, chance)
+    for row in range(1, shown):
+        state = dreamer.imagine(state, recording.played(dreamer.spec, begins + row - 1), chance)
+        state = dreamer.observe(_evidence(dreamer, recording, begins + row, alone), state, chance)
+    parts, episodes = [], torch.arange(len(begins)) + number * rollout.batch
+    for step in range(horizon):
+        rows = begins + shown + step
+        state = _onward(dreamer, state, recording, rows, posed, chance)
+        drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float() / 255
+        maps, situation = noted.pop()
+        off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)
+        cells = F.avg_pool2d(off, 2 * CELLS, ceil_mode=True, count_include_pad=False)
+        kind = torch.full((len(begins),), ARMS.index(arm))
+        parts.append(Dreamt(maps, situation, cells, off.mean((1, 2)), episodes, kind))
+    return Dreamt.joined(parts)
+
+
+def _onward(
+    world: LearnedWorld, state: State, recording: Recording, rows: np.ndarray, pose: bool, chance: torch.Generator
+) -> State:
+    if pose:
+        return world.observe({"pose": recording.pose(rows)}, state, chance)
+    return world.imagine(state, recording.played(world.spec, rows - 1), chance)
+
+
+def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int, arm: str, rng) -> LearnedWorld:
+    """`world` with the memory that is left in this arm."""
+    if arm == MEMORY:
+        return world
+    if arm in (NONE, LONE):
+        return world.without_memory()
+    middle = recording.pose(begins + int(rng.integers(0, horizon)))[:, :2].to(world.device)
+    away = (world.memory.pose[None, :, :2] - middle[:, None]).norm(dim=-1).amin(0)
+    left = (away > float(rng.uniform(2.0, 8.0))).nonzero()[:, 0]
+    return world.with_memory(world.memory.at(left))
+
+
+def _evidence(world: LearnedWorld, recording: Recording, rows: np.ndarray, alone: bool) -> Observation:
+    seen = recording.evidence(world.config, rows)
+    return {"rgb": seen["rgb"]} if alone else seen
+
+
+def _ahead(recording: Recording) -> np.ndarray:
+    """Of each row, how many follow one another from it on that may be seen, by valid actions in one episode: [N]."""
+    fine = recording.usable & np.asarray(recording.cache.action_valid)
+    if recording.cache.done is not None:
+        fine &= ~np.asarray(recording.cache.done)
+    last = np.append(recording.start[1:] != recording.start[:-1], True)
+    ends = np.flatnonzero(~fine | last)
+    rows = np.arange(len(fine))
+    end = ends[np.searchsorted(ends, rows)]
+    return np.where(fine, end - rows + fine[end], 0)
+
+
+def _begins(recording: Recording, length: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Rows from which `length` of the same episode may be seen."""
+    return rng.choice(np.flatnonzero(_ahead(recording) >= length), count)
+
+
+class Errors:
+    """By the likelihood of errors that scatter exponentially around the expected one, of frames and of their cells: the
+    expectation, not the median, is learned, and small errors count as much as large ones."""
+
+    def __init__(self, uncertainty: Uncertainty, seen: Dreamt):
+        self.uncertainty, self.seen = uncertainty, seen
+        optimiser = torch.optim.AdamW(uncertainty.parameters(), 3e-3, (0.9, 0.99), weight_decay=1e-3)
+
+        def rate(now: Now) -> float:
+            return 3e-3 * min(1, (now.step + 1) / 50) * cosine(now.share)
+
+        self.modules = {"uncertainty": uncertainty}
+        self.learners = {"uncertainty": Learner(optimiser, (uncertainty,), rate)}
+
+    def picked(self, now: Now) -> tuple[torch.Tensor, ...]:
+        """64 frames: their clues, situations, cells and errors; mirrored and in other colours now and then."""
+        pick = torch.from_numpy(now.rng.integers(0, len(self.seen.error), 64))
+        maps, cells = self.seen.clues[pick].float(), self.seen.cells[pick]
+        if now.rng.random() < 0.5:
+            maps, cells = maps.flip(-1), cells.flip(-1)
+        if now.rng.random() < 0.5:
+            colours = torch.from_numpy(now.rng.permutation(3))
+            maps = torch.cat([maps[:, colours], maps[:, 3 + colours], maps[:, 6:]], 1)
+        return maps, self.seen.situation[pick], cells, self.seen.error[pick]
+
+    def losses(self, batch: tuple[torch.Tensor, ...], now: Now) -> Iterator[Loss]:
+        maps, situation, cells, error = batch
+        answer = self.uncertainty(maps, situation)
+        loss = _unlikely(answer.mean((1, 2)), error) + 0.3 * _unlikely(answer, cells)
+        yield Loss("uncertainty", loss, {"unlikely": loss})
+
+
+def fit(run: Run, seen: Dreamt, steps: int) -> Uncertainty:
+    """An uncertainty that expects the errors that were `seen`."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(run.seed)
+        objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
+    run.stage("uncertainty", Drawn(objective.picked), objective, steps, device=torch.device("cpu")).run(run.report)
+    return objective.uncertainty.eval().requires_grad_(False)
+
+
+def calibrate(uncertainty: Uncertainty, seen: Dreamt) -> None:
+    """Isotonic regression (pool adjacent violators) of the error on the answer, in KNOTS bins of as many frames; and the
+    levels at which the page of play calls a world sure or inventing."""
+    answer = answers(uncalibrated(uncertainty), seen)
+    order = answer.argsort()
+    bins = [part for part in np.array_split(order.numpy(), KNOTS) if len(part)]
+    found = [float(answer[part].mean()) for part in bins]
+    meant = pooled([float(seen.error[part].mean()) for part in bins], [len(part) for part in bins])
+    while len(found) < KNOTS:
+        found, meant = [*found, found[-1]], [*meant, meant[-1]]
+    uncertainty.found.copy_(torch.tensor(found))
+    uncertainty.meant.copy_(torch.tensor(meant))
+    known = torch.tensor([arm == MEMORY for arm in ARMS])[seen.arm]
+    sure = seen.error[known].median() if known.any() else seen.error.quantile(0.25)
+    rest = seen.error[~known].quantile(0.6) if (~known).any() else seen.error.quantile(0.9)
+    uncertainty.sure.copy_(sure)
+    uncertainty.invents.copy_(torch.maximum(rest, 1.5 * sure))
+
+
+def uncalibrated(uncertainty: Uncertainty) -> Uncertainty:
+    """The same network, answering as it was learned."""
+    plain = Uncertainty(uncertainty.config)
+    plain.load_state_dict({**plain.state_dict(), **dict(uncertainty.named_parameters())})
+    return plain.eval().requires_grad_(False)
+
+
+@torch.inference_mode()
+def answers(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
+    """The calibrated error that `uncertainty` expects of each frame [N]."""
+    parts = torch.arange(len(seen.error)).split(256)
+    return torch.cat(
+        [uncertainty.calibrated(uncertainty(seen.clues[p].float(), seen.situation[p]).mean((1, 2))) for p in parts]
+    )
+
+
+def pooled(values: list[float], weights: list[float]) -> list[float]:
+    """The ascending sequence nearest to `values` in weighted squares (Ayer et al. 1955)."""
+    blocks: list[list[float]] = []  # mean, weight, count
+    for value, weight in zip(values, weights, strict=True):
+        blocks.append([value, weight, 1])
+        while len(blocks) > 1 and blocks[-2][0] >= blocks[-1][0]:
+            mean, heavy, count = blocks.pop()
+            below = blocks[-1]
+            total = below[1] + heavy
+            blocks[-1] = [(below[0] * below[1] + mean * heavy) / total, total, below[2] + count]
+    return [mean for mean, _, count in blocks for _ in range(int(count))]
+
+
+def _unlikely(expected: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    return (expected.log() + error / expected).mean()
+
+
+def _rank_correlation(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Spearman's."""
+    ranks = torch.stack([values.argsort().argsort().double() for values in (a, b)])
+    return float(torch.corrcoef(ranks)[0, 1])

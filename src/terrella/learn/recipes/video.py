@@ -1,0 +1,287 @@
+"""train video: a recording into a playable world, in stages: motion, outcome, objects, generator, estimator, uncertainty."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...core.errors import DatasetError, TrainingError
+from ...space.keyframes import Keyframes
+from ...worlds.body import Motion, MotionBody
+from ...worlds.config import VideoConfig
+from ...worlds.folder import save_world
+from ...worlds.generator import Generator
+from ...worlds.history import FrameHistory, Starts
+from ...worlds.learned import About, LearnedWorld
+from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
+from ...worlds.outcome import Constant, ConstantConfig, Outcome
+from ...worlds.places import KeyframeScene
+from ..feeds import frames_feed
+from ..objectives.flow import Flow
+from ..objectives.motion import learn_motion
+from ..objectives.objects import learn_objects
+from ..objectives.outcome import Happenings, Pieces, learn_outcome
+from ..objectives.uncertainty import forget
+from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
+from ..strips import draw_strip
+from ..trainer import Report, Run, Trainer, device_named
+from .uncertainty import SensesConfig, learn_senses
+
+NEEDS = (
+    "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
+)
+MAY_CHANGE = ("hours", "device", "learning_rate", "save_every_s", "strip_every_s")  # settings, within a run
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of a training run.
+
+    Args:
+        name: Name of the world.
+        size: Height and width of its frames in pixels.
+        geometry: Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
+        channels: Channels of the generator at 1/2, 1/4, 1/8, ... of the size.
+        frames: Last frames that a world without geometry sees.
+        objects_steps: Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a
+            recording that tells objects apart. 0 draws them like everything else.
+        outcome_steps: Training steps of the model that predicts reward, end and vitals.
+        moving: Learn what moves (monsters, doors, pick-ups), if a recording with depth and poses marks it.
+        flow_steps: Steps in which a frame is drawn. With more than one the whole flow from noise to frame is learned, so that
+            a frame is a sample and not a mean: a teacher for `train distil`.
+        steps: Training steps of the generator. Training ends after these or after `hours`.
+        hours: Hours of training, those of earlier runs included.
+        batch: Frames per step. Default: 8 on a CPU, 64 on a GPU.
+        learning_rate: Highest learning rate of the generator.
+        motion_steps: Training steps of the motion model.
+        keyframes: Number of recorded keyframes that the world remembers.
+        keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees, to score new places.
+        critic_from: Step from which a critic judges sharpness.
+        critic_weight: Weight of the critic, relative to the loss.
+        estimator_steps: Training steps of the depth and odometry estimator. 0 leaves it out.
+        uncertainty_frames: Predicted frames from which the uncertainty is learned. 0 leaves it out.
+        save_every_s: Seconds between saves.
+        strip_every_s: Seconds between pictures of truth and prediction.
+        seed: Random seed.
+        device: cpu, cuda or auto.
+    """
+
+    name: str = "world"
+    size: tuple[int, int] = (96, 128)
+    geometry: bool = True
+    channels: tuple[int, ...] = (32, 56, 88, 128)
+    frames: int = 4
+    outcome_steps: int = 1500
+    objects_steps: int = 2500
+    moving: bool = True
+    flow_steps: int = 1
+    steps: int = 8000
+    hours: float = 24.0
+    batch: int | None = None
+    learning_rate: float = 8e-4
+    motion_steps: int = 6000
+    keyframes: int = 640
+    keep_out: Box | None = None
+    critic_from: int = 1500
+    critic_weight: float = 0.3
+    estimator_steps: int = 2500
+    uncertainty_frames: int = 9000
+    save_every_s: float = 120.0
+    strip_every_s: float = 300.0
+    seed: int = 0
+    device: str = "auto"
+
+
+def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> dict:
+    """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
+    if any(length < 16 or length % 8 for length in config.size):
+        raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
+    device = device_named(config.device)
+    recording = Recording.open(data, config.size, report, needs=("rgb", "action"), why=NEEDS)
+    recipe = {name: value for name, value in asdict(config).items() if name not in MAY_CHANGE}
+    times = {"save_every_s": config.save_every_s, "strip_every_s": config.strip_every_s}
+    run = Run(Path(out), {**recipe, "frames": recording.cache.length}, report, config.seed, device, **times)
+    torch.manual_seed(config.seed)
+    return _Learned(run, recording, config).learn()
+
+
+def plan(recording: Recording, config: TrainConfig) -> VideoConfig:
+    """What kind of world can be learned of a recording."""
+    cache, controls = recording.cache, recording.controls
+    posed = config.geometry and recording.posed
+    moving = posed and config.moving and THINGS in cache.arrays
+    objects = moving and there(cache, OBJECTS) and there(cache, INSTANCES) and config.objects_steps > 0
+    if objects and cache.arrays[OBJECTS].shape[1:] != (ROWS, 4):
+        raise DatasetError(
+            f"{recording.name} lists objects as {cache.arrays[OBJECTS].shape[1:]}, and {(ROWS, 4)} is read: number and place "
+            f"of up to {ROWS}. Record it so, or train with --objects-steps 0."
+        )
+    return VideoConfig(
+        tuple(cache.world["camera"]) if posed else (1.0, 1.0, 0.5, 0.5),
+        controls.numbers,
+        config.size,
+        config.channels,
+        slots=3 if posed else config.frames,
+        geometry=posed,
+        steps=config.flow_steps,
+        residual=not posed and config.flow_steps == 1,
+        moving=moving,
+        objects=objects,
+    )
+
+
+class _Learned:
+    """The parts of a world, which its stages train one after another."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig):
+        self.run, self.config, self.video = run, config, plan(recording, config)
+        if config.keep_out is not None:
+            if not self.video.geometry:
+                raise DatasetError(
+                    f"{recording.name} has no poses, so no part of its map can be kept out; drop --keep-out."
+                )
+            usable = Recording.of(recording.cache, recording.seen, config.keep_out).usable
+            recording = replace(recording, usable=usable)
+        self.recording = recording.enough()
+        known = ObjectsConfig(self.video.actions, self.video.history)
+        self.objects = Objects(known) if self.video.objects else None
+        self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable)
+        self.outcome: Outcome | None = None
+        if self.happened.tells_something and (self.video.moving or not self.video.geometry):
+            begins = _at_first(self.happened.vitals, recording)
+            self.video = replace(self.video, vitals=begins)
+            self.outcome = Outcome(replace(self.happened.config(), begins=begins)).to(run.device)
+        self.memory = self._memory() if self.video.geometry else None
+        parts = config.flow_steps, config.learning_rate, config.critic_from, config.critic_weight
+        self.flow = Flow(Generator(self.video.generator), *parts)
+        self.motion = Motion(self.video.motion)
+        self.facts: dict = {}
+
+    def _memory(self) -> Keyframes:
+        rows = np.flatnonzero(self.recording.usable)
+        picks = choose_keyframes(np.asarray(self.recording.cache.pose), rows, self.config.keyframes)
+        return self.recording.sharp_keyframes(picks, self.video.camera)
+
+    def learn(self) -> dict:
+        """All stages; each goes on where it was stopped."""
+        config, run, recording = self.config, self.run, self.recording
+        batch = config.batch or (64 if run.device.type == "cuda" else 8)
+        dream = self.flow.dream if config.flow_steps == 1 else None  # a teacher sees recorded frames alone
+        feed = frames_feed(recording, self.memory, self.video, batch, config.seed, dream)
+        trainer = run.stage("flow", feed, self.flow, config.steps, config.hours)
+        if self.memory is not None:
+            self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
+        if self.outcome is not None:
+            pieces = Pieces(self.outcome, recording.rgb, self.happened)
+            self.facts |= learn_outcome(run, pieces, config.outcome_steps)
+        if self.objects is not None:
+            starts, rgb = recording.pose(self._beginnings()), recording.dataset.rgb_at
+            parts = self.objects, recording, rgb, starts, self.video.camera, config.objects_steps
+            self.facts |= learn_objects(run, *parts)
+        done = (run.out / "world" / "world.json").exists() and "senses" in trainer.facts
+        if not trainer.finished:
+            forget(run.out)  # it knew the errors of an earlier generator
+            trainer.facts.pop("senses", None)
+            done = False
+        trainer.run(run.report, lambda: self.draw_strip(trainer))
+        if not done:
+            self._finish(trainer)
+        senses = trainer.facts.pop("senses")
+        return {"world": str(run.out / "world"), **trainer.told, **self.facts, **senses}
+
+    def _finish(self, trainer: Trainer) -> None:
+        """The last strip, and the estimator and uncertainty of the finished world."""
+        config = self.config
+        self.draw_strip(trainer)
+        world = self.world(trainer)
+        settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
+        sensing, facts = learn_senses(self.run, world, self.recording, config.keep_out, settings)
+        save_world(sensing.replaced(card=facts), self.run.out / "world")
+        trainer.once("senses", lambda: facts)
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""
+        recording, cache, about = self.recording, self.recording.cache, self.recording.cache.world
+        names = about.get("action_names") or cache.action_names  # of a choice, the recording names each
+        named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
+        assert recording.controls is not None  # see NEEDS
+        what = About(self.config.name, recording.controls, *named, ignored=recording.ignored)
+        generator = copy.deepcopy(self.flow.smooth.module).cpu().float()
+        usual = float(np.median(self.happened.reward))
+        if self.memory is None:
+            outcome = self._outcome(ConstantConfig(usual))
+            scene = FrameHistory(self.video.frames, self._starts())
+            return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
+        ends = self.happened.done & np.array(cache.action_valid)
+        outcome = self._outcome(ConstantConfig(usual, _ending_pays(self.happened.reward - usual, ends)))
+        starts = open_views(self.memory, 32)
+        if self.video.moving:  # monsters wait where episodes begin, and the player is well
+            first = self._beginnings()
+            starts = recording.sharp_keyframes(first, self.video.camera) if len(first) else starts
+        fitted = {name: self.facts[name] for name in ("body_m", "short")}
+        body = MotionBody(copy.deepcopy(self.motion), replace(self.video.motion, **fitted))
+        scene = KeyframeScene(self.video.keyframes, self.memory, starts)
+        objects = copy.deepcopy(self.objects)
+        return LearnedWorld(what, scene=scene, generator=generator, body=body, objects=objects, outcome=outcome)
+
+    def _outcome(self, constant: ConstantConfig) -> Outcome | Constant:
+        return Constant(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
+
+    def _card(self, trainer: Trainer) -> dict:
+        recording, parts = self.recording, [self.flow.generator] + [self.motion] * (self.memory is not None)
+        source, episodes = recording.dataset, len(recording.cache.episodes) - len(recording.held_out)
+        name = recording.cache.world.get("name", source.root.name)
+        return {
+            "what": f"Learned from {source.length:,} frames of {name}",
+            "data": f"{recording.usable.sum():,} frames, {episodes} episodes",
+            "steps": trainer.facts["step"],
+            "hours": round(trainer.facts["seconds"] / 3600, 2),
+            "keep_out": self.config.keep_out,
+            "keyframes": 0 if self.memory is None else len(self.memory),
+            "parameters": sum(weight.numel() for module in parts for weight in module.parameters()),
+            **self.facts,
+        }
+
+    def _beginnings(self) -> np.ndarray:
+        """Some 32 rows with which episodes begin."""
+        first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
+        return first[:: max(1, len(first) // STARTS)][:STARTS]
+
+    def _starts(self) -> Starts:
+        """Where episodes begin in a world without geometry: some 32 moments of the recording, evenly."""
+        slots, recording = self.video.slots, self.recording
+        since = np.arange(recording.cache.length) - recording.start
+        rows = np.flatnonzero(self.happened.real & (since >= slots))  # from which it goes on
+        if not len(rows):
+            raise DatasetError(f"no episode is longer than the {slots} frames of history that one begins with.")
+        rows = rows[:: max(1, len(rows) // 32)]
+        frames = rows[:, None] - np.arange(slots)
+        return Starts(
+            recording.rgb(frames.ravel()).view(*frames.shape, 3, *self.video.size),
+            recording.actions_before(rows, np.arange(1, slots + 1)),
+            torch.from_numpy(self.happened.vitals[rows]),
+        )
+
+    def draw_strip(self, trainer: Trainer) -> None:
+        """Truth above dream, with the memory and without; and the world as it now is, so that it can be played while it
+        learns."""
+        world = self.world(trainer)
+        worlds = (world, world.without_memory()) if self.video.geometry else (world,)
+        draw_strip(worlds, self.recording, self.run.out / f"strip-{trainer.facts['step']:06d}.png")
+        save_world(world, self.run.out / "world")
+
+
+def _at_first(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:
+    """The vitals [N, V] with which episodes begin."""
+    first = np.unique(recording.start[recording.usable])
+    return tuple(float(value) for value in np.median(vitals[first], 0))
+
+
+def _ending_pays(extra: np.ndarray, ends: np.ndarray) -> float:
+    """Reward above the usual in the last steps before an episode's end (games may pay a step or two before it)."""
+    rows = np.flatnonzero(ends)
+    return float(np.mean([extra[max(row - 3, 0) : row + 1].sum() for row in rows])) if len(rows) else 0.0

@@ -1,0 +1,238 @@
+"""Recording: the rows of a recording as tensors on demand, which of them training may see, and which become a memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ..core.errors import DatasetError
+from ..core.spec import Spec
+from ..data import ClipCache, Dataset, split
+from ..space.camera import Intrinsics, yaw
+from ..space.floorplan import Box, horizon, sees_into
+from ..space.keyframes import Keyframes, doubled
+from ..space.reproject import least_around
+from ..worlds.config import VideoConfig
+from ..worlds.controls import AXES, CHOICE, Controls
+from ..worlds.moving import covering, still
+from .trainer import Report
+
+THINGS = "observation.things"  # the channel that marks what may move or vanish
+OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
+FEWEST = 64  # frames that can be trained on
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rows of a clip cache as tensors on demand; `start[row]` is the first row of its episode."""
+
+    cache: ClipCache
+    start: np.ndarray
+    usable: np.ndarray  # rows that training may see
+    controls: Controls | None = None  # what its actions mean; None: buttons
+    dataset: Dataset | None = None  # where its pictures lie at their full size
+    held_out: tuple[int, ...] = ()  # episodes that training does not see
+
+    @staticmethod
+    def open(
+        data: str | Path,
+        size: tuple[int, int],
+        report: Report,
+        keep_out: Box | None = None,
+        needs: tuple[str, ...] = ("rgb",),
+        why: str = "a world of pictures is learned from them",
+    ) -> Recording:
+        """The recording `data` with pictures at `size` (height, width). Every 20th episode is held out, and so are the rows
+        from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or rows."""
+        dataset = Dataset(data)
+        cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
+        lacks = [name for name in needs if not there(cache, name)]
+        if lacks:
+            raise DatasetError(f"{data} holds no {', '.join(lacks)}; {why}.")
+        if keep_out is not None and not there(cache, "pose"):
+            raise DatasetError(f"{data} has no poses, so no part of its map can be kept out; drop --keep-out.")
+        train, held_out = split(len(cache.episodes))
+        found = Recording.of(cache, train, keep_out)
+        return replace(found, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+
+    @staticmethod
+    def of(cache: ClipCache, episodes: list[int], keep_out: Box | None) -> Recording:
+        """The rows of `episodes` from which nothing in the box `keep_out` is seen."""
+        start = np.zeros(cache.length, np.int64)
+        for first, last in cache.episodes:
+            start[first:last] = first
+        fx, fy, cx, cy = cache.world.get("camera") or (1.0, 1.0, 0.5, 0.5)
+        return Recording(cache, start, usable_rows(cache, episodes, keep_out, (fx, fy, cx, cy)))
+
+    def enough(self) -> Recording:
+        """The same; DatasetError where too little of it may be trained on."""
+        if self.usable.sum() < FEWEST:
+            raise DatasetError(
+                f"{self.name} leaves {self.usable.sum()} frames to train on; record more, or a smaller keep_out."
+            )
+        return self
+
+    @property
+    def name(self) -> str:
+        return "the recording" if self.dataset is None else str(self.dataset.root)
+
+    @property
+    def seen(self) -> list[int]:
+        """The episodes that training sees."""
+        return [number for number in range(len(self.cache.episodes)) if number not in self.held_out]
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Cameras of the recording that training does not see: it learns from the main one."""
+        source = self.dataset
+        return () if source is None else tuple(name for name in source.cameras if name != source.rgb_key)
+
+    @property
+    def posed(self) -> bool:
+        """Whether it has depth, poses and a camera."""
+        return all(there(self.cache, name) for name in ("depth", "pose", "camera"))
+
+    def rgb(self, rows) -> torch.Tensor:
+        """uint8 [n, 3, H, W]"""
+        return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
+
+    def action(self, rows) -> torch.Tensor:
+        """float32 [n, A], as networks are given it."""
+        action = torch.from_numpy(np.array(self.cache.action[rows], np.float32))
+        return action if self.controls is None else self.controls.encode(action)
+
+    def actions_before(self, rows: np.ndarray, back: np.ndarray) -> torch.Tensor:
+        """float32 [n, len(back), A]: the actions `back` rows before `rows`; zero before an episode's first."""
+        wanted = rows[:, None] - back
+        action = self.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
+        return torch.where(torch.from_numpy(wanted >= self.start[rows][:, None])[..., None], action, 0.0)
+
+    def depth(self, rows) -> torch.Tensor:
+        """float32 [n, H, W] metres at the size of the frames, whatever size was recorded."""
+        depth = torch.from_numpy(np.asarray(self.cache.depth[rows], np.float32)).clamp(0.1, 60.0)
+        return F.interpolate(depth[:, None], self.cache.rgb.shape[1:3], mode="nearest-exact")[:, 0]
+
+    def pose(self, rows) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
+
+    def things(self, rows) -> torch.Tensor:
+        """float32 [n, H, W], 1 where something is that may move or vanish; 0 everywhere where that was not recorded."""
+        recorded = self.cache.arrays.get(THINGS)
+        height, width = self.cache.rgb.shape[1:3]
+        if recorded is None:
+            return torch.zeros(len(rows), height, width)
+        things = torch.from_numpy(np.asarray(recorded[rows], np.float32))
+        return F.adaptive_max_pool2d(things[:, None], (height, width))[:, 0]
+
+    def instances(self, rows) -> torch.Tensor:
+        """uint8 [n, H, W], which row of `objects` is seen at a pixel, counted from 1 (0: none)."""
+        recorded = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
+        return F.adaptive_max_pool2d(recorded[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
+
+    def covered(self, rows) -> torch.Tensor:
+        """bool [n, H, W], see worlds/moving.covering."""
+        return covering(self.instances(rows), self.things(rows))
+
+    def lasting(self, rows) -> torch.Tensor:
+        """The depth [n, H, W] that a keyframe may hold: 0 where things are and right beside them, where a film bleeds."""
+        kept = still(self.depth(rows), self.things(rows))
+        return torch.where(least_around(kept) > 0, kept, 0.0)
+
+    def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:
+        """What a world of this make observes of `rows`."""
+        seen = {"rgb": self.rgb(rows).permute(0, 2, 3, 1).contiguous()}
+        if config.geometry:
+            seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
+        if config.moving:
+            seen["things"] = self.things(rows)
+        if config.objects:
+            seen["instances"] = self.instances(rows)
+            seen["objects"] = torch.from_numpy(np.array(self.cache.arrays[OBJECTS][rows], np.float32))
+        return seen
+
+    def played(self, spec: Spec, rows) -> torch.Tensor:
+        """The actions of `rows` as the world of `spec` takes them: [n, *spec.action.shape]."""
+        actions = np.asarray(self.cache.action[rows]).astype(spec.action.dtype)
+        return torch.from_numpy(actions).view(len(rows), *(spec.action.shape or ()))
+
+    def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
+        """As a dream keeps its own."""
+        return Keyframes.of(doubled(self.rgb(rows)), self.lasting(rows), self.pose(rows), camera)
+
+    def sharp_keyframes(self, rows: np.ndarray, camera: Intrinsics) -> Keyframes:
+        """Twice the size of the frames, like those of a dream, from the pictures as they were recorded."""
+        rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).float()
+        size = [2 * length for length in self.cache.rgb.shape[1:3]]
+        rgb = F.interpolate(rgb, size, mode="area" if rgb.shape[-1] >= size[1] else "nearest-exact")
+        return Keyframes.of(rgb.round().to(torch.uint8), self.lasting(rows), self.pose(rows), camera)
+
+
+def there(cache: ClipCache, name: str) -> bool:
+    """Whether a recording has a channel, by its name or by its key ("observation.things")."""
+    if name == "camera":
+        return bool(cache.world.get("camera"))
+    return getattr(cache, name, None) is not None or name in cache.arrays
+
+
+def controls_of(cache: ClipCache) -> Controls | None:
+    """What the actions of a recording mean: as its world said, else as they look (buttons where all are 0 or 1); None where
+    it has none."""
+    if cache.action is None:
+        return None
+    low, high = cache.world.get("action_low"), cache.world.get("action_high")
+    whole = bool(cache.world.get("discrete"))
+    if low is None or high is None:
+        action = np.asarray(cache.action)
+        low, high = action.min(0).tolist(), action.max(0).tolist()
+        buttons = not whole and bool(np.isin(action, (0, 1)).all())
+    else:
+        buttons = str(cache.world.get("action_space")).startswith("MultiBinary")
+    if buttons:
+        return Controls.buttons(cache.action.shape[1])
+    return Controls(CHOICE if whole else AXES, tuple(map(float, low)), tuple(map(float, high)))
+
+
+def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
+    """Rows of `episodes` in which the camera neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
+    usable = np.zeros(cache.length, bool)
+    for episode in episodes:
+        usable[slice(*cache.episodes[episode])] = True
+    if keep_out is None:
+        return usable
+    x0, y0, x1, y1 = keep_out
+    pose = torch.from_numpy(np.array(cache.pose))
+    usable &= ~((pose[:, 0] > x0) & (pose[:, 0] < x1) & (pose[:, 1] > y0) & (pose[:, 1] < y1)).numpy()
+    rows = np.flatnonzero(usable)
+    row = horizon(camera, cache.depth.shape[1])
+    for some in np.array_split(rows, max(1, len(rows) // 4096)):
+        level = torch.from_numpy(np.asarray(cache.depth[some, row], np.float32))
+        usable[some[sees_into(keep_out, level, pose[some], camera).numpy()]] = False
+    return usable
+
+
+def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_turn: float = 6.0) -> np.ndarray:
+    """`count` of `rows` that cover places and headings evenly: farthest-point sampling of (x, y, heading)."""
+    turn = yaw(torch.from_numpy(np.array(pose[rows]))).numpy()
+    scale = metres_per_turn / (2 * np.pi)
+    points = np.concatenate([pose[rows][:, :2], scale * np.cos(turn)[:, None], scale * np.sin(turn)[:, None]], 1)
+    picks, gap = [0], np.full(len(rows), np.inf)
+    while len(picks) < min(count, len(rows)):
+        gap = np.minimum(gap, np.square(points - points[picks[-1]]).sum(1))
+        picks.append(int(gap.argmax()))
+    return np.sort(rows[picks])
+
+
+def open_views(memory: Keyframes, count: int) -> Keyframes:
+    """`count` of the keyframes, spread over the map, among the quarter that looks farthest: a good place to begin."""
+    far = memory.depth.flatten(1).median(1).values.argsort(descending=True)[: max(count, len(memory) // 4)]
+    return memory.at(torch.from_numpy(choose_keyframes(memory.pose.numpy(), far.sort().values.numpy(), count)))
+
+
+def box_of(card: Any) -> Box | None:
+    """The box x0 y0 x1 y1 that a world's card says was kept out of its training."""
+    return (float(card[0]), float(card[1]), float(card[2]), float(card[3])) if isinstance(card, (list, tuple)) else None

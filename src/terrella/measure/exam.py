@@ -1,0 +1,202 @@
+"""What is asked of whom: the arms, the clips, the settings; and the dreams of them that several probes read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..core.world import World, make_rng
+from .album import Album
+from .clips import Clip
+from .roll import Results, Watch, can_idle, dream, true_motion_works
+from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report
+from .work import Unit
+
+CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: of figures, of drift, those that may run into an end
+
+
+@dataclass(frozen=True)
+class ExamConfig:
+    """horizons: steps at which figures are given; control_horizons: where true actions are set against another player's and
+    against none; batch: clips rolled together; strips: clips of each place whose pictures are kept; walked_m: clips that
+    went less far have no share of it; drop: PSNR at the first horizon less that at the second; frechet: compare looks
+    through the fixed encoder; true_motion: also along the true poses; closure_deg: how far the camera turns before it comes
+    back; closure_walk: steps of the walk there and back, 0 for none; long_steps: of the long rollouts, 0 for none;
+    speed_steps: 0 for none."""
+
+    horizons: tuple[int, ...] = (1, 8, 32, 64, 128)
+    control_horizons: tuple[int, ...] = (8, 32)
+    drop: tuple[int, int] = (8, 64)
+    batch: int = 16
+    strips: int = 3
+    walked_m: float = 0.5
+    frechet: bool = True
+    true_motion: bool = True
+    closure_deg: tuple[float, ...] = (90.0, 180.0)
+    closure_step_deg: float = 6.0
+    closure_walk: int = 100
+    closure_clips: int = 24
+    long_steps: int = 1000
+    long_rollouts: int = 8
+    speed_steps: int = 400
+
+    @staticmethod
+    def quick(horizons: tuple[int, ...] = (1, 8, 32)) -> ExamConfig:
+        """Of which doom-maze is through within a minute on two cores."""
+        return ExamConfig(
+            horizons=horizons, control_horizons=(horizons[-1],), batch=8, strips=1, true_motion=False, closure_deg=(180.0,),
+            closure_step_deg=15.0, closure_walk=0, closure_clips=4, long_steps=0, speed_steps=50,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Exam:
+    """arms: the worlds by name, the first is the one that is asked about; sets: CLIPS, LONG and ENDINGS by place; going: of
+    ENDINGS, bool [T] a clip, rows whose action was played; album: real frames by place; closing: more arms, of which only
+    memory is asked; seed: of everything that is drawn."""
+
+    arms: Mapping[str, World]
+    sets: Mapping[str, Mapping[str, Sequence[Clip]]]
+    config: ExamConfig
+    seed: int = 0
+    going: Mapping[str, np.ndarray] = field(default_factory=dict)
+    album: Album | None = None
+    closing: Mapping[str, World] = field(default_factory=dict)
+    _known: dict[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def places(self) -> Mapping[str, Sequence[Clip]]:
+        return self.sets[CLIPS]
+
+    @property
+    def dt_s(self) -> float:
+        return next(iter(self.arms.values())).spec.dt_s
+
+    def rng(self, number: int = 0) -> torch.Generator:
+        """Chance for one purpose: always the same, whatever was drawn before."""
+        return make_rng(self.seed + number)
+
+    def once(self, name: str, make: Callable[[], Any]) -> Any:
+        """What `make` gives, made once."""
+        if name not in self._known:
+            self._known[name] = make()
+        return self._known[name]
+
+    def shared(self, world: World, *names: str) -> list[str]:
+        """Channels of these kinds that the world shows and every clip holds at the world's shape, the main one first."""
+        clip = next(iter(self.places.values()))[0]
+        both = [name for kind in names for name in world.spec.kinds(kind) if name in clip.channels]
+        return [name for name in both if tuple(world.spec.channels[name].shape or ()) == clip.channels[name].shape[1:]]
+
+    def follows_poses(self, world: World) -> bool:
+        """Whether the world draws what is seen from a pose that it is given."""
+        clip = next(iter(self.places.values()))[0]
+        return self.once(f"poses {id(world)}", lambda: true_motion_works(world, clip, self.rng()))
+
+    def fingerprint(self, identity: str = "") -> str:
+        """What must be the same for kept results to count."""
+        drawn = {
+            f"{kind} {place}": [
+                (int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action)) for clip in some
+            ]
+            for kind, places in self.sets.items()
+            for place, some in places.items()
+        }
+        arms = {arm: repr(world.spec) for arm, world in {**self.arms, **self.closing}.items()}
+        return json.dumps([identity, self.seed, asdict(self.config), arms, drawn])
+
+
+@dataclass(frozen=True)
+class Found:
+    """Results of units by key."""
+
+    results: Mapping[str, Results]
+
+    def joined(self, kind: str) -> Results:
+        """Batches of clips as one; empty where nothing of that kind was done."""
+        parts, number = [], 0
+        while (part := self.results.get(f"{kind}|{number}")) is not None:
+            parts.append(part)
+            number += 1
+        return {name: torch.cat([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+
+    def dreamt(self, of: str, arm: str, place: str, motion: str) -> Results:
+        return self.joined(f"dream|{of}|{arm}|{place}|{motion}")
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A question to every arm. name and `question` head its section, `lead` is the text below; missing(exam, world): what it
+    needs and lacks ("needs pose"), "" where it can be asked; watch(exam, world, of): what it keeps of the dreams that the
+    probes share; units: work of its own; report: figures of what was found."""
+
+    name: str
+    question: str
+    lead: str
+    missing: Callable[[Exam, World], str]
+    report: Callable[[Exam, Found], Report]
+    watch: Callable[[Exam, World, str, int], list[Watch]] = lambda exam, world, of, first: []
+    units: Callable[[Exam], list[Unit]] = lambda exam: []
+
+
+def batches(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[int, Sequence[Clip]]]:
+    """(number of the first clip, clips) of as many clips at once as is asked for and the world takes."""
+    size = min(exam.config.batch, world.spec.max_batch or exam.config.batch)
+    return [(first, clips[first : first + size]) for first in range(0, len(clips), size)]
+
+
+def motions_of(exam: Exam, world: World, of: str, clips: Sequence[Clip]) -> dict[str, int]:
+    """What is dreamt of a set of clips, and for how many steps."""
+    if not world.spec.observes:
+        return {}
+    config = exam.config
+    steps = clips[0].horizon if of != CLIPS else max(config.horizons)
+    found = {PREDICTED: steps}
+    if of == ENDINGS:
+        return found
+    if config.true_motion and exam.follows_poses(world):
+        found[TRUE] = steps
+    control = [step for step in config.control_horizons if step <= steps]
+    if of == CLIPS and control:
+        found |= {OTHERS: max(control)} if len(clips) > 1 else {}
+        found |= {IDLE: max(control)} if can_idle(world.spec) else {}
+    return found
+
+
+def dreams(exam: Exam, probes: Sequence[Probe]) -> list[Unit]:
+    """The dreams that the probes watch, in batches; arms see the same clips, random numbers and "other" actions."""
+    units = []
+    for of, places in exam.sets.items():
+        for place, clips in places.items():
+            order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
+            turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
+            others = [clips[turn[number]] for number in range(len(clips))]
+            for arm, world in exam.arms.items():
+                for motion, steps in motions_of(exam, world, of, clips).items():
+                    for number, (first, some) in enumerate(batches(exam, world, clips)):
+                        watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
+                        if watches:
+                            hands = others[first : first + len(some)]
+                            key = f"dream|{of}|{arm}|{place}|{motion}|{number}"
+                            units.append(_dream(exam, key, arm, world, some, motion, steps, first, watches, hands))
+    return units
+
+
+def _dream(exam, key, arm, world, clips, motion, steps, first, watches, others) -> Unit:
+    verb = "pose" if motion == TRUE else "imagine"
+    calls = {(arm, "observe"): len(clips) * clips[0].context, (arm, verb): len(clips) * steps}
+    place = key.split("|")[3]
+    words = f"{arm}, {place} places, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
+    return Unit(
+        key, words, calls,
+        lambda tick: dream(world, clips, motion, steps, exam.rng(1000 + first), watches, others, tick),
+    )  # fmt: skip
+
+
+def _sum(values: np.ndarray) -> float:
+    return float(np.asarray(values, np.float64).sum())

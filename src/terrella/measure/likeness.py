@@ -1,0 +1,164 @@
+"""What any measure of likeness is reported as: figures and curves beside copy-last, other actions, no action; drift."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from .clips import Clip
+from .exam import CLIPS, LONG, Exam, Found, Probe
+from .roll import Results
+from .scorecard import COPY_LAST, IDLE, OTHERS, PREDICTED, TRUE, Curve, Report, Row
+from .statistics import last_step_above, mean_band, mean_interval
+
+FALL_DB = 10 * math.log10(2)  # twice the squared error
+
+
+@dataclass(frozen=True)
+class Series:
+    """A measure of every step. values [n, T] of what was dreamt; copied [n, T]: the same of the last row shown."""
+
+    channel: str
+    what: str
+    unit: str
+    better: int
+    values: torch.Tensor
+    copied: torch.Tensor
+
+    @property
+    def gain(self) -> torch.Tensor:
+        """[n, T]: by how much it is better than copying."""
+        return self.better * (self.values - self.copied)
+
+
+Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
+SeriesOf = Callable[
+    [Exam, Found, str, str, Sequence[Clip], Results], list[Series]
+]  # exam, found, set, place, clips, dreamt
+
+
+def report(exam: Exam, found: Found, probe: str, series_of: SeriesOf) -> Report:
+    """Rows at the horizons, curves at every step, of all arms and places; then those of the long clips."""
+    whole, config = Report(), exam.config
+    for place, clips in exam.places.items():
+        copied: set[str] = set()
+        for arm in exam.arms:
+            made = {
+                motion: _asked(motion, series_of(exam, found, CLIPS, place, clips, dreamt))
+                for motion in (PREDICTED, TRUE, OTHERS, IDLE)
+                if (dreamt := found.dreamt(CLIPS, arm, place, motion))
+            }
+            for motion in (PREDICTED, TRUE):
+                for number, series in enumerate(made.get(motion, ())):
+                    strangers = {name: made[name][number] for name in (OTHERS, IDLE) if name in made}
+                    where = probe, series.channel, series.what, series.unit, place
+                    for step in config.horizons:
+                        whole.rows.append(_row(exam, where, arm, motion, step, series, strangers))
+                    whole.curves.append(_curve(exam, where, arm, motion, series.values))
+                    if (name := f"{series.channel} {series.what}") not in copied:
+                        copied.add(name)
+                        whole.curves.append(_curve(exam, where, COPY_LAST, "", series.copied))
+            whole.rows += _control(exam, place, arm, made)
+    return whole
+
+
+def drift(exam: Exam, found: Found, series_of: SeriesOf) -> Report:
+    """The long clips' curves, and how far each can be used.
+
+    A dream's PSNR can be used up to the last step before it has fallen by 3.01 dB (twice the squared error) from its own
+    first, and from copy-last's first, one yardstick for all; whatever else, as long as it is better than copy-last.
+    """
+    whole = Report()
+    for place, clips in exam.sets.get(LONG, {}).items():
+        still: dict[str, tuple[Where, Series]] = {}
+        for arm in exam.arms:
+            for motion in (PREDICTED, TRUE):
+                dreamt = found.dreamt(LONG, arm, place, motion)
+                made = series_of(exam, found, LONG, place, clips, dreamt) if dreamt else []
+                for series in _asked(motion, made):
+                    where = "drift", series.channel, series.what, series.unit, place
+                    _add_usable(exam, whole, where, arm, motion, series.values, series)
+                    still.setdefault(f"{series.channel} {series.what}", (where, series))
+        for where, series in still.values():
+            _add_usable(exam, whole, where, COPY_LAST, "", series.copied, series)
+    return whole
+
+
+def _asked(motion: str, made: list[Series]) -> list[Series]:
+    """Poses that were given are not predicted."""
+    return [series for series in made if motion != TRUE or series.channel.partition(".")[0] != "pose"]
+
+
+def _row(
+    exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]
+) -> Row:
+    at, rng = step - 1, exam.rng
+    beside = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
+    if motion == PREDICTED:
+        reach = {name: other.values for name, other in strangers.items() if at < other.values.shape[1]}
+        beside |= {name: mean_interval(values[:, at], rng()) for name, values in reach.items()}
+    figure, gain = mean_interval(series.values[:, at], rng()), mean_interval(series.gain[:, at], rng())
+    return Row(*where, arm, motion, step, figure, series.better, beside, gain)
+
+
+def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor) -> Curve:
+    return Curve(*where, arm, motion, range(1, values.shape[1] + 1), mean_band(values, exam.rng()))
+
+
+def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) -> list[Row]:
+    """By how much the true actions are better than another player's, and than none, clip by clip."""
+    rows = []
+    for name in (OTHERS, IDLE):
+        for mine, theirs in zip(made.get(PREDICTED, ()), made.get(name, ())):
+            for step in exam.config.control_horizons:
+                if step <= theirs.values.shape[1]:
+                    values = mine.values[:, step - 1], theirs.values[:, step - 1]
+                    better = mean_interval(mine.better * (values[0] - values[1]), exam.rng())
+                    what = f"{mine.what}: true actions over {name}"
+                    where = "control", mine.channel, what, mine.unit, place, arm, PREDICTED, step
+                    rows.append(Row(*where, better, 1))
+    return rows
+
+
+def _add_usable(
+    exam: Exam, whole: Report, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series
+) -> None:
+    steps, mark = values.shape[1], None
+    if series.unit == "dB":
+        yardsticks = {
+            "steps within twice its first error": values[:, 0] - FALL_DB,
+            "steps within twice copy-last's first error": series.copied[:, 0] - FALL_DB,
+        }
+        usable = {what: last_step_above(values, floor, exam.rng()) for what, floor in yardsticks.items()}
+        mark = next(iter(usable.values())).value
+    elif arm == COPY_LAST:
+        usable = {}
+    else:
+        usable = {"steps better than copy-last": last_step_above(series.gain, torch.zeros(len(values)), exam.rng())}
+    probe, channel, what, unit, place = where
+    for words, figure in usable.items():
+        whole.rows.append(Row(probe, channel, f"{what}: {words}", "steps", place, arm, motion, steps, figure, 1))
+    curve = _curve(exam, (probe, channel, what, unit, place), arm, motion, values)
+    whole.curves.append(Curve(*where, arm, motion, curve.x, curve.band, mark or None))
+
+
+def _long_missing(exam: Exam, world) -> str:
+    return "" if exam.sets.get(LONG) and world.spec.observes else "needs longer clips"
+
+
+def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
+    """Of every series that the other probes have."""
+
+    def found(exam: Exam, results: Found) -> Report:
+        parts = [drift(exam, results, some) for some in series_of]
+        return Report([row for part in parts for row in part.rows], [curve for part in parts for curve in part.curves])
+
+    lead = (
+        "The same at every step of longer clips. A dot marks the last step up to which the squared error stays within twice "
+        "that of the dream's own first step, which is where the curve has fallen by 3 dB; the table adds the same from "
+        "copy-last's first step, one yardstick for all."
+    )
+    return Probe("drift", "How far can it be used?", lead, _long_missing, found)

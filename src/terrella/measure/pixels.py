@@ -1,0 +1,169 @@
+"""Pixels, of every camera: PSNR, SSIM, sharpness, and the Frechet distance of looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+
+from ..core.world import World
+from .clips import Clip
+from .encoder import MIN_SIDE, frame_features
+from .exam import CLIPS, ENDINGS, LONG, Exam, Found, Probe, batches
+from .fidelity import blurred, gradient_energy, psnr, ssim
+from .frechet import frechet_interval
+from .likeness import Series, report
+from .roll import Results, Tick, Watch, rows_at
+from .scorecard import COPY_LAST, PREDICTED, TRUE, Curve, Picture, Report, Row
+from .statistics import mean_interval, ratio_band, ratio_interval
+from .work import Unit
+
+LEAD = (
+    "How close each dreamt frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
+    "are 95% intervals. Sharpness is gradient energy, dream over game: below 1 is blurred, above 1 too rough. The Frechet "
+    "distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
+)
+_LEAST_SSIM = 11  # pixels: the size of its window
+
+
+def cameras(exam: Exam, world: World) -> list[str]:
+    return exam.shared(world, "rgb")
+
+
+def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+    """PSNR of every camera that was dreamt."""
+    truth = found.joined(f"truth|{of}|{place}")
+    made = []
+    for name in [key.removesuffix("/psnr") for key in dreamt if key.endswith("/psnr")]:
+        values = dreamt[f"{name}/psnr"]
+        made.append(Series(name, "PSNR", "dB", 1, values, truth[f"{name}/copied"][:, : values.shape[1]]))
+    return made
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+    if of == ENDINGS:
+        return []
+    horizons = exam.config.horizons if of == CLIPS else ()
+    return [Watch((name,), partial(_see, exam, name, horizons, first)) for name in cameras(exam, world)]
+
+
+def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip], row: int, step: int) -> Results:
+    mine, truth = seen[name], rows_at(clips, name, row)
+    kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
+    if step in horizons:
+        if min(mine.shape[1:3]) >= _LEAST_SSIM:
+            kept[f"{name}/ssim"] = ssim(mine, truth)
+        if exam.config.frechet and min(mine.shape[1:3]) >= MIN_SIDE:
+            kept[f"{name}/features"] = frame_features(mine)
+        kept[f"{name}/frames"] = mine[: max(0, exam.config.strips - first)]
+    return kept
+
+
+def _units(exam: Exam) -> list[Unit]:
+    """What the recording says by itself, of each place: how alike the last frame shown is to those that follow."""
+    world, units = next(iter(exam.arms.values())), []
+    names = cameras(exam, world)
+    for of in (CLIPS, LONG) if names and world.spec.observes else ():
+        for place, clips in exam.sets.get(of, {}).items():
+            for number, (_, some) in enumerate(batches(exam, world, clips)):
+                steps = clips[0].horizon if of == LONG else max(exam.config.horizons)
+                run = partial(_truth, exam, names, some, steps, exam.config.horizons if of == CLIPS else ())
+                calls = {("recording", "compare"): float(steps * len(some))}
+                units.append(Unit(f"truth|{of}|{place}|{number}", f"recordings of {place} places", calls, run))
+    return units
+
+
+def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, horizons, tick: Tick) -> Results:
+    kept: dict[str, list[torch.Tensor]] = {}
+    context = clips[0].context
+    for name in names:
+        last = rows_at(clips, name, context - 1)
+        looks = exam.config.frechet and min(last.shape[1:3]) >= MIN_SIDE
+        alone = {f"{name}/first": gradient_energy(last)} | ({f"{name}/last": frame_features(last)} if looks else {})
+        for step in range(1, steps + 1):
+            frames = rows_at(clips, name, context - 1 + step)
+            here = {f"{name}/copied": psnr(last, frames), f"{name}/energy": gradient_energy(frames)}
+            if step in horizons:
+                if min(last.shape[1:3]) >= _LEAST_SSIM:
+                    here[f"{name}/copied_ssim"] = ssim(last, frames)
+                if looks:
+                    here |= {
+                        f"{name}/features": frame_features(frames),
+                        f"{name}/blurred": frame_features(blurred(frames)),
+                    }
+            for key, value in here.items():
+                kept.setdefault(key, []).append(value)
+            tick(len(clips) / len(names))
+        kept |= {key: [value] for key, value in alone.items()}
+    return {key: torch.stack(values, 1) for key, values in kept.items()}
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    whole = report(exam, found, "pixels", series)
+    for place, clips in exam.places.items():
+        truth, strips = found.joined(f"truth|{CLIPS}|{place}"), [{} for _ in clips[: exam.config.strips]]
+        for name in [key.removesuffix("/copied") for key in truth if key.endswith("/copied")]:
+            shown = [clip.context - 1 + step for clip in clips[:1] for step in (0, *exam.config.horizons)]
+            for strip, clip in zip(strips, clips):
+                strip[f"truth, {name}"] = np.stack([np.asarray(clip.channels[name][row]) for row in shown])
+            for arm in exam.arms:
+                for motion in (PREDICTED, TRUE):
+                    dreamt = found.dreamt(CLIPS, arm, place, motion)
+                    if f"{name}/psnr" in dreamt:
+                        where = "pixels", name, place, arm, motion
+                        whole.rows += _rows(exam, where, dreamt, truth)
+                        whole.curves.append(_sharpness(exam, where, dreamt, truth))
+                        for strip, frames in zip(strips, dreamt[f"{name}/frames"]):
+                            now = strip[f"truth, {name}"][:1]
+                            strip[f"{arm}, {motion} motion, {name}"] = np.concatenate([now, frames.numpy()])
+        columns = ["now", *(f"{step} step{'s'[: step > 1]}, {step * exam.dt_s:.2f} s" for step in exam.config.horizons)]
+        whole.pictures += [
+            Picture("pixels", f"{place} places, clip {number + 1}", columns, strip)
+            for number, strip in enumerate(strips)
+            if strip
+        ]
+    return whole
+
+
+def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
+    (probe, name, place, arm, motion), config = where, exam.config
+    rows, mine, real = [], dreamt[f"{name}/energy"], truth[f"{name}/energy"]
+    for number, step in enumerate(config.horizons):
+        if f"{name}/ssim" in dreamt:
+            beside = {COPY_LAST: mean_interval(truth[f"{name}/copied_ssim"][:, number], exam.rng())}
+            figure = mean_interval(dreamt[f"{name}/ssim"][:, number], exam.rng())
+            rows.append(Row(probe, name, "SSIM", "", place, arm, motion, step, figure, 1, beside))
+        still = truth[f"{name}/first"].flatten()
+        beside = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
+        sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
+        rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, beside))
+        if f"{name}/features" in dreamt:
+            looks = truth[f"{name}/features"][:, number]
+            others = {COPY_LAST: truth[f"{name}/last"][:, 0], "blurred by 1 pixel": truth[f"{name}/blurred"][:, number]}
+            beside = {words: frechet_interval(looks, features) for words, features in others.items()}
+            figure = frechet_interval(looks, dreamt[f"{name}/features"][:, number])
+            rows.append(Row(probe, name, "Frechet distance", "", place, arm, motion, step, figure, -1, beside))
+    first, last = config.drop
+    if last <= max(config.horizons):
+        loss = mean_interval(dreamt[f"{name}/psnr"][:, first - 1] - dreamt[f"{name}/psnr"][:, last - 1], exam.rng())
+        what = f"PSNR lost from {first} to {last} steps"
+        rows.append(Row(probe, name, what, "dB", place, arm, motion, last, loss, -1))
+    return rows
+
+
+def _sharpness(exam: Exam, where, dreamt: Results, truth: Results) -> Curve:
+    probe, name, place, arm, motion = where
+    band = ratio_band(dreamt[f"{name}/energy"], truth[f"{name}/energy"], exam.rng())
+    steps = range(1, len(band.value) + 1)
+    return Curve(probe, name, "sharpness", "\u00d7", place, arm, motion, steps, band, guides=(0.7, 1.0, 1.3))
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if not world.spec.observes:
+        return "needs a world that takes evidence"
+    return "" if cameras(exam, world) else "needs rgb, of the world and of the recording"
+
+
+PIXELS = Probe("pixels", "Likeness over time", LEAD, _missing, _report, _watch, _units)

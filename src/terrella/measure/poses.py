@@ -1,0 +1,69 @@
+"""Pose: how far the world's belief of where its cameras are drifts from the truth, in metres, radians, and of the way gone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from ..core.world import World
+from .clips import Clip
+from .exam import CLIPS, ENDINGS, Exam, Found, Probe
+from .likeness import Series, report
+from .roll import Results, Watch, rows_at
+from .scorecard import PREDICTED, Report, Row
+from .statistics import mean_interval, median_interval
+
+LEAD = (
+    "Where the world believes the camera to be under the true actions, against where it was; copy-last stays where it is. "
+    "The table adds the distance as a share of the length of the true path."
+)
+
+
+def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+    """Distance and turn between the predicted and the true pose."""
+    made, context = [], clips[0].context
+    for name in [key.removesuffix("/where") for key in dreamt if key.endswith("/where")]:
+        given = dreamt[f"{name}/where"].double()
+        truth = torch.stack([rows_at(clips, name, context + step) for step in range(given.shape[1])], 1).double()
+        last = rows_at(clips, name, context - 1).double()[:, None]
+        far = [(some[..., :3] - truth[..., :3]).norm(dim=-1) for some in (given, last)]
+        turned = [
+            2 * torch.arccos((some[..., 3:] * truth[..., 3:]).sum(-1).abs().clamp(max=1)) for some in (given, last)
+        ]
+        made += [Series(name, "distance", "m", -1, *far), Series(name, "turn", "rad", -1, *turned)]
+    return made
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+    names = exam.shared(world, "pose")
+    if of == ENDINGS or not names:
+        return []
+    return [Watch(tuple(names), lambda seen, *_: {f"{name}/where": seen[name] for name in names})]
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    whole, config = report(exam, found, "pose", series), exam.config
+    for place, clips in exam.places.items():
+        for arm in exam.arms:
+            dreamt = found.dreamt(CLIPS, arm, place, PREDICTED)
+            for made in series(exam, found, CLIPS, place, clips, dreamt) if dreamt else ():
+                walked = torch.from_numpy(np.stack([clip.walked_m(made.channel) for clip in clips]))
+                for step in config.horizons if made.unit == "m" else ():
+                    went = walked[:, step - 1] > config.walked_m
+                    if went.any():
+                        share = 100 * made.values[went, step - 1] / walked[went, step - 1]
+                        for what, figure in (("mean", mean_interval), ("median", median_interval)):
+                            where = "pose", made.channel, f"distance over the way gone, {what}", "%", place, arm
+                            whole.rows.append(Row(*where, PREDICTED, step, figure(share, exam.rng()), -1))
+    return whole
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if not world.spec.observes:
+        return "needs a world that takes evidence"
+    return "" if exam.shared(world, "pose") else "needs pose, of the world and of the recording"
+
+
+POSES = Probe("pose", "Position", LEAD, _missing, _report, _watch)

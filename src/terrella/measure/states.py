@@ -1,0 +1,117 @@
+"""State vectors: normalised error, R2, and how long a world predicts them better than a copy does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..core.world import World
+from .clips import Clip
+from .exam import CLIPS, ENDINGS, Exam, Found, Probe
+from .likeness import Series, report
+from .roll import Results, Watch
+from .scorecard import PREDICTED, TRUE, Report, Row
+from .statistics import Figure, last_step_above, ratio_interval
+
+LEAD = (
+    "How far each predicted vector is from the recorded one: root mean square over its numbers, each in units of its own "
+    "standard deviation in these recordings. R\u00b2 is the share of the variance that is predicted: 1 is all, 0 is no more "
+    "than their mean."
+)
+NOT_VECTORS = ("rgb", "depth", "pose", "reward", "done", "uncertainty", "known", "keyframes", "instruction")
+
+
+def vectors(exam: Exam, world: World) -> list[str]:
+    """The channels of numbers, one axis at most, that the world shows and the recording holds."""
+    clip = next(iter(exam.places.values()))[0]
+    found = []
+    for name, space in world.spec.channels.items():
+        plain = name.partition(".")[0] not in NOT_VECTORS and np.dtype(space.dtype).kind == "f"
+        if plain and len(space.shape or ()) <= 1 and name in clip.channels:
+            if int(np.prod(space.shape or (1,))) == int(np.prod(clip.channels[name].shape[1:])):
+                found.append(name)
+    return found
+
+
+@dataclass(frozen=True)
+class _Vector:
+    """A recorded channel [n, T, D] of all clips' rows, in standard deviations; numbers that never change are left out."""
+
+    values: torch.Tensor
+    unit: torch.Tensor
+    moves: torch.Tensor
+    context: int
+
+    @staticmethod
+    def of(clips: Sequence[Clip], name: str) -> _Vector:
+        whole = torch.stack([torch.from_numpy(np.array(clip.channels[name], np.float64)) for clip in clips])
+        whole = whole.reshape(*whole.shape[:2], -1)
+        unit = whole.flatten(0, 1).std(0, correction=0)
+        moves = unit > 1e-6 * whole.abs().amax((0, 1)).clamp_min(1e-6)
+        return _Vector((whole / unit)[..., moves], unit, moves, clips[0].context)
+
+    def away(self, given: torch.Tensor) -> torch.Tensor:
+        """Predictions [n, T, ...] less the truth after the context: [n, T, D]."""
+        mine = (given.double().reshape(*given.shape[:2], -1) / self.unit)[..., self.moves]
+        return mine - self.values[:, self.context : self.context + mine.shape[1]]
+
+    def stood(self, steps: int) -> torch.Tensor:
+        """The last row shown less the truth: [n, steps, D]."""
+        return self.values[:, self.context - 1 : self.context] - self.values[:, self.context : self.context + steps]
+
+
+def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+    """Normalised RMSE of every vector that was dreamt."""
+    made = []
+    for name in [key.removesuffix("/vector") for key in dreamt if key.endswith("/vector")]:
+        vector, given = _Vector.of(clips, name), dreamt[f"{name}/vector"]
+        if vector.moves.any():
+            parts = [part.square().mean(-1).sqrt() for part in (vector.away(given), vector.stood(given.shape[1]))]
+            made.append(Series(name, "RMSE", "\u03c3", -1, *parts))
+    return made
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+    if of == ENDINGS:
+        return []
+    names = vectors(exam, world)
+    return [Watch(tuple(names), lambda seen, *_: {f"{name}/vector": seen[name] for name in names})] if names else []
+
+
+def _report(exam: Exam, found: Found) -> Report:
+    whole = report(exam, found, "state", series)
+    for place, clips in exam.places.items():
+        for arm in exam.arms:
+            for motion in (PREDICTED, TRUE):
+                dreamt = found.dreamt(CLIPS, arm, place, motion)
+                for made in series(exam, found, CLIPS, place, clips, dreamt) if dreamt else ():
+                    where = "state", made.channel
+                    steps = made.values.shape[1]
+                    usable = last_step_above(made.gain, torch.zeros(len(clips)), exam.rng())
+                    words = "steps better than copy-last"
+                    whole.rows.append(Row(*where, words, "steps", place, arm, motion, steps, usable, 1))
+                    vector = _Vector.of(clips, made.channel)
+                    away = vector.away(dreamt[f"{made.channel}/vector"])
+                    for step in exam.config.horizons:
+                        share = _explained(exam, vector, away, step)
+                        whole.rows.append(Row(*where, "R\u00b2", "", place, arm, motion, step, share, 1))
+    return whole
+
+
+def _explained(exam: Exam, vector: _Vector, away: torch.Tensor, step: int) -> Figure:
+    """1 - squared error / squared deviation from the mean of that step, both summed over clips."""
+    truth = vector.values[:, vector.context - 1 + step]
+    left = ratio_interval(away[:, step - 1].square().sum(1), (truth - truth.mean(0)).square().sum(1), exam.rng())
+    return Figure(1 - left.value, 1 - left.high, 1 - left.low, left.count)
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if not world.spec.observes:
+        return "needs a world that takes evidence"
+    return "" if vectors(exam, world) else "needs a vector of numbers, of the world and of the recording"
+
+
+STATES = Probe("state", "State vectors", LEAD, _missing, _report, _watch)

@@ -1,0 +1,193 @@
+"""Work in units that are kept as they are done: go on where it was stopped, and say honestly how long it will take."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from ..core.errors import TerrellaError
+from ..core.world import World, make_rng
+from .clips import Clip, evidence
+from .roll import Results, Tick, actions_at, fold_context, poses_at
+
+Clock = Callable[[], float]
+Progress = Callable[[float, str, float], None]  # share done in 0..1, what is being done, seconds left
+Calls = Mapping[tuple[str, str], float]  # (arm, verb) -> how many, each counted once for every clip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A piece of work. key: names its result, "kind|number": units of a kind cost alike; calls: what it costs, by verb;
+    run(tick): does it, from its own seed alone, so that nothing depends on what was done before."""
+
+    key: str
+    words: str
+    calls: Calls
+    run: Callable[[Tick], Results]
+
+    @property
+    def kind(self) -> str:
+        return self.key.rpartition("|")[0]
+
+
+class Forecast:
+    """Seconds that units will take: their calls at measured prices, put right by how long units of their kind took."""
+
+    def __init__(self, prices: Calls):
+        self.prices = prices
+        self.took: dict[str, tuple[float, float]] = {}  # kind ("" for all) -> seconds, priced seconds; the past fades
+
+    def priced(self, unit: Unit) -> float:
+        return sum(count * self.prices.get(call, 1e-3) for call, count in unit.calls.items()) + 1e-3
+
+    def done(self, unit: Unit, seconds: float) -> None:
+        for name in (unit.kind, ""):
+            took, priced = self.took.get(name, (0.0, 0.0))
+            self.took[name] = 0.7 * took + seconds, 0.7 * priced + self.priced(unit)
+
+    def seconds(self, unit: Unit) -> float:
+        took, priced = self.took.get(unit.kind) or self.took.get("") or (1.0, 1.0)
+        return self.priced(unit) * took / priced
+
+
+class Store:
+    """Results of units in a folder, or nowhere. What was begun as something else (another `fingerprint`) is thrown away."""
+
+    def __init__(self, folder: Path | None, fingerprint: str):
+        self.folder = folder
+        if folder is None:
+            return
+        about = {"fingerprint": hashlib.sha256(fingerprint.encode()).hexdigest()}
+        try:
+            if json.loads((folder / "about.json").read_text(encoding="utf-8")) == about:
+                return
+        except (OSError, ValueError):
+            pass
+        self.clear()
+        with _writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "about.json").write_text(json.dumps(about), encoding="utf-8")
+
+    def get(self, key: str) -> Results | None:
+        """A result that was kept; None where there is none, or a damaged one."""
+        try:
+            return load_file(self._path(key)) if self.folder else None
+        except (OSError, SafetensorError):
+            return None
+
+    def put(self, key: str, result: Results) -> None:
+        if self.folder is None:
+            return
+        with _writing(self.folder):
+            part = self._path(key).with_suffix(".part")
+            save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, part)
+            os.replace(part, self._path(key))
+
+    def clear(self) -> None:
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, key: str) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
+
+
+class _writing:
+    """Turns what a full or foreign disk says into one sentence."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind, error, trace) -> None:
+        if isinstance(error, (OSError, SafetensorError)):
+            raise TerrellaError(f"cannot write to {self.folder} ({error}); choose another folder.") from error
+
+
+def run_all(units: Sequence[Unit], store: Store, prices: Calls, clock: Clock, progress: Progress) -> dict[str, Results]:
+    """The results of all units by key, those that are in `store` as they were kept."""
+    forecast = Forecast(prices)
+    found = {unit.key: kept for unit in units if (kept := store.get(unit.key)) is not None}
+    whole = sum(map(forecast.priced, units)) or 1.0
+    behind = sum(forecast.priced(unit) for unit in units if unit.key in found)
+    todo = [unit for unit in units if unit.key not in found]
+    for number, unit in enumerate(todo):
+        began, later = clock(), sum(map(forecast.seconds, todo[number + 1 :]))
+
+        def tell(share: float, unit=unit, began=began, later=later, behind=behind) -> None:
+            pace = (1 - share) * forecast.seconds(unit) + clock() - began  # believes its own pace more and more
+            progress((behind + share * forecast.priced(unit)) / whole, unit.words, (1 - share) * pace + later)
+
+        result = unit.run(_Ticks(sum(unit.calls.values()), tell))
+        found[unit.key] = {name: tensor.cpu() for name, tensor in result.items()}
+        store.put(unit.key, found[unit.key])
+        forecast.done(unit, clock() - began)
+        behind += forecast.priced(unit)
+    progress(1.0, "measured", 0.0)
+    return found
+
+
+class _Ticks:
+    """Counts what was done of a unit and tells the share."""
+
+    def __init__(self, whole: float, tell: Callable[[float], None]):
+        self.whole, self.tell, self.done = whole or 1.0, tell, 0.0
+        tell(0.0)
+
+    def __call__(self, done: float) -> None:
+        self.done += done
+        self.tell(min(self.done / self.whole, 1.0))
+
+
+def prices_of(
+    arm: str, world: World, clips: Sequence[Clip], clock: Clock, steps: int = 3
+) -> dict[tuple[str, str], float]:
+    """Seconds a clip of each verb, by a few steps of each: "observe" evidence after imagining, "imagine" and look, follow a
+    "pose" and look, and imagine "alone", one clip."""
+    rng, count = make_rng(0), len(clips)
+    shown = tuple(name for name in ("rgb", "pose") if name in world.spec.channels) or tuple(world.spec.channels)[:1]
+    found: dict[tuple[str, str], float] = {}
+
+    def timed(verb: str, step: Callable[[int], None], some: int) -> None:
+        step(0)  # the first may compile
+        began = clock()
+        for number in range(steps):
+            step(number)
+        found[arm, verb] = (clock() - began) / (steps * some)
+
+    states = [fold_context(world, clips, rng)]
+
+    def imagine(number: int) -> None:
+        states[0] = world.imagine(states[0], actions_at(world, clips[: states[0].batch], number), rng)
+        world.render(states[0], shown)
+
+    def observe(number: int) -> None:
+        states[0] = world.imagine(states[0], actions_at(world, clips, number), rng)
+        states[0] = world.observe(evidence(clips, world.spec, number), states[0], rng)
+
+    def follow(number: int) -> None:
+        states[0] = world.observe({"pose": poses_at(clips, number)}, states[0], rng)
+        world.render(states[0], shown)
+
+    if world.spec.observes:
+        timed("observe", observe, count)
+    timed("imagine", imagine, count)
+    if "pose" in world.spec.observes and "rgb" in world.spec.observes:
+        try:
+            timed("pose", follow, count)
+        except TerrellaError:
+            pass  # it takes no pose alone
+    if count > 1:
+        states[0] = states[0].at(0)
+    timed("alone", imagine, 1)
+    return found

@@ -1,0 +1,367 @@
+"""A timeline: one world, or a game with a dream beside it, stepped by a person or a policy, with its past and its recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import simplejpeg
+import torch
+from gymnasium import spaces
+
+from ..core.errors import ServeError, TerrellaError
+from ..core.policy import Policy, act
+from ..core.spec import Spec
+from ..core.state import State
+from ..core.world import World, make_rng
+from .actions import Person
+from .chart import Chart, chart, mapped, tinted
+from .history import History, Image, Moment
+from .picture import MAX_DROPPED_PIXELS, picture_of, uncertainty_levels
+from .protocol import DONE, FRESH
+from .recording import Recording, SinkFactory
+
+JPEG_QUALITY = 90
+
+
+def vitals(spec: Spec) -> list[str]:
+    """The channels that are one number of the player's, such as health, which the page shows beside the score."""
+    others = ("reward", "done", "uncertainty")
+    return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
+
+
+def _alike(one: Spec, other: Spec, name: str) -> bool:
+    """Whether both show the channel, in the same form."""
+    return name in one.channels and name in other.channels and one.channels[name].shape == other.channels[name].shape
+
+
+@dataclass(frozen=True)
+class TimelineConfig:
+    """history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory for the states among them."""
+
+    history_s: float = 30.0
+    state_mb: int = 256
+
+
+def check_playable(worlds: Sequence[World]) -> None:
+    """ServeError where these worlds cannot be shown on one page, with the reason."""
+    if len(worlds) not in (1, 2):
+        raise ServeError(f"a page shows one world or two side by side; got {len(worlds)}.")
+    for world in worlds:
+        for name in world.spec.kinds("rgb") or ("rgb",):
+            space = world.spec.channels.get(name)
+            drawn = isinstance(space, spaces.Box) and len(space.shape) == 3 and space.shape[2] == 3
+            if not drawn or space.dtype != np.uint8:
+                raise ServeError(
+                    f"{world.spec.name} has no pictures to show (a channel {name}, uint8 [H, W, 3]), so it cannot be "
+                    "played; `terrella record` and `terrella score` take it."
+                )
+    if len(worlds) == 2 and worlds[0].spec.action != worlds[1].spec.action:
+        first, second = (world.spec for world in worlds)
+        raise ServeError(
+            f"{first.name} and {second.name} take different actions; compare a world with the game it learned."
+        )
+
+
+class Timeline:
+    """Not thread-safe, and slow: the session calls it from one worker thread, a verb at a time.
+
+    `policy` drives while nobody touches the controls; without one, or with `driving` off, the person at the page does.
+    """
+
+    def __init__(
+        self,
+        worlds: Sequence[World],
+        seed: int,
+        sink_factory: SinkFactory | None = None,
+        config: TimelineConfig | None = None,
+        picture: torch.Tensor | None = None,
+        policy: Policy | None = None,
+    ):
+        check_playable(worlds)
+        config = config or TimelineConfig()
+        self.worlds, self._picture = tuple(worlds), picture
+        self.notice = ""  # something that a person should know, in one sentence
+        self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
+        self.driving = policy is not None
+        self._policy, self._person, self._memory = policy, Person(self.spec), None
+        self._recording = Recording(sink_factory)
+        frames = int(min(max(config.history_s / self.spec.dt_s, 64), 4096))
+        self._history = History(frames, config.state_mb * 2**20)
+        self.restart(seed)
+
+    @property
+    def spec(self) -> Spec:
+        """Of the world that is played; a dream beside it follows."""
+        return self.worlds[0].spec
+
+    @property
+    def no_rewind(self) -> str:
+        """Why there is no way back; empty where there is."""
+        fixed = [world.spec.name for world in self.worlds if not world.spec.forkable]
+        return f"{fixed[0]} is a running game: it cannot go back in time." if fixed else ""
+
+    @property
+    def recording(self) -> bool:
+        return self._recording.on
+
+    @property
+    def shown(self) -> Moment:
+        """The moment that the timeline stands at: the newest, unless it was rewound."""
+        return self._shown
+
+    @property
+    def newest_step(self) -> int:
+        return self._history.newest.step
+
+    @property
+    def oldest_step(self) -> int:
+        return self._history.oldest_step
+
+    @property
+    def rewound(self) -> bool:
+        return self._shown.step < self.newest_step
+
+    @property
+    def state_bytes(self) -> int:
+        return self._history.state_bytes
+
+    def pictures(self) -> list[tuple[bytes, ...]]:
+        """The JPEGs of the recent past, oldest first, up to the moment shown, while the same cameras were looked through."""
+        past = self._history.pictures()
+        past = past[: len(past) - (self.newest_step - self._shown.step)]
+        views = [image[:2] for image in past[-1]]
+        first = next((at for at in range(len(past), 0, -1) if [image[:2] for image in past[at - 1]] != views), 0)
+        return [tuple(image.jpeg for image in images) for images in past[first:]]
+
+    @torch.inference_mode()
+    def chart(self) -> tuple[int, Chart] | None:
+        """The map of the moment shown, of the last world that has one, and which that is; None where none has."""
+        number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
+        if number is None:
+            return None
+        return number, chart(self.worlds[number], (self._shown.states or self._states)[number])
+
+    @torch.inference_mode()
+    def images(self, moment: Moment, invented: bool = False) -> tuple[Image, ...]:
+        """The moment through the cameras that are shown now, and with what was invented tinted if asked, as far as the moment's
+        states are kept."""
+        views = tuple((number, camera) for number in range(len(self.worlds)) for camera in self._shown_of(number))
+        if moment.states is None or (not invented and views == tuple(image[:2] for image in moment.images)):
+            return moment.images
+        images: list[Image] = []
+        for number, (world, state) in enumerate(zip(self.worlds, moment.states, strict=True)):
+            for camera, name in self._shown_of(number).items():
+                known = "known" + name.removeprefix("rgb")
+                tint = invented and known in world.spec.channels
+                seen = world.render(state, (name, known) if tint else (name,))
+                picture = tinted(seen[name], seen[known]) if tint else seen[name]
+                images.append(Image(number, camera, encode_jpeg(picture)))
+        return tuple(images)
+
+    # -- verbs --------------------------------------------------------------------------------------------------
+
+    @torch.inference_mode()
+    def restart(self, seed: int, same_picture: bool = True) -> Moment:
+        """Begins anew from `seed`, and from the picture that this episode began with, if any; the past is forgotten, once the
+        new episode has begun."""
+        picture, self._picture = self._picture, self._picture if same_picture else None
+        rngs = tuple(make_rng(seed) for _ in (*self.worlds, "policy"))
+        try:
+            states = self._starts(rngs)
+        except TerrellaError:
+            self._picture = picture
+            raise
+        self.seed, self._rngs = seed, rngs
+        self._history.clear()
+        return self._begin(0, states)
+
+    @torch.inference_mode()
+    def step(self, held: Sequence[str] = (), axes: Sequence[float] = ()) -> Moment:
+        """One step of every world under what is held, or under the policy; after `done`, the first moment of a new episode."""
+        self._person.hold(held, axes)
+        if self.rewound:
+            self._return_to(self._history.newest)
+        if self._shown.flags & DONE:
+            return self._begin(self._shown.step + 1, self._starts(self._rngs))
+        action = self._action()
+        pairs = zip(self.worlds, self._states, self._rngs, strict=False)
+        self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
+        return self._show(self._shown.step + 1, 0, action)
+
+    def stand_at(self, step: int) -> Moment:
+        """Shows a remembered moment without going on from it."""
+        if self.no_rewind:
+            raise ServeError(self.no_rewind)
+        self._shown = self._history.at(step)
+        return self._shown
+
+    @torch.inference_mode()
+    def branch(self) -> Moment:
+        """Goes on from the moment shown: what came after it is forgotten, and the same actions lead to the same frames."""
+        if self.rewound:
+            self._recording.end_episode()
+            self._history.forget_after(self._shown.step)
+            self._return_to(self._shown)
+        return self._shown
+
+    def to_newest(self) -> Moment:
+        self._shown = self._history.newest
+        return self._shown
+
+    @torch.inference_mode()
+    def enter(self, data: bytes) -> Moment:
+        """A new episode that begins with a picture, the bytes of an image file; the past stays."""
+        height, width = self.spec.channels["rgb"].shape[:2]
+        before = self._picture
+        self._picture = picture_of(data, (height, width), MAX_DROPPED_PIXELS, "this picture")
+        try:
+            states = self._starts(self._rngs)
+        except TerrellaError:
+            self._picture = before
+            raise
+        if self.rewound:
+            self._return_to(self._history.newest)
+        return self._begin(self._shown.step + 1, states)
+
+    @torch.inference_mode()
+    def sync(self) -> Moment:
+        """The dream observes the game as it is now."""
+        if len(self.worlds) != 2:
+            raise ServeError("there is no game beside this world to observe; play with --compare.")
+        if self.rewound or self._shown.flags & DONE:
+            raise ServeError("go on from this moment first, then let the dream observe the game.")
+        self._states = (self._states[0], self._dream_of(self._states[0], self._rngs[1]))
+        return self._show(self._shown.step + 1, 0, None)
+
+    def look(self, cameras: Sequence[str]) -> None:
+        """Shows the pictures of these channels from now on; of a world that has none of them, its main one."""
+        self.cameras = tuple(cameras) or ("rgb",)
+
+    def record(self, on: bool) -> None:
+        """Begins or ends writing the played world (the game, where two are shown) to a dataset."""
+        if on:
+            self._recording.begin()
+        else:
+            self.close()
+
+    def close(self) -> None:
+        """Ends the recording."""
+        self._recording.close()
+        self.notice = self._recording.fault or self.notice
+
+    # -- inside -------------------------------------------------------------------------------------------------
+
+    def _shown_of(self, number: int) -> dict[int, str]:
+        """The cameras of a world that are shown: their place among its own, and their channels."""
+        known = dict(enumerate(self.worlds[number].spec.kinds("rgb")))
+        return {at: name for at, name in known.items() if name in self.cameras} or {0: known[0]}
+
+    def _action(self) -> torch.Tensor:
+        """[1, ...], the person's, or the policy's while it drives and nobody touches the controls."""
+        if self._policy is None or not self.driving or self._person.active:
+            return act(self._person, {}, None, 1, self.spec, self._rngs[-1])[0]
+        seen = self.worlds[0].render(self._states[0], tuple(self.spec.channels))
+        action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
+        return action
+
+    def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
+        if self._picture is not None:
+            return (self._entered(self._picture, rngs[0]),)
+        self.notice = ""
+        game = self.worlds[0].start(1, rngs[0])
+        return (game,) if len(self.worlds) == 1 else (game, self._dream_of(game, rngs[1]))
+
+    def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
+        self._recording.end_episode()
+        self._states, self._return = states, 0.0
+        self._begin_policy()
+        return self._show(step, FRESH, None)
+
+    def _begin_policy(self) -> None:
+        self._memory = self._policy.begin(1, self._rngs[-1]) if self._policy is not None else None
+
+    def _entered(self, picture: torch.Tensor, rng: torch.Generator) -> State:
+        """The played world after it observed `picture`; a notice says so where it is unlike what the world knows."""
+        world = self.worlds[0]
+        if len(self.worlds) == 2:
+            raise ServeError("a comparison cannot start from a picture: the game cannot; play without --compare.")
+        if "rgb" not in world.spec.observes:
+            raise ServeError(f"{world.spec.name} takes no pictures, so it cannot start from one.")
+        state = world.observe({"rgb": picture[None]}, None, rng)
+        levels = uncertainty_levels(world.spec)
+        self.notice = ""
+        if levels and float(world.render(state, ("uncertainty",))["uncertainty"][0]) >= levels[1]:
+            self.notice = (
+                f"this picture is unlike the recordings that {world.spec.name} was trained on: most of what follows is "
+                "invented."
+            )
+        return state
+
+    def _dream_of(self, game: State, rng: torch.Generator) -> State:
+        """The dream after it observed the game."""
+        dream = self.worlds[1]
+        missing = [name for name in dream.spec.observes if name not in self.spec.channels]
+        if missing or not dream.spec.observes:
+            self.notice = f"the dream starts on its own: it cannot observe {self.spec.name}."
+            return dream.start(1, rng)
+        try:
+            shared = [name for name in dream.spec.may_observe if _alike(self.spec, dream.spec, name)]
+            state = dream.observe(self.worlds[0].render(game, [*dream.spec.observes, *shared]), None, rng)
+        except TerrellaError as error:
+            self.notice = f"the dream starts on its own: {error}"
+            return dream.start(1, rng)
+        self.notice = ""
+        return state
+
+    def _show(self, step: int, flags: int, action: torch.Tensor | None) -> Moment:
+        observations = [self._observed(number) for number in range(len(self.worlds))]
+        seen, last = observations[0], observations[-1]
+        images = tuple(
+            Image(number, camera, encode_jpeg(observations[number][name]))
+            for number in range(len(self.worlds))
+            for camera, name in self._shown_of(number).items()
+        )
+        acted = action is not None
+        reward = float(seen["reward"][0]) if "reward" in seen and acted else 0.0
+        done = bool(seen["done"][0]) if "done" in seen and acted else False
+        self._return += reward
+        self._recording.add(seen, action, reward, done)
+        self.notice = self._recording.fault or self.notice
+        moment = Moment(
+            step,
+            images,
+            flags | DONE * done,
+            self._return,
+            None if self.no_rewind else self._states,
+            None if self.no_rewind else tuple(rng.get_state() for rng in self._rngs),
+            float(last["uncertainty"][0]) if "uncertainty" in last else -1.0,
+            tuple(float(seen[name][0]) for name in vitals(self.spec)),
+        )
+        self._history.push(moment)
+        self._shown = moment
+        return moment
+
+    def _observed(self, number: int) -> Mapping[str, torch.Tensor]:
+        """What is shown of a world; of the one that is recorded, all."""
+        spec = self.worlds[number].spec
+        wanted = [*self._shown_of(number).values(), "uncertainty"]
+        if number == 0:
+            wanted += ["reward", "done", *vitals(spec), *(spec.channels if self.recording else ())]
+        names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))
+        return self.worlds[number].render(self._states[number], names)
+
+    def _return_to(self, moment: Moment) -> None:
+        self._shown = moment
+        if moment.states is not None and moment.rngs is not None:
+            self._states, self._return = moment.states, moment.episode_return
+            for rng, state in zip(self._rngs, moment.rngs, strict=True):
+                rng.set_state(state)
+            self._begin_policy()
+
+
+def encode_jpeg(rgb: torch.Tensor) -> bytes:
+    """One JPEG of rgb uint8 [1, H, W, 3]; colours are not subsampled, for small pictures are shown large."""
+    picture = np.ascontiguousarray(rgb[0].cpu().numpy())
+    return simplejpeg.encode_jpeg(picture, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="444")
