@@ -135,7 +135,7 @@ class LearnedWorld:
 
     def to(self, device: torch.device | str) -> LearnedWorld:
         """The same world on another device: its networks, its memory and its geometry."""
-        moved = {
+        moved: dict[str, Any] = {
             name: copy.deepcopy(part) if isinstance(part, nn.Module) else part for name, part in self.parts.items()
         }
         return LearnedWorld(self.about, **{name: part.to(device) for name, part in moved.items()})

@@ -311,9 +311,9 @@ def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
     """Of looks `off` [..., looks] away the one [...] that a thing has which looked like `was` [...]: that one, unless another is
     clearly nearer; NONE where all are far."""
     least, best = off.min(-1)
-    was = torch.as_tensor(was, device=off.device)
-    stays = (was != NONE) & (off.gather(-1, was.clamp_min(0)[..., None])[..., 0] < least + STICKS)
-    return torch.where(least > ALIKE, NONE, torch.where(stays, was, best))
+    before = torch.as_tensor(was, device=off.device)
+    stays = (before != NONE) & (off.gather(-1, before.clamp_min(0)[..., None])[..., 0] < least + STICKS)
+    return torch.where(least > ALIKE, NONE, torch.where(stays, before, best))
 
 
 def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
