@@ -19,7 +19,7 @@ OPTIONS = {
     "record world": "--frames --human --json --live-mcap --out --pictures --port --seed --size",
     "play": "--compare --device --estimator --fast --host --image --json --memory-mb --no-memory --port --record --remember --seed "
     "--token --truth",
-    "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --seed",
+    "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",
     "data convert": "--episodes --fps --json --pictures --policy --seed --to",
@@ -218,6 +218,7 @@ def test_ctrl_c_exits_with_130(capsys, monkeypatch):
 
     monkeypatch.setattr("terrella.library.worlds", interrupted)
     assert main(["list"]) == 130
+    assert capsys.readouterr().err == "terrella: stopped.\n"
 
 
 def test_our_own_faults_keep_their_trace(monkeypatch):

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import pytest
 import uvicorn
 
-from terrella.serve.server import ServeConfig, make_server, open_port
+from terrella.serve.door import open_port
+from terrella.serve.server import Offer, ServeConfig, make_server
 
 from .panorama import Panorama
 
@@ -60,10 +61,8 @@ def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, po
         sinks.append(ListSink())
         return sinks[-1]
 
-    server = make_server(
-        worlds, listener, host, token, sink_factory if record else None, on_ready, config=config or ServeConfig(),
-        policy=policy,
-    )  # fmt: skip
+    offer = Offer(worlds, 0, sink_factory if record else None, policy=policy, config=config or ServeConfig())
+    server = make_server(offer, listener, host, token, on_ready)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     assert ready.wait(20), "the server did not start"

@@ -19,11 +19,12 @@ from websockets.sync.client import connect
 
 from terrella.core.errors import ServeError
 from terrella.serve import door, serve
+from terrella.serve.door import open_port
 from terrella.serve.guard import RateLimit, is_loopback, refusal
-from terrella.serve.protocol import decode_frame
-from terrella.serve.server import ServeConfig, open_port
+from terrella.serve.server import ServeConfig
 
 from .panorama import Panorama, SlowDream
+from .wire import decode_frame
 
 
 class Client:

@@ -6,11 +6,12 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from terrella.serve.protocol import REPLAY, Ack, Branch, Controls, Pause, Restart, Resume, Rewind, Seek, decode_frame
+from terrella.serve.protocol import REPLAY, Ack, Controls, Restart, Rewind, Seek, Verb
 from terrella.serve.session import MAX_UNACKED, Session
 from terrella.serve.timeline import Timeline
 
 from .panorama import Panorama
+from .wire import decode_frame
 
 
 class FakeSocket:
@@ -112,12 +113,12 @@ def test_pausing_stops_time():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: len(socket.frames) > 3)
-        session.hear(Pause())
+        session.hear(Verb.PAUSE)
         await until(lambda: socket.events and socket.events[-1]["paused"])
         count = len(socket.frames)
         await asyncio.sleep(0.05)
         assert len(socket.frames) == count
-        session.hear(Resume())
+        session.hear(Verb.RESUME)
         await until(lambda: len(socket.frames) > count + 3)
 
     play(scenario)
@@ -128,7 +129,7 @@ def test_rewind_then_branch_goes_on_from_there():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: socket.frames and socket.last.step >= 20)
-        session.hear(Pause())
+        session.hear(Verb.PAUSE)
         await until(lambda: socket.events[-1]["paused"])
         shown = {frame.step: frame.images for frame in socket.frames}
         end = socket.last.step
@@ -137,7 +138,7 @@ def test_rewind_then_branch_goes_on_from_there():
         assert socket.last.step == end - 10 and socket.last.images == shown[end - 10] and socket.last.newest == end
         session.hear(Seek(5))
         await until(lambda: socket.last.step == 5)
-        session.hear(Branch())
+        session.hear(Verb.BRANCH)
         await until(lambda: not socket.last.flags & REPLAY and socket.last.step >= 12)
         again = {frame.step: frame.images for frame in socket.frames[-6:]}
         assert all(images == shown[step] for step, images in again.items() if step in shown)

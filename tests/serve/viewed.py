@@ -7,7 +7,7 @@ import threading
 
 import httpx
 
-from terrella.serve.server import open_port
+from terrella.serve.door import open_port
 from terrella.serve.viewer import make_viewer
 
 

@@ -163,3 +163,11 @@ def test_what_cannot_be_opened_is_refused_in_one_sentence():
         Doom(DoomConfig(scenario="no_such_map"))
     with pytest.raises(TerrellaError, match="100x100"):
         Doom(DoomConfig(size=(100, 100)))
+
+
+def test_nothing_is_left_in_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    world, rng = Doom(), make_rng(0)
+    world.imagine(world.start(1, rng), press("MOVE_FORWARD"), rng)
+    world.close()
+    assert list(tmp_path.iterdir()) == []

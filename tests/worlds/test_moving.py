@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from terrella.core.world import make_rng
 from terrella.space.camera import planar_pose
 from terrella.space.keyframes import Keyframes, look, retrieve
-from terrella.worlds.moving import Frame, _carried, carried_slowly, carry_frames, still
+from terrella.space.reproject import carry_things, carry_things_slowly
+from terrella.worlds.moving import Frame, carry_frames, still
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (24, 32)
 
@@ -53,8 +54,7 @@ def test_memory_keeps_the_wall_and_not_the_thing():
     found = {}
     for name, depth in (("kept", still(frame.depth, frame.things)), ("all", frame.depth)):
         keys = Keyframes.of(frame.rgb, depth, frame.pose, CAMERA)
-        picks = retrieve([keys], pose[0], CAMERA, SIZE, 1)[0]
-        found[name] = look([keys.at(picks)], pose, CAMERA, SIZE, 1)
+        found[name] = look(keys, retrieve(keys, pose, CAMERA, SIZE, 1), pose, CAMERA, SIZE, 1)
     kept = found["kept"]
     assert (kept.depth[0][kept.known[0] > 0] > 5.5).all() and kept.known[0].mean() > 0.5
     assert (kept.rgb[0, 0, 0] * kept.known[0]).max() < 0.6  # no red
@@ -65,7 +65,7 @@ def test_a_keyframe_of_nothing_but_things_says_nothing():
     frame = scene(slice(0, 24), slice(0, 32))
     keys = Keyframes.of(frame.rgb, still(frame.depth, frame.things), frame.pose, CAMERA)
     assert (keys.walls.abs() >= 1e5).all()
-    assert look([keys], at((0.0, 0.3, 0.0)), CAMERA, SIZE, 1).known.sum() == 0
+    assert look(keys, torch.tensor([[0]]), at((0.0, 0.3, 0.0)), CAMERA, SIZE, 1).known.sum() == 0
 
 
 def test_a_thing_that_comes_nearer_grows_whole():
@@ -97,7 +97,7 @@ def test_the_kernel_carries_as_the_slow_way_does():
     rgb = torch.randint(256, (6, 3, 24, 32), generator=rng, dtype=torch.uint8)
     pose, aside = at(*[(0.0, 0.0, 0.3)] * 6), at(*[(0.2 * n, -0.1 * n, 0.3 - 0.04 * n) for n in range(6)])
     covered = torch.rand(depth.shape, generator=rng) < 0.1
-    frame = Frame(rgb, depth - 1.5 * things, things, pose, covered)
+    frame = rgb, depth - 1.5 * things, things, covered, pose
     for seen_from in (pose, aside):
-        quick, slow = _carried(frame, seen_from, CAMERA), carried_slowly(frame, seen_from, CAMERA)
+        quick, slow = carry_things(*frame, seen_from, CAMERA), carry_things_slowly(*frame, seen_from, CAMERA)
         assert ((quick - slow).abs() > 1e-3).float().mean() < 1e-3 and slow[:, 3].mean() > 0.4

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from ..data.dataset import decoded
+from ..data.features import decoded
 from ..data.format import AUTOMATIC, to_numpy
 from ..data.storage.tables import open_parquet
 from .survey import Survey

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.dataset import decoded
+from ..data.features import decoded, sensors_of
 from ..data.format import (
     ACTION_VALID,
     AUTOMATIC,
@@ -21,7 +21,6 @@ from ..data.format import (
     TIME,
     Layout,
     schema,
-    sensors_of,
     tidy,
 )
 from ..data.source import follows, is_action

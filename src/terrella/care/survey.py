@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from ..data.dataset import checked_features
 from ..data.episodes import Episode, EpisodeTable
+from ..data.features import checked_features
 from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, inside, sensor_from_json
 from ..data.source import Sensor
 from ..data.storage.tables import open_parquet, read_json, read_whole

@@ -30,10 +30,11 @@ COMMANDS = {
     "data label": ("data:label", "write learned actions into a recording"),
     "data view": ("data:view", "look through a recording in the browser"),
 }
-# what older releases called commands and options
+# other names of commands and options, most of them those of older releases
 RENAMED = {
     "train eye": "train estimator",
     "train things": "train objects",
+    "record gym": "record world",
     "train senses": "train uncertainty",
     "--eye": "--estimator",
 }
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _run(given)
     except KeyboardInterrupt as stop:
-        print(f"terrella: {stop or 'stopped.'}", file=sys.stderr)
+        print(f"terrella: {str(stop) or 'stopped.'}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # whoever read our output has gone
         sys.stdout = None
@@ -148,6 +149,7 @@ def _sentence(error: Exception) -> str | None:
         return f"{error.strerror}{where}; choose another folder, or free some space."
     source = f"{type(error).__module__} {error}"
     if any(word in source for word in _DRAWING):
-        what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        sys.unraisablehook = lambda _: None  # half-made renderers complain again when they are thrown away
+        what = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
         return f"the simulator cannot draw without a display ({what}); set MUJOCO_GL=egl or MUJOCO_GL=osmesa and try again."
     return None

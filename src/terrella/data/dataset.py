@@ -2,58 +2,35 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import Image
 
 from ..core.errors import DatasetError
+from ..core.spec import Camera, kind_of
+from .channels import ACTION, DONE, REWARD, RGB, cameras_of, channel_of
 from .episodes import Episode, EpisodeTable, read_episodes
-from .format import (
-    ACTION,
-    ACTION_VALID,
-    DEPTH,
-    DEPTH_BEYOND,
-    DEPTH_UNIT_M,
-    DONE,
-    INFO,
-    POSE_NAMES,
-    REWARD,
-    RGB,
-    STATE,
-    STREAM_PATH,
-    TASKS,
-    TIME,
-    WORLD,
-    names_of,
-    schema,
-    sensor_from_json,
-    sensors_of,
-    to_numpy,
-    where,
-)
+from .features import as_depth, checked_features, is_deep, metres, sensors_of, shown, unit_of
+from .format import ACTION_VALID, DEPTH_BEYOND, INFO, STREAM_PATH, TIME, names_of, to_numpy, where
+from .meta import read_about, read_info, read_sensors, read_tasks
 from .resample import resample
 from .source import Lazy, Readings, Sensor, Source, Take, follows, is_action
 from .storage import mp4
 from .storage.remote import Files, LocalFiles, open_files
-from .storage.tables import RowsOf, ValuesOf, read_json, read_rows, read_whole
+from .storage.tables import RowsOf, ValuesOf, read_rows, read_whole
 
-# array name -> feature that holds it
-COLUMNS = {
-    "depth": DEPTH,
-    "pose": STATE,
+TASK = "task_index"
+_FIXED = {
     "action": ACTION,
     "action_valid": ACTION_VALID,
     "reward": REWARD,
     "done": DONE,
-}
-_PICTURES = ("PNG", "JPEG", "WEBP")
-_BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)
-_WIDEST = 1 << 27  # numbers in one row of one feature; more is damage
+    "task": TASK,
+}  # array -> feature
 
 
 class Dataset:
@@ -66,6 +43,7 @@ class Dataset:
     sensors:      the same as Sensors, without those that every LeRobot dataset has.
     streams:      sensors with clocks of their own, kept beside the rows.
     cameras:      names of the features that are pictures.
+    channels:     channel of a World ("rgb", "rgb.wrist", "depth", "pose", "health", …) -> feature that holds it.
     fps:          rows a second.
     length:       rows in all.
     episodes:     a sequence of Episode.
@@ -78,7 +56,7 @@ class Dataset:
         self.files = open_files(root) if isinstance(root, str | Path) else root
         self.root = Path(root if isinstance(root, str | Path) else root.root)
         self.name = str(root).rstrip("/").rsplit("/", 1)[-1]
-        self.info = _read_info(self)
+        self.info = read_info(self.root, self.files)
         try:
             self.features: dict[str, dict] = checked_features(self.info["features"])
             self.fps = float(self.info["fps"])
@@ -87,14 +65,28 @@ class Dataset:
                 raise ValueError("a sensible fps, total_frames or total_episodes")
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise DatasetError(f"{self.root / INFO} lacks {error}: it is not a whole LeRobot v3 info.json.") from error
-        self.about = _read_about(self)
+        self.about = read_about(self.root, self.files)
         self.world: dict = self.about.get("world", {})
-        known = _read_sensors(self, "sensors")
-        self.sensors = sensors_of(self.features, known)
-        self.streams = _read_sensors(self, "streams")
+        self.sensors = sensors_of(self.features, read_sensors(self.root, self.about, "sensors"))
+        self.streams = read_sensors(self.root, self.about, "streams")
+        videos = [name for name, sensor in self.sensors.items() if self.features[name]["dtype"] == "video"]
+        self.episodes: EpisodeTable = read_episodes(self, videos, count)
+        self._look_for_depth()
         self.cameras = tuple(name for name, sensor in self.sensors.items() if sensor.kind == "image")
         self.rgb_key = RGB if RGB in self.cameras else (self.cameras[0] if self.cameras else None)
-        self.episodes: EpisodeTable = read_episodes(self, count)
+        self.channels = self._channels()
+        self._array = {"depth": self.channels.get("depth"), "pose": self.channels.get("pose"), **_FIXED}
+
+    @cached_property
+    def tasks(self) -> tuple[str, ...]:
+        """The texts of the tasks by their number ("task_index")."""
+        return read_tasks(self.root, self.files)
+
+    @cached_property
+    def camera_models(self) -> dict[str, Camera]:
+        """channel -> Camera: intrinsics, size, and the pose channel that it is mounted on; {} where nobody said."""
+        size = self.sensors[self.rgb_key].shape[:2] if self.rgb_key else (1, 1)
+        return cameras_of(self.world, size)
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -102,35 +94,37 @@ class Dataset:
         return names_of(feature) or tuple(f"action_{i}" for i in range(feature["shape"][0]))
 
     def has(self, name: str) -> bool:
-        """Whether episodes have the array `name` (rgb, depth, pose, action, action_valid, reward, done)."""
-        if name == "rgb":
-            return self.rgb_key is not None
-        if name == "pose":
-            return names_of(self.features.get(STATE, {})) == POSE_NAMES
+        """Whether episodes have the array `name` (rgb, depth, pose, action, action_valid, reward, done), or a channel."""
         if name == "action_valid":
             return any(map(is_action, self.features))
-        return COLUMNS[name] in self.features
+        return name in self.channels
+
+    def feature(self, name: str) -> str | None:
+        """The feature that an array, a channel or a feature's own name means; None where the recording has none such."""
+        if name in self.features:
+            return name
+        meant = (_FIXED.get(name), self.channels.get(name), self.channels.get(channel_of(name)))
+        return next((feature for feature in meant if feature in self.features), None)
 
     def episode(self, number: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The arrays of one episode of T rows: `names`, or all but the cameras other than "rgb".
+        """The arrays of one episode of T rows: `names` (arrays, channels or features), or all but the cameras other than "rgb".
 
         rgb uint8 [T, H, W, 3]; depth float32 [T, h, w] metres (65.535 = beyond range); pose float32 [T, 7];
         action float32 [T, A]; action_valid bool [T]; reward float32 [T]; done bool [T]; other features by their key
-        (cameras as rgb, other depth as depth, the rest as stored).
+        (cameras as rgb, other depth as depth, texts as objects, the rest as stored).
         """
         episode = self._episode(number)
-        known = [name for name in ("rgb", *COLUMNS) if self.has(name)]
-        taken = {COLUMNS[name] for name in known if name != "rgb"}
-        extra = [key for key in self.features if key.startswith("observation.") and key not in taken]
-        numeric = [key for key in extra if key not in self.cameras]
-        wanted = [*known, *numeric] if names is None else list(names)
+        known = [name for name in ("rgb", *self._array) if self.has(name)]
+        taken = {self.feature(name) for name in known}
+        extra = [key for key in self.sensors if key not in taken]
+        wanted = [*known, *(key for key in extra if key not in self.cameras)] if names is None else list(names)
         for name in wanted:
-            if name not in known and name not in self.features:
+            if self.feature(name) is None and name != "action_valid":
                 raise DatasetError(f"{self.root} has no '{name}'; it has {', '.join([*known, *extra])}.")
-        pictures = [name for name in wanted if name == "rgb" or name in self.cameras]
+        pictures = [name for name in wanted if self.feature(name) in self.cameras]
         found = self._columns(episode, [name for name in wanted if name not in pictures])
         for name in pictures:
-            found[name] = np.stack(list(self.frames(number, None if name == "rgb" else name)))
+            found[name] = np.stack(list(self.frames(number, name)))
         return {name: found[name] for name in wanted}
 
     def frames(
@@ -149,16 +143,15 @@ class Dataset:
         if camera in episode.videos:
             path, begin = self._film(episode, camera)
             return iter(mp4.frames(path, begin + first, count, self.fps)) if count else iter(())
-        shape = tuple(self.features[camera]["shape"])
-        pictures = self._table(episode, [camera])[camera]
-        return (decoded(pictures[i].as_py(), shape, camera) for i in range(first, first + count))
+        sensor, pictures = self.sensors[camera], self._table(episode, [camera])[camera]
+        return (shown(pictures[i].as_py(), sensor) for i in range(first, first + count))
 
     def rgb_at(self, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
         """Full-resolution pictures uint8 [n, H, W, 3] of any rows of the dataset, in the order asked."""
         wanted, camera = np.asarray(indices, dtype=np.int64).reshape(-1), self._camera(camera)
         if wanted.size and not (0 <= wanted.min() and wanted.max() < self.length):
             raise DatasetError(f"row {wanted.max()} was asked of {self.root}, which has rows 0 to {self.length - 1}.")
-        result = np.empty((len(wanted), *self.features[camera]["shape"]), np.uint8)
+        result = np.empty((len(wanted), *self.sensors[camera].shape), np.uint8)
         numbers = self.episodes.of_rows(wanted)
         for number in np.unique(numbers):
             episode, inside = self.episodes[int(number)], np.flatnonzero(numbers == number)
@@ -167,9 +160,8 @@ class Dataset:
                 path, first = self._film(episode, camera)
                 result[inside] = mp4.frames_at(path, (rows + first).tolist(), self.fps)[back]
             else:
-                table = self._table(episode, [camera])[camera]
-                shape = result.shape[1:]
-                result[inside] = np.stack([decoded(table[int(row)].as_py(), shape, camera) for row in rows])[back]
+                table, sensor = self._table(episode, [camera])[camera], self.sensors[camera]
+                result[inside] = np.stack([shown(table[int(row)].as_py(), sensor) for row in rows])[back]
         return result
 
     def time_s(self, number: int) -> np.ndarray:
@@ -181,9 +173,14 @@ class Dataset:
 
     def readings(self, number: int, name: str) -> Readings:
         """What a sensor or stream read in one episode, at its true times; [] where it read nothing."""
+        if name not in self.streams and name not in self.sensors:
+            there = ", ".join(dict.fromkeys([*self.streams, *self.sensors])) or "none"
+            raise DatasetError(f"{self.root} has no sensor '{name}'; it has {there}.")
         if name in self.streams:
-            return self._stream(number, self.streams[name])
-        return self._take(number).readings[name]
+            stream = self._stream(number, self.streams[name])
+            if len(stream.time_s) or name not in self.sensors:
+                return stream
+        return self._of_rows(self._episode(number), name, self.time_s(number))  # it has the rows' times
 
     def aligned(
         self,
@@ -192,19 +189,17 @@ class Dataset:
         policy: Literal["previous", "nearest", "linear"] = "previous",
         max_gap_s: float | None = None,
     ) -> tuple[Sequence | np.ndarray, np.ndarray]:
-        """A stream's readings brought to the rows of an episode: (values of T rows, valid bool [T]), as `resample` says."""
-        if name not in self.streams:
-            raise DatasetError(f"{self.root} has no stream '{name}'; it has {', '.join(self.streams) or 'none'}.")
-        return resample(
-            self._stream(number, self.streams[name]), self.streams[name], self.time_s(number), policy, max_gap_s
-        )
+        """A sensor's readings brought to the rows of an episode: (values of T rows, valid bool [T]), as `resample` says."""
+        readings = self.readings(number, name)
+        sensor = self.streams[name] if name in self.streams else self.sensors[name]
+        return resample(readings, sensor, self.time_s(number), policy, max_gap_s)
 
     def source(self) -> Source:
         """This recording as every format is read: sensors at the rows' times, streams at their own."""
         sensors = {**self.sensors, **self.streams}
 
         rate = None if self.streams or TIME in self.features else self.fps
-        ours = ("version", "sensors", "streams", "terminal", "pose", "depth_unit_m", "depth_beyond")
+        ours = ("version", "sensors", "streams", "channels", "terminal", "pose", "depth_unit_m", "depth_beyond")
         facts = {key: value for key, value in self.about.items() if key not in ours}
         takes = Lazy(len(self.episodes), self._take)
         return Source(self.name, sensors, lambda: takes, rate, str(self.info.get("robot_type") or ""), (), facts)
@@ -213,28 +208,29 @@ class Dataset:
 
     def _take(self, number: int) -> Take:
         episode, at = self._episode(number), self.time_s(number)
-        readings: dict[str, Readings] = {}
-        for name, sensor in self.sensors.items():
-            there = self._there(episode, name)
-            if not there.any():
-                continue
-            if sensor.kind == "image":
-                values = self._pictures(episode, name)
-            elif sensor.kind == "depth":
-                stored = RowsOf(self.files.local(episode.data), name, episode.start, episode.stop, self.features)
-                values = Lazy(episode.length, lambda i, stored=stored: _metres(stored[i]))
-            else:
-                values = self._stored(episode, [name])[name]
-            if not there.all():
-                rows = np.flatnonzero(there)
-                values = values[rows] if isinstance(values, np.ndarray) else _chosen(values, rows)
-            readings[name] = Readings(at[there], values)
-        for name, sensor in self.streams.items():
-            stream = self._stream(number, sensor)
-            if len(stream.time_s):
-                readings[name] = stream
+        readings = {name: self._of_rows(episode, name, at) for name in self.sensors}
+        streams = {name: self._stream(number, sensor) for name, sensor in self.streams.items()}
+        readings |= {name: stream for name, stream in streams.items() if len(stream.time_s)}
+        readings = {name: one for name, one in readings.items() if len(one.time_s)}
         facts = {"language": self._language(episode, at)} if len(episode.tasks) > 1 else {}
         return Take(readings, episode.task, episode.start_ns, facts)
+
+    def _of_rows(self, episode: Episode, name: str, at: np.ndarray) -> Readings:
+        """What a sensor read in the rows, whose times are `at`."""
+        sensor, there = self.sensors[name], self._there(episode, name)
+        if not there.any():
+            return Readings(np.zeros(0), [])
+        if sensor.kind == "image":
+            values = self._pictures(episode, name)
+        elif sensor.kind == "depth":
+            stored = self._pictures(episode, name)
+            values = Lazy(episode.length, lambda i: metres(stored[i].reshape(sensor.shape), sensor))
+        else:
+            values = self._stored(episode, [name])[name]
+        if not there.all():
+            rows = np.flatnonzero(there)
+            values = values[rows] if isinstance(values, np.ndarray) else _chosen(values, rows)
+        return Readings(at[there], values)
 
     def _there(self, episode: Episode, name: str) -> np.ndarray:
         """bool [T]: the rows in which a sensor was read; the rest is padding."""
@@ -249,22 +245,21 @@ class Dataset:
 
     def _language(self, episode: Episode, at: np.ndarray) -> list[list]:
         """[[time_s, text], ...]: what is being done from each time on, in an episode whose rows have several tasks."""
-        table = read_whole(self.files.local(TASKS))
-        name = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)
-        if name is None or "task_index" not in table.column_names:
-            raise DatasetError(f"{self.root / TASKS} is no table of tasks; see `terrella data doctor {self.root}`.")
-        texts = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist()))
-        number = self._stored(episode, ["task_index"])["task_index"].reshape(-1)
+        number = self._stored(episode, [TASK])[TASK].reshape(-1)
         changes = [0, *(np.flatnonzero(np.diff(number)) + 1)]
-        return [[float(at[row]), str(texts.get(int(number[row]), ""))] for row in changes]
+        texts = dict(enumerate(self.tasks))
+        return [[float(at[row]), texts.get(int(number[row]), "")] for row in changes]
 
-    def _pictures(self, episode: Episode, camera: str) -> Sequence[np.ndarray]:
-        if camera in episode.videos:
-            path, first = self._film(episode, camera)
-            return mp4.Frames(path, first, episode.length, self.fps)
-        stored = RowsOf(self.files.local(episode.data), camera, episode.start, episode.stop, self.features)
-        shape = tuple(self.features[camera]["shape"])
-        return Lazy(episode.length, lambda i: decoded(stored[i], shape, camera))
+    def _pictures(self, episode: Episode, name: str) -> Sequence[np.ndarray]:
+        """An image or depth sensor's rows as they are stored, each decoded when it is looked at."""
+        sensor = self.sensors[name]
+        if name in episode.videos:
+            path, first = self._film(episode, name)
+            return mp4.Frames(path, first, episode.length, self.fps, deep=sensor.kind == "depth")
+        stored = RowsOf(self.files.local(episode.data), name, episode.start, episode.stop, self.features)
+        if self.features[name]["dtype"] != "image":
+            return stored
+        return Lazy(episode.length, lambda i: shown(stored[i], sensor))
 
     def _stream(self, number: int, sensor: Sensor) -> Readings:
         name = STREAM_PATH.format(name=sensor.name, suffix="parquet", **where(number))
@@ -288,7 +283,7 @@ class Dataset:
                 numbers = stored[i].reshape(shape)
             except ValueError as error:
                 raise DatasetError(f"{self.root / name}: reading {i} is not of shape {shape}; restore it.") from error
-            return _metres(numbers) if sensor.kind == "depth" else numbers
+            return metres(numbers, sensor) if sensor.kind == "depth" else numbers
 
         values = Lazy(len(time_s), value)
         if sensor.kind == "vector" and len(time_s):
@@ -301,12 +296,40 @@ class Dataset:
         return self.episodes[number]
 
     def _camera(self, name: str | None) -> str:
-        name = self.rgb_key if name is None else name
-        if name is None or name not in self.cameras:
+        found = self.rgb_key if name is None else self.feature(name)
+        if found is None or found not in self.cameras:
             raise DatasetError(
                 f"{self.root} has no pictures{f' {name}' if name else ''}; it has {', '.join(self.features)}."
             )
-        return name
+        return found
+
+    def _channels(self) -> dict[str, str]:
+        told, found = {feature: channel for channel, feature in self.about.get("channels", {}).items()}, {}
+        main = {"rgb": self.rgb_key} if self.rgb_key else {}
+        for name, sensor in self.sensors.items():
+            channel = told.get(name) or channel_of(name, sensor.names)
+            kind = {"image": "rgb", "depth": "depth"}.get(sensor.kind)
+            if kind and kind_of(channel) != kind:  # a stranger's own way of naming it
+                channel = f"{kind}.{name.rsplit('.', 1)[-1]}"
+                main.setdefault(kind, name)
+            found.setdefault(channel, name)
+        return {**main, **found}
+
+    def _look_for_depth(self) -> None:
+        """Makes depth of image features of one channel that prove to have 16 bits, though nothing says that they are depth."""
+        for name, sensor in self.sensors.items():
+            feature = self.features[name]
+            if (
+                sensor.kind == "image"
+                and feature["dtype"] == "image"
+                and feature["shape"][2] == 1
+                and len(self.episodes)
+            ):
+                try:
+                    first = self._table(self.episodes[0], [name])[name]
+                    self.sensors[name] = as_depth(sensor) if len(first) and is_deep(first[0].as_py()) else sensor
+                except DatasetError:
+                    pass  # whoever reads it is told
 
     def _film(self, episode: Episode, camera: str) -> tuple[Path, int]:
         film = episode.videos[camera]
@@ -328,11 +351,14 @@ class Dataset:
         return found
 
     def _columns(self, episode: Episode, names: list[str]) -> dict[str, np.ndarray]:
-        stored = {name: COLUMNS.get(name, name) for name in names}
-        there = self._stored(episode, [key for key in stored.values() if key in self.features])
+        stored = {name: self.feature(name) for name in names}
+        columns = {key: key for key in stored.values() if key is not None}
+        pictured = [key for key in columns if self.features[key]["dtype"] in ("image", "video")]
+        there = self._stored(episode, [key for key in columns if key not in pictured])
+        there |= {key: np.stack(list(self._pictures(episode, key))) for key in pictured}
         found = {}
         for name, key in stored.items():
-            if key not in there:  # action_valid of a stranger's recording: what follows the last row is unknown
+            if key is None:  # action_valid of a stranger's recording: what follows the last row is unknown
                 found[name] = np.arange(episode.length) < episode.length - 1
             else:
                 found[name] = _as_promised(name, there[key], self.sensors.get(key))
@@ -341,7 +367,8 @@ class Dataset:
 
 def _as_promised(name: str, array: np.ndarray, sensor: Sensor | None) -> np.ndarray:
     if sensor is not None and sensor.kind == "depth":
-        return array.astype(np.float32) * np.float32(DEPTH_UNIT_M)
+        flat = array.reshape(len(array), *sensor.shape)
+        return metres(flat, sensor, beyond=DEPTH_BEYOND * unit_of(sensor))
     if name in ("reward", "done", "action_valid"):
         return array.reshape(-1).astype(np.float32 if name == "reward" else bool)
     return array.astype(np.float32) if name in ("pose", "action") else array
@@ -349,80 +376,3 @@ def _as_promised(name: str, array: np.ndarray, sensor: Sensor | None) -> np.ndar
 
 def _chosen(values: Sequence, rows: np.ndarray) -> Lazy:
     return Lazy(len(rows), lambda i: values[int(rows[i])])
-
-
-def _metres(stored: np.ndarray) -> np.ndarray:
-    metres = stored.astype(np.float32) * np.float32(DEPTH_UNIT_M)
-    return np.where(stored == DEPTH_BEYOND, np.float32(np.inf), metres)
-
-
-def decoded(picture: Mapping | None, shape: tuple[int, ...], camera: str) -> np.ndarray:
-    """A picture kept as bytes, uint8 [H, W, 3]."""
-    try:
-        with Image.open(io.BytesIO((picture or {})["bytes"]), formats=_PICTURES) as image:
-            if image.size != (shape[1], shape[0]):
-                raise ValueError(f"it has {image.size[1]}x{image.size[0]} pixels, {shape[0]}x{shape[1]} are promised")
-            return np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, KeyError, TypeError, SyntaxError, *_BOMBS) as error:
-        raise DatasetError(f"a picture of {camera} cannot be read ({error}); restore its file from a copy.") from error
-
-
-def checked_features(features: object) -> dict[str, dict]:
-    """The features of an info.json; ValueError where they are none."""
-    if not isinstance(features, dict) or not 0 < len(features) <= 10_000:
-        raise ValueError("features")
-    for name, feature in features.items():
-        shape: list = (feature.get("shape") if isinstance(feature, dict) else None) or []
-        whole = isinstance(shape, list) and 0 < len(shape) <= 5 and all(type(n) is int and n > 0 for n in shape)
-        if not whole or not isinstance(feature.get("dtype"), str):
-            raise ValueError(f"a dtype and shape of feature '{name[:100]}'")
-        if math.prod(shape) > _WIDEST:
-            raise ValueError(f"a possible shape of feature '{name[:100]}' ({math.prod(shape):,} numbers a row)")
-        if feature["dtype"] in ("video", "image"):
-            if len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3):  # some write channels first
-                feature["shape"] = shape = [shape[1], shape[2], shape[0]]
-            if len(shape) != 3 or shape[2] != 3:
-                raise ValueError(f"height, width and 3 channels of camera '{name[:100]}'")
-    schema(features)
-    return features
-
-
-def _read_info(dataset: Dataset) -> dict:
-    root, files = dataset.root, dataset.files
-    make_one = f"record one with `terrella record doom --out {root}`"
-    if not files.exists(INFO):
-        if isinstance(files, LocalFiles) and not root.is_dir():
-            raise DatasetError(f"there is no dataset at {root}; {make_one}.")
-        if files.exists("meta/episodes.jsonl"):
-            raise DatasetError(f"{root} has no {INFO}; it looks like a damaged LeRobot v2 dataset.")
-        raise DatasetError(f"{root} is not a LeRobot dataset (it has no {INFO}); {make_one} in a new folder.")
-    path = files.local(INFO)
-    try:
-        info: dict = read_json(path)  # pyright: ignore  (a TypeError where it is none)
-        version = str(info["codebase_version"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DatasetError(f"{root / INFO} is not a LeRobot info.json ({error}); restore it from a copy.") from error
-    if version.removeprefix("v").split(".")[0] != "3":
-        raise DatasetError(
-            f"{root} is a LeRobot dataset of version {version[:20]} and v3.0 is read here; convert it with LeRobot's "
-            "`python -m lerobot.datasets.v30.convert_dataset_v21_to_v30`."
-        )
-    return info
-
-
-def _read_about(dataset: Dataset) -> dict:
-    if not dataset.files.exists(WORLD):
-        return {}
-    path = dataset.files.local(WORLD)
-    try:
-        about: dict = read_json(path)  # pyright: ignore  (a TypeError where it is none)
-        return {**about, "world": dict(about["world"])}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DatasetError(f"{dataset.root / WORLD} is not readable ({error}); restore it from a copy.") from error
-
-
-def _read_sensors(dataset: Dataset, kind: str) -> dict[str, Sensor]:
-    try:
-        return {name: sensor_from_json(name, told) for name, told in dict(dataset.about.get(kind, {})).items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"{dataset.root / WORLD} is not readable ({error}); restore it from a copy.") from error

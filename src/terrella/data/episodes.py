@@ -106,14 +106,16 @@ class EpisodeTable(Sequence[Episode]):
         return np.searchsorted(self.stops, rows, side="right")
 
 
-def read_episodes(dataset: Dataset, count: int) -> EpisodeTable:
-    """The first `count` episodes of meta/episodes; what a killed recorder left beyond them is not looked at."""
+def read_episodes(dataset: Dataset, cameras: Sequence[str], count: int) -> EpisodeTable:
+    """The first `count` episodes of meta/episodes; what a killed recorder left beyond them is not looked at.
+
+    cameras: features that are kept as video.
+    """
     root = dataset.root
     if count > _MOST:
         raise DatasetError(
             f"{root} claims {count:,} episodes, more than can be meant; restore meta/info.json from a copy."
         )
-    cameras = [name for name in dataset.cameras if dataset.features[name]["dtype"] == "video"]
     columns = [
         "episode_index",
         "data/chunk_index",

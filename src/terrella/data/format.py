@@ -1,4 +1,4 @@
-"""The LeRobotDataset v3.0 layout: where its files lie, which features it has and how Arrow holds them."""
+"""The LeRobotDataset v3.0 layout: where its files lie, which features it has, and how Arrow holds them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from gymnasium import spaces
 
 from ..core.errors import DatasetError
-from ..core.spec import Spec, dtype_of, shape_of
+from ..core.spec import Spec, shape_of
+from .channels import ACTION, DEPTH, DONE, POSE_NAMES, REWARD, RGB, STATE, facts_of, sensors_of_channels
 from .source import Sensor, is_action
 
 VERSION = "v3.0"
@@ -26,16 +26,12 @@ EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.par
 STREAM_PATH = "streams/{name}/chunk-{chunk_index:03d}/file-{file_index:03d}.{suffix}"
 INFO, STATS, TASKS, WORLD = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/terrella.json"
 
-RGB, DEPTH, STATE = "observation.images.rgb", "observation.depth", "observation.state"
-ACTION, ACTION_VALID, REWARD, DONE = "action", "action_valid", "next.reward", "next.done"
+ACTION_VALID = "action_valid"
 TIME = "time_s"  # float64: seconds since the episode began, by the recorder's clock; `timestamp` is frame_index / fps
 AUTOMATIC = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 POSE_CONVENTION = "T_world_cam: metres and quaternion w,x,y,z; world z up; camera x forward, y left, z up"
 DEPTH_UNIT_M = 0.001  # one step of the stored uint16
 DEPTH_BEYOND = 65535  # stored where nothing lies within range; reads back as 65.535 m
-KNOWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
-DREAMT = ("uncertainty", "known", "keyframes")  # what a dream tells of itself is no evidence
 
 
 @dataclass(frozen=True)
@@ -50,6 +46,7 @@ class Layout:
     robot:    LeRobot's robot_type.
     world:    free facts about the recorded world, kept in meta/terrella.json.
     facts:    whatever else is kept there, by name.
+    channels: channel of the recorded world -> the sensor that holds it, where that is not `feature_of(channel)`.
     """
 
     fps: float
@@ -60,6 +57,7 @@ class Layout:
     robot: str = "terrella"
     world: Mapping[str, object] = field(default_factory=dict)
     facts: Mapping[str, object] = field(default_factory=dict)
+    channels: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def of_channels(
@@ -87,35 +85,19 @@ class Layout:
 
     @staticmethod
     def of(spec: Spec, fps: float | None = None) -> Layout:
-        """The layout that records every channel of a world that LeRobot v3.0 can hold."""
-        channels = spec.channels
-        size = {name: _height_width(channels[name]) for name in ("rgb", "depth") if name in channels}
-        vectors = {
-            name: int(np.prod(shape_of(space)))
-            for name, space in channels.items()
-            if name not in (*KNOWN_CHANNELS, *DREAMT) and len(shape_of(space)) <= 1
-        }
-        arrays = {
-            name: (shape_of(space), dtype_of(space).name)
-            for name, space in channels.items()
-            if name not in (*KNOWN_CHANNELS, *DREAMT) and len(shape_of(space)) == 2
-        }
+        """The layout that records every channel of a world; DatasetError names what no recording can hold."""
+        channels = sensors_of_channels(spec)
         width = int(np.prod(shape_of(spec.action)))
         names = spec.action_names if len(spec.action_names) == width else tuple(f"action_{i}" for i in range(width))
-        world = {
-            "name": spec.name,
-            "dt_s": spec.dt_s,
-            "camera": list(spec.camera) if spec.camera else None,
-            "action_space": str(spec.action),
-            "action_names": list(spec.action_names),
-            "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
-            "units": dict(spec.units),
-            "discrete": isinstance(spec.action, spaces.Discrete),
-            **_limits(spec),
-        }
+        units = spec.action_units or (spec.units.get(ACTION, ""),) * width
+        units = {name: unit for name, unit in zip(names, units) if unit}
+        action = Sensor(ACTION, "vector", (width,), names=names, units=units, frame=spec.action_frame)
+        follow = {"reward": Sensor(REWARD, "vector", (1,)), "done": Sensor(DONE, "vector", (1,), "bool")}
+        seen = [sensor for name, sensor in channels.items() if name not in follow]
+        made = [*seen, action, *(channels.get(name, sensor) for name, sensor in follow.items())]
         rate = tidy(fps if fps is not None else 1 / spec.dt_s)
-        pictured = size.get("rgb"), size.get("depth"), "pose" in channels
-        return Layout.of_channels(rate, names, *pictured, vectors, world, arrays)
+        named = {name: sensor.name for name, sensor in channels.items()}
+        return Layout(rate, {sensor.name: sensor for sensor in made}, world=facts_of(spec), channels=named)
 
     @property
     def rows(self) -> dict[str, Sensor]:
@@ -171,26 +153,6 @@ def even(sensor: Sensor) -> tuple[int, int]:
     return height, width
 
 
-def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dict[str, Sensor]:
-    """The sensors of a stranger's `features`; what `known` (meta/terrella.json) says of one is added."""
-    found = {}
-    for name, feature in features.items():
-        if name in AUTOMATIC or name in (ACTION_VALID, TIME):
-            continue
-        shape, dtype = tuple(feature["shape"]), feature["dtype"]
-        if dtype in ("video", "image"):
-            sensor = Sensor(name, "image", shape, "uint8")
-        elif dtype == "uint16" and len(shape) == 2 and name.startswith(DEPTH):
-            sensor = Sensor(name, "depth", shape)
-        else:
-            sensor = Sensor(name, "vector", shape, dtype, names_of(feature))
-        if name in known:
-            more = known[name]
-            sensor = replace(sensor, units=more.units, frame=more.frame, rate_hz=more.rate_hz, facts=more.facts)
-        found[name] = sensor
-    return found
-
-
 def names_of(feature: Mapping) -> tuple[str, ...]:
     """One name per number of a feature, () where it does not say."""
     names = feature.get("names")
@@ -229,17 +191,6 @@ def sensor_from_json(name: str, told: Mapping) -> Sensor:
         None if rate is None else float(rate),
         dict(told.get("facts", {})),
     )
-
-
-def _limits(spec: Spec) -> dict[str, list[float]]:
-    """The least and greatest action, where both are finite."""
-    low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
-    return {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
-
-
-def _height_width(space: spaces.Space) -> tuple[int, int]:
-    height, width = shape_of(space)[:2]
-    return height, width
 
 
 def tidy(fps: float) -> float:

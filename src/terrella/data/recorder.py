@@ -5,11 +5,12 @@ from __future__ import annotations
 import errno
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import av
 import numpy as np
@@ -17,32 +18,25 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from . import stats
-from .format import (
-    ACTION,
-    ACTION_VALID,
-    DEPTH,
-    DEPTH_BEYOND,
-    DEPTH_UNIT_M,
-    DONE,
-    REWARD,
-    RGB,
-    STATE,
-    TIME,
-    Layout,
-    even,
-)
+from .channels import ACTION, DONE, REWARD, feature_of
+from .features import unit_of
+from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even
 from .source import Sensor, follows, is_action
 from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Staged, about, growing, growing_stream, pack_row
 from .storage.journal import Journal
 from .storage.mp4 import Mp4Writer
 from .writer import Writer, fresh
 
-if TYPE_CHECKING:
-    from ..exchange.live import Live
-
-_CHANNELS = {"rgb": RGB, "depth": DEPTH, "pose": STATE}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
+
+
+class Watch(Protocol):
+    """Where what is recorded is shown to somebody at the same time. start_ns: wall-clock time of its time 0."""
+
+    start_ns: int
+
+    def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -76,7 +70,7 @@ class Recorder:
         layout: Layout,
         task: str = "explore",
         interrupted: Literal["keep", "discard"] = "keep",
-        live: Live | None = None,
+        live: Watch | None = None,
     ):
         self.task, self.layout, self.recovered, self.live = task, layout, 0, live
         self._writer = Writer(root, layout)
@@ -86,7 +80,9 @@ class Recorder:
         self._numbers = {name: 1 + i for i, name in enumerate(layout.streams)}
         self._videos: dict[str, Mp4Writer] = {}
         self._films: dict[str, Mp4Writer] = {}
+        self._running: list[Callable[[], object]] = []  # ends the files in flight
         self._journal: Journal | None = None
+        weakref.finalize(self, _abandon, self._running, self._writer.close).atexit = False
         self._pressure = Pressure()
         self._closed = False
         self._forget()
@@ -127,7 +123,12 @@ class Recorder:
 
         `action` is None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`.
         """
-        row = {_CHANNELS.get(name, f"observation.{name}"): value for name, value in observation.items()}
+        row = {self.layout.channels.get(name) or feature_of(name): value for name, value in observation.items()}
+        unknown = sorted(name for name in row if name not in self.layout.sensors)
+        if unknown:
+            raise DatasetError(
+                f"this recording has no place for '{unknown[0]}'; it holds {', '.join(self.layout.sensors)}."
+            )
         if action is not None:
             row[ACTION] = np.asarray(action, np.float32).reshape(-1)
             row[REWARD] = np.array([reward], np.float32)
@@ -302,6 +303,8 @@ class Recorder:
                 if sensor.kind == "image":
                     rate = sensor.rate_hz or layout.fps
                     self._films[name] = Mp4Writer(growing_stream(folder, name), even(sensor), rate)
+            videos = [*self._videos.values(), *self._films.values()]
+            self._running += [self._journal.close, *(video.abandon for video in videos)]
         return self._journal
 
     # -- what is left over --------------------------------------------------------------------------------------
@@ -352,6 +355,7 @@ class Recorder:
         """Ends the files in flight."""
         self._pressure = self.pressure
         videos, self._videos, self._films = [*self._videos.values(), *self._films.values()], {}, {}
+        self._running.clear()
         if self._journal:
             self._journal.close()
             self._journal = None
@@ -370,6 +374,13 @@ class Recorder:
         self._stop(quietly=True)
         self._forget()
         shutil.rmtree(self._staging, ignore_errors=True)
+
+
+def _abandon(running: list[Callable[[], object]], let_go: Callable[[], None]) -> None:
+    """What is left to do for a recorder that nobody closed: the next one keeps the rows that it has staged."""
+    for end in running:
+        end()
+    let_go()
 
 
 class NotFinite(DatasetError):
@@ -396,7 +407,8 @@ def _as_stored(sensor: Sensor, value, what: str) -> np.ndarray:
         raise DatasetError(f"{what} should have shape {sensor.shape}; got {array.shape}.")
     if sensor.kind == "depth":
         with np.errstate(over="ignore"):
-            steps = np.nan_to_num(array.astype(np.float64) / DEPTH_UNIT_M + 0.5, nan=DEPTH_BEYOND, posinf=DEPTH_BEYOND)
+            steps = array.astype(np.float64) / unit_of(sensor) + 0.5
+            steps = np.nan_to_num(steps, nan=DEPTH_BEYOND, posinf=DEPTH_BEYOND)
         return np.clip(steps, 0, DEPTH_BEYOND).astype(np.uint16)
     dtype = np.dtype(sensor.dtype)
     if dtype.kind in "iub" and array.dtype != dtype:

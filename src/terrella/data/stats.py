@@ -19,7 +19,9 @@ def summarise(values: np.ndarray, sampled: bool = False) -> Summary:
 
 
 def summarise_pictures(pictures: np.ndarray) -> Summary:
-    """Of uint8 [n, H, W, 3] pictures, per colour in 0..1 as shape [3, 1, 1]."""
+    """Of uint8 [n, H, W, 3] pictures, per colour in 0..1 as shape [3, 1, 1]; of depth [n, H, W] as it is, shape [1, 1, 1]."""
+    if pictures.ndim == 3:
+        return _summary(pictures.reshape(-1, 1).astype(np.float64), len(pictures), (1, 1, 1))
     return _summary(pictures.reshape(-1, 3) / 255.0, len(pictures), (3, 1, 1))
 
 

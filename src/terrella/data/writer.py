@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import pyarrow.parquet as pq
 
 from ..core.errors import DatasetError
 from . import stats
+from .channels import NAME
 from .format import (
     ACTION_VALID,
     DATA_PATH,
@@ -44,7 +44,6 @@ from .storage import durable
 
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
-NAME = re.compile(r"\w[\w.-]{0,200}")
 _CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error, not another number
 EPISODES_PER_TABLE = (
     128  # so many one-row tables of meta/episodes are made one, so that opening a long dataset stays quick
@@ -187,6 +186,7 @@ class Writer:
             facts = {"pose": POSE_CONVENTION, "depth_unit_m": DEPTH_UNIT_M, "depth_beyond": DEPTH_BEYOND}
             layout = self.layout
             told = {"world": dict(layout.world), "sensors": _json(layout.sensors), "streams": _json(layout.streams)}
+            told |= {"channels": dict(layout.channels)} if layout.channels else {}
             try:
                 durable.write_json(self.root / WORLD, {**layout.facts, "version": 2, **told, **facts})
             except (TypeError, ValueError) as error:
@@ -202,7 +202,8 @@ class Writer:
         for kind, sensors in (("streams", self.layout.streams), ("sensors", self.layout.sensors)):
             now = json.loads(json.dumps(_json(sensors)))
             was = world.get(kind, {} if kind == "streams" else now)  # recordings of version 1 do not tell
-            changed += sorted(name for name in {*was, *now} if was.get(name) != now.get(name) and name not in changed)
+            told = sorted(name for name in {*was, *now} if not _alike(was.get(name), now.get(name)))
+            changed += [name for name in told if name not in changed]
         if changed or info["fps"] != self.layout.fps:
             what = ", ".join(changed) if changed else f"{info['fps']} frames/s"
             raise DatasetError(f"{self.root} was recorded with another layout ({what}); record to a new folder.")
@@ -404,6 +405,13 @@ def _columns(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _stream(name: str, number: int, suffix: str) -> str:
     return STREAM_PATH.format(name=name, suffix=suffix, **where(number))
+
+
+def _alike(was: Mapping | None, now: Mapping | None) -> bool:
+    """Whether a sensor is what it was, units and frame that were not told then apart."""
+    if was is None or now is None:
+        return was is now
+    return all(was.get(key) == value or (key in ("units", "frame") and not was.get(key)) for key, value in now.items())
 
 
 def _json(sensors: Mapping[str, Sensor]) -> dict:

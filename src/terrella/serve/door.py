@@ -1,28 +1,103 @@
-"""The HTTP connections of a server: one that does not finish its request in time is closed, and only so many may wait."""
+"""What our pages share: the port, the files, and HTTP connections of which only so many may wait, and none for long."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
+import socket
 import sys
 from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from importlib import resources
 from typing import Any
 
 import h11
 import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from ..core.errors import ServeError
+from .guard import Guard
 
 REQUEST_S = 10.0  # from the first to the last byte of a request
 MOST_WAITING = 64  # connections that have not finished a request; beyond it the oldest of them goes
 COMPLAIN_EVERY_S = 60.0
 
 
-def settings(app: Any, websockets: bool) -> uvicorn.Config:
-    """How our pages are served; `websockets`: the page has one."""
-    return uvicorn.Config(
+def open_port(host: str, port: int) -> socket.socket:
+    """A listening socket; ServeError where the address cannot be had. Port 0 takes any free one."""
+    if not 0 <= port < 2**16:
+        raise ServeError(f"{port} is no port; choose one from 1 to 65535 with --port (0 takes any that is free).")
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, number)
+    except OSError as error:
+        raise ServeError(f"{host} is no address of this machine ({error.strerror}); use --host 127.0.0.1.") from error
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise ServeError(
+                f"port {port} is in use; stop what uses it or choose another with --port (0 takes any)."
+            ) from error
+        raise ServeError(
+            f"cannot listen on {host}:{port} ({error.strerror}); choose another with --host and --port."
+        ) from error
+    listener.setblocking(False)
+    return listener
+
+
+def page_address(host: str, port: int, token: str | None) -> str:
+    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    shown = f"[{shown}]" if ":" in shown else shown
+    return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
+
+
+def application(
+    files: Mapping[str, tuple[str, str]],
+    routes: Sequence[BaseRoute],
+    lifespan: Callable[[Starlette], AbstractAsyncContextManager[None]],
+    host: str,
+    token: str | None,
+) -> Starlette:
+    """A page as an ASGI application. files: path -> the file below web/ that answers it, and its type; `host` is the address
+    that it is bound to, which decides what Host headers it answers to."""
+    web = resources.files("terrella.serve") / "web"
+    contents = {path: ((web / name).read_bytes(), kind) for path, (name, kind) in files.items()}
+
+    def show(request: Request) -> Response:
+        content, kind = contents[request.url.path]
+        return Response(content, media_type=kind)
+
+    @contextlib.asynccontextmanager
+    async def quiet_lifespan(app: Starlette) -> AsyncIterator[None]:
+        quiet_accepting(asyncio.get_running_loop())
+        async with lifespan(app):
+            yield
+
+    guard = Middleware(Guard, host=host, token=token, files=contents)
+    return Starlette(
+        routes=[*(Route(path, show) for path in contents), *routes], lifespan=quiet_lifespan, middleware=[guard]
+    )
+
+
+def make_uvicorn(app: Starlette, websockets: bool) -> uvicorn.Server:
+    """The server of a page; `websockets`: the page has one."""
+    settings = uvicorn.Config(
         app, http=Door, ws="websockets-sansio" if websockets else "none", ws_max_size=2**16, ws_max_queue=64,
         ws_per_message_deflate=False, log_level="error", access_log=False, timeout_graceful_shutdown=2,
         server_header=False, proxy_headers=False,
     )  # fmt: skip
+    return uvicorn.Server(settings)
 
 
 def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:

@@ -7,6 +7,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 from ..core.errors import ProtocolError
 from .actions import MAX_AXES
@@ -69,31 +70,6 @@ def encode_frame(frame: Frame) -> bytes:
     return b"".join([*parts, struct.pack(f"<{len(frame.vitals)}f", *frame.vitals)])
 
 
-def decode_frame(data: bytes) -> Frame:
-    """What `encode_frame` wrote; ProtocolError where the bytes are cut short or of another version."""
-    try:
-        fields = _HEADER.unpack_from(data)
-        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, uncertainty = fields
-        if version != VERSION:
-            raise ProtocolError(
-                f"a frame of protocol version {version} came, this side speaks {VERSION}; reload the page."
-            )
-        images, at = [], _HEADER.size
-        for _ in range(count):
-            world, camera, _, length = _IMAGE.unpack_from(data, at)
-            at += _IMAGE.size
-            images.append(Image(world, camera, data[at : at + length]))
-            at += length
-        vitals = struct.unpack(f"<{max(len(data) - at, 0) // 4}f", data[at:])
-    except struct.error as error:
-        raise ProtocolError(f"a frame of {len(data)} bytes is cut short; reload the page.") from error
-    if at > len(data):
-        raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
-    return Frame(
-        seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, uncertainty, vitals
-    )
-
-
 @dataclass(frozen=True)
 class Controls:
     """What is held from now on: keys in the order they were pressed, and the value of each axis in the world's units.
@@ -112,14 +88,13 @@ class Ack:
     seq: int
 
 
-@dataclass(frozen=True)
-class Pause:
-    pass
+class Verb(Enum):
+    """Messages without a body."""
 
-
-@dataclass(frozen=True)
-class Resume:
-    """Goes on; out of the past, back to the newest moment."""
+    PAUSE = "pause"
+    RESUME = "resume"  # goes on; out of the past, back to the newest moment
+    BRANCH = "branch"  # goes on from the moment shown; what came after it is forgotten
+    SYNC = "sync"  # the dream observes the game beside it
 
 
 @dataclass(frozen=True)
@@ -141,16 +116,6 @@ class Seek:
     """Stand at `step`, or the nearest that is remembered."""
 
     step: int
-
-
-@dataclass(frozen=True)
-class Branch:
-    """Goes on from the moment shown; what came after it is forgotten."""
-
-
-@dataclass(frozen=True)
-class Sync:
-    """The dream observes the game beside it."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +147,7 @@ class Picture:
     data: bytes
 
 
-Message = Controls | Ack | Pause | Resume | Restart | Rewind | Seek | Branch | Sync | Record | Drive | Show | Picture
+Message = Controls | Ack | Verb | Restart | Rewind | Seek | Record | Drive | Show | Picture
 
 
 def parse_message(data: str | bytes) -> Message:
@@ -216,15 +181,12 @@ def _controls(body: dict) -> Controls:
 
 
 _READERS: dict[str, Callable[[dict], Message]] = {
+    **{verb.value: lambda body, verb=verb: verb for verb in Verb},
     "controls": _controls,
     "ack": lambda body: Ack(_integer(body, "seq", 0, U32)),
-    "pause": lambda body: Pause(),
-    "resume": lambda body: Resume(),
     "restart": lambda body: Restart(None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1)),
     "rewind": lambda body: Rewind(_integer(body, "steps", -U32, U32)),
     "seek": lambda body: Seek(_integer(body, "step", 0, U32)),
-    "branch": lambda body: Branch(),
-    "sync": lambda body: Sync(),
     "record": lambda body: Record(_switch(body, "on")),
     "drive": lambda body: Drive(_switch(body, "on")),
     "show": lambda body: Show(

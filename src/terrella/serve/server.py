@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import os
 import secrets
 import signal
@@ -14,12 +13,10 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib import resources
 
 import torch
 import uvicorn
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
@@ -33,8 +30,8 @@ from . import protocol
 from .actions import axes_of
 from .chart import knows_share, mapped
 from .clip import make_clip
-from .door import quiet_accepting, settings
-from .guard import Guard, RateLimit, is_loopback
+from .door import application, make_uvicorn, open_port, page_address
+from .guard import RateLimit, is_loopback
 from .picture import uncertainty_levels
 from .recording import SinkFactory
 from .session import Session
@@ -63,22 +60,28 @@ class ServeConfig:
     timeline: TimelineConfig = TimelineConfig()
 
 
+@dataclass(frozen=True)
+class Offer:
+    """What a page plays: see `serve`."""
+
+    worlds: Sequence[World]
+    seed: int = 0
+    sink_factory: SinkFactory | None = None
+    picture: torch.Tensor | None = None
+    policy: Policy | None = None
+    config: ServeConfig = ServeConfig()
+
+    def timeline(self) -> Timeline:
+        """A new one, for one person."""
+        return Timeline(self.worlds, self.seed, self.sink_factory, self.config.timeline, self.picture, self.policy)
+
+
 class Sessions:
     """The sessions of one server, their one worker thread and their seats."""
 
-    def __init__(
-        self,
-        worlds: Sequence[World],
-        seed: int,
-        sink_factory: SinkFactory | None,
-        config: ServeConfig,
-        picture: torch.Tensor | None = None,
-        policy: Policy | None = None,
-    ):
-        self.worlds, self.seed, self.config = tuple(worlds), seed, config
-        self.picture, self.policy = picture, policy
-        self._sink_factory = sink_factory
-        self._seats = config.seats if all(world.spec.forkable for world in worlds) else 1
+    def __init__(self, offer: Offer):
+        self.offer, self.worlds, self.config = offer, offer.worlds, offer.config
+        self._seats = offer.config.seats if all(world.spec.forkable for world in offer.worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
         self._open: dict[str, tuple[Session, asyncio.Task]] = {}
         self._ended: set[asyncio.Task] = set()
@@ -95,7 +98,7 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self._make_timeline, self._worker)
+        session = Session(self.offer.timeline, self._worker)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -119,9 +122,6 @@ class Sessions:
         self._ended.add(task)
         task.add_done_callback(self._ended.discard)
 
-    def _make_timeline(self) -> Timeline:
-        return Timeline(self.worlds, self.seed, self._sink_factory, self.config.timeline, self.picture, self.policy)
-
     def hello(self, session: Session, resumed: bool) -> str:
         """All that the page needs to know about the worlds."""
         labels = ("game", "dream") if len(self.worlds) == 2 else ("",)
@@ -133,8 +133,8 @@ class Sessions:
             resumed=resumed,
             worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
             no_rewind=f"{fixed} is a running game: it cannot go back in time." if fixed else "",
-            no_record="" if self._sink_factory else "start the server with --record FOLDER.",
-            driver=type(self.policy).__name__ if self.policy else "",
+            no_record="" if self.offer.sink_factory else "start the server with --record FOLDER.",
+            driver=type(self.offer.policy).__name__ if self.offer.policy else "",
         )
 
 
@@ -165,26 +165,14 @@ def _describe(world: World, label: str) -> dict:
 
 
 def build_app(
-    worlds: Sequence[World],
-    host: str = "127.0.0.1",
-    token: str | None = None,
-    sink_factory: SinkFactory | None = None,
-    seed: int = 0,
-    config: ServeConfig | None = None,
-    on_ready: Callable[[], None] | None = None,
-    picture: torch.Tensor | None = None,
-    policy: Policy | None = None,
+    offer: Offer, host: str = "127.0.0.1", token: str | None = None, on_ready: Callable[[], None] | None = None
 ) -> Starlette:
-    """The ASGI application; `host` is the address it is bound to, which decides what Host headers it answers to."""
-    check_playable(worlds)
-    config = config or ServeConfig()
-    page = resources.files("terrella.serve") / "web"
-    files = {path: ((page / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
+    """The ASGI application; ServeError where the worlds cannot be played."""
+    check_playable(offer.worlds)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        quiet_accepting(asyncio.get_running_loop())
-        app.state.sessions = sessions = Sessions(worlds, seed, sink_factory, config, picture, policy)
+        app.state.sessions = sessions = Sessions(offer)
         sweeper = asyncio.create_task(_sweep(sessions))
         if on_ready:
             on_ready()
@@ -194,10 +182,6 @@ def build_app(
             sweeper.cancel()
             await sessions.end_all()
 
-    def show(request: Request) -> Response:
-        content, kind = files[request.url.path]
-        return Response(content, media_type=kind)
-
     def check(request: Request) -> Response:
         return PlainTextResponse("ok")
 
@@ -206,7 +190,7 @@ def build_app(
         pictures = await session.pictures() if session else []
         if not pictures:
             return PlainTextResponse("this session has ended; reload the page.", 404)
-        spec = worlds[0].spec
+        spec = offer.worlds[0].spec
         content = await asyncio.get_running_loop().run_in_executor(None, make_clip, pictures, spec.dt_s)
         name = "".join(letter if letter.isalnum() else "-" for letter in spec.name)[:60]
         disposition = {"Content-Disposition": f'attachment; filename="{name}.mp4"'}
@@ -215,11 +199,8 @@ def build_app(
     async def play(websocket: WebSocket) -> None:
         await _play(websocket, websocket.app.state.sessions)
 
-    routes = [Route(path, show) for path in files]
-    routes += [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
-    return Starlette(
-        routes=routes, lifespan=lifespan, middleware=[Middleware(Guard, host=host, token=token, files=files)]
-    )
+    routes = [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
+    return application(_FILES, routes, lifespan, host, token)
 
 
 async def _sweep(sessions: Sessions) -> None:
@@ -271,32 +252,6 @@ async def _listen(websocket: WebSocket, session: Session, config: ServeConfig) -
                 return await websocket.close(1008, "too many faults")
 
 
-def open_port(host: str, port: int) -> socket.socket:
-    """A listening socket; ServeError where the address cannot be had. Port 0 takes any free one."""
-    if not 0 <= port < 2**16:
-        raise ServeError(f"{port} is no port; choose one from 1 to 65535 with --port (0 takes any that is free).")
-    try:
-        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, number)
-    except OSError as error:
-        raise ServeError(f"{host} is no address of this machine ({error.strerror}); use --host 127.0.0.1.") from error
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind(address)
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise ServeError(
-                f"port {port} is in use; stop what uses it or choose another with --port (0 takes any)."
-            ) from error
-        raise ServeError(
-            f"cannot listen on {host}:{port} ({error.strerror}); choose another with --host and --port."
-        ) from error
-    listener.setblocking(False)
-    return listener
-
-
 def serve(
     worlds: Sequence[World],
     host: str = "127.0.0.1",
@@ -316,14 +271,15 @@ def serve(
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
     """
-    check_playable(worlds)
+    offer = Offer(tuple(worlds), seed, sink_factory, picture, policy, config or ServeConfig())
+    check_playable(offer.worlds)
     # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
     torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(16)
     listener = open_port(host, port)
     with contextlib.closing(listener):
-        server = make_server(worlds, listener, host, token, sink_factory, on_ready, seed, config, picture, policy)
+        server = make_server(offer, listener, host, token, on_ready)
         with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
             server.run(sockets=[listener])
 
@@ -342,25 +298,12 @@ def _ended_like_ctrl_c() -> Iterator[None]:
 
 
 def make_server(
-    worlds: Sequence[World],
+    offer: Offer,
     listener: socket.socket,
     host: str = "127.0.0.1",
     token: str | None = None,
-    sink_factory: SinkFactory | None = None,
     on_ready: Callable[[str], None] | None = None,
-    seed: int = 0,
-    config: ServeConfig | None = None,
-    picture: torch.Tensor | None = None,
-    policy: Policy | None = None,
 ) -> uvicorn.Server:
     """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
-    ready = (lambda: on_ready(url)) if on_ready else None
-    app = build_app(worlds, host, token, sink_factory, seed, config, ready, picture, policy)
-    return uvicorn.Server(settings(app, websockets=True))
-
-
-def page_address(host: str, port: int, token: str | None) -> str:
-    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
-    shown = f"[{shown}]" if ":" in shown else shown
-    return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
+    return make_uvicorn(build_app(offer, host, token, (lambda: on_ready(url)) if on_ready else None), websockets=True)

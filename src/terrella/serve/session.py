@@ -19,20 +19,17 @@ from .chart import Chart
 from .history import Moment
 from .protocol import (
     Ack,
-    Branch,
     Controls,
     Drive,
     Frame,
     Message,
-    Pause,
     Picture,
     Record,
     Restart,
-    Resume,
     Rewind,
     Seek,
     Show,
-    Sync,
+    Verb,
 )
 from .timeline import Timeline
 
@@ -204,9 +201,9 @@ class Session:
     async def _obey(self, message: Message, timeline: Timeline) -> None:
         try:
             match message:
-                case Pause():
+                case Verb.PAUSE:
                     self._paused = True
-                case Resume():
+                case Verb.RESUME:
                     self._unseen = await self._work(timeline.to_newest) if timeline.rewound else self._unseen
                     self._paused, self._error = False, ""
                 case Restart(seed):
@@ -217,13 +214,13 @@ class Session:
                     self._unseen = await self._work(timeline.stand_at, timeline.shown.step - steps)
                 case Seek(step):
                     self._unseen = await self._work(timeline.stand_at, step)
-                case Branch():
+                case Verb.BRANCH:
                     self._unseen = await self._work(timeline.branch)
                     self._paused, self._error = False, ""
                 case Picture(data):
                     self._unseen = await self._work(timeline.enter, data)
                     self._paused, self._error = False, ""
-                case Sync():
+                case Verb.SYNC:
                     self._unseen = await self._work(timeline.sync)
                 case Record(on):
                     await self._work(timeline.record, on)

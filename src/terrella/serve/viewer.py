@@ -11,23 +11,20 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from importlib import resources
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .door import quiet_accepting, settings
-from .guard import Guard, is_loopback
-from .server import open_port, page_address
+from .door import application, make_uvicorn, open_port, page_address
+from .guard import is_loopback
 
 _SCRIPTS = ("app", "library", "tiles", "depth", "points", "map", "tracks", "colours")
 _FILES = {
@@ -236,12 +233,9 @@ def build_viewer(
     exporting = Exporting(viewable, Path(export_to) if export_to is not None else None)
     desk = _Desk(viewable, exporting)
     worker = ThreadPoolExecutor(1, thread_name_prefix="recording")
-    web = resources.files("terrella.serve") / "web"
-    files = {path: ((web / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        quiet_accepting(asyncio.get_running_loop())
         if on_ready:
             on_ready()
         try:
@@ -249,10 +243,6 @@ def build_viewer(
         finally:
             await asyncio.get_running_loop().run_in_executor(None, exporting.stop)
             worker.shutdown(cancel_futures=True)
-
-    def show(request: Request) -> Response:
-        content, kind = files[request.url.path]
-        return Response(content, media_type=kind)
 
     async def answered(request: Request, method: Callable[..., Response], *arguments: object) -> Response:
         try:
@@ -279,8 +269,7 @@ def build_viewer(
     async def export(request: Request) -> Response:
         return _json(exporting.status) if request.method == "GET" else await answered(request, desk.export)
 
-    routes = [Route(path, show) for path in files]
-    routes += [
+    routes = [
         Route("/about", asks(desk.about)),
         Route("/episode/{number:int}", asks(desk.episode)),
         Route("/times/{number:int}/{sensor:int}", asks(desk.times)),
@@ -289,9 +278,7 @@ def build_viewer(
         Route("/mark", mark, methods=["POST"]),
         Route("/export", export, methods=["GET", "POST"]),
     ]
-    app = Starlette(
-        routes=routes, lifespan=lifespan, middleware=[Middleware(Guard, host=host, token=token, files=files)]
-    )
+    app = application(_FILES, routes, lifespan, host, token)
     app.state.exporting = exporting
     return app
 
@@ -320,7 +307,7 @@ def make_viewer(
     """The server behind `view`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
     url = page_address(host, listener.getsockname()[1], token)
     app = build_viewer(viewable, host, token, export_to, (lambda: on_ready(url)) if on_ready else None)
-    return uvicorn.Server(settings(app, websockets=False))
+    return make_uvicorn(app, websockets=False)
 
 
 def view(

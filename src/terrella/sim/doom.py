@@ -8,6 +8,7 @@ place should hold it. Each sprite among it is told apart: `cast` says where it s
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import tempfile
@@ -321,13 +322,24 @@ def _open_game(
         game.set_doom_skill(config.skill)
     game.add_game_args("+movebob 0")  # the head does not bob: its phase would be a hidden state
     game.set_episode_timeout(config.timeout_tics)
+    _begin(game, scenario)
+    return game, buttons, alive
+
+
+def _begin(game: vizdoom.DoomGame, scenario: str) -> None:
+    """Starts the process. The empty folder for saved games that ViZDoom makes in the working folder is taken away again."""
+    saves = Path("_vizdoom")
+    existed = saves.exists()
     try:
         game.init()
     except vizdoom.FileDoesNotExistException as error:
         raise TerrellaError(
             f"{scenario} needs a file that ViZDoom does not bring ({error}); choose another."
         ) from error
-    return game, buttons, alive
+    finally:
+        if not existed:
+            with contextlib.suppress(OSError):
+                saves.rmdir()
 
 
 def _wad(game: vizdoom.DoomGame) -> Path:

@@ -104,7 +104,7 @@ def painted(
         return painted_slowly(rgb, depth, pictures, order, there, sides, far)
     rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
     given = arrays(order, there, pictures, sides.double(), far.double(), depth + BEHIND_M)
-    parts = (*given, *arrays(rgb, onto, instances))
+    parts = [*given, *arrays(rgb, onto, instances)]
     over_views(len(rgb), lambda first, last: paint_views(first, last, *parts))
     return rgb, onto, instances
 

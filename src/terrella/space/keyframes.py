@@ -137,8 +137,9 @@ def retrieve(
         return retrieve_slowly(shared, pose, camera, size, count, own, rows)
     picks = torch.full((len(pose), count), -1)
     lots = (tuple(arrays(keys.coarse, keys.depth, keys.turn, keys.pose)) for keys in (shared, own))
-    parts = (*lots, *arrays(rows, rotation(pose), pose[:, :3]), camera, (size[0] // 2, size[1] // 2), _GRID, ANYWAY)
-    over_views(len(pose), lambda first, last: kernels.choose(first, last, *parts, picks.numpy()))
+    parts = [*lots, *arrays(rows, rotation(pose), pose[:, :3]), camera, (size[0] // 2, size[1] // 2), _GRID, ANYWAY]
+    parts.append(picks.numpy())
+    over_views(len(pose), lambda first, last: kernels.choose(first, last, *parts))
     return picks
 
 
@@ -179,7 +180,7 @@ def pick(votes: torch.Tensor, count: int) -> torch.Tensor:
     if votes.device.type != "cpu":
         return pick_slowly(votes, count)
     picks = torch.full((len(votes), count), -1)
-    parts = (*arrays(votes), ANYWAY, picks.numpy())
+    parts = [*arrays(votes), ANYWAY, picks.numpy()]
     over_views(len(votes), lambda first, last: kernels.pick_views(first, last, *parts))
     return picks
 
@@ -213,13 +214,13 @@ def look(
     depth = torch.full((batch, height, width), FAR_M)
     turns, positions, chosen = arrays(rotation(pose), pose[:, :3], picks)
     mine = arrays(own.depth, own.turn, own.pose)
-    cast = (chosen, *arrays(shared.fine), *mine, turns, positions, camera, FINE, SLANT, depth.numpy())
+    cast = [chosen, *arrays(shared.fine), *mine, turns, positions, camera, FINE, SLANT, depth.numpy()]
     over_views(batch, lambda first, last: surfaces(first, last, *cast))
     hit = depth < FAR_M
     depth = fill_holes(depth)
     colours, trust = torch.zeros(batch, slots, 3, height, width), torch.zeros(batch, slots, height, width)
     lots = (tuple(arrays(keys.rgb, keys.depth, keys.turn, keys.pose)) for keys in (shared, own))
-    parts = (chosen, *lots, depth.numpy(), turns, positions, camera, colours.numpy(), trust.numpy())
+    parts = [chosen, *lots, depth.numpy(), turns, positions, camera, colours.numpy(), trust.numpy()]
     over_views(batch, lambda first, last: kernels.recall(first, last, *parts))
     return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 

@@ -183,7 +183,7 @@ class Memory:
             return self.covered_slowly(held, views)
         keys, share = self._keyframes(held), torch.zeros(rows.shape)
         given = arrays(keys.coarse, keys.depth, keys.turn, keys.pose, rows, dreamt)
-        parts = (*given, self.camera, _EVERY, share.numpy())
+        parts = [*given, self.camera, _EVERY, share.numpy()]
         over_views(len(views), lambda first, last: kernels.covered(first, last, *parts))
         return share
 

@@ -22,7 +22,7 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
 
     One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
     their neighbours' by half, and cross(down, across) points towards the camera that saw them. A patch that would reach
-    over an edge in the depth image keeps to its own pixel; one that is too slanted to be told from a bridge between two
+    over an edge in the depth image keeps to its own pixel; one that is too slanted to be distinguished from a bridge between two
     surfaces shrinks to nothing, lest from the side it be a wall across the room.
     """
     if depth.device.type != "cpu":
@@ -32,7 +32,7 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
         depth.float().reshape(-1, height, width), rotation(pose).reshape(-1, 3, 3), pose[..., :3].reshape(-1, 3)
     )
     found = torch.empty(len(images), patch_count((height, width), stride), 9)
-    parts = images, turns, positions, camera, stride, SLANT, found.numpy()
+    parts = [images, turns, positions, camera, stride, SLANT, found.numpy()]
     over_views(len(images), lambda first, last: lift_views(first, last, *parts))
     return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
 
@@ -84,7 +84,7 @@ def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tupl
     if patch.device.type != "cpu":
         return cast_slowly(patch, pose, camera, size)
     depth = torch.full((len(pose), *size), FAR_M)
-    parts = (*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy())
+    parts = [*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy()]
     over_views(len(pose), lambda first, last: cast_views(first, last, *parts))
     return depth
 

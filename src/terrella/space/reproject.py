@@ -43,7 +43,7 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
     filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
-    parts = (*arrays(depth, least_around(depth)), FAR_M, levels, filled.numpy())
+    parts = [*arrays(depth, least_around(depth)), FAR_M, levels, filled.numpy()]
     over_views(len(depth), lambda first, last: fill_views(first, last, *parts))
     return filled
 
@@ -108,7 +108,7 @@ def carry_unknown(
         return carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera)
     carried = torch.zeros(len(rgb), 4, *target_depth.shape[-2:])
     given = rgb, depth, rotation(pose), pose, known, target_depth, rotation(target_pose), target_pose
-    parts = (*arrays(*given), camera, carried.numpy())
+    parts = [*arrays(*given), camera, carried.numpy()]
     over_views(len(rgb), lambda first, last: carry_views(first, last, *parts))
     return carried
 
@@ -135,11 +135,11 @@ def carry_things(
     pixels = arrays(rgb, depth, things, covered)
     turns, poses, new_turns, new_poses = arrays(rotation(pose), pose, rotation(target_pose), target_pose)
     flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
-    splat = (*pixels[1:3], turns, poses, new_turns, new_poses, camera, flat.numpy(), canvas.numpy())
+    splat = [*pixels[1:3], turns, poses, new_turns, new_poses, camera, flat.numpy(), canvas.numpy()]
     over_views(len(rgb), lambda first, last: splat_views(first, last, *splat))
     (seen,) = arrays(_closed(canvas))
     found = torch.zeros(len(rgb), 6, *depth.shape[1:])
-    fetch = pixels[0], flat.numpy(), *pixels[2:], turns, poses, seen, new_turns, new_poses, camera, found.numpy()
+    fetch = [pixels[0], flat.numpy(), *pixels[2:], turns, poses, seen, new_turns, new_poses, camera, found.numpy()]
     over_views(len(rgb), lambda first, last: fetch_views(first, last, *fetch))
     return found
 

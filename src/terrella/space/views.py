@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
-import numpy as np
 import torch
 
 _POOL = ThreadPoolExecutor(os.cpu_count() or 1, "views")
@@ -23,6 +23,6 @@ def over_views(batch: int, work: Callable[[int, int], object]) -> None:
         other.result()
 
 
-def arrays(*parts: torch.Tensor) -> list[np.ndarray]:
+def arrays(*parts: torch.Tensor) -> list[Any]:
     """Tensors of the CPU as contiguous arrays, for kernels."""
     return [part.detach().contiguous().numpy() for part in parts]

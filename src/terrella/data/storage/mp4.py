@@ -179,8 +179,11 @@ def finish(growing: Path, target: Path, frames: int | None = None) -> int:
     return count
 
 
-def frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.ndarray]:
-    """Frames `first` .. `first + count - 1` of the file, uint8 [H, W, 3]; DatasetError where one is missing."""
+def frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -> Iterator[np.ndarray]:
+    """Frames `first` .. `first + count - 1` of the file, uint8 [H, W, 3]; DatasetError where one is missing.
+
+    deep: of depth in a video of one channel of 16 bits, uint16 [H, W].
+    """
     expected = first
     try:
         boxes.check(path)
@@ -202,7 +205,7 @@ def frames(path: Path, first: int, count: int, fps: float) -> Iterator[np.ndarra
                     break
                 if (frame.width, frame.height) != (stream.width, stream.height):
                     raise _broken(path, f"frame {expected} has another size than it claims")
-                yield reformatter.reformat(frame, format="rgb24").to_ndarray()
+                yield reformatter.reformat(frame, format="gray16le" if deep else "rgb24").to_ndarray()
                 expected += 1
                 if expected == first + count:
                     return
@@ -236,8 +239,8 @@ def frames_at(path: Path, indices: Sequence[int], fps: float) -> np.ndarray:
 class Frames(Sequence):
     """Frames `first` .. `first + count - 1` of a file, decoded when looked at; going on in order does not seek."""
 
-    def __init__(self, path: Path, first: int, count: int, fps: float):
-        self._path, self._first, self._count, self._fps = path, first, count, fps
+    def __init__(self, path: Path, first: int, count: int, fps: float, deep: bool = False):
+        self._path, self._first, self._count, self._fps, self._deep = path, first, count, fps, deep
         self._next, self._run = -1, iter(())
 
     def __len__(self) -> int:
@@ -251,7 +254,7 @@ class Frames(Sequence):
         index = int(index) % self._count
         ahead = index - self._next
         if self._next < 0 or not 0 <= ahead <= 2 * KEYFRAME_EVERY:
-            self._run = frames(self._path, self._first + index, self._count - index, self._fps)
+            self._run = frames(self._path, self._first + index, self._count - index, self._fps, self._deep)
             ahead = 0
         self._next = -1  # until it is found
         for _ in range(ahead):

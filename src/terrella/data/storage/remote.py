@@ -57,6 +57,11 @@ class LocalFiles:
     def exists(self, name: str) -> bool:
         return self.local(name).is_file()
 
+    def mark(self, name: str) -> str:
+        """What changes when the file does: its size; "" where it is not there."""
+        path = self.local(name)
+        return str(path.stat().st_size) if path.is_file() else ""
+
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""
         top = self.local(folder) if folder else self.root
@@ -107,6 +112,10 @@ class Files:
 
     def exists(self, name: str) -> bool:
         return self._facts(name) is not None
+
+    def mark(self, name: str) -> str:
+        """What changes when the file does: its size, and its tag or date; "" where it is not there."""
+        return ":".join(map(str, self._facts(name) or ("",)))
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""

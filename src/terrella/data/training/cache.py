@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import islice
 from pathlib import Path
@@ -15,13 +15,17 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.spec import Camera
+from ..channels import ESTIMATES, cameras_of, channel_of, feature_of, renamed
 from ..dataset import Dataset
-from ..format import DEPTH, INFO, STATE
+from ..format import INFO
 from ..storage import durable
-from ..storage.remote import LocalFiles
+from ..storage.remote import BUDGET_BYTES, LocalFiles
 
 Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]  # (dtype, shape of a row) by array
-_FORMAT = 2
+INSTRUCTION = "instruction"
+_FORMAT = 3
+_FETCHING = 4  # episodes of a recording far away that are fetched at once
 _TYPES = {
     "rgb": np.uint8,
     "depth": np.float16,
@@ -30,6 +34,7 @@ _TYPES = {
     "action_valid": np.bool_,
     "reward": np.float32,
     "done": np.bool_,
+    "task": np.int64,
 }
 _NUMBERS = {"float64": "float32"} | {
     name: name
@@ -58,9 +63,11 @@ class ClipCache:
     """Read-only arrays over all N rows of a dataset; what the recording lacks is None.
 
     rgb uint8 [N, H, W, 3]; depth float16 [N, h, w] metres (>= 65.5: beyond range); pose float32 [N, 7]; action float32
-    [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; episodes: (start, stop) row ranges.
-    `arrays` has those that there are by name, and the recording's other vectors ("observation.state", …) by their key.
-    All are memory-mapped: opening reads nothing of them, and takes no longer for a longer recording.
+    [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; task int64 [N], the place in `tasks` of the text that
+    the row is about; episodes: (start, stop) row ranges.
+    `arrays` has those that there are by name, and the recording's other vectors ("observation.state", …) by their key;
+    `keys` names the array of each channel. All are memory-mapped: opening reads nothing of them, and takes no longer for a
+    longer recording.
     """
 
     rgb: np.ndarray | None
@@ -70,6 +77,7 @@ class ClipCache:
     action_valid: np.ndarray
     reward: np.ndarray
     done: np.ndarray
+    task: np.ndarray | None
 
     def __init__(self, path: Path):
         self.path = path
@@ -79,6 +87,8 @@ class ClipCache:
             self.episodes = Ranges(np.load(path / "episodes.npy", mmap_mode="r"))
             self.length = self.episodes[-1][1]
             self.fps, self.action_names, self.world = about["fps"], tuple(about["action_names"]), about["world"]
+            self.tasks: tuple[str, ...] = tuple(about["tasks"])
+            self.keys: dict[str, str] = dict(about["keys"])
             short = [name for name, array in self.arrays.items() if len(array) != self.length]
             if short:
                 raise ValueError(f"{short[0]} has {len(self.arrays[short[0]])} of {self.length} rows")
@@ -91,9 +101,17 @@ class ClipCache:
 
     @property
     def further(self) -> dict[str, np.ndarray]:
-        """What else was recorded of the world's channels, such as "things" or "health", by name."""
+        """What else was recorded of the world's channels, such as "things" or "health", by name: no pictures, and nothing
+        of what a learned world says of itself, which is no evidence."""
         prefix = "observation."
-        return {key.removeprefix(prefix): array for key, array in self.arrays.items() if key.startswith(prefix)}
+        names = {key: key.removeprefix(prefix) for key in self.arrays if key.startswith(prefix)}
+        hidden = {key for key, name in names.items() if name in ESTIMATES or name.startswith("images.")}
+        return {name: self.arrays[key] for key, name in names.items() if key not in hidden}
+
+    @property
+    def camera_models(self) -> dict[str, Camera]:
+        """channel -> Camera of the recorded world; {} where nobody said."""
+        return cameras_of(self.world, self.rgb.shape[1:3] if self.rgb is not None else (1, 1))
 
     @property
     def vitals(self) -> dict[str, np.ndarray]:
@@ -106,23 +124,21 @@ class ClipCache:
         size: tuple[int, int] = (96, 128),
         progress: Callable[[int, int], None] | None = None,
         cameras: Sequence[str] = (),
+        budget_bytes: int = BUDGET_BYTES,
     ) -> ClipCache:
         """The cache of `dataset` with rgb at `size` (height, width), built first where it is missing or out of date.
 
         `cameras` are further ones by their keys, kept at the same size in `arrays`.
 
-        It lies in ROOT/.cache/terrella, or under $XDG_CACHE_HOME where the dataset's folder cannot be written.
+        It lies in ROOT/.cache/terrella, or under $XDG_CACHE_HOME where the dataset's folder cannot be written or lies far
+        away ("hf://…", "file://…"); then its files are fetched one by one, and the cache has at most `budget_bytes`.
         `progress(done, total)` counts episodes. Killing the build leaves nothing that could be mistaken for a cache.
         """
         dataset = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
-        if not isinstance(dataset.files, LocalFiles):
-            raise DatasetError(
-                f"{dataset.root} lies far away, and a clip cache is built of files here: read it with Clips, or copy it."
-            )
         if not dataset.length:
             raise DatasetError(f"{dataset.root} has no finished episode yet; record some first.")
-        shelf = _shelf(dataset)
-        more = "".join(f"+{hashlib.sha256(name.encode()).hexdigest()[:8]}" for name in sorted(set(cameras)))
+        shelf, cameras = _shelf(dataset), sorted(set(cameras))
+        more = "".join(f"+{hashlib.sha256(name.encode()).hexdigest()[:8]}" for name in cameras)
         kind = f"{size[0]}x{size[1]}{more}"
         path = shelf / f"{kind}-{_key(dataset, size)}"
         if path.is_dir():
@@ -133,7 +149,7 @@ class ClipCache:
                 for old in [*shelf.glob(f"{kind}-*"), *shelf.glob(".building*")]:
                     shutil.rmtree(old, ignore_errors=True)
                 try:
-                    _build(dataset, size, sorted(set(cameras)), shelf, path, progress)
+                    _build(dataset, size, cameras, path, budget_bytes, progress)
                 except OSError as error:
                     raise DatasetError(f"cannot build the cache {path} ({error}); free some space there.") from error
                 finally:
@@ -182,47 +198,60 @@ def _box(source: int, target: int) -> np.ndarray:
 
 def _key(dataset: Dataset, size: tuple[int, int]) -> str:
     """Changes whenever the recording does: its info, its episodes' statistics and every file's size go in."""
-    digest = hashlib.sha256(json.dumps([_FORMAT, list(size)]).encode())
-    digest.update((dataset.root / INFO).read_bytes())
-    for path in sorted((dataset.root / "meta" / "episodes").glob("*/*.parquet")):
-        with open(path, "rb") as file:
+    digest, files = hashlib.sha256(json.dumps([_FORMAT, list(size)]).encode()), dataset.files
+    for name in (INFO, *files.list("meta/episodes", ".parquet")):
+        with open(files.local(name), "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     last: tuple[str, ...] = ()
     for episode in dataset.episodes:
         for name in sorted(set(episode.files).difference(last)):
-            path = dataset.root / name
-            digest.update(f"{name}:{path.stat().st_size if path.exists() else -1};".encode())
+            digest.update(f"{name}:{files.mark(name)};".encode())
         last = episode.files
     return digest.hexdigest()[:16]
 
 
 def _shelf(dataset: Dataset) -> Path:
-    near = dataset.root / ".cache" / "terrella"
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    name = hashlib.sha256(str(dataset.root.resolve()).encode()).hexdigest()[:16]
-    for shelf in (near, home / "terrella" / name):
+    """The folder of a dataset's caches: in its own, or in the user's where that cannot be written or is far away."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "terrella"
+    if isinstance(dataset.files, LocalFiles):
+        name, near = str(dataset.root.resolve()), [dataset.root / ".cache" / "terrella"]
+    else:
+        name, near = str(dataset.files), []
+    shelves = [*near, home / hashlib.sha256(name.encode()).hexdigest()[:16]]
+    for shelf in shelves:
         try:
             shelf.mkdir(parents=True, exist_ok=True)
             (shelf / ".lock").touch()
             return shelf
         except OSError:
             continue
-    raise DatasetError(f"no cache can be written in {near} or {home}; set XDG_CACHE_HOME to a folder that can.")
+    tried = " or ".join(str(shelf) for shelf in shelves)
+    raise DatasetError(f"no cache can be written in {tried}; set XDG_CACHE_HOME to a folder that can.")
 
 
-def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], shelf: Path, path: Path, progress) -> None:
-    staged = shelf / ".building"
+def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path: Path, budget: int, progress) -> None:
+    staged, near = path.parent / ".building", isinstance(dataset.files, LocalFiles)
     staged.mkdir()
     kinds = kinds_of(dataset, size, cameras)
-    need = bytes_a_row(kinds) * dataset.length
-    free = shutil.disk_usage(shelf).free
+    need, free = bytes_a_row(kinds) * dataset.length, shutil.disk_usage(staged).free
     if need > free:
         raise DatasetError(
-            f"the cache of {dataset.root} needs {need / 1e9:.1f} GB and {free / 1e9:.1f} GB are free at {shelf}."
+            f"the cache of {dataset.root} needs {need / 1e9:.1f} GB and {free / 1e9:.1f} GB are free at {path.parent}."
+        )
+    if need > budget and not near:
+        raise DatasetError(
+            f"the cache of {dataset.files} needs {need / 1e9:.2g} GB and {budget / 1e9:.2g} GB may be kept here: allow more, "
+            "ask for smaller pictures, or read it in windows with Clips."
         )
     arrays = new_arrays(staged, kinds, dataset.length)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # decoding and resizing release the interpreter lock
-        jobs = [pool.submit(fill_episode, dataset, number, size, arrays) for number in range(len(dataset.episodes))]
+
+    def fill(number: int) -> None:
+        with dataset.files.holding(*(() if near else dataset.episodes[number].files)):
+            fill_episode(dataset, number, size, arrays)
+
+    workers = os.cpu_count() or 1  # decoding and resizing release the interpreter lock
+    with ThreadPoolExecutor(workers if near else min(workers, _FETCHING)) as pool:
+        jobs = [pool.submit(fill, number) for number in range(len(dataset.episodes))]
         try:
             for done, job in enumerate(as_completed(jobs), 1):
                 job.result()
@@ -233,33 +262,58 @@ def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], shel
                 job.cancel()
             raise
     ranges = np.stack([dataset.episodes.starts, dataset.episodes.stops], 1)
-    finish(staged, path, arrays, ranges, dataset.fps, dataset.action_names, dataset.world)
+    facts = {"action_names": list(dataset.action_names), "world": dataset.world}
+    finish(staged, path, arrays, ranges, dataset.fps, facts | {"tasks": list(dataset.tasks), "keys": keys_of(dataset)})
+
+
+def further_cameras(dataset: Dataset, channels: Sequence[str]) -> list[str]:
+    """The features of the cameras among `channels`, but for the main one."""
+    features = [dataset.feature(name) for name in channels]
+    return [name for name in features if name in dataset.cameras and name != dataset.rgb_key]
+
+
+def array_for(channel: str, arrays: Collection[str], keys: Mapping[str, str]) -> str | None:
+    """The array of a cache that a channel, a feature or an array's own name means; None where it has none such."""
+    task = "task" if channel == INSTRUCTION else None
+    meant = (channel, keys.get(channel), keys.get(channel_of(channel)), feature_of(channel), task)
+    return next((name for name in meant if name in arrays), None)
+
+
+def keys_of(dataset: Dataset) -> dict[str, str]:
+    """channel -> the array that holds it."""
+    arrays = {dataset.feature(name): name for name in _TYPES if dataset.feature(name)}
+    return {channel: arrays.get(feature, renamed(feature)) for channel, feature in dataset.channels.items()}
 
 
 def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:
     """(dtype, shape of a row) of every array that the cache of a dataset has, with pictures at `size` (height, width)."""
     if min(size) < 1:
         raise DatasetError(f"pictures of {size[0]}x{size[1]} pixels cannot be; ask for a (height, width).")
+    seen = dataset.feature("depth")
     shapes = {
         "rgb": (*size, 3),
-        "depth": tuple(dataset.features.get(DEPTH, {}).get("shape", ())),
+        "depth": () if seen is None else dataset.sensors[seen].shape,
         "pose": (7,),
         "action": (len(dataset.action_names),),
     }
-    found = {name: (np.dtype(_TYPES[name]), shapes.get(name, ())) for name in _TYPES if dataset.has(name)}
+    found = {name: (np.dtype(_TYPES[name]), shapes.get(name, ())) for name in _TYPES if _has(dataset, name)}
+    taken = {dataset.feature(name) for name in found}
     for name, sensor in dataset.sensors.items():
         if Path(name).name != name:
             raise DatasetError(f"a feature is named '{name[:100]}', which no file can be; rename it in meta/info.json.")
-        known = not name.startswith("observation.") or name == DEPTH or (name == STATE and "pose" in found)
-        if sensor.kind == "depth" and not known:
-            found[name] = (np.dtype(np.float16), sensor.shape)
-        elif sensor.kind == "vector" and sensor.dtype in _NUMBERS and not known:
-            found[name] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
+        if sensor.kind == "depth" and name not in taken:
+            found[renamed(name)] = (np.dtype(np.float16), sensor.shape)
+        elif sensor.kind == "vector" and sensor.dtype in _NUMBERS and name not in taken:
+            found[renamed(name)] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
     for name in cameras:
         if name not in dataset.cameras:
             raise DatasetError(f"{dataset.root} has no camera '{name}'; it has {', '.join(dataset.cameras) or 'none'}.")
         found[name] = (np.dtype(np.uint8), (*size, 3))
     return {name: kind for name, kind in found.items() if np.prod(kind[1]) > 0}
+
+
+def _has(dataset: Dataset, name: str) -> bool:
+    return bool(dataset.tasks) and dataset.feature(name) is not None if name == "task" else dataset.has(name)
 
 
 def bytes_a_row(kinds: Kinds) -> int:
@@ -284,15 +338,17 @@ def finish(
     arrays: Mapping[str, np.ndarray],
     ranges: np.ndarray,
     fps: float,
-    action_names: Sequence[str] = (),
-    world: Mapping[str, object] | None = None,
+    facts: Mapping[str, object] | None = None,
 ) -> None:
-    """Makes a folder of filled arrays and `ranges` int64 [E, 2] the cache at `path`, in one step."""
+    """Makes a folder of filled arrays and `ranges` int64 [E, 2] the cache at `path`, in one step.
+
+    facts: action_names, world, tasks and keys, where they are known.
+    """
     np.save(staged / "episodes.npy", ranges)
     for name in [*arrays, "episodes"]:
         durable.sync_file(staged / f"{name}.npy")
-    about = {"arrays": sorted(arrays), "fps": fps, "action_names": list(action_names), "world": dict(world or {})}
-    durable.write_json(staged / "about.json", about)
+    unknown = {"action_names": [], "world": {}, "tasks": [], "keys": {}}
+    durable.write_json(staged / "about.json", {**unknown, **(facts or {}), "arrays": sorted(arrays), "fps": fps})
     durable.move_into_place(staged, path)
 
 

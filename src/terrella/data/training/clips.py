@@ -14,9 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.instruction import embed_all
 from ..dataset import Dataset
 from ..storage.remote import Files
-from .cache import ClipCache
+from .cache import INSTRUCTION, ClipCache, array_for, further_cameras
 from .order import Plan, Starts, chosen
 from .windows import Windows
 
@@ -34,9 +35,10 @@ class Clips:
             saved = clips.state()                # JSON; Clips(...).resume(saved) goes on with the batch after this one
 
     A clip never crosses an episode, and each row at which one may begin is visited once an epoch. Channels are those of
-    the ClipCache (rgb, depth, pose, action, action_valid, reward, done, or a vector by its key), and "episode" and "row"
-    (int64) for where a frame is from. A batch is yours for as long as you hold on to it or to a view of it; only then
-    is its memory used for another.
+    the recorded world ("rgb", "rgb.wrist", "depth", "pose", "health", …), the arrays of the ClipCache (action,
+    action_valid, reward, done, or a vector by its key); "task" (int64, its place in `tasks`) and "instruction" (float32 [D],
+    its embedding); and "episode" and "row" (int64) for where a frame is from. A batch is yours for as long as you hold on
+    to it or to a view of it; only then is its memory used for another.
 
     source:    a Dataset, a ClipCache, a folder, or a URL (hf://…, s3://…, file://…). What is far is read in windows.
     batch:     clips in a batch. With `drop_last` clips that fill no batch are left out of the epoch.
@@ -85,15 +87,28 @@ class Clips:
             self._shelf: Shelf = Windows.of(source, plan, channels, size, episodes, budget_bytes // 4)
         else:
             if isinstance(source, Dataset):
-                source = ClipCache.open(source, size, progress, [name for name in channels if name in source.cameras])
+                source = ClipCache.open(source, size, progress, further_cameras(source, channels), budget_bytes)
             self._shelf = _Whole(source, plan, episodes)
-        kinds = {**_PLACES, **self._shelf.kinds}
-        missing = [name for name in channels if name not in kinds]
-        if missing:
-            raise DatasetError(f"the recording has no '{missing[0]}'; it has {', '.join(sorted(kinds))}.")
-        self._kinds = {name: kinds[name] for name in channels}
+        self._keys, self._kinds = self._chosen(channels)
+        self._meanings = embed_all(self.tasks)
         self._epoch, self._next = 0, 0
         self._batches(0)
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The texts that "task" numbers."""
+        return self._shelf.tasks
+
+    def _chosen(self, channels: Sequence[str]) -> tuple[dict[str, str], Kinds]:
+        """(channel -> array that holds it, the arrays that are filled)."""
+        kinds, keys = {**_PLACES, **self._shelf.kinds}, {}
+        for name in channels:
+            key = array_for(name, kinds, self._shelf.keys)
+            if key is None:
+                there = {*kinds, *self._shelf.keys, *([INSTRUCTION] if "task" in kinds else [])}
+                raise DatasetError(f"the recording has no '{name}'; it has {', '.join(sorted(there))}.")
+            keys[name] = key
+        return keys, {key: kinds[key] for key in keys.values()}
 
     def __len__(self) -> int:
         """Batches of the whole of this epoch."""
@@ -179,7 +194,14 @@ class Clips:
             for name, (dtype, shape) in self._kinds.items()
         }
         fill(epoch, number, arrays)
-        return arrays
+        return {name: self._meant(name, arrays[key]) for name, key in self._keys.items()}
+
+    def _meant(self, channel: str, array: np.ndarray) -> np.ndarray:
+        """What was asked for: the array that holds it, or the embeddings of its tasks."""
+        if channel != INSTRUCTION or array.dtype.kind == "f":
+            return array
+        found = self._memory.empty((*array.shape, self._meanings.shape[1]), self._meanings.dtype)
+        return np.take(self._meanings, array, axis=0, out=found, mode="clip")
 
 
 def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) -> Any:
@@ -189,7 +211,9 @@ def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) 
 class Shelf(Protocol):
     """Where clips come from: one clip cache, or windows of a recording far away."""
 
-    kinds: Kinds  # (dtype, shape of a row) by channel
+    kinds: Kinds  # (dtype, shape of a row) by array
+    keys: Mapping[str, str]  # channel -> array
+    tasks: tuple[str, ...]
 
     def facts(self) -> dict:
         """JSON values that, with the epoch, decide the order."""
@@ -215,6 +239,8 @@ class _Whole:
         self._plan = plan
         self._arrays = {name: np.asarray(array) for name, array in cache.arrays.items()}
         self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
+        self.keys: Mapping[str, str] = cache.keys
+        self.tasks = cache.tasks
         self._episodes = chosen(episodes, len(cache.episodes))
         first, stop = cache.episodes.pairs[slice(None) if self._episodes is None else self._episodes].T
         self._counts = np.maximum(stop - first - plan.span + 1, 0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ..dataset import Dataset
-from .cache import Kinds, bytes_a_row, fill_episode, kinds_of
+from .cache import Kinds, array_for, bytes_a_row, fill_episode, further_cameras, keys_of, kinds_of
 from .order import Plan, Starts, chosen
 
 _FILES, _CLIPS = 1, 2  # which of an epoch's shuffles
@@ -43,7 +43,8 @@ class Windows:
                 "or shorter clips."
             )
         self.dataset, self.kinds, self.size, self.plan = dataset, kinds, size, plan
-        self.window_rows = window_rows
+        self.keys: Mapping[str, str] = keys_of(dataset)
+        self.window_rows, self.tasks = window_rows, dataset.tasks
         picked = chosen(episodes, len(dataset.episodes))
         self._numbers = np.arange(len(dataset.episodes)) if picked is None else picked
         lengths = (dataset.episodes.stops - dataset.episodes.starts)[self._numbers]
@@ -62,14 +63,15 @@ class Windows:
         window_bytes: int,
     ) -> Windows:
         """Windows of as many rows of `channels` as `window_bytes` hold; channels that the recording lacks are not in `kinds`."""
-        there = kinds_of(dataset, size, [name for name in channels if name in dataset.cameras])
-        kinds = {name: there[name] for name in channels if name in there} or there
+        there, keys = kinds_of(dataset, size, further_cameras(dataset, channels)), keys_of(dataset)
+        wanted = [array_for(name, there, keys) for name in channels]
+        kinds = {key: there[key] for key in wanted if key is not None} or there
         return Windows(dataset, plan, kinds, size, episodes, window_bytes // bytes_a_row(kinds))
 
     def files_of(self, number: int) -> tuple[str, ...]:
         """The files that hold the wanted channels of an episode."""
         episode, cameras = self.dataset.episodes[number], self.dataset.cameras
-        wanted = {self.dataset.rgb_key if name == "rgb" else name for name in self.kinds} & set(cameras)
+        wanted = {self.dataset.feature(name) for name in self.kinds} & set(cameras)
         films = [episode.videos[name].file for name in cameras if name in wanted and name in episode.videos]
         return (episode.data, *films)
 

@@ -93,8 +93,8 @@ function hello(body) {
   $('tint').hidden = !worlds.some((world) => world.knows_share);
   const wish = localStorage.getItem('terrella-map'), open = worlds.length === 1 ? wish !== 'closed' : wish === 'open';
   showMemory(same ? {} : { map: open && innerWidth > 1000 });
-  now.actionId = controlsId;
   sendControls(performance.now());
+  now.actionId = controlsId;  // what is sent before anything is held measures nothing
   showState('starting');
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,10 +14,7 @@ from ..core.errors import DatasetError
 from ..core.policy import Policy, act
 from ..core.world import Observation, World, make_rng
 from .format import Layout
-from .recorder import Recorder
-
-if TYPE_CHECKING:
-    from ..exchange.live import Live
+from .recorder import Recorder, Watch
 
 
 def record(
@@ -30,17 +27,16 @@ def record(
     fps: float | None = None,
     max_episode_steps: int = 1050,
     task: str | None = None,
-    live: Live | None = None,
+    live: Watch | None = None,
     pictures: Literal["video", "png"] = "video",
 ) -> Recorder:
     """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
 
     An episode ends at `done` or after `max_episode_steps`. Each episode has a generator of its own, drawn from `rng`'s
     seed and the episode's number, so that a run that was killed and started again with the same seed records the same
-    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to;
-    `pictures` as in Layout.
-    Returns the closed recorder (its rows and
-    episodes can be read). DatasetError as Recorder raises it; what was committed before is safe.
+    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to; `pictures` as in Layout.
+    Returns the closed recorder (its rows and episodes can be read). DatasetError as Recorder raises it; what was
+    committed before is safe.
     """
     if frames < 2:
         raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")

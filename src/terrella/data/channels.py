@@ -1,0 +1,185 @@
+"""How a world's channels are named in a recording, and back: `rgb.wrist` is observation.images.wrist; which Sensor each is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ..core.errors import DatasetError, TerrellaError
+from ..core.spec import Camera, Spec, dtype_of, kind_of, shape_of
+from .source import Sensor
+
+RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
+ACTION, REWARD, DONE = "action", "next.reward", "next.done"
+POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+NAME = re.compile(r"\w[\w.-]{0,200}")  # of a feature, and so of a file and a folder
+MOST_AXES = 5
+ESTIMATES = (
+    "uncertainty",
+    "known",
+    "keyframes",
+)  # what a learned world says of itself: recorded, but never learned from
+RENAMED = {"cast": "objects"}  # channel of old recordings -> what it is called now
+_MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
+_IMAGES = "observation.images."
+
+
+def feature_of(channel: str) -> str:
+    """The feature that holds a channel: rgb.wrist -> observation.images.wrist, depth.wrist -> observation.depth.wrist.
+
+    The main camera's are observation.images.rgb, observation.depth and observation.state (its pose).
+    """
+    kind, _, suffix = channel.partition(".")
+    if channel in _MAIN:
+        return _MAIN[channel]
+    return f"{_IMAGES}{suffix}" if kind == "rgb" and suffix else f"observation.{channel}"
+
+
+def channel_of(feature: str, names: Iterable[str] = ()) -> str:
+    """The inverse of `feature_of`, for a stranger's features too; `names`: one per number of it, () where unknown."""
+    if feature in (STATE, POSE):
+        return "pose" if tuple(names) == POSE_NAMES else feature.removeprefix("observation.")
+    for channel, known in _MAIN.items():
+        if feature == known:
+            return channel
+    if feature.startswith(_IMAGES):
+        return f"rgb.{feature.removeprefix(_IMAGES)}"
+    channel = feature.removeprefix("observation.")
+    return RENAMED.get(channel, channel)
+
+
+def renamed(feature: str) -> str:
+    """What a feature of an old recording is called now."""
+    channel = feature.removeprefix("observation.")
+    return f"observation.{RENAMED[channel]}" if channel in RENAMED and channel != feature else feature
+
+
+def features_of(channels: Iterable[str]) -> dict[str, str]:
+    """channel -> feature of all channels of one world; DatasetError where two would be one, or a name can be none.
+
+    Where a world has a channel `state` besides its `pose`, the pose is observation.pose.
+    """
+    found: dict[str, str] = {}
+    channels = list(channels)
+    for channel in channels:
+        feature = POSE if channel == "pose" and "state" in channels else feature_of(channel)
+        if not NAME.fullmatch(feature):
+            raise DatasetError(
+                f"the channel '{channel[:100]}' cannot name a file; use letters, digits, '.', '_' and '-'."
+            )
+        for other, taken in found.items():
+            if taken.lower() == feature.lower():
+                raise DatasetError(
+                    f"the channels '{other}' and '{channel}' would both be {feature}; rename one of them."
+                )
+        found[channel] = feature
+    return found
+
+
+def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
+    """channel -> Sensor of everything that a world shows; DatasetError names what no recording can hold."""
+    features = features_of(spec.channels)
+    return {name: _sensor(spec, name, space, features[name]) for name, space in spec.channels.items()}
+
+
+def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sensor:
+    shape, dtype = _form(spec.name, channel, space)
+    kind, unit = kind_of(channel), spec.units.get(channel, "")
+    if kind == "rgb":
+        if len(shape) != 3 or shape[2] != 3 or dtype != np.uint8:
+            raise DatasetError(
+                f"the channel '{channel}' of {spec.name} is {dtype} {shape}, and a picture is uint8 [height, width, 3]: "
+                "give it another name, or that form."
+            )
+        return Sensor(feature, "image", shape, "uint8")
+    if kind == "depth" and len(shape) == 2 and dtype.kind == "f":
+        return Sensor(feature, "depth", shape)
+    if kind == "pose" and shape == (7,):
+        return Sensor(feature, "vector", shape, names=POSE_NAMES)
+    if channel in ("reward", "done"):
+        return Sensor(feature, "vector", (1,), "bool" if channel == "done" else "float32")
+    units = {feature: unit} if unit else {}
+    if len(shape) > 1:
+        return Sensor(feature, "vector", shape, dtype.name, units=units)
+    width = int(np.prod(shape))
+    names = tuple(f"{channel}_{i}" for i in range(width))
+    return Sensor(feature, "vector", (width,), dtype.name, names, dict.fromkeys(names, unit) if unit else {})
+
+
+def _form(world: str, channel: str, space: spaces.Space) -> tuple[tuple[int, ...], np.dtype]:
+    try:
+        shape, dtype = shape_of(space), dtype_of(space)
+    except (TerrellaError, TypeError) as error:
+        raise DatasetError(
+            f"the channel '{channel}' of {world} cannot be recorded: its values are not one array of numbers ({space})."
+        ) from error
+    if dtype.kind not in "biuf" or dtype.itemsize > 8 or len(shape) > MOST_AXES or 0 in shape:
+        raise DatasetError(
+            f"the channel '{channel}' of {world} is {dtype} {shape}, and a recording holds bools, integers and floats of "
+            f"1 to {MOST_AXES} axes, none of them empty."
+        )
+    return shape, dtype
+
+
+def facts_of(spec: Spec) -> dict[str, object]:
+    """What meta/terrella.json keeps of a world, JSON values: its actions, cameras, units and clock."""
+    low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
+    limits = {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
+    return {
+        "name": spec.name,
+        "dt_s": spec.dt_s,
+        "camera": list(spec.camera) if spec.camera else None,
+        "cameras": {channel: _camera_json(camera) for channel, camera in spec.cameras.items()},
+        "action_space": str(spec.action),
+        "action_shape": list(shape_of(spec.action)),
+        "action_names": list(spec.action_names),
+        "action_units": list(spec.action_units),
+        "action_mode": spec.action_mode,
+        "action_frame": spec.action_frame,
+        "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
+        "units": dict(spec.units),
+        "discrete": isinstance(spec.action, spaces.Discrete),
+        **limits,
+    }
+
+
+def _camera_json(camera: Camera) -> dict[str, object]:
+    return {
+        "intrinsics": [float(number) for number in camera.intrinsics],
+        "size": [int(number) for number in camera.size],
+        "pose": camera.pose,
+        "mount": [float(number) for number in camera.mount],
+    }
+
+
+def cameras_of(world: Mapping, size: Sequence[int] = (1, 1)) -> dict[str, Camera]:
+    """channel -> Camera, from the facts of a recorded world; {} where they name none. DatasetError where they are damaged.
+
+    Of an old recording, which knew but one camera: the main one, on the channel `pose`; `size` is that of its pictures.
+    """
+    try:
+        if "cameras" not in world:
+            main = world.get("camera")
+            return {"rgb": Camera(_numbers(main, 4), _numbers(size, 2, int))} if main else {}
+        return {
+            str(channel): Camera(
+                _numbers(about["intrinsics"], 4),
+                _numbers(about["size"], 2, int),
+                None if about["pose"] is None else str(about["pose"]),
+                _numbers(about["mount"], 7),
+            )
+            for channel, about in dict(world["cameras"]).items()
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DatasetError(f"meta/terrella.json tells no cameras ({error}); restore it from a copy.") from error
+
+
+def _numbers(values: Any, count: int, kind: type = float) -> Any:
+    found = tuple(kind(value) for value in values)
+    if len(found) != count or not np.isfinite(found).all():
+        raise ValueError(f"{count} finite numbers were expected, not {values!r}")
+    return found
