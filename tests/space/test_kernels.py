@@ -49,7 +49,7 @@ def test_a_rotation_turns_a_vector_as_its_quaternion_does():
 
 @pytest.mark.parametrize("camera", [CAMERA, (0.8, 0.8, 0.3, 0.6)])
 def test_patches_at_the_rim_are_not_lost(camera):
-    """Many small and large patches all around the eye, most of them out of the picture."""
+    """Many small and large patches all around the camera, most of them out of the picture."""
     rng = make_rng(1)
     centre = torch.randn(400, 3, generator=rng) * 3
     sides = torch.randn(400, 6, generator=rng) * torch.rand(400, 1, generator=rng) * 2

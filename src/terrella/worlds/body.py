@@ -72,13 +72,15 @@ class MotionBody:
     def channels(self) -> Channels:
         return Channels({"pose": POSE}, {"pose": POSE_UNIT}, ("pose",))
 
-    def blank(self, batch: int, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def blank(self, batch: int, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
         """A body that stands still at `pose` [B, 7]."""
+        assert pose is not None
         still = pose.new_zeros(batch, 2), torch.zeros(batch, dtype=torch.bool, device=pose.device)
         return {"pose": pose, "speed": still[0], "dreamt": still[1]}
 
-    def observed(self, prior: State, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def observed(self, prior: State, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
         """The body at `pose` [B, 7], where evidence says that it is: as fast as it was dreamt, and as that was wrong."""
+        assert pose is not None
         speed = pose[:, :2] - prior["pose"][:, :2] + torch.where(prior["dreamt"][:, None], prior["speed"], 0.0)
         speed = torch.where((speed.norm(dim=-1) < FASTEST_M)[:, None], speed, 0.0)
         return {"pose": pose, "speed": speed, "dreamt": torch.zeros_like(prior["dreamt"])}

@@ -54,6 +54,13 @@ class FrameHistory:
     def to(self, device) -> FrameHistory:
         return FrameHistory(self.config, Starts(*(part.to(device) for part in vars(self.starts).values())))
 
+    def with_memory(self, recorded: Keyframes) -> FrameHistory:
+        """It has no use for keyframes."""
+        return self
+
+    def with_memory_of(self, budget_mb: float) -> FrameHistory:
+        return self
+
     @property
     def device(self) -> torch.device:
         return self.starts.frames.device

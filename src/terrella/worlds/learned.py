@@ -36,7 +36,7 @@ from .parts import NOISE, Evidence
 from .places import KeyframeScene
 from .uncertainty import GONE, Asked, NoUncertainty, Uncertainty, gone_on
 
-ABSENT = {"body": NoBody, "objects": NoObjects, "uncertainty": NoUncertainty, "estimator": NoEstimator}
+PATIENCE = 4096  # steps after which a frame is drawn though nobody looks: what waits is kept in memory
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class LearnedWorld:
 
     def to(self, device: torch.device | str) -> LearnedWorld:
         """The same world on another device: its networks, its memory and its geometry."""
-        moved = {
+        moved: dict[str, Any] = {
             name: copy.deepcopy(part) if isinstance(part, nn.Module) else part for name, part in self.parts.items()
         }
         return LearnedWorld(self.about, **{name: part.to(device) for name, part in moved.items()})
@@ -237,9 +237,7 @@ class LearnedWorld:
         scene, body = self.scene, self.body
         if not body:
             return asked
-        walls = scene.walls(state)
-        half_m = body.config.body_m
-        walls = walls._replace(own=torch.cat([walls.own, self.objects.bodies(state, half_m)], 1))
+        walls = self.objects.among(scene.walls(state), state, body.config.body_m)
         return asked.replace(**body.step(state, acts, walls, scene.recorded.pose[:, :3]))
 
     def conditioning(self, asked: State, before: State) -> Conditioning:
@@ -283,7 +281,10 @@ class LearnedWorld:
         """`asked` with its frame, which is drawn when it is first read; entries that are `still` [B] keep that of `before`."""
         now = {name: asked[name] for name in asked if name not in self._drawn_names}
         frame = Step(self._frame, before, {**now, "seeds": seeds, "still": still})
-        return State(now, asked.arenas, Deferred(self._drawn_names, frame))
+        drawn = Deferred(self._drawn_names, frame)
+        if drawn.length > PATIENCE:
+            drawn.values()
+        return State(now, asked.arenas, drawn)
 
     def _frame(self, before: State, now: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """The tensors that follow from drawing the frame of the state that `before` and `now` make."""

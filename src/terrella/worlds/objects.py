@@ -22,7 +22,7 @@ from ..core.state import State
 from ..space.billboards import PICTURE, Cutout, cut_out, painted
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import NOWHERE
-from .parts import GOES, LOOKS, MOVES, Channels
+from .parts import GOES, LOOKS, MOVES, Channels, Walls
 
 # A billboard: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its
 # last move (x, y), steps since that, and its light, of its look's own.
@@ -143,6 +143,10 @@ class Objects(nn.Module):
         """The billboards of `after`, a step after `before`: those that were in sight have done something."""
         billboards = self.step(before["billboards"], in_sight(before), after["pose"], after["actions"], seeds)
         return {"billboards": billboards, "billboards_before": before["billboards"]}
+
+    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
+        """`walls` and the sides of those billboards that stop a body of half width `half_m`."""
+        return walls._replace(own=torch.cat([walls.own, self.bodies(state, half_m)], 1))
 
     def painted(self, state: State, camera: Intrinsics | None) -> State:
         """`state` with its billboards in its frame."""
@@ -290,8 +294,8 @@ class NoObjects:
     def painted(self, state: State, camera: Intrinsics | None) -> State:
         return state
 
-    def bodies(self, state: State, half_m: float) -> torch.Tensor:
-        return torch.zeros(state.batch, 0, 4, device=state["done"].device)
+    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
+        return walls
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
         return {}
@@ -307,9 +311,9 @@ def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
     """Of looks `off` [..., looks] away the one [...] that a thing has which looked like `was` [...]: that one, unless another is
     clearly nearer; NONE where all are far."""
     least, best = off.min(-1)
-    was = torch.as_tensor(was, device=off.device)
-    stays = (was != NONE) & (off.gather(-1, was.clamp_min(0)[..., None])[..., 0] < least + STICKS)
-    return torch.where(least > ALIKE, NONE, torch.where(stays, was, best))
+    before = torch.as_tensor(was, device=off.device)
+    stays = (before != NONE) & (off.gather(-1, before.clamp_min(0)[..., None])[..., 0] < least + STICKS)
+    return torch.where(least > ALIKE, NONE, torch.where(stays, before, best))
 
 
 def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, final
 
@@ -16,9 +16,9 @@ from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics, yaw
-from ..space.floorplan import NOWHERE, floor_plan
+from ..space.floorplan import floor_plan
 from ..space.keyframes import Glimpse, Keyframes
-from ..space.memory import DREAMT, EMPTY, RECORDED, Memory, keyframe_table
+from ..space.memory import RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
@@ -36,6 +36,7 @@ SEEN = (
     "instances",
 )  # of a frame that is still needed two steps later, where things move
 NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
+CELL_M = 0.25  # side of the cells of the map in which that is looked up
 EXACTLY = "donot_use_mm_for_euclid_dist"
 
 
@@ -47,14 +48,10 @@ class KeyframeScene:
 
     def __init__(self, config: KeyframesConfig, recorded: Keyframes, starts: Keyframes):
         self.config, self.recorded, self.starts = config, recorded, starts
-        self.own = own_memory(config)
+        self.own = own_memory(config, str(recorded.pose.device))
 
     def to(self, device) -> KeyframeScene:
-        parts = (
-            Keyframes(*(getattr(keys, field.name).to(device) for field in fields(keys)))
-            for keys in (self.recorded, self.starts)
-        )
-        return KeyframeScene(self.config, *parts)
+        return KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
 
     def with_memory(self, recorded: Keyframes) -> KeyframeScene:
         return KeyframeScene(self.config, recorded, self.starts)
@@ -84,6 +81,16 @@ class KeyframeScene:
     @cached_property
     def _plan(self) -> torch.Tensor:
         return floor_plan(self.recorded.walls, self.recorded.pose)
+
+    @cached_property
+    def _cells(self) -> torch.Tensor:
+        """The cells of the map that lie within NEAR_M of a recorded keyframe, ascending; never none."""
+        reach = int(NEAR_M / CELL_M) + 1
+        steps = CELL_M * torch.arange(-reach, reach + 1, device=self.device)
+        around = torch.cartesian_prod(steps, steps)
+        around = around[around.norm(dim=1) <= NEAR_M]
+        codes = _cell_codes((self.recorded.pose[:, None, :2] + around).flatten(0, 1))
+        return torch.cat([codes, codes.new_full((1,), 2**62)]).unique()
 
     def channels(self) -> Channels:
         height, width = self.config.size
@@ -189,8 +196,8 @@ class KeyframeScene:
         if self.config.moving:
             tensors |= {"things": plane, "instances": mask}
             tensors |= {f"earlier_{part}": tensors[part] for part in SEEN}
-        state = State({**tensors, **self.own.empty(batch)})
-        return state.replace(observed_walls=self._own_walls(state, dreamt=False))
+        state = State({**tensors, **self.own.empty(batch)}, self.own.arenas)
+        return state.replace(observed_walls=self.own.walls(state, dreamt=False))
 
     def pictured(self, state: State, evidence: Evidence) -> State:
         """`state` with the picture of the evidence."""
@@ -200,7 +207,7 @@ class KeyframeScene:
         """`state`, whose memory keeps the picture that was observed; an episode that begins has stood still."""
         kept = self.own.observed(state, state["rgb"], self._lasting(state), state["pose"])
         state = state.replace(**kept)
-        state = state.replace(observed_walls=self._own_walls(state, dreamt=False))
+        state = state.replace(observed_walls=self.own.walls(state, dreamt=False))
         return self.aged(state, state) if begins else state
 
     def aged(self, state: State, before: State) -> State:
@@ -213,12 +220,15 @@ class KeyframeScene:
 
     def walls(self, state: State) -> Walls:
         """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
-        own = state["observed_walls"]
-        apart = torch.cdist(state["pose"][:, :2], self.recorded.pose[:, :2], compute_mode=EXACTLY)
-        away = F.pad(apart, (0, 1), value=AWAY_M).amin(1) > NEAR_M
+        own, away = state["observed_walls"], ~self._known_ground(state["pose"])
         if away.any():
-            own = torch.where(away[:, None, None], self._own_walls(state, dreamt=True), own)
+            own = torch.where(away[:, None, None], self.own.walls(state), own)
         return Walls(self._plan, own)
+
+    def _known_ground(self, pose: torch.Tensor) -> torch.Tensor:
+        """Whether `pose` [B, 7] is in a cell of the map that recorded keyframes are near: bool [B]."""
+        cells, codes = self._cells, _cell_codes(pose[:, :2])
+        return cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] == codes
 
     def familiar(self, state: State) -> torch.Tensor:
         """How far the next recorded keyframe is, a radian counting two metres, and how much of its own memory is in use; as
@@ -265,24 +275,25 @@ class KeyframeScene:
             "keyframes": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
 
-    def _own_walls(self, state: State, dreamt: bool) -> torch.Tensor:
-        """The walls [B, N, 4] that an episode's own keyframes saw, those of dreamt ones with `dreamt`; NOWHERE the rest."""
-        kind = state["memory_kind"]
-        counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
-        return torch.where(counts[..., None, None], state["memory_walls"], NOWHERE).flatten(1, 2)
-
     def _lasting(self, state: State) -> torch.Tensor:
         """What a keyframe may keep of the frame's depth."""
         return still(state["depth"], state["things"]) if self.config.moving else state["depth"]
 
 
-def own_memory(config: KeyframesConfig) -> Memory:
+def _cell_codes(places: torch.Tensor) -> torch.Tensor:
+    """The number of the cell of the map in which places [N, 2] lie: int64 [N]."""
+    column, row = (places / CELL_M).floor().clamp(-(2**30), 2**30).long().unbind(-1)
+    return column * 2**31 + row
+
+
+def own_memory(config: KeyframesConfig, device: str) -> Memory:
     """The memory of an episode's own; where its budget has no room, one of the last frame, which each new one replaces."""
-    whole = Memory(config.camera, config.size, config.memory_mb, config.new_view, config.known_enough)
+    rules = config.memory_mb, config.new_view, config.known_enough
+    whole = Memory(config.camera, config.size, *rules, device=device)
     if whole.capacity:
         return whole
     frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
-    return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0)
+    return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0, device=device)
 
 
 def carry(
