@@ -64,6 +64,37 @@ def test_every_format_says_what_it_has_no_place_for(tmp_path, to):
     assert len(next(iter(take.readings.values())).values) in (5, 6)
 
 
+def test_what_an_mcap_file_loses_is_said_whatever_it_becomes(tmp_path, capsys):
+    writer_of = pytest.importorskip("mcap.writer")
+    with open(tmp_path / "log.mcap", "wb") as file:
+        writer = writer_of.Writer(file, chunk_size=500)
+        writer.start()
+        schemas = {"foxglove.Log": "/rosout", "my.Labels": "/labels", "my.State": "/state", "my.Ros": "/scan"}
+        channels = {}
+        for name, topic in schemas.items():
+            number = writer.register_schema(name, "jsonschema", b"{}")
+            channels[topic] = writer.register_channel(topic, "cdr" if name == "my.Ros" else "json", number)
+        writer.add_attachment(0, 0, "arm.urdf", "text/xml", b"<robot/>")
+        for i in range(40):
+            said = {"message": f"step {i}", "level": 2, "name": "arm"}
+            for topic, fields in (
+                ("/rosout", said),
+                ("/labels", {"label": "cup"}),
+                ("/state", {"x": i}),
+                ("/scan", {}),
+            ):
+                writer.add_message(channels[topic], i * 10**8, json.dumps(fields).encode(), i * 10**8)
+        writer.finish()
+    whole = (tmp_path / "log.mcap").read_bytes()
+    (tmp_path / "log.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    for to in ("lerobot", "mcap", "rollouts"):
+        out = tmp_path / f"out-{to}"
+        assert main(["data", "convert", str(tmp_path / "log.mcap"), str(out), "--to", to, "--json"]) == 0
+        told = " ".join(json.loads(capsys.readouterr().out)["left_out"])
+        for what in ("cut off", "arm.urdf", "/labels", "/scan", "log texts", "/rosout"):
+            assert what in told, (to, what)
+
+
 def test_text_stays_text_in_lerobot_and_is_read_beside_the_pictures(tmp_path):
     write_source(_talking(), tmp_path / "one")
     write_source(open_source(tmp_path / "one"), tmp_path / "two")

@@ -123,6 +123,8 @@ def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleName
     valid[length - 1 :: length] = False
     return SimpleNamespace(
         further={},
+        arrays={},
+        keys={},
         action_names=Panorama().spec.action_names,
         rgb=look(pose).numpy(),
         depth=None,

@@ -22,20 +22,10 @@ from safetensors.torch import save
 import terrella
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
-from terrella.measure import (
-    PROBES,
-    ExamConfig,
-    clip_features,
-    encoder,
-    frame_features,
-    frechet_interval,
-    page,
-    shipped_encoder,
-    to_json,
-)
-from terrella.measure.encoder import FEATURES, FrameEncoder, encoder_of
+from terrella.measure import PROBES, ExamConfig, encoder, page, to_json
+from terrella.measure.encoder import FEATURES, FrameEncoder, encoder_of, frame_features, shipped_encoder
 from terrella.measure.fidelity import blurred, psnr
-from terrella.measure.frechet import frechet, frechet_of_moments
+from terrella.measure.frechet import frechet, frechet_interval, frechet_of_moments
 
 
 def draw(n: int, d: int, seed: int) -> torch.Tensor:
@@ -259,20 +249,6 @@ def test_only_the_published_weights_are_taken(tmp_path, monkeypatch):
     shipped_encoder.cache_clear()
     with pytest.raises(TerrellaError, match="install terrella again"):
         shipped_encoder()
-
-
-def test_flicker_and_standstill_show_in_clips_and_not_in_their_frames():
-    calm = draw(40 * 8, 6, 0).reshape(40, 8, 6).cumsum(1)
-    jumbled = calm[:, torch.tensor([0, 4, 1, 5, 2, 6, 3, 7])]
-    assert float(frechet(calm.flatten(0, 1), jumbled.flatten(0, 1))) == pytest.approx(0, abs=1e-6)
-    assert float(frechet(clip_features(calm), clip_features(jumbled))) > 1
-    still = calm[:, :1].expand(-1, 8, -1)
-    assert clip_features(still)[:, 6:].abs().max() == 0 and clip_features(calm)[:, 6:].min() > 0
-    with pytest.raises(ValueError, match="T at least 2"):
-        clip_features(calm[:, :1])
-
-
-# --- in the scorecard ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

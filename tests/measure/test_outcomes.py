@@ -55,23 +55,22 @@ def recording(lengths=(40, 30, 50)):
     return SimpleNamespace(
         episodes=[(stop - length, stop) for length, stop in zip(lengths, stops)], length=rows, depth=None, pose=None,
         rgb=np.zeros((rows, 8, 8, 3), np.uint8), action=action, reward=reward, done=done,
-        further={"health": health[:, None]},
+        arrays={}, keys={}, further={"health": health[:, None]},
     )  # fmt: skip
 
 
-def exam_rows(shown, horizons=(4, 16)):
+def exam_rows(clips, real, horizons=(4, 16)):
     """Rows by arm, horizon and name."""
-    clips = [passage.clip for passage in shown]
     config = ExamConfig(horizons, (), batch=5, strips=1, long_steps=0, speed_steps=0)
     arms = {"right": Game(), "blind": Game(blind=True)}
-    going = {"recorded": [passage.real for passage in shown]}
+    going = {"recorded": real}
     card = examine(Exam(arms, {CLIPS: {"recorded": clips}, ENDINGS: {"recorded": clips}}, config, going=going))
     return {(row.arm, row.horizon, row.what): row for row in card.rows if row.probe == "outcomes"}
 
 
 def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
     shown = passages(recording(), (0, 1, 2), 5, 16, 24, make_rng(0))
-    rows = exam_rows(shown)
+    rows = exam_rows(*shown)
     for horizon in (4, 16):
         assert rows["right", horizon, "return error"].figure.value == rows["right", horizon, "error"].figure.value == 0
         blind = rows["blind", horizon, "error"]
@@ -88,12 +87,12 @@ def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
 
 def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
     shown = passages(recording(), (0, 1, 2), 5, 16, 20, make_rng(1))
-    short = [passage for passage in shown if not passage.real.all()]
+    short = [(clip, real) for clip, real in zip(*shown) if not real.all()]
     assert len(short) >= 10
-    for passage in short:
-        after = passage.clip.channels["health"][int(passage.real.sum()) :]
-        assert (after == after[0]).all() and (passage.clip.action[~passage.real] == 0).all()
-        assert passage.real[:5].all()
+    for clip, real in short:
+        after = clip.channels["health"][int(real.sum()) :]
+        assert (after == after[0]).all() and (clip.action[~real] == 0).all()
+        assert real[:5].all()
 
 
 def test_auc_counts_pairs():
@@ -119,6 +118,6 @@ def test_passages_stay_where_they_may():
     allowed = np.zeros(cache.length, bool)
     allowed[cache.episodes[1][0] + 3 : cache.episodes[1][1] - 2] = True
     shown = passages(cache, (0, 1, 2), 2, 4, 12, make_rng(0), lambda cache, first, stop: allowed[first:stop])
-    for passage in shown:
-        rows = passage.clip.start + np.arange(len(passage.real) + 1)
-        assert allowed[rows[:-1][passage.real]].all() and allowed[passage.clip.start]
+    for clip, real in zip(*shown):
+        rows = clip.start + np.arange(len(real) + 1)
+        assert allowed[rows[:-1][real]].all() and allowed[clip.start]

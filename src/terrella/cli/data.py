@@ -13,23 +13,23 @@ from tyro.conf import Positional, arg
 from .. import progress
 from .say import Host, Json, Port, Seed, Token, result, say
 
-Fps = Annotated[float | None, arg(help="Rows a second; without it those that the recording has.")]
+Fps = Annotated[float | None, arg(help="Frames per second of the new dataset. Default: those of the recording.")]
 Policy = Annotated[
     Literal["previous", "nearest", "linear"],
-    arg(help="What a row holds of a sensor with a clock of its own: its newest reading, the nearest, or a mixture."),
+    arg(help="How a sensor with its own clock is sampled: its latest value, the nearest in time, or interpolated."),
 ]
 
 
 def doctor(
     folder: Positional[Path], repair: bool = False, out: Path | None = None, yes: bool = False, json: Json = False
 ) -> int:
-    """Look for faults in a recording and say how to mend each; the exit code is 1 where there are any.
+    """Look for faults in a recording and say how to repair each. The exit code is 1 if there are any.
 
     Args:
-        folder: Folder of a LeRobot v3 dataset, ours or anybody's.
-        repair: Write a mended copy that keeps every whole row; the original is not touched.
-        out: Where the mended copy goes; without it FOLDER-mended.
-        yes: Repair without asking even where most rows would be lost.
+        folder: A LeRobot v3 dataset, recorded by Terrella or by any other program.
+        repair: Write a repaired copy that keeps every intact row. The original is not changed.
+        out: Folder of the repaired copy. Default: FOLDER-mended.
+        yes: Repair without asking, even if most rows would be lost.
     """
     from ..care import repair as mend
     from ..care.doctor import examine
@@ -64,14 +64,17 @@ def convert(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Turn a recording of one format into another: LeRobot v3, MCAP, Minari, HDF5, rollouts, videos, images.
+    """Convert a recording to another format: LeRobot v3, MCAP, Minari, HDF5, rollouts (.npz), videos, images.
+
+    Whatever the new format cannot hold is listed at the end. The target is written completely or not at all.
 
     Args:
-        source: Where it lies (which format it is, is seen from what lies there), or "gym:ID" for rollouts of an environment.
-        target: Where it shall lie; NAME.mcap and NAME.hdf5 name their formats, else it is a LeRobot v3 folder.
-        to: The format to write, where its name does not tell.
-        pictures: How LeRobot rows keep pictures: H.264 video, or PNG, which is exact and larger.
-        episodes: Rollouts to draw from "gym:ID".
+        source: The recording to read. Its format is recognised from its content. "gym:ID" draws rollouts of a Gymnasium
+            environment with random actions.
+        target: The recording to write. NAME.mcap and NAME.hdf5 choose their formats; any other name is a LeRobot v3 folder.
+        to: Format to write, if the name of the target does not say it.
+        pictures: How a LeRobot dataset stores pictures: H.264 video, or PNG (lossless, larger).
+        episodes: Number of rollouts to draw from "gym:ID".
     """
     from ..exchange.convert import open_source, write_source
     from ..exchange.formats.lerobot import Rows
@@ -104,14 +107,14 @@ def merge(
     dry: bool = False,
     json: Json = False,
 ) -> None:
-    """Make one training set of several robots' recordings: named dimensions, masks, statistics of each body.
+    """Merge recordings of several robots into one training set, with named dimensions, masks and statistics per robot.
 
     Args:
-        sources: Recordings of any format.
+        sources: Recordings in any format.
         out: Folder of the merged dataset (LeRobot v3).
-        mapping: File that says which number is which; without one it is guessed from the names and written to OUT.toml,
-            to be looked at, edited and given here.
-        dry: Write the guessed mapping alone.
+        mapping: TOML file that says which number of which robot fills which merged dimension. Without it, a mapping is
+            guessed from the names and written to OUT.toml, for you to check, edit and pass here.
+        dry: Write the guessed mapping and stop.
     """
     from ..exchange.convert import open_source
     from ..exchange.merging.write import merge_into
@@ -131,12 +134,12 @@ def view(
     token: Token = None,
     json: Json = False,
 ) -> None:
-    """Look through a recording in the browser: cameras, plots, depth, map and points in step; mark what is bad.
+    """Look through a recording in the browser: cameras, depth, plots, map and points side by side. Mark bad episodes.
 
     Args:
-        folder: Recording of any format.
-        rerun: Hand it to Rerun instead, where that is installed.
-        out: Folder to which the page exports the episodes that are not marked bad; without it FOLDER-good.
+        folder: A recording in any format.
+        rerun: Open it in the Rerun viewer instead, if Rerun is installed.
+        out: Folder for the export of the episodes that are not marked bad. Default: FOLDER-good.
     """
     if rerun:
         from ..exchange.convert import open_source
@@ -166,14 +169,14 @@ def label(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Write a copy of a recording whose actions are the codes that `terrella train latent-actions` learned.
+    """Write a copy of a recording with the latent actions that `terrella train latent-actions` learned.
 
     Args:
-        run: Folder of that run.
-        folder: Recording to label; pictures alone will do.
-        out: Folder of the labelled copy, which `terrella train video` makes a world of.
-        labelled: Recording with real actions, by which keys are mapped to codes.
-        frames: How many of its frames are looked at.
+        run: Folder of the training run.
+        folder: Recording to label. Pictures alone are enough.
+        out: Folder of the labelled copy. `terrella train video` can learn a world from it.
+        labelled: Recording with real actions, used to map keys to latent actions.
+        frames: Number of its frames to use.
     """
     from ..exchange import write_source
     from ..exchange.formats.lerobot import Rows

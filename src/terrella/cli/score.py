@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -142,9 +143,8 @@ def _exam(
             say(
                 f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
-        shown = passages(*asked, max(config.horizons), clips, make_rng(seed + 2), where)
-        sets[ENDINGS][place] = [passage.clip for passage in shown]
-        going[place] = [passage.real for passage in shown]
+        drawn = passages(*asked, max(config.horizons), clips, make_rng(seed + 2), where)
+        sets[ENDINGS][place], going[place] = drawn
     album = None if cache.pose is None or cache.rgb is None else Album.of_cache(cache)
     paths = " ".join(str(source.path) for source, _, _ in sources.values())
     return Exam(arms, sets, config, seed, going, album, closing), f"{__version__} {paths} "
@@ -152,15 +152,21 @@ def _exam(
 
 def _cache(data: Path, world: World) -> Any:
     """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
-    from ..data import ClipCache
+    from ..data import ClipCache, Dataset
     from ..measure import check_recording
 
-    picture = world.spec.channels.get("rgb")
-    size: dict[str, Any] = {"size": tuple(picture.shape[:2])} if picture is not None and picture.shape else {}
+    dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
+    for channel in world.spec.kinds("rgb"):
+        height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
+        feature = dataset.channels.get(channel)
+        sizes.setdefault((height, width), []).extend([feature] if feature and channel != "rgb" else [])
     with progress.shown(f"reading {data}") as report:
-        cache = ClipCache.open(data, progress=report, **size)
-    check_recording(cache, world.spec)
-    return cache
+        asked = (sizes or {(96, 128): []}).items()
+        caches = [ClipCache.open(dataset, size, report, cameras) for size, cameras in asked]
+    for cache, cameras in zip(caches, sizes.values()):  # cameras of another size have a cache of their own
+        caches[0].arrays.update({feature: cache.arrays[feature] for feature in cameras})
+    check_recording(caches[0], world.spec)
+    return caches[0]
 
 
 def _files_of(name: str) -> str:
@@ -181,15 +187,15 @@ def _files_of(name: str) -> str:
 def _lines(card: Scorecard) -> list[str]:
     """The first arm's figures at its longest horizon, and what was not applicable."""
     arm = next(iter(card.worlds))
-    rows = [row for row in card.rows if row.arm == arm and row.motion != "true" and not row.void]
     last: dict[tuple, Any] = {}
-    for row in rows:
-        last[row.probe, row.channel, row.what, row.place] = row
+    for row in card.rows:
+        if row.arm == arm and row.motion == "predicted" and not row.void and math.isfinite(row.figure.value):
+            last[row.probe, row.channel, row.what, row.place] = row
     lines = []
     for row in last.values():
+        sure = f" [{row.figure.low:.3g}, {row.figure.high:.3g}]" if math.isfinite(row.figure.low) else ""
         beside = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
-        steps = f" after {row.horizon} steps" if row.horizon else ""
         about = " ".join(part for part in (row.channel, row.what) if part)
-        lines.append(f"{row.probe:>12}  {about}, {row.place}{steps}: {row.figure} {row.unit}{beside}")
-    gone = [f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm]
-    return [*lines, *gone]
+        figure = f"{row.figure.value:.3g} {row.unit}".rstrip() + sure + beside
+        lines.append(f"{row.probe:>12}  {about}, {row.place} places, {row.horizon} steps: {figure}")
+    return [*lines, *(f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm)]

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core.errors import DatasetError, ObservationError
-from ..core.spec import Spec
+from ..core.spec import Spec, kind_of
 from ..space.floorplan import horizon, sees_into
 
 Where = Callable[
@@ -60,7 +60,8 @@ class Clip:
 def recorded_channels(cache) -> dict[str, np.ndarray]:
     """A clip cache's arrays by the names of the world's channels."""
     named = {name: getattr(cache, name, None) for name in ("rgb", "depth", "pose", "reward", "done")}
-    return {**{name: array for name, array in named.items() if array is not None}, **cache.further}
+    keyed = {channel: cache.arrays.get(key) for channel, key in cache.keys.items()}
+    return {name: array for name, array in {**named, **cache.further, **keyed}.items() if array is not None}
 
 
 def check_recording(cache, spec: Spec) -> None:
@@ -171,7 +172,7 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
             raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
         stacked = torch.from_numpy(np.stack([np.asarray(array[row]) for array in arrays]))
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
-        if name == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
+        if kind_of(name) == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
         marks = stacked.ndim == 3 and stacked.dtype in (torch.bool, torch.uint8)
         if name in spec.may_observe and marks and len(wanted) == 2:  # and so are marks: one pixel of many counts

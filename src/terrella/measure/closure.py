@@ -20,7 +20,7 @@ from .roll import Results, Tick, fold_context, poses_at
 from .scorecard import PREDICTED, TRUE, Picture, Report, Row
 from .statistics import mean_interval
 from .turning import turns
-from .work import Unit
+from .work import UNSEEN, Unit
 
 STATIC_DB = 20.0  # a far view this like the first one means that the picture hardly changed at all
 WALKED_M = 1.0  # who goes less far does not leave
@@ -135,7 +135,7 @@ def _asked(exam: Exam) -> list[tuple[str, World, str, int, Way, Sequence[Clip]]]
 def _units(exam: Exam) -> list[Unit]:
     units = []
     for arm, world, place, which, way, clips in _asked(exam):
-        verb = "imagine" if way.acted else "pose"
+        verb = ("imagine" if way.acted else "pose") + UNSEEN
         for number, (first, some) in enumerate(batches(exam, world, clips)):
             steps = len(way.steps(some, poses_at(some, 0) if some[0].pose is not None else None))
             calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * (steps + steps // 2)}

@@ -17,7 +17,7 @@ from .exam import Exam, Found, Probe
 from .roll import Results, Tick, fold_context
 from .scorecard import PREDICTED, Curve, Picture, Report, Row
 from .statistics import Band, Figure, ratio_interval
-from .work import Unit
+from .work import UNSEEN, Unit
 
 STRIDE = 5  # every fifth frame is looked at
 NAMES = ("sharpness", *(f"{what} of {colour}" for what in ("mean", "spread") for colour in ("red", "green", "blue")))
@@ -136,7 +136,7 @@ def _units(exam: Exam) -> list[Unit]:
     for arm, world in exam.arms.items():
         if config.long_steps and not _missing(exam, world):
             lanes = min(config.long_rollouts, len(clips), world.spec.max_batch or config.long_rollouts)
-            calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine"): lanes * config.long_steps}
+            calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * config.long_steps}
             words = f"{arm}: {config.long_steps:,} steps on end"
             units.append(
                 Unit(f"endurance|{arm}|0", words, calls, lambda tick, world=world: _go(exam, world, clips, tick))

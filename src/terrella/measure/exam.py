@@ -49,7 +49,7 @@ class ExamConfig:
     def quick(horizons: tuple[int, ...] = (1, 8, 32)) -> ExamConfig:
         """Of which doom-maze is through within a minute on two cores."""
         return ExamConfig(
-            horizons=horizons, control_horizons=(horizons[-1],), batch=8, strips=1, true_motion=False, closure_deg=(180.0,),
+            horizons=horizons, control_horizons=(min(8, horizons[-1]),), batch=8, strips=1, true_motion=False, closure_deg=(180.0,),
             closure_step_deg=15.0, closure_walk=0, closure_clips=4, long_steps=0, speed_steps=50,
         )  # fmt: skip
 
@@ -64,7 +64,7 @@ class Exam:
     sets: Mapping[str, Mapping[str, Sequence[Clip]]]
     config: ExamConfig
     seed: int = 0
-    going: Mapping[str, np.ndarray] = field(default_factory=dict)
+    going: Mapping[str, Sequence[np.ndarray]] = field(default_factory=dict)
     album: Album | None = None
     closing: Mapping[str, World] = field(default_factory=dict)
     _known: dict[str, Any] = field(default_factory=dict, compare=False)

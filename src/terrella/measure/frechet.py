@@ -72,17 +72,6 @@ def frechet_interval(
     return Figure(value, value - 1.96 * deviation, value + 1.96 * deviation, len(real))
 
 
-def clip_features(features: torch.Tensor) -> torch.Tensor:
-    """Features of short clips from those of their frames: [N, T, D] -> [N, 2 D], T at least 2.
-
-    The mean over the clip, and the root mean square of the steps from frame to frame: flicker makes those too large, a
-    film that stands still too small, and neither can be seen in single frames.
-    """
-    if features.ndim != 3 or features.shape[1] < 2:
-        raise ValueError(f"clips are features [N, T, D] with T at least 2; got {tuple(features.shape)}.")
-    return torch.cat([features.mean(1), features.diff(dim=1).square().mean(1).sqrt()], 1)
-
-
 def _moments(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     mean = features.mean(-2)
     away = features - mean[..., None, :]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from ..core.spec import kind_of
 from .clips import Clip
 from .exam import CLIPS, LONG, Exam, Found, Probe
 from .roll import Results
@@ -89,7 +90,7 @@ def drift(exam: Exam, found: Found, series_of: SeriesOf) -> Report:
 
 def _asked(motion: str, made: list[Series]) -> list[Series]:
     """Poses that were given are not predicted."""
-    return [series for series in made if motion != TRUE or series.channel.partition(".")[0] != "pose"]
+    return [series for series in made if motion != TRUE or kind_of(series.channel) != "pose"]
 
 
 def _row(

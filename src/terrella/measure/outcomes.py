@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,15 +25,6 @@ LEAD = (
 USUAL = "the usual reward"
 
 
-@dataclass(frozen=True)
-class Passage:
-    """A clip that may run into the end of its episode, from where it stands still: `real` bool [T] marks the rows whose
-    action was played."""
-
-    clip: Clip
-    real: np.ndarray
-
-
 def passages(
     cache,
     episodes: Sequence[int],
@@ -43,9 +33,10 @@ def passages(
     count: int,
     rng: torch.Generator,
     where: Where | None = None,
-) -> list[Passage]:
-    """`count` windows of the episodes, of rows that `where` allows, half of them shortly before an end where there are ends;
-    DatasetError without any."""
+) -> tuple[list[Clip], list[np.ndarray]]:
+    """`count` clips that may run into the end of their episode, from where they stand still, and of each which rows' actions
+    were played, bool [T]. Of rows that `where` allows, half of them shortly before an end where there are ends; DatasetError
+    without any."""
     spans = [cache.episodes[number] for number in episodes]
     whole = [part for first, stop in spans for part in _allowed(cache, first, stop, where)]
     long = [(first, stop) for first, stop in whole if stop - first > context + 1]
@@ -60,20 +51,19 @@ def passages(
         last = stop - context - 2  # a window has a step after its context
         least = max(first, last - horizon + 2) if pool is ending else first
         found.append(_passage(cache, least + _whole(rng, last - least + 1), stop, context, horizon))
-    return found
+    return [clip for clip, _ in found], [real for _, real in found]
 
 
 def outcomes(
-    place: str, arm: str, shown: Sequence[Passage], dreamt: Results, horizons: Sequence[int], rng
+    exam: Exam, place: str, arm: str, shown: Sequence[Clip], going: torch.Tensor, dreamt: Results
 ) -> list[Row]:
-    """Figures of reward, of single numbers, and of the end, of passages that a world dreamt on from their context; rng():
-    a generator for each figure."""
-    context = shown[0].clip.context
-    going = torch.from_numpy(np.stack([passage.real for passage in shown]))
-    channels = {name: np.stack([passage.clip.channels[name] for passage in shown]) for name in dreamt}
+    """Figures of reward, of single numbers, and of the end, of clips that a world dreamt on from their context; going: bool
+    [n, T], rows whose action was played."""
+    context, rng = shown[0].context, exam.rng
+    channels = {name: np.stack([clip.channels[name] for clip in shown]) for name in dreamt}
     truth = {name: torch.from_numpy(array.reshape(*array.shape[:2])).double() for name, array in channels.items()}
     rows = []
-    for step in horizons:
+    for step in exam.config.horizons:
         part = slice(context - 1, context - 1 + step)
         live, where = going[:, part], ("outcomes", "reward")
         tail = place, arm, PREDICTED, step
@@ -143,10 +133,10 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 def _report(exam: Exam, found: Found) -> Report:
     whole = Report()
     for place, clips in exam.sets.get(ENDINGS, {}).items():
-        shown = [Passage(clip, real) for clip, real in zip(clips, exam.going[place])]
+        going = torch.from_numpy(np.stack(exam.going[place]))
         for arm in exam.arms:
             if dreamt := found.dreamt(ENDINGS, arm, place, PREDICTED):
-                whole.rows += outcomes(place, arm, shown, dreamt, exam.config.horizons, exam.rng)
+                whole.rows += outcomes(exam, place, arm, clips, going, dreamt)
     return whole
 
 
@@ -170,14 +160,13 @@ def _allowed(cache, first: int, stop: int, where: Where | None) -> list[tuple[in
     return [(first + int(a), first + int(b)) for a, b in zip(begins, ends)]
 
 
-def _passage(cache, start: int, stop: int, context: int, horizon: int) -> Passage:
+def _passage(cache, start: int, stop: int, context: int, horizon: int) -> tuple[Clip, np.ndarray]:
     wanted = start + np.arange(context + horizon)
     rows, real = np.minimum(wanted, stop - 1), wanted < stop - 1
 
     action = np.asarray(cache.action[rows]) * real.reshape(-1, *[1] * (np.ndim(cache.action) - 1))
     channels = {name: np.asarray(array[rows]) for name, array in recorded_channels(cache).items()}
-    clip = Clip(channels, action, context, 0, start)
-    return Passage(clip, real)
+    return Clip(channels, action, context, 0, start), real
 
 
 def _whole(rng: torch.Generator, below: int) -> int:

@@ -7,9 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .page_parts import bar_table, charts_of, figure_table, picture_of, section
-from .scorecard import Bar, Scorecard
-from .verdict import verdict
+from .page_parts import bar_table, charts_of, figure_table, number, picture_of, section, steps_words, table_of
+from .scorecard import BETTER, WORSE, Bar, Row, Scorecard, compared, judged, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
@@ -40,9 +39,24 @@ def page(card: Scorecard, bars: Sequence[Bar], title: str, probes: Sequence[Prob
 
 
 def _verdict(card: Scorecard) -> str:
-    first, *further = verdict(card)
-    lines = "".join(f"<li>{escape(line)}</li>" for line in further)
-    return f"<section class=verdict><h2>{escape(first)}</h2>{f'<ul>{lines}</ul>' if lines else ''}</section>"
+    """The answer, and a table of gains over copying the last frame: filled where the whole interval says so."""
+    rows, lines = compared(card), []
+    steps = sorted({row.horizon for row in rows})
+    for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
+        mine = {row.horizon: row for row in rows if (row.channel, row.what, row.unit, row.place) == kind}
+        about = f"{escape(f'{kind[0]} {kind[1]}, {kind[2]}')}<small>{escape(kind[3])} places</small>"
+        lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
+    inside = (
+        table_of(["gain over copying the last frame", *(steps_words(step) for step in steps)], lines) if lines else ""
+    )
+    return f"<section><h2>{escape(verdict(card)[0])}</h2>{inside}</section>"
+
+
+def _gain(row: Row) -> str:
+    kind = {BETTER: "met", WORSE: "missed"}.get(judged(row), "void")
+    words = number(abs(row.gain.value)) if row.gain else ""
+    sign = "" if row.gain is None else "\u2212" if row.gain.value < 0 else "+"
+    return f"<span class='status {kind}' title='{judged(row)}'>{sign}{words}</span>"
 
 
 def _bars(bars: Sequence[Bar]) -> str:
@@ -61,8 +75,9 @@ def _section(card: Scorecard, probe: Probe) -> str:
     rows = [row for row in card.rows if row.probe == probe.name]
     control = [row for row in card.rows if row.probe == "control"] if probe.name == "drift" else []
     pictures = "".join(picture_of(picture) for picture in card.pictures if picture.probe == probe.name)
-    inside = charts_of(card, probe.name) + figure_table(rows, card.dt_s, open_=len(rows) <= 40)
-    whole = section(probe.question, escape(probe.lead), inside + pictures)
+    charts = charts_of(card, probe.name)
+    inside = charts + pictures + figure_table(rows, card.dt_s, open_=not charts)
+    whole = section(probe.question, escape(probe.lead), inside)
     if not control:
         return whole
     lead = (

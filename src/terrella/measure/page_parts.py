@@ -16,7 +16,6 @@ from .strip import join_row, jpeg
 
 COLOURS = ("#6fd3c1", "#e3a857", "#8ea6ff", "#e07a9b", "#b6d36f")
 QUIET = "#8b93a3"
-_WIDE_FROM = 100  # steps from which a chart has the width of the page
 
 
 def section(heading: str, lead: str, inside: str) -> str:
@@ -37,6 +36,10 @@ def figure_text(figure: Figure, unit: str = "") -> str:
     if not math.isfinite(figure.low):
         return value
     return f"{value}<small>{number(figure.low)} to {number(figure.high)}</small>"
+
+
+def steps_words(step: int) -> str:
+    return f"{step:,} step{'s'[: step != 1]}"
 
 
 def named(arm: str, motion: str) -> str:
@@ -66,7 +69,10 @@ def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
             about = [named(arm, motion), *([channel] if channel else [])]
             words = f"{escape(f'{what}, {unit}' if unit else what)}<small>{escape(', '.join(about))}</small>"
             lines.append([words, *(_cell(found[step]) if step in found else "" for step in steps)])
-        heads = [f"{escape(place)} places", *(f"{step:,} steps<small>{step * dt_s:.2f} s</small>" for step in steps)]
+        heads = [
+            f"{escape(place)} places",
+            *(f"{steps_words(step)}<small>{step * dt_s:.2f} s</small>" for step in steps),
+        ]
         inside = table_of(heads, lines)
         folded = f"<details><summary>All figures, {escape(place)} places</summary>{inside}</details>"
         tables += inside if open_ else folded
@@ -104,20 +110,19 @@ def charts_of(card: Scorecard, probe: str) -> str:
     groups: dict[tuple, list[Curve]] = {}
     for curve in curves:
         groups.setdefault((curve.channel, curve.what, curve.unit), []).append(curve)
-    boxes = ""
+    charts = ""
     for (channel, what, unit), some in groups.items():
-        guides = some[0].guides
+        guides, boxes = some[0].guides, ""
         span = y_span([v for c in some for v in (*c.band.value, *c.band.low, *c.band.high)] + list(guides))
         for place in dict.fromkeys(curve.place for curve in some):
             mine = [curve for curve in some if curve.place == place]
             lines = [_line(card, curve) for curve in sorted(mine, key=lambda curve: curve.arm == COPY_LAST)]
-            long = max(len(curve.x) for curve in mine) >= _WIDE_FROM
             x_label, log = ("% kept, the surest first", False) if probe == "calibration" else ("steps", True)
-            label = f"{what}, {unit}" if unit else what
-            svg = line_chart(lines, _ticks(mine, log), x_label, label, log, span, guides, named=long)
+            svg = line_chart(lines, _ticks(mine, log), x_label, f"{what}, {unit}" if unit else what, log, span, guides)
             title = f"{place} places, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
-            boxes += _box(title, svg, [] if long else lines, "wide" if long else "")
-    return f"<div class=charts>{boxes}</div>" if boxes else ""
+            boxes += _box(title, svg, lines)
+        charts += f"<div class=charts>{boxes}</div>"
+    return charts
 
 
 def _ticks(curves: Sequence[Curve], log: bool) -> list[tuple[float, str]]:
@@ -144,15 +149,14 @@ def _line(card: Scorecard, curve: Curve) -> Line:
     return Line(label, list(curve.x), band.value, band.low, band.high, colour, dash, curve.mark)
 
 
-def _box(title: str, svg: str, lines: Sequence[Line], kind: str) -> str:
+def _box(title: str, svg: str, lines: Sequence[Line]) -> str:
     keys = "".join(
         f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{line.colour}" stroke-width="2.5"'
         + (f' stroke-dasharray="{line.dash}"' if line.dash else "")
         + f"/></svg>{escape(line.label)}</span>"
         for line in lines
     )
-    inside = f"<div class=scroll>{svg}</div>" if kind else svg
-    return f"<figure class='{kind}'><h3>{escape(title)}</h3>{inside}<figcaption>{keys}</figcaption></figure>"
+    return f"<figure><h3>{escape(title)}</h3>{svg}<figcaption>{keys}</figcaption></figure>"
 
 
 def picture_of(picture: Picture) -> str:

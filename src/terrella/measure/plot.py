@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
 _WIDTH, _HEIGHT, _RIGHT = 380, 250, 12
-_WIDE, _WIDE_HEIGHT, _LABELS = 900, 380, 190  # of a chart that names its lines at their ends, and the room for that
 _LEFT, _TOP, _BOTTOM = 40, 14, 40
 
 
@@ -35,11 +34,9 @@ def line_chart(
     log_x: bool = False,
     y_range: tuple[float, float] | None = None,
     guides: Sequence[float] = (),
-    named: bool = False,
 ) -> str:
-    """An <svg> of the lines; `guides` are dotted horizontals (targets). Its title is the page's affair, and so is its
-    legend, unless it is `named`: then it is wide and each line has its name at its end."""
-    width, height, margin = (_WIDE, _WIDE_HEIGHT, _LABELS) if named else (_WIDTH, _HEIGHT, _RIGHT)
+    """An <svg> of the lines; `guides` are dotted horizontals (targets). Title and legend are the page's affair."""
+    width, height, margin = _WIDTH, _HEIGHT, _RIGHT
     warp = math.log2 if log_x else float
     xs = [warp(x) for line in lines for x in line.x]
     bottom, top = y_range or y_span([v for line in lines for v in (*line.y, *line.low, *line.high)] + list(guides))
@@ -72,30 +69,10 @@ def line_chart(
         if line.mark is not None and line.mark in line.x:
             x, y = at(line.mark, line.y[line.x.index(line.mark)])
             parts.append(f'<circle class="mark" cx="{x}" cy="{y}" r="4.5" stroke="{line.colour}">{name}</circle>')
-    parts += _names(lines, at, height - _BOTTOM) if named else []
     middle = (_LEFT + width - margin) / 2
     parts.append(f'<text x="{middle}" y="{height - 5}" text-anchor="middle">{escape(x_label)}</text>')
     parts.append(f'<text x="{_LEFT + 4}" y="{_TOP - 3}">{escape(y_label)}</text></svg>')
     return "".join(parts)
-
-
-def _names(
-    lines: Sequence[Line], at: Callable[[float, float], tuple[float, float]], lowest: float, apart: float = 15.0
-) -> list[str]:
-    """The lines' names to the right of their ends, moved up and down until they are `apart`."""
-    ends = [(*at(line.x[-1], line.y[-1]), line) for line in lines if math.isfinite(line.y[-1])]
-    ends.sort(key=lambda end: end[1])
-    heights: list[float] = []
-    for _, y, _ in ends:
-        heights.append(max(y, heights[-1] + apart) if heights else y)
-    for k in reversed(range(len(heights))):
-        heights[k] = min(heights[k], heights[k + 1] - apart if k + 1 < len(heights) else lowest)
-    parts = []
-    for (x, y, line), level in zip(ends, heights):
-        parts.append(f'<path class="lead" d="M{x + 3} {y}L{x + 13} {level:g}" stroke="{line.colour}"/>')
-        style = f'style="fill:{line.colour}"'
-        parts.append(f'<text x="{x + 17}" y="{level + 4:g}" {style}>{escape(line.label)}</text>')
-    return parts
 
 
 def _band_path(line: Line, at) -> str:

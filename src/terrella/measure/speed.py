@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from ..core.policy import Replay
+from ..core.spec import kind_of
 from ..core.world import World
 from .clips import Clip
 from .endurance import recorded_actions
@@ -29,7 +30,7 @@ def speed(
 ) -> Results:
     """ms [steps] from the first clip's context under recorded actions, after ten untimed ones; `threads` of torch."""
     state = fold_context(world, clips[:1], rng)
-    shown = tuple(name for name in world.spec.channels if name.partition(".")[0] == "rgb") or tuple(world.spec.channels)
+    shown = tuple(name for name in world.spec.channels if kind_of(name) == "rgb") or tuple(world.spec.channels)
     policy = Replay(recorded_actions(world, clips, 1, steps + _WARM, rng))
     memory, times = policy.begin(1, rng), []
     for _ in range(steps + _WARM):

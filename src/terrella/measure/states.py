@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..core.spec import kind_of
 from ..core.world import World
 from .clips import Clip
 from .exam import CLIPS, ENDINGS, Exam, Found, Probe
@@ -29,7 +30,7 @@ def vectors(exam: Exam, world: World) -> list[str]:
     clip = next(iter(exam.places.values()))[0]
     found = []
     for name, space in world.spec.channels.items():
-        plain = name.partition(".")[0] not in NOT_VECTORS and np.dtype(space.dtype).kind == "f"
+        plain = kind_of(name) not in NOT_VECTORS and np.dtype(space.dtype).kind == "f"
         if plain and len(space.shape or ()) <= 1 and name in clip.channels:
             if int(np.prod(space.shape or (1,))) == int(np.prod(clip.channels[name].shape[1:])):
                 found.append(name)

@@ -6,7 +6,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import TerrellaError
+from ..core.state import State
 from ..core.world import World, make_rng
 from .clips import Clip, evidence
 from .roll import Results, Tick, actions_at, fold_context, poses_at
@@ -37,24 +39,28 @@ class Unit:
     def kind(self) -> str:
         return self.key.rpartition("|")[0]
 
+    @property
+    def arm(self) -> str:
+        return next(iter(self.calls))[0]
+
 
 class Forecast:
     """Seconds that units will take: their calls at measured prices, put right by how long units of their kind took."""
 
     def __init__(self, prices: Calls):
         self.prices = prices
-        self.took: dict[str, tuple[float, float]] = {}  # kind ("" for all) -> seconds, priced seconds; the past fades
+        self.took: dict[str, tuple[float, float]] = {}  # kind or arm -> seconds, priced seconds; the past fades
 
     def priced(self, unit: Unit) -> float:
         return sum(count * self.prices.get(call, 1e-3) for call, count in unit.calls.items()) + 1e-3
 
     def done(self, unit: Unit, seconds: float) -> None:
-        for name in (unit.kind, ""):
+        for name, kept in ((unit.kind, 0.7), (unit.arm, 0.9)):
             took, priced = self.took.get(name, (0.0, 0.0))
-            self.took[name] = 0.7 * took + seconds, 0.7 * priced + self.priced(unit)
+            self.took[name] = kept * took + seconds, kept * priced + self.priced(unit)
 
     def seconds(self, unit: Unit) -> float:
-        took, priced = self.took.get(unit.kind) or self.took.get("") or (1.0, 1.0)
+        took, priced = self.took.get(unit.kind) or self.took.get(unit.arm) or (1.0, 1.0)
         return self.priced(unit) * took / priced
 
 
@@ -100,18 +106,13 @@ class Store:
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
 
 
-class _writing:
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
     """Turns what a full or foreign disk says into one sentence."""
-
-    def __init__(self, folder: Path):
-        self.folder = folder
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind, error, trace) -> None:
-        if isinstance(error, (OSError, SafetensorError)):
-            raise TerrellaError(f"cannot write to {self.folder} ({error}); choose another folder.") from error
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise TerrellaError(f"cannot write to {folder} ({error}); choose another folder.") from error
 
 
 def run_all(units: Sequence[Unit], store: Store, prices: Calls, clock: Clock, progress: Progress) -> dict[str, Results]:
@@ -149,45 +150,44 @@ class _Ticks:
         self.tell(min(self.done / self.whole, 1.0))
 
 
-def prices_of(
-    arm: str, world: World, clips: Sequence[Clip], clock: Clock, steps: int = 3
-) -> dict[tuple[str, str], float]:
+UNSEEN = ", unseen"  # of steps of which few are looked at
+
+
+def prices_of(arm: str, world: World, clips: Sequence[Clip], clock: Clock) -> dict[tuple[str, str], float]:
     """Seconds a clip of each verb, by a few steps of each: "observe" evidence after imagining, "imagine" and look, follow a
-    "pose" and look, and imagine "alone", one clip."""
-    rng, count = make_rng(0), len(clips)
+    "pose" and look, either UNSEEN but for the last, and imagine "alone", one clip."""
+    rng, state = make_rng(0), fold_context(world, clips, make_rng(0))
     shown = tuple(name for name in ("rgb", "pose") if name in world.spec.channels) or tuple(world.spec.channels)[:1]
-    found: dict[tuple[str, str], float] = {}
 
-    def timed(verb: str, step: Callable[[int], None], some: int) -> None:
-        step(0)  # the first may compile
+    def imagine(state: State, row: int) -> State:
+        return world.imagine(state, actions_at(world, clips[: state.batch], row), rng)
+
+    def observe(state: State, row: int) -> State:
+        return world.observe(evidence(clips, world.spec, row), imagine(state, row), rng)
+
+    def follow(state: State, row: int) -> State:
+        return world.observe({"pose": poses_at(clips, row)}, state, rng)
+
+    def seconds(state: State, step: Callable[[State, int], State], look: bool, count: int = 4) -> tuple[State, float]:
         began = clock()
-        for number in range(steps):
-            step(number)
-        found[arm, verb] = (clock() - began) / (steps * some)
+        for row in range(count + 1):
+            if row == 1:
+                began = clock()  # the first may compile
+            state = step(state, row)
+            if look or row in (0, count):
+                world.render(state, shown)
+        return state, (clock() - began) / (count * state.batch)
 
-    states = [fold_context(world, clips, rng)]
-
-    def imagine(number: int) -> None:
-        states[0] = world.imagine(states[0], actions_at(world, clips[: states[0].batch], number), rng)
-        world.render(states[0], shown)
-
-    def observe(number: int) -> None:
-        states[0] = world.imagine(states[0], actions_at(world, clips, number), rng)
-        states[0] = world.observe(evidence(clips, world.spec, number), states[0], rng)
-
-    def follow(number: int) -> None:
-        states[0] = world.observe({"pose": poses_at(clips, number)}, states[0], rng)
-        world.render(states[0], shown)
-
+    found: dict[tuple[str, str], float] = {}
     if world.spec.observes:
-        timed("observe", observe, count)
-    timed("imagine", imagine, count)
-    if "pose" in world.spec.observes and "rgb" in world.spec.observes:
+        state, found[arm, "observe"] = seconds(state, observe, False)
+    if "pose" in world.spec.observes:
         try:
-            timed("pose", follow, count)
+            state, found[arm, "pose"] = seconds(state, follow, True)
+            state, found[arm, "pose" + UNSEEN] = seconds(state, follow, False)
         except TerrellaError:
             pass  # it takes no pose alone
-    if count > 1:
-        states[0] = states[0].at(0)
-    timed("alone", imagine, 1)
+    state, found[arm, "imagine"] = seconds(state, imagine, True)
+    state, found[arm, "imagine" + UNSEEN] = seconds(state, imagine, False)
+    state, found[arm, "alone"] = seconds(state.at(0) if state.batch > 1 else state, imagine, True)
     return found

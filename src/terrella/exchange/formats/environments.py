@@ -1,8 +1,8 @@
-"""Rollouts of a Gymnasium environment, drawn when they are asked for."""
+"""Rollouts of a Gymnasium environment under random actions, drawn when they are asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import gymnasium
@@ -16,80 +16,54 @@ _MOST_STEPS = 1000
 
 
 def from_env(
-    env_or_id: str | gymnasium.Env | Callable[[], gymnasium.Env],
-    policy: Callable[[object], object] | None = None,
+    env: str | Callable[[], gymnasium.Env],
     episodes: int = 10,
     seed: int = 0,
     fps: float | None = None,
-    render: bool = False,
     max_steps: int = _MOST_STEPS,
 ) -> Source:
-    """Rollouts of a Gymnasium environment, collected when a take is asked for; the same at each call of `takes`.
+    """Rollouts of an environment, its id or a function that makes one; the same at each call of `takes`.
 
-    env_or_id: an id, an environment (used as it is, and not closed), or a function that makes one.
-    policy:    policy(observation) -> action; None draws from the action space, seeded.
-    fps:       rows a second; by default from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
-    render:    also keep what it draws, as "observation.images.render" (an environment handed over must have been made
-               with render_mode="rgb_array").
+    fps: rows a second; by default from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
     max_steps: an episode is cut (truncated) after so many.
 
     Observations are one more than actions: the one after the last step is kept. Spaces are flattened as in minari.read.
-    DatasetError for unknown ids, spaces that are not arrays, and environments that draw nothing.
+    DatasetError for unknown ids, and spaces that are not arrays.
     """
     if episodes < 1 or max_steps < 1:
         raise DatasetError(f"{episodes} episodes of {max_steps} steps are no recording; ask for 1 or more of each.")
     rows.check_fps(fps, "the rollout")
-    env, name = _make(env_or_id, render)
-    observation, action = spaces.to_json(env.observation_space), spaces.to_json(env.action_space)
-    plan = {
-        "observations": spaces.leaves(rows.OBSERVATION, observation, name),
-        "actions": spaces.leaves(rows.ACTION, action, name),
-    }
-    sensors = {leaf.sensor.name: leaf.sensor for leaf in (*plan["observations"], *plan["actions"]) if leaf.sensor}
+    made, name = _make(env)
+    observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
+    rate, notes = rows.rate_of(fps, _rate(made), name)
+    made.close()
+    both = ((rows.OBSERVATION, observation), (rows.ACTION, action))
+    leaves = {role: spaces.leaves(role, space, name) for role, space in both}
+    sensors = {leaf.sensor.name: leaf.sensor for parts in leaves.values() for leaf in parts if leaf.sensor}
     for role, kind in ((rows.REWARD, "float64"), (rows.DONE, "bool"), (rows.TRUNCATED, "bool")):
         sensors[role] = replace(rows.sensor_for("", role, (), kind), name=role)
-    rate, notes = rows.rate_of(fps, _rate(env), name)
-    camera = f"{rows.IMAGES}render"
-    if render:
-        env.reset(seed=seed)
-        shape = np.shape(_drawn(env, name))
-        sensors[camera] = Sensor(camera, "image", shape, "uint8", rate_hz=rate)
-    _close(env, env_or_id)
 
     def takes() -> Iterator[Take]:
-        env, _ = _make(env_or_id, render)
+        made, _ = _make(env)
         try:
             for number in range(episodes):
-                yield _rollout(
-                    env, policy, plan, sensors, seed, number, rate, camera if render else "", max_steps, name
-                )
+                draw = np.random.SeedSequence([seed, number]).generate_state(2)
+                yield _take(_rollout(made, draw, max_steps), leaves, sensors, rate, name, int(draw[0]))
         finally:
-            _close(env, env_or_id)
+            made.close()
 
     facts = {"observation_space": observation, "action_space": action, "env": name, "seed": seed}
     return Source(name, sensors, takes, rate, notes=notes, facts=facts)
 
 
-def _make(env_or_id, render: bool) -> tuple[gymnasium.Env, str]:
-    if isinstance(env_or_id, str):
-        try:
-            env = gymnasium.make(env_or_id, render_mode="rgb_array" if render else None)
-        except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
-            raise DatasetError(
-                f"the environment '{env_or_id}' cannot be made: {str(error).splitlines()[0]}."
-            ) from error
-        return env, env_or_id
-    env = env_or_id() if not isinstance(env_or_id, gymnasium.Env) and callable(env_or_id) else env_or_id
-    if not isinstance(env, gymnasium.Env):
-        raise DatasetError(
-            f"{env!r} is no Gymnasium environment; give an id, an environment, or a function that makes one."
-        )
-    return env, env.spec.id if env.spec else type(env.unwrapped).__name__
-
-
-def _close(env: gymnasium.Env, given) -> None:
-    if env is not given:
-        env.close()
+def _make(env: str | Callable[[], gymnasium.Env]) -> tuple[gymnasium.Env, str]:
+    try:
+        made = gymnasium.make(env) if isinstance(env, str) else env()
+    except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
+        raise DatasetError(f"the environment '{env}' cannot be made: {str(error).splitlines()[0]}.") from error
+    if not isinstance(made, gymnasium.Env):
+        raise DatasetError(f"{made!r} is no Gymnasium environment; give an id, or a function that makes one.")
+    return made, env if isinstance(env, str) else type(made.unwrapped).__name__
 
 
 def _rate(env: gymnasium.Env) -> float | None:
@@ -102,58 +76,51 @@ def _rate(env: gymnasium.Env) -> float | None:
     return float(told) if isinstance(told, int | float) and told > 0 else None
 
 
-def _drawn(env: gymnasium.Env, name: str) -> np.ndarray:
-    drawn = env.render()
-    if not isinstance(drawn, np.ndarray) or drawn.dtype != np.uint8 or drawn.ndim != 3 or drawn.shape[2] != 3:
-        raise DatasetError(f"{name} draws no pictures; make it with render_mode='rgb_array', or leave out render.")
-    return drawn
-
-
-def _rollout(
-    env, policy, plan, sensors, seed: int, number: int, fps: float, camera: str, max_steps: int, name: str
-) -> Take:
-    draw = np.random.SeedSequence([seed, number]).generate_state(2)
+def _rollout(env: gymnasium.Env, draw: np.ndarray, max_steps: int) -> dict[str, list]:
     seen, _ = env.reset(seed=int(draw[0]))
     env.action_space.seed(int(draw[1]))
-    observations, actions, rewards, done, cut, pictures = [seen], [], [], [], [], []
-    pictures += [_drawn(env, name)] if camera else []
-    while len(actions) < max_steps and not (done and (done[-1] or cut[-1])):
-        action = env.action_space.sample() if policy is None else policy(seen)
+    found: dict[str, list] = {rows.OBSERVATION: [seen], rows.ACTION: []}
+    found |= {name: [] for name in (rows.REWARD, rows.DONE, rows.TRUNCATED)}
+    done = cut = False
+    while not (done or cut):
+        action = env.action_space.sample()
         seen, reward, terminated, truncated, _ = env.step(action)
-        observations.append(seen)
-        actions.append(action)
-        rewards.append(float(reward))
-        done.append(bool(terminated))
-        cut.append(bool(truncated))
-        pictures += [_drawn(env, name)] if camera else []
-    cut[-1] = cut[-1] or not done[-1]
-    time_s = np.arange(len(observations)) / fps
+        done, steps = bool(terminated), len(found[rows.ACTION]) + 1
+        cut = bool(truncated) or (steps == max_steps and not done)
+        for name, value in zip(found, (seen, action, float(reward), done, cut)):  # type: ignore[arg-type]
+            found[name].append(value)
+    return found
+
+
+def _take(
+    found: Mapping[str, list],
+    leaves: Mapping[str, tuple[spaces.Leaf, ...]],
+    sensors: Mapping[str, Sensor],
+    fps: float,
+    name: str,
+    seed: int,
+) -> Take:
+    time_s = np.arange(len(found[rows.OBSERVATION])) / fps
     readings, task, texts = {}, "", {}
-    for root, values in (("observations", observations), ("actions", actions)):
-        for leaf in plan[root]:
-            found = [_at(value, leaf.path) for value in values]
+    for role, parts in leaves.items():
+        for leaf in parts:
+            values = found[role]
+            for key in leaf.path:
+                values = [value[key] for value in values]
             if leaf.sensor is None:
-                if leaf.is_instruction and len(set(found)) == 1 and not task:
-                    task = str(found[0])
+                if leaf.is_instruction and len(set(values)) == 1 and not task:
+                    task = str(values[0])
                 else:
-                    texts["/".join(map(str, (root, *leaf.path)))] = [str(text) for text in found]
+                    texts["/".join(map(str, (f"{role}s", *leaf.path)))] = [str(text) for text in values]
                 continue
             shape = rows.stored_shape(leaf.sensor)
             try:
-                stacked = np.stack([np.asarray(value, leaf.sensor.dtype).reshape(shape) for value in found])
+                stacked = np.stack([np.asarray(value, leaf.sensor.dtype).reshape(shape) for value in values])
             except (TypeError, ValueError) as error:
                 raise DatasetError(
                     f"{name} gave {leaf.sensor.name} of another shape than its space says: {error}."
                 ) from error
-            readings[leaf.sensor.name] = Readings(time_s[: len(found)], rows.from_stored(stacked, leaf.sensor))
-    for role, values in ((rows.REWARD, rewards), (rows.DONE, done), (rows.TRUNCATED, cut)):
-        readings[role] = Readings(time_s[:-1], np.asarray(values, sensors[role].dtype)[:, None])
-    if camera:
-        readings[camera] = Readings(time_s, np.stack(pictures))
-    return Take(readings, task, facts={"seed": int(draw[0]), **({"texts": texts} if texts else {})})
-
-
-def _at(value, path: tuple):
-    for part in path:
-        value = value[part]
-    return value
+            readings[leaf.sensor.name] = Readings(time_s[: len(values)], rows.from_stored(stacked, leaf.sensor))
+    for role in (rows.REWARD, rows.DONE, rows.TRUNCATED):
+        readings[role] = Readings(time_s[:-1], np.asarray(found[role], sensors[role].dtype)[:, None])
+    return Take(readings, task, facts={"seed": seed, **({"texts": texts} if texts else {})})

@@ -77,15 +77,10 @@ def clean(camera: str) -> str:
 
 def numbered(source: Source, cameras: Mapping[str, str], progress) -> Iterator[tuple[int, Take]]:
     """Takes with pictures, checked; DatasetError where there are none."""
-    number = -1
-    for number, take in enumerate(source.takes()):
+    for number, take in rows.numbered(source, progress):
         seen = [name for name in cameras if name in take.readings and len(take.readings[name].values)]
         if not seen:
             raise DatasetError(f"take {number} has no pictures; leave it out.")
         for name in seen:
             rows.check_times(take.readings[name], f"'{name}' in take {number}")
         yield number, Take({name: take.readings[name] for name in seen}, take.task)
-        if progress:
-            progress(number + 1, 0)
-    if number < 0:
-        raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
-from . import messages
+from . import messages, rows
 from .films import VideoDecoder, decodable
 from .mcap_index import Index, Metadata, Schema
 
@@ -31,6 +31,7 @@ _READERS = {  # the kinds that a message can be declared as
     messages.VIDEO: ("image",),
     "foxglove.PointCloud": ("points",),
 }
+_LOG = "foxglove.Log"
 _NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 _MOST_FRAMES = 256  # coordinate frames that one topic of transforms is split into
 
@@ -184,8 +185,7 @@ class _File:
                 try:
                     value = json.loads(text)
                     if name == SENSORS:
-                        sensor = _sensor(key, value)
-                        declared[str(value["topic"])] = sensor
+                        declared[str(value["topic"])] = rows.sensor_of({**value, "name": key})
                     elif isinstance(value, _ABOUT.get(key, ())):
                         (self.about if name == SOURCE else take)[key] = value
                     else:
@@ -233,6 +233,9 @@ class _File:
                 self._calibrations.append((group.topic, first))
                 if first != last:
                     self._note(group.topic, "the calibration changes on the way; only the first is carried over")
+                return []
+            if group.schema.name == _LOG:
+                self._note(group.topic, f"its {len(group.log_ns)} log texts are left out")
                 return []
             if group.schema.name in (messages.TRANSFORM, messages.TRANSFORMS):
                 return self._transforms(group)
@@ -427,28 +430,3 @@ def _camera_of(topic: str, frame: str, cameras: Mapping[str, str], sensors: Mapp
 
 _ABOUT: dict[str, Any] = {"name": str, "robot": str, "task": str, "notes": list, "facts": dict, "zero_ns": int}
 _ABOUT |= {"fps": (int, float, type(None)), "start_ns": (int, type(None))}
-_DECLARED = {"image": ("uint8",), "depth": ("float32",), "points": ("float32",)}
-
-
-def _sensor(name: str, value: Mapping[str, Any]) -> Sensor:
-    """A declaration out of a file; ValueError, TypeError or KeyError where it is none."""
-    kind, shape, dtype = value["kind"], tuple(int(size) for size in value["shape"]), str(value["dtype"])
-    if kind not in (*_DECLARED, "vector") or dtype not in _DECLARED.get(kind, (dtype,)):
-        raise ValueError(f"it is {kind} of {dtype}")
-    if kind == "vector" and np.dtype(dtype).kind not in "biuf":
-        raise ValueError(f"its numbers are {dtype}")
-    dimensions = {"image": 3, "depth": 2, "points": 2}.get(kind, len(shape))
-    if len(shape) != dimensions or min(shape, default=0) < 0 or not isinstance(value.get("facts"), dict):
-        raise ValueError(f"its shape is {list(shape)}")
-    rate = value.get("rate_hz")
-    return Sensor(
-        name,
-        kind,
-        shape,
-        dtype,
-        tuple(str(item) for item in value["names"]),
-        {str(key): str(unit) for key, unit in value["units"].items()},
-        str(value["frame"]),
-        None if rate is None else float(rate),
-        value["facts"],
-    )

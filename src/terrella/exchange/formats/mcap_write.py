@@ -35,18 +35,16 @@ def write(
     Nothing stands at `path` until all of it does. Returns notes on what is not exact. DatasetError where the path is
     taken, the disk is full, or a reading is not what its sensor declares.
     """
-    path, notes, count = Path(path), dict[str, None](), 0
+    path, notes = Path(path), dict[str, None]()
     with rows.fresh(path) as staged:
-        for count, take in enumerate(source.takes(), 1):
-            if path.suffix == ".mcap" and count > 1:
+        for number, take in rows.numbered(source, None):
+            if path.suffix == ".mcap" and number:
                 raise DatasetError(f"'{source.name}' has more than one take, and '{path}' is one file; name a folder.")
             if path.suffix != ".mcap":
                 staged.mkdir(exist_ok=True)
-            target = staged if path.suffix == ".mcap" else staged / f"take-{count - 1:06d}.mcap"
+            target = staged if path.suffix == ".mcap" else staged / f"take-{number:06d}.mcap"
             notes |= dict.fromkeys(_write_take(source, take, target, image, progress))
             durable.sync_file(target)
-        if not count:
-            raise DatasetError(f"'{source.name}' has no takes; there is nothing to write.")
     return list(notes)
 
 

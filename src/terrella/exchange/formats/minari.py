@@ -17,7 +17,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
 from . import rows, spaces
-from .minari_stored import Episode, joined, open_storage, read_json
+from .minari_stored import Episode, joined, open_storage
 
 VERSION = "0.5.4"  # of the layout that `write` writes (the first with pictures that are not JPEG)
 _ID = re.compile(r"(?:[-\w][-\w/]*/)?[-\w]+-v\d+", re.ASCII)
@@ -45,7 +45,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         raise DatasetError(
             f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name a dataset's folder."
         )
-    meta = read_json(data / "metadata.json")
+    meta = rows.read_json(data / "metadata.json")
     count = meta.get("total_episodes")
     if not isinstance(count, int) or not 0 < count <= 1 << 32:
         raise DatasetError(f"{data} claims {count} episodes; there is nothing to read.")
@@ -199,18 +199,14 @@ def write(
     with rows.fresh(path) as staged:
         data = staged / "data"
         data.mkdir(parents=True)
-        steps, count = 0, 0
+        steps, number = 0, 0
         with hdf5.File(data / "main_data.hdf5", "w", track_order=True) as file:
-            for count, take in enumerate(source.takes(), 1):
-                group = file.create_group(f"episode_{count - 1}")
-                steps += _write_take(group, count - 1, source, take, places, notes)
-                if progress:
-                    progress(count, 0)
-        if not count:
-            raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")
+            for number, take in rows.numbered(source, progress):
+                group = file.create_group(f"episode_{number}")
+                steps += _write_take(group, number, source, take, places, notes)
         meta = _metadata(source, given, dataset_id)
         size = round((data / "main_data.hdf5").stat().st_size / 1e6, 1)
-        meta |= {"total_episodes": count, "total_steps": steps, "dataset_size": size}
+        meta |= {"total_episodes": number + 1, "total_steps": steps, "dataset_size": size}
         (data / "metadata.json").write_text(json.dumps(meta), encoding="utf-8")
     return list(notes)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -135,7 +134,7 @@ class TableEpisode:
         return [str(text) for text in self._array(place).to_pylist()]
 
     def facts(self) -> dict[str, object]:
-        return read_json(self._folder / "metadata.json", missing={})
+        return rows.read_json(self._folder / "metadata.json", missing={})
 
     def _array(self, place: Place) -> pa.Array:
         array = self._columns.get(str(place[0]))
@@ -178,19 +177,6 @@ def _width(kind: pa.DataType) -> int:
     if pa.types.is_fixed_size_list(kind):
         return kind.list_size * _width(kind.value_type)
     return max(1, kind.bit_width // 8) if pa.types.is_primitive(kind) else 1
-
-
-def read_json(path: Path, missing: dict | None = None) -> dict:
-    """A JSON object; DatasetError where it is damaged (or missing, unless `missing` says what to give)."""
-    if missing is not None and not path.exists():
-        return missing
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path} is missing or damaged ({error}); restore it from a copy.") from error
-    if not isinstance(found, dict):
-        raise DatasetError(f"{path} is not a JSON object; restore it from a copy.")
-    return found
 
 
 def joined(place: Sequence[str | int]) -> str:

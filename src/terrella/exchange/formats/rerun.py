@@ -6,15 +6,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import simplejpeg
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
-from ...data.storage.durable import move_into_place, sync_file
+from ...data.storage.durable import sync_file
 from ..poses import pose_columns
+from . import rows
 
 try:
     import rerun as rr  # pyright: ignore[reportMissingImports]
@@ -34,29 +34,18 @@ def write(source: Source, path: str | Path) -> list[str]:
     DatasetError where `path` exists, or a single file is asked for and there is no take or more than one.
     """
     path = Path(path)
-    if path.exists():
-        raise DatasetError(f"{path} exists already; move it away, or choose another name.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        files = []
-        for number, take in enumerate(source.takes()):
-            if path.suffix == ".rrd" and number == 1:
+    with rows.fresh(path) as staged:
+        for number, take in rows.numbered(source, None):
+            if path.suffix == ".rrd" and number:
                 raise DatasetError(f"{source.name} has more than one episode; name a folder for Rerun's files.")
-            files.append(Path(folder) / f"episode-{number:06d}.rrd")
+            if path.suffix != ".rrd":
+                staged.mkdir(exist_ok=True)
+            file = staged if path.suffix == ".rrd" else staged / f"episode-{number:06d}.rrd"
             stream = _stream(source, number)
-            stream.save(files[-1])
+            stream.save(file)
             _log(stream, source, take)
             stream.disconnect()
-            sync_file(files[-1])
-        if path.suffix != ".rrd":
-            (Path(folder) / "whole").mkdir()
-            for file in files:
-                move_into_place(file, Path(folder) / "whole" / file.name)
-            move_into_place(Path(folder) / "whole", path)
-        elif files:
-            move_into_place(files[0], path)
-        else:
-            raise DatasetError(f"{source.name} has no episode to write.")
+            sync_file(file)
     return _left_out(source)
 
 

@@ -201,14 +201,10 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     notes: dict[str, None] = {}
     known = _facts(source)
     with rows.fresh(path) as staged, hdf5.File(staged, "w") as file:
-        data, total, count = file.create_group("data"), 0, 0
-        for count, take in enumerate(source.takes(), 1):
+        data, total = file.create_group("data"), 0
+        for number, take in rows.numbered(source, progress):
             demo = data.create_group(_demo_name(take, data))
-            total += _write_demo(demo, source, take, f"take {count - 1}", notes)
-            if progress:
-                progress(count, 0)
-        if not count:
-            raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")
+            total += _write_demo(demo, source, take, f"take {number}", notes)
         _write_attributes(data, known.get("attributes"))
         gym = {"env_name": source.name, "env_type": 2, "env_kwargs": {}}  # 2 is robomimic's number for Gym environments
         written = {name: sensor for name, sensor in source.sensors.items() if _place(sensor) is not None}

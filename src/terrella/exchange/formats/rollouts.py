@@ -54,7 +54,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     files = sorted(path.glob("*.npz"), key=lambda p: rows.natural(p.name)) if path.is_dir() else [path]
     if not files:
         raise DatasetError(f"{path} has no .npz files; name a folder of episodes, one .npz each.")
-    about = _about(path if path.is_dir() else path.parent)
+    about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
     sensors, notes = _sensors(_headers(files[0]), described, str(files[0]))
     rate, more = rows.rate_of(fps, about.get("fps"), "the folder")
@@ -68,20 +68,6 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         notes=(*notes, *more),
         facts=facts if isinstance(facts, dict) else {},
     )
-
-
-def _about(folder: Path) -> dict:
-    if not (folder / ABOUT).is_file():
-        return {}
-    try:
-        found = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(
-            f"{folder / ABOUT} is damaged ({error}); delete it to read the arrays without it."
-        ) from error
-    if not isinstance(found, dict):
-        raise DatasetError(f"{folder / ABOUT} is not a JSON object; delete it to read the arrays without it.")
-    return found
 
 
 def _headers(path: Path) -> dict[str, _Array]:
@@ -236,13 +222,8 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     keys = _keys(source, notes)
     with rows.fresh(path) as staged:
         staged.mkdir()
-        count = 0
-        for count, take in enumerate(source.takes(), 1):
-            _write_take(staged / f"episode_{count - 1}.npz", source, take, keys, f"take {count - 1}")
-            if progress:
-                progress(count, 0)
-        if not count:
-            raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")
+        for number, take in rows.numbered(source, progress):
+            _write_take(staged / f"episode_{number}.npz", source, take, keys, f"take {number}")
         written = {name: sensor for name, sensor in source.sensors.items() if name in keys}
         about = rows.describe(replace(source, sensors=written))
         (staged / ABOUT).write_text(json.dumps(about, indent=1), encoding="utf-8")

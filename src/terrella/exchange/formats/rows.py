@@ -7,7 +7,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -169,7 +169,7 @@ def rows_of(take: Take, where: str) -> Rows:
     if len(set(seen.values())) > 1 or len(set(done.values())) > 1:
         counts = ", ".join(f"{name} {count}" for name, count in {**seen, **done}.items())
         raise DatasetError(
-            f"{where} has sensors of different rates ({counts} readings); resample it to one rate first."
+            f"{where} has sensors of different rates ({counts} readings); convert it to LeRobot first, which brings it to one rate."
         )
     steps = next(iter(done.values()), 0)
     count = next(iter(seen.values()), steps)
@@ -183,7 +183,9 @@ def rows_of(take: Take, where: str) -> Rows:
     for name in (*seen, *done):
         other = take.readings[name].time_s
         if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
-            raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; resample it to one rate first.")
+            raise DatasetError(
+                f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first, which brings it to one rate."
+            )
     return Rows(count, steps, time_s)
 
 
@@ -257,7 +259,7 @@ def describe(source: Source) -> dict:
 def sensors_described(text: object, where: str) -> dict[str, Sensor]:
     """The sensors of a description; DatasetError where it is not one of ours."""
     try:
-        found = [_sensor(item) for item in text["sensors"]]  # type: ignore[index]
+        found = [sensor_of(item) for item in text["sensors"]]  # type: ignore[index]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(
             f"the description of sensors in {where} is damaged ({error}); delete it to read without."
@@ -265,18 +267,39 @@ def sensors_described(text: object, where: str) -> dict[str, Sensor]:
     return {sensor.name: sensor for sensor in found}
 
 
-def _sensor(item: dict) -> Sensor:
+def sensor_of(item: Mapping) -> Sensor:
+    """A sensor out of a file's description of it; ValueError, TypeError or KeyError where it is none."""
     known = {field.name for field in fields(Sensor)}
     sensor = Sensor(**{key: value for key, value in item.items() if key in known})
-    shape = tuple(int(n) for n in sensor.shape)
-    np.dtype(sensor.dtype)
+    shape, kinds = tuple(int(n) for n in sensor.shape), np.dtype(sensor.dtype).kind
+    dimensions = {"image": 3, "depth": 2, "points": 2, "vector": len(shape)}
+    wanted = {"image": "uint8", "depth": "float32", "points": "float32"}.get(sensor.kind, sensor.dtype)
     if (
-        sensor.kind not in ("image", "depth", "points", "vector")
+        sensor.kind not in dimensions
         or not isinstance(sensor.name, str)
-        or min(shape, default=0) < 0
+        or sensor.dtype != wanted
+        or kinds not in "biuf"
     ):
-        raise ValueError(f"'{sensor.name}' is no sensor")
-    return replace(sensor, shape=shape, names=tuple(sensor.names), units=dict(sensor.units), facts=dict(sensor.facts))
+        raise ValueError(f"'{sensor.name}' is {sensor.kind} of {sensor.dtype}")
+    if len(shape) != dimensions[sensor.kind] or min(shape, default=0) < 0 or not isinstance(sensor.frame, str):
+        raise ValueError(f"the shape of '{sensor.name}' is {list(shape)}")
+    names, units = tuple(map(str, sensor.names)), {str(key): str(unit) for key, unit in dict(sensor.units).items()}
+    rate = None if sensor.rate_hz is None else float(sensor.rate_hz)
+    return replace(sensor, shape=shape, names=names, units=units, rate_hz=rate, facts=dict(sensor.facts))
+
+
+def read_json(path: Path, missing: dict | None = None) -> dict:
+    """A JSON object; DatasetError where it is damaged (or missing, unless `missing` says what to give)."""
+    if missing is not None and not path.exists():
+        return missing
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        what = "damaged" if path.exists() else "missing"
+        raise DatasetError(f"{path} is {what} ({error}); restore it from a copy.") from error
+    if not isinstance(found, dict):
+        raise DatasetError(f"{path} is not a JSON object; restore it from a copy.")
+    return found
 
 
 def json_or_none(value: object) -> object:
@@ -293,6 +316,17 @@ def json_or_none(value: object) -> object:
 
 
 # -- files that are either whole or not there
+
+
+def numbered(source: Source, progress: Callable[[int, int], None] | None) -> Iterator[tuple[int, Take]]:
+    """The takes with their numbers; `progress(takes, 0)` after each is written. DatasetError where there are none."""
+    number = -1
+    for number, take in enumerate(source.takes()):
+        yield number, take
+        if progress:
+            progress(number + 1, 0)
+    if number < 0:
+        raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")
 
 
 @contextmanager
