@@ -1,5 +1,5 @@
 """Estimator: what a picture alone says of space: how far everything is, how the viewer moved since the one before, and whether
-it looks like the pictures that the eye learned from. Trained by learn/eye.py."""
+it looks like the pictures that it learned from. Trained by learn/senses.py."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def estimator_weights(estimator: Estimator) -> dict[str, torch.Tensor]:
 
 
 def estimator_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Estimator:
-    """The eye that `asdict(eye.config)` and `estimator_weights` describe."""
+    """The estimator that `asdict(estimator.config)` and `estimator_weights` describe."""
     size, camera = tuple(config["size"]), tuple(config["camera"])
     estimator = Estimator(EstimatorConfig(size, config["near_m"], config["far_m"], tuple(config["channels"]), camera))
     estimator.load_state_dict({name: value.float() for name, value in weights.items()})
@@ -192,7 +192,7 @@ def estimator_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Estima
 
 def save_estimator(estimator: Estimator, path: str | Path) -> None:
     """Writes one safetensors file."""
-    about = {"kind": "eye", "config": asdict(estimator.config)}
+    about = {"kind": "estimator", "config": asdict(estimator.config)}
     save_file(estimator_weights(estimator), str(path), metadata={"terrella": json.dumps(about)})
 
 
@@ -201,9 +201,9 @@ def load_estimator(path: str | Path) -> Estimator:
     try:
         with safe_open(str(path), framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("terrella", "{}"))
-        if about.get("kind") != "eye":
-            raise CheckpointError(f"{path} holds no eye; make one with `terrella train eye`.")
+        if about.get("kind") not in ("estimator", "eye"):  # as it was called at first
+            raise CheckpointError(f"{path} holds no estimator; make one with `terrella train estimator`.")
         return estimator_of(about["config"], load_file(str(path)))
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         first = str(error).splitlines()[0]
-        raise CheckpointError(f"{path} is no eye that can be read ({first}); train it again.") from error
+        raise CheckpointError(f"{path} is no estimator that can be read ({first}); train it again.") from error
