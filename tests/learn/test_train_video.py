@@ -203,7 +203,7 @@ def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
     world = load_world(trained[0] / "world")
     save_world(world.without_memory(), tmp_path / "bare")
     bare = load_world(tmp_path / "bare")
-    assert len(bare.memory) == 0 and len(bare.starts) == len(world.starts)
+    assert len(bare.memory) == 0 and len(bare.starts.pose) == len(world.starts.pose)  # pyright: ignore
     assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
 
 
