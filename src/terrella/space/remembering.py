@@ -164,7 +164,6 @@ class Remembering:
         y = pose[:, 1] + forward * heading.sin() + left * heading.cos()
         return planar_pose(x, y, pose[:, 2], heading + turn)
 
-
     def _joined(self, inner: State, seen: Mapping, held: State, **own: torch.Tensor) -> State:
         """The inner world's state, what it shows of reward and end, memory's tensors in `held`, and what is shown."""
         tensors = {f"{_INNER}{name}": tensor for name, tensor in inner.items()}
