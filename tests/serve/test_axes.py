@@ -8,11 +8,13 @@ from gymnasium import spaces
 
 from terrella.core import Spec, check_world
 from terrella.core.policy import Random, Reactive
+from terrella.data import Layout, Recorder
+from terrella.exchange.browse import browse
 from terrella.serve.actions import MAX_AXES, Person, action_of, axes_of
 from terrella.serve.protocol import Show
 from terrella.serve.timeline import Timeline
 
-from .robot import HIGH, LOW, NAMES, Robot
+from .robot import HIGH, LOW, NAMES, UNITS, Robot
 from .test_page import PAD, open_page, until  # noqa: F401  (a fixture)
 from .test_server import Client
 
@@ -131,6 +133,23 @@ def test_two_forkable_worlds_rewind_and_branch():
     timeline.stand_at(3)
     timeline.branch()
     assert [timeline.step((), (1.0,)).images for _ in range(5)] == first[3:]
+
+
+def test_play_with_axes_is_recorded_through_every_camera_and_can_be_viewed(tmp_path):
+    world = Robot()
+    layout = Layout.of(world.spec)
+    timeline = Timeline([world], 0, lambda: Recorder(tmp_path / "set", layout, "play"))
+    timeline.record(True)
+    for _ in range(12):
+        timeline.step((), (1.0, 0.5, 0.25))
+    timeline.record(False)
+    assert timeline.notice == ""
+    recording = browse(str(tmp_path / "set"))
+    sensors = {sensor["name"]: sensor for sensor in recording.about()["sensors"]}
+    assert sensors["action"]["names"] == list(NAMES) and sensors["action"]["units"] == list(UNITS)
+    assert np.allclose(recording.series(0, "action")[0], [1.0, 0.5, 0.25])
+    sizes = {recording.reading(0, name, 3).shape for name, sensor in sensors.items() if sensor["kind"] == "image"}
+    assert sizes == {(48, 64, 3), (32, 32, 3)}
 
 
 def test_axes_and_cameras_over_the_wire(serve_world):

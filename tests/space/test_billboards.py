@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 
 from terrella.core import make_rng
-from terrella.space.billboards import BEHIND_M, PICTURE, cut_out, painted
-from terrella.space.camera import planar_pose, project
+from terrella.space.billboards import PICTURE, cut_out, painted, painted_slowly
+from terrella.space.camera import planar_pose
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 BOX = torch.tensor([0.4, 0.4, 0.0, 1.6])  # 0.8 m wide, 1.6 m tall, on its feet
@@ -92,37 +91,15 @@ def test_frames_without_cards_give_none():
     assert len(cut.view) == 0 and cut.picture.shape == (0, 4, *PICTURE)
 
 
-def painted_slowly(rgb, depth, places, pictures, boxes, pose):
-    """The same in plain tensor algebra, for one view: every card is drawn twice as fine and averaged."""
-    height, width = depth.shape
-    where, ahead = project(places, pose[0], CAMERA)
-    behind, instances = depth.clone(), torch.zeros(height, width, dtype=torch.uint8)
-    for card in ahead.argsort(descending=True).tolist():
-        across, along = (CAMERA[axis] * (width, height)[axis] / ahead[card] for axis in (0, 1))
-        u, v = (torch.arange(2 * length) / 2 + 0.25 for length in (width, height))
-        u = (u - where[card, 0] * width + boxes[card, 0] * across) / (boxes[card, :2].sum() * across)
-        v = (v - where[card, 1] * height + boxes[card, 3] * along) / (boxes[card, 2:].sum() * along)
-        grid = torch.stack(torch.meshgrid(2 * u - 1, 2 * v - 1, indexing="xy"), -1)
-        fine = F.grid_sample(pictures[card][None], grid[None], align_corners=False, padding_mode="border")
-        inside = (grid.abs().amax(-1) <= 1) & (fine[:, 3:] > 0.5) & (ahead[card] > 0.25)
-        layer = F.avg_pool2d(torch.cat([fine[:, :3] * inside, inside.float()], 1), 2)[0]
-        seen = behind + BEHIND_M > ahead[card]
-        cover = layer[3] * seen
-        rgb = rgb * (1 - cover) + layer[:3] * seen
-        depth = torch.where(cover > 0.5, ahead[card], depth)
-        instances = torch.where(cover > 0.1, card + 1, instances).to(torch.uint8)
-    return rgb, depth, instances
-
-
 def test_the_kernel_paints_as_the_slow_way_does():
-    """Cards with holes in them, before, in and behind a rough wall, some of them cut off by the picture's edge."""
+    """Billboards with holes in them, before, in and behind a rough wall, some of them cut off by the picture's edge."""
     rng = make_rng(0)
     for _ in range(10):
-        places = torch.rand(5, 3, generator=rng) * torch.tensor([6.0, 5.0, 0.4]) + torch.tensor([0.5, -2.5, -0.2])
-        pictures, boxes = torch.rand(5, 4, *PICTURE, generator=rng), 0.2 + torch.rand(5, 4, generator=rng)
-        rgb, depth = torch.rand(3, *SIZE, generator=rng), 2 + 4 * torch.rand(SIZE, generator=rng)
-        there = torch.ones(1, 5, dtype=torch.bool)
-        quick = painted(rgb[None], depth[None], (places[None], pictures[None], boxes[None]), there, camera_at(), CAMERA)
-        slow = painted_slowly(rgb, depth, places, pictures, boxes, camera_at())
-        assert torch.allclose(quick[0][0], slow[0], atol=1e-4) and torch.allclose(quick[1][0], slow[1])
-        assert torch.equal(quick[2][0], slow[2]) and (slow[2] > 0).any()
+        places = torch.rand(2, 5, 3, generator=rng) * torch.tensor([6.0, 5.0, 0.4]) + torch.tensor([0.5, -2.5, -0.2])
+        pictures, boxes = torch.rand(2, 5, 4, *PICTURE, generator=rng), 0.2 + torch.rand(2, 5, 4, generator=rng)
+        rgb, depth = torch.rand(2, 3, *SIZE, generator=rng), 2 + 4 * torch.rand(2, *SIZE, generator=rng)
+        there = torch.rand(2, 5, generator=rng) < 0.8
+        given = rgb, depth, (places, pictures, boxes), there, camera_at().expand(2, 7), CAMERA
+        quick, slow = painted(*given), painted_slowly(*given)
+        assert torch.allclose(quick[0], slow[0], atol=1e-3) and torch.allclose(quick[1], slow[1])
+        assert torch.equal(quick[2], slow[2]) and (slow[2] > 0).any()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -23,6 +23,7 @@ def play(
     remember: bool = False,
     estimator: str | None = None,
     memory_mb: float | None = None,
+    policy: Literal["explore", "random"] | None = None,
     record: Path | None = None,
     port: Port = 8765,
     host: Host = "127.0.0.1",
@@ -43,6 +44,7 @@ def play(
         remember: Add a spatial memory to a world that has none.
         estimator: Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one.
         memory_mb: Size limit of the spatial memory in MiB; default: as the world was saved, or 16.
+        policy: Who acts while nobody touches the controls: a script that explores, or random actions.
         record: Folder of a dataset to which the page can record.
     """
     from ..core.errors import TerrellaError
@@ -61,12 +63,17 @@ def play(
 
         layout, folder = Layout.of(worlds[0].spec), record
         sink = lambda: Recorder(folder, layout, "play")  # noqa: E731
-    names = [world.spec.name for world in worlds]
+    names, driver = [world.spec.name for world in worlds], None
+    if policy is not None:
+        from ..act.explorer import Explorer
+        from ..core.policy import Random
+
+        driver = Explorer(worlds[0].spec) if policy == "explore" else Random(worlds[0].spec, (3, 40))
 
     def ready(address: str) -> None:
-        result({"address": address, "worlds": names}, json, f"{' beside '.join(names)}: open {address}")
+        result({"address": address, "worlds": names}, json, f"{' and '.join(names)}: open {address}")
 
-    serve(worlds, host=host, port=port, token=token, sink_factory=sink, on_ready=ready, seed=seed, picture=picture)
+    serve(worlds, host, port, token, sink, ready, seed, picture=picture, policy=driver)
 
 
 def _first_picture(path: Path, world: World) -> Any:

@@ -1,0 +1,98 @@
+"""Makes docs/images/play.webp: a few seconds inside a learned world, with the keys that are held.
+
+    python recipes/play_animation.py docs/images/play.webp --seed 3
+
+Every frame is drawn by the world from the state before it and the keys; the keys are those of act/explorer.py.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import tyro
+from PIL import Image, ImageDraw, ImageFont
+from tyro.conf import Positional
+
+import terrella
+from terrella.act.explorer import Explorer
+from terrella.core.policy import act
+
+GROUND, RAISED, LINE, INK, MUTED, HELD = "#0b0c0f", "#14161a", "#24272d", "#eceae4", "#8d9097", "#7fe3c4"
+CAPS = [  # label, column, row, action
+    ("W", 1, 0, "MOVE_FORWARD"), ("A", 0, 1, "MOVE_LEFT"), ("S", 1, 1, "MOVE_BACKWARD"), ("D", 2, 1, "MOVE_RIGHT"),
+    ("<", 4, 1, "TURN_LEFT"), (">", 5, 1, "TURN_RIGHT"),
+]  # fmt: skip
+CAP, GAP, MARGIN = 34, 4, 14
+
+
+def main(
+    out: Positional[Path] = Path("docs/images/play.webp"),
+    world: str = "doom-maze",
+    seed: int = 0,
+    skip: int = 40,
+    seconds: float = 9.0,
+    every: int = 2,
+    scale: int = 4,
+    quality: int = 52,
+) -> None:
+    """Args:
+    skip: Steps before the first frame shown.
+    every: Steps of the world from one frame to the next; the animation runs at the world's own pace.
+    scale: Screen pixels per pixel of the world.
+    """
+    played = terrella.load(world)
+    steps = round(seconds / played.spec.dt_s)
+    pictures, pressed = play(played, seed, skip, steps)
+    frames = [draw(picture, keys, played.spec, scale) for picture, keys in zip(pictures[::every], pressed[::every])]
+    frames = looped(frames, 8)
+    pause_ms = round(1000 * played.spec.dt_s * every)
+    frames[0].save(out, save_all=True, append_images=frames[1:], duration=pause_ms, loop=0, quality=quality, method=6)
+    print(f"{out}: {len(frames)} frames, {len(frames) * pause_ms / 1000:.1f} s, {out.stat().st_size / 2**20:.2f} MiB")
+
+
+@torch.inference_mode()
+def play(world, seed: int, skip: int, steps: int) -> tuple[list[Image.Image], list[set[str]]]:
+    """The world's pictures, and the names of the buttons held at each."""
+    spec, rng = world.spec, terrella.make_rng(seed)
+    policy, state = Explorer(spec), world.start(1, rng)
+    memory, pictures, pressed = policy.begin(1, rng), [], []
+    for step in range(skip + steps):
+        seen = world.render(state, ("rgb", "depth", "pose"))
+        action, memory = act(policy, seen, memory, 1, spec, rng)
+        if step >= skip:
+            pictures.append(Image.fromarray(seen["rgb"][0].cpu().numpy()))
+            pressed.append({name for name, on in zip(spec.action_names, action[0].tolist()) if on})
+        state = world.imagine(state, action, rng)
+    return pictures, pressed
+
+
+def draw(picture: Image.Image, held: set[str], spec, scale: int) -> Image.Image:
+    """The picture, crisply enlarged, above the keys."""
+    width, height = picture.width * scale, picture.height * scale
+    frame = Image.new("RGB", (width, height + 2 * CAP + GAP + 2 * MARGIN), GROUND)
+    frame.paste(picture.resize((width, height), Image.Resampling.NEAREST))
+    pen, font, small = ImageDraw.Draw(frame), ImageFont.load_default(15), ImageFont.load_default(13)
+    for label, column, row, name in CAPS:
+        x, y, on = MARGIN + column * (CAP + GAP), height + MARGIN + row * (CAP + GAP), name in held
+        pen.rounded_rectangle((x, y, x + CAP, y + CAP), 6, HELD if on else RAISED, HELD if on else LINE)
+        ink, middle = (GROUND if on else INK), (x + CAP / 2, y + CAP / 2)
+        if label in "<>":
+            tip = -7 if label == "<" else 7
+            pen.polygon([(middle[0] + tip, middle[1])] + [(middle[0] - tip / 2, middle[1] + d) for d in (-6, 6)], ink)
+        else:
+            pen.text(middle, label, ink, font, anchor="mm")
+    right, top = width - MARGIN, height + MARGIN + CAP + GAP / 2
+    pen.text((right, top - 10), f"terrella play {spec.name}", INK, font, anchor="rm")
+    pen.text((right, top + 12), "every frame drawn by a learned model", MUTED, small, anchor="rm")
+    return frame
+
+
+def looped(frames: list[Image.Image], over: int) -> list[Image.Image]:
+    """The last frames fade into the first, so that the loop has no jolt."""
+    fade = [Image.blend(frames[at - over], frames[at], (at + 1) / (over + 1)) for at in range(over)]
+    return frames[over:-over] + fade
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
