@@ -46,7 +46,7 @@ def load(
              compiled graph where that is faster here: worlds/fast.py), for the game the fields of
              DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
-             `terrella train eye` wrote or a world that has an eye, tells pose and depth where the world does not (to give one
+             `terrella train estimator` wrote or a world that has one, gives pose and depth where the world does not (to give one
              asks to remember).
     memory_mb: the budget in MiB of what a story remembers; as its world was saved, or 16.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
@@ -137,27 +137,27 @@ def _read_card(folder: Path) -> Mapping[str, object]:
 
 def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     kind = _read(folder).get("kind")
-    if kind == "video":
+    if kind in ("learned", "video"):  # "video" is of an earlier release, and load_world says how it is converted
         from .worlds.folder import load_world
 
         world = load_world(folder, **{name: value for name, value in options.items() if name != "fast"})
         if options.get("fast"):
-            from .worlds.fast import quicken
+            from .worlds.fast import quickened
 
-            quicken(world)
+            return quickened(world)[0]
         return world
     raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
 
 
 def open_estimator(source: str | Path) -> Estimator:
-    """The eye in a file that `terrella train eye` wrote, or of a world that has one."""
+    """The estimator in a file that `terrella train estimator` wrote, or of a world that has one."""
     from .space.estimator import Estimator, load_estimator
 
     if Path(source).is_file():
         return load_estimator(source)
     estimator = getattr(load(source), "estimator", None)
     if not isinstance(estimator, Estimator):
-        raise TerrellaError(f"{source} has no eye; give a file that `terrella train eye` wrote.")
+        raise TerrellaError(f"{source} has no estimator; give a file that `terrella train estimator` wrote.")
     return estimator
 
 

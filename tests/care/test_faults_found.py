@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from test_doctor import DATA
 
 from terrella.care import doctor, repair
@@ -277,6 +279,46 @@ def test_pictures_that_cannot_be_decoded_are_named_and_left_out(pictured, tmp_pa
     assert faults[0].file == DATA and faults[0].row == 34
     repair(pictured, tmp_path / "out")
     assert Dataset(tmp_path / "out").length == 71 - 3 and doctor(tmp_path / "out") == []
+
+
+def _depth_png(depth_mm: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(depth_mm.astype(np.uint16)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def deep(pictured) -> Path:
+    """With a camera of one channel of 16 bits, as LeRobot keeps depth."""
+    rng = np.random.default_rng(3)
+    for path in sorted((pictured / "data").rglob("*.parquet")):
+        table = pq.read_table(path)
+        pictures = [_depth_png(rng.integers(300, 9000, (8, 8))) for _ in range(len(table))]
+        form = table.schema.field(CAMERA).type
+        made = pa.array([{"bytes": picture, "path": None} for picture in pictures], form)
+        pq.write_table(table.append_column("observation.images.depth", made), path)
+    told = json.loads((pictured / "meta/info.json").read_text())
+    feature = {"dtype": "image", "shape": [8, 8, 1], "names": ["height", "width", "channels"]}
+    told["features"]["observation.images.depth"] = feature
+    (pictured / "meta/info.json").write_text(json.dumps(told))
+    return pictured
+
+
+@pytest.mark.parametrize("info_lost", [False, True])
+def test_depth_of_sixteen_bits_keeps_them(deep, tmp_path, info_lost):
+    before = pq.read_table(deep / DATA)["observation.images.depth"].to_pylist()
+    assert [fault for fault in doctor(deep) if fault.file != "meta/stats.json"] == []
+    if info_lost:
+        (deep / "meta/info.json").unlink()
+        (deep / "meta/terrella.json").unlink()
+    repair(deep, tmp_path / "out")
+    told = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert told["features"]["observation.images.depth"]["shape"] == [8, 8, 1]
+    after = pq.read_table(tmp_path / "out" / DATA)["observation.images.depth"].to_pylist()
+    for was, now in zip(before, after, strict=True):
+        with Image.open(io.BytesIO(was["bytes"])) as a, Image.open(io.BytesIO(now["bytes"])) as b:
+            assert np.array_equal(np.asarray(a), np.asarray(b)) and np.asarray(b).max() > 255
+    assert doctor(tmp_path / "out") == []
 
 
 # -- the report ------------------------------------------------------------------------------------------------------

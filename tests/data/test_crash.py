@@ -270,3 +270,34 @@ def test_truncated_episode_table_is_named(recording):
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(DatasetError, match="file-002.parquet"):
         Dataset(recording)
+
+
+def test_a_recorder_that_nobody_closed_lets_go_and_loses_no_row(tmp_path):
+    """A closed tab, or an exception that was swallowed, leaves a recorder behind."""
+    layout = Layout.of_channels(10, ("go",), rgb=(16, 16))
+
+    def left_behind() -> None:
+        recorder = Recorder(tmp_path / "recording", layout)
+        for i in range(9):
+            recorder.add({"rgb": np.full((16, 16, 3), 20 * i, np.uint8)}, [i])
+
+    left_behind()
+    with Recorder(tmp_path / "recording", layout) as recorder:
+        assert recorder.recovered == 9 and recorder.episodes == 1
+
+
+def test_a_recorder_that_fails_on_closing_lets_go(tmp_path, monkeypatch):
+    layout = Layout.of_channels(10, ("go",), pose=True)
+    recorder = Recorder(tmp_path / "recording", layout)
+    for i in range(9):
+        recorder.add({"pose": np.arange(7) + i}, [i])
+
+    def broken(*_):
+        raise ValueError("no")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("terrella.data.writer.Writer.put", broken)
+        with pytest.raises(ValueError):
+            recorder.close()
+    with Recorder(tmp_path / "recording", layout) as again:
+        assert again.recovered == 9

@@ -320,3 +320,27 @@ def test_errors_of_a_window_reach_the_reader(far, recording, tmp_path):
         list(clips)
     with pytest.raises(DatasetError, match="holds no clip"):
         streaming(far, tmp_path, 1 << 30, size=(40_000, 4_000))
+
+
+@pytest.mark.parametrize("scheme", ["file", "memory"])
+def test_a_clip_cache_of_a_recording_far_away(recording, tmp_path, monkeypatch, scheme):
+    import fsspec
+
+    from terrella.data import ClipCache
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    near = ClipCache.open(recording, (12, 16))
+    root = f"file://{recording}"
+    if scheme == "memory":
+        root = "memory://far/recording"
+        memory = fsspec.filesystem("memory")
+        for path in recording.rglob("*"):
+            if path.is_file() and ".cache" not in path.parts:
+                memory.pipe(f"/far/recording/{path.relative_to(recording)}", path.read_bytes())
+    dataset = Dataset(Files(root, tmp_path / "files", budget_bytes=1 << 20))
+    far = ClipCache.open(dataset, (12, 16))
+    assert far.path.is_relative_to(tmp_path / "home") and far.episodes == near.episodes and far.tasks == near.tasks
+    assert all(np.array_equal(near.arrays[name], far.arrays[name]) for name in near.arrays)
+    assert ClipCache.open(dataset, (12, 16)).path == far.path  # built once
+    with pytest.raises(DatasetError, match="may be kept here.*smaller pictures"):
+        ClipCache.open(dataset, (24, 32), budget_bytes=100_000)

@@ -17,9 +17,9 @@ def pose_at(x: float, y: float, heading: float) -> torch.Tensor:
 def room_depth(pose: torch.Tensor, size=SIZE, half: float = 4.0, ceiling: float = 4.0) -> torch.Tensor:
     """Exact depth [B, H, W] inside a box room centred on the origin."""
     beam = rays(CAMERA, *size) @ rotation(pose)[:, None].mT
-    eye = pose[:, None, None, :3]
+    origin = pose[:, None, None, :3]
     low, high = torch.tensor([-half, -half, 0.0]), torch.tensor([half, half, ceiling])
-    to_wall = torch.where(beam > 0, (high - eye) / beam.clamp_min(1e-9), (low - eye) / beam.clamp_max(-1e-9))
+    to_wall = torch.where(beam > 0, (high - origin) / beam.clamp_min(1e-9), (low - origin) / beam.clamp_max(-1e-9))
     return to_wall.amin(-1)
 
 

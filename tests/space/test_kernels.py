@@ -8,8 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from terrella.core import make_rng
-from terrella.space import billboards
-from terrella.space.billboards import PICTURE, painted, painted_slowly
+from terrella.space.billboards import PICTURE, painted
 from terrella.space.camera import FAR_M, planar_pose, rotation
 from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
 from terrella.space.keyframes import Keyframes, pick, pick_slowly
@@ -49,7 +48,7 @@ def test_a_rotation_turns_a_vector_as_its_quaternion_does():
 
 @pytest.mark.parametrize("camera", [CAMERA, (0.8, 0.8, 0.3, 0.6)])
 def test_patches_at_the_rim_are_not_lost(camera):
-    """Many small and large patches all around the eye, most of them out of the picture."""
+    """Many small and large patches all around the camera, most of them out of the picture."""
     rng = make_rng(1)
     centre = torch.randn(400, 3, generator=rng) * 3
     sides = torch.randn(400, 6, generator=rng) * torch.rand(400, 1, generator=rng) * 2
@@ -161,25 +160,6 @@ def test_straight_runs_are_those_of_the_slow_twin():
     runs = straight_runs(inverse, left)
     torch.testing.assert_close(runs, straight_runs_slowly(inverse, left))
     assert (runs[..., 1] > 0).sum() > 40
-
-
-def test_billboards_are_painted_as_the_slow_twin_does(monkeypatch):
-    rng = make_rng(10)
-    rgb, depth = torch.rand(2, 3, 48, 64, generator=rng), 3 + torch.rand(2, 48, 64, generator=rng)
-    places = torch.rand(2, 3, 3, generator=rng) * torch.tensor([2.0, 2.0, 0.2]) + torch.tensor([1.5, -1.0, -0.5])
-    pictures = F.avg_pool2d(torch.rand(2, 3, 4, *PICTURE, generator=rng).flatten(0, 1), 9, 1, 4).view(2, 3, 4, *PICTURE)
-    boards = places, pictures, torch.full((2, 3, 4), 0.4)
-    there, pose = torch.tensor([[True, True, False], [True, True, True]]), planar_pose(*torch.zeros(4, 2))
-    quick = painted(rgb, depth, boards, there, pose, CAMERA)
-    monkeypatch.setattr(billboards, "paint_views", lambda first, last, *parts: None)
-    given: list = []
-    monkeypatch.setattr(billboards, "arrays", lambda *parts: given.extend(parts) or [part.numpy() for part in parts])
-    painted(rgb, depth, boards, there, pose, CAMERA)
-    order, _, _, sides, far = given[:5]
-    slow = painted_slowly(rgb, depth, pictures, order, there, sides.float(), far.float())
-    assert (quick[2] > 0).float().mean() > 0.02
-    for one, other in zip(quick, slow):
-        assert float(torch.isclose(one.float(), other.float(), atol=0.02).float().mean()) > 0.97, "but for the rims"
 
 
 def test_views_are_shared_out_whole_and_errors_come_back():

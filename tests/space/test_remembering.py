@@ -17,7 +17,6 @@ from terrella.space.camera import planar_pose, yaw
 from terrella.space.keyframes import Glimpse
 from terrella.space.memory import DREAMT, OBSERVED
 from terrella.space.remembering import Remembering, blend, remember
-from terrella.worlds.video import VideoWorld
 
 from .rooms import CAMERA, SIZE, painted, room_depth
 
@@ -27,7 +26,7 @@ TURN = math.radians(6)
 class Fickle:
     """Stands in a box room and repaints it at every step, in colours of its own choice; what it is shown it believes.
 
-    `channels`: which of depth and pose it tells. Its picture says in three corner pixels where it stands, for the eye.
+    `channels`: which of depth and pose it tells. Its picture says in three corner pixels where it stands, for the estimator.
     """
 
     def __init__(self, channels=("depth", "pose"), length: int = 10**6):
@@ -89,7 +88,7 @@ class Fickle:
 
 
 class Told:
-    """An eye for Fickle: it knows the room, and adds up the motions that a list of its own holds."""
+    """An estimator for Fickle: it knows the room, and adds up the motions that a list of its own holds."""
 
     def __init__(self):
         self.moves: list[tuple[float, float, float]] = []
@@ -186,7 +185,7 @@ def test_memory_is_part_of_the_state(tmp_path):
     assert torch.equal(other["memory_pose"][:1], one["memory_pose"])
 
 
-def test_an_eye_gives_pose_and_depth_to_a_world_that_has_none():
+def test_an_estimator_gives_pose_and_depth_to_a_world_that_has_none():
     estimator = Told()
     estimator.moves = [(0.0, 0.0, turn) for turn in [TURN] * 15 + [-TURN] * 15]
     world = Remembering(Fickle(channels=()), estimator=estimator)
@@ -216,7 +215,7 @@ def test_evidence_is_kept_and_a_world_that_cannot_look_says_so():
 
 
 def test_who_cannot_be_given_a_memory_is_told_why():
-    with pytest.raises(ContractError, match="give an eye"):
+    with pytest.raises(ContractError, match="give an estimator"):
         Remembering(Fickle(channels=("depth",)))
     lens = Fickle()
     lens.spec = replace(lens.spec, cameras={})
@@ -246,7 +245,7 @@ def test_a_seam_between_memory_and_invention_does_not_show():
 
 def test_the_bundled_world_remembers_by_itself():
     world = terrella.load("doom-maze", remember=True, memory_mb=2)
-    assert isinstance(world, VideoWorld) and world.own.nbytes <= 2 * 2**20
+    assert world.scene.own.nbytes <= 2 * 2**20
     with pytest.raises(TerrellaError, match="There is no world"):
         terrella.load("doom-maze", estimator="no such file")
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from ..core.errors import DatasetError
 from ..data.format import INFO, STATS
 from ..data.storage import journal, mp4
-from .film_checks import Shown, examine_films, examine_streams, same
+from .film_checks import Shown, examine_films, same
 from .motion_checks import misaligned
 from .row_checks import Rows, examine_rows
+from .streams import examine_streams
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey, survey
 from .value_checks import constants, frozen, statistics
 

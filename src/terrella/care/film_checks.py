@@ -1,4 +1,4 @@
-"""What a doctor finds in videos and streams: lengths against rows and times, pictures that are damaged or exchanged."""
+"""What a doctor finds in the videos: lengths against rows, pictures that are damaged, exchanged or none."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.episodes import Episode
-from ..data.format import STREAM_PATH, where
-from ..data.source import Sensor
 from ..data.staged import SAMPLE_EVERY
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
-from ..data.storage.tables import read_whole
-from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
+from .survey import LEFTOVER, RESTORE, Fault, Survey
 
 _SHORTEN = "let --repair keep the rows that the video shows"
 _EXCHANGE = "exchange the two videos, as --repair does"
@@ -186,92 +183,6 @@ def _exchanged(keys: list[Key], there: np.ndarray, kept: np.ndarray, noise: np.n
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The largest difference of two looks [..., 6]; deviations, which coding smooths, count half."""
     return (np.abs(a - b) * np.array([1, 1, 1, 0.5, 0.5, 0.5])).max(-1)
-
-
-# -- streams ---------------------------------------------------------------------------------------------------------
-
-
-def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
-    """Every stream of every episode: its times ascend, its values are of its shape, its film is as long as its times."""
-    files = set(listed(survey.root, "streams", ".parquet")) | set(listed(survey.root, "streams", ".mp4"))
-    known: set[str] = set()
-    for name, sensor in survey.streams.items():
-        seen = False
-        for episode in survey.episodes.values():
-            place = STREAM_PATH.format(name=name, suffix="parquet", **where(episode.number))
-            film = STREAM_PATH.format(name=name, suffix="mp4", **where(episode.number))
-            known |= {place, film}
-            if place in files:
-                seen = True
-                yield from _stream(survey, sensor, episode, place, film, film in files)
-            elif film in files:
-                yield Fault(film, episode.start, "the times of this film are missing", RESTORE)
-        if survey.episodes and not seen:
-            what = f"stream '{name}' is declared in meta/terrella.json, but no episode has any of it"
-            yield Fault(f"streams/{name}", None, what, "restore its files from a copy, or record anew")
-    if survey.complete and not busy:
-        for file in sorted(files - known):
-            yield Fault(file, None, "no episode and no stream of meta/terrella.json uses this file", LEFTOVER)
-
-
-def _stream(survey: Survey, sensor: Sensor, episode: Episode, place: str, film: str, has_film: bool) -> Iterator[Fault]:
-    try:
-        table = read_whole(survey.path(place))
-        time_s = table["time_s"].to_numpy().astype(np.float64)
-        if sensor.kind != "image":
-            _checked_values(table, sensor)
-    except (DatasetError, KeyError, ValueError, AttributeError, TypeError, NotImplementedError) as error:
-        what = (
-            "the table is missing, truncated or not parquet"
-            if isinstance(error, DatasetError)
-            else f"it holds no readings ({error})"
-        )
-        yield Fault(place, episode.start, what, RESTORE)
-        return
-    falls = np.flatnonzero(~(np.diff(time_s) >= 0) | ~np.isfinite(time_s[1:])) if len(time_s) else []
-    if len(falls) or not np.isfinite(time_s[:1]).all():
-        at = int(falls[0]) + 1 if len(falls) else 0
-        what = f"reading {at} of stream '{sensor.name}' is at {time_s[at]:g} s, which does not ascend"
-        yield Fault(place, episode.start, what, "let --repair leave out the readings that are out of order")
-    if sensor.kind == "image":
-        yield from _stream_film(survey, sensor, episode, film, has_film, len(time_s))
-
-
-def _checked_values(table, sensor: Sensor) -> None:
-    """ValueError where a reading has another size than the sensor's."""
-    value = table["value"].combine_chunks()
-    sizes = np.diff(value.offsets.to_numpy())
-    each = sensor.shape[1] if sensor.kind == "points" else int(np.prod(sensor.shape))
-    if value.null_count or value.values.null_count:
-        raise ValueError("a reading is null")
-    wrong = np.flatnonzero(sizes % each if sensor.kind == "points" else sizes != each)
-    if len(wrong):
-        raise ValueError(
-            f"reading {int(wrong[0])} has {int(sizes[wrong[0]])} numbers, which is no {sensor.kind} of {sensor.shape}"
-        )
-
-
-def _stream_film(
-    survey: Survey, sensor: Sensor, episode: Episode, film: str, has_film: bool, times: int
-) -> Iterator[Fault]:
-    if not has_film:
-        yield Fault(film, episode.start, f"the film of stream '{sensor.name}' is missing", RESTORE)
-        return
-    rate = sensor.rate_hz or survey.fps
-    try:
-        count = reel(survey.path(film), rate).count
-    except DatasetError:
-        yield Fault(film, episode.start, "the video is truncated or not mp4", RESTORE)
-        return
-    if count != times:
-        what = f"the film has {count} frames, its table {times} times"
-        yield Fault(film, episode.start, what, "let --repair keep the frames that have a time")
-        return
-    try:
-        if times:
-            mp4.frames_at(survey.path(film), sorted({0, times - 1}), rate)
-    except DatasetError:
-        yield Fault(film, episode.start, "the film's first or last frame cannot be decoded", RESTORE)
 
 
 def same(seen: Mapping[int, str]) -> Iterator[tuple[int, int]]:

@@ -22,26 +22,24 @@ _UNEVEN = 0.05  # share by which a step may differ from the usual one
 _MOST = 2 / 3  # of the episodes, or of the videos, must agree
 
 
-def true_rate(root: Path, declared: float | None, data: Sequence[str], films: Sequence[str]) -> tuple[float, str]:
-    """(frames per second, what is wrong with those of info.json or "").
+def true_rate(
+    root: Path, declared: float | None, data: Sequence[str], films: Sequence[str]
+) -> tuple[float, tuple[str, str, str] | None]:
+    """(frames per second, the file, fault and mend where they are not those of info.json, or of the videos).
 
     The rate of info.json stands unless the timestamps of the rows agree on another, and no video contradicts them.
     """
     rows, shown = _rate_of_rows(root, data), _rate_of_films(root, films)
     if declared is None:
-        return tidy(rows or shown or 1.0), ""
+        return tidy(rows or shown or 1.0), None
     if rows and not _same(rows, declared) and (shown is None or _same(shown, rows)):
         witnesses = "the timestamps of the rows and the videos run" if shown else "the timestamps of the rows run"
-        return tidy(rows), f"fps is {declared:g}, but {witnesses} at {rows:g} frames per second"
-    return declared, ""
-
-
-def film_rate_fault(root: Path, fps: float, films: Sequence[str]) -> str:
-    """What is wrong where most videos run at another rate than `fps`; "" where they do not."""
-    shown = _rate_of_films(root, films)
-    if shown is None or _same(shown, fps):
-        return ""
-    return f"the videos run at {shown:g} frames per second, {INFO} and the timestamps of the rows at {fps:g}"
+        what = f"fps is {declared:g}, but {witnesses} at {rows:g} frames per second"
+        return tidy(rows), (INFO, what, f"set fps to {rows:g} there, as --repair does")
+    if shown and not _same(shown, declared):
+        what = f"the videos run at {shown:g} frames per second, {INFO} says {declared:g}"
+        return declared, ("videos", what, "restore the videos from a copy, or encode them again at that rate")
+    return declared, None
 
 
 def _same(a: float, b: float) -> bool:

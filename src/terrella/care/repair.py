@@ -14,15 +14,7 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.features import decoded, sensors_of
-from ..data.format import (
-    ACTION_VALID,
-    AUTOMATIC,
-    INFO,
-    TIME,
-    Layout,
-    schema,
-    tidy,
-)
+from ..data.format import ACTION_VALID, AUTOMATIC, INFO, TIME, Layout, schema, tidy
 from ..data.source import follows, is_action
 from ..data.staged import LOG, SAMPLE_EVERY, Staged
 from ..data.storage import durable, mp4
@@ -33,7 +25,7 @@ from .features import BROKEN, mended_features, schemas_of
 from .footage import Footage
 from .footers import rebuild
 from .pieces import Piece, RowReader, Table, pieces_of, read_table, runs, short, uncovered
-from .stream_mending import StreamMender, possible
+from .streams import StreamMender, possible
 from .survey import Survey, cameras_of, survey
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read

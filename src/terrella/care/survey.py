@@ -19,7 +19,7 @@ from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, 
 from ..data.source import Sensor
 from ..data.storage.tables import open_parquet, read_json, read_whole
 from .features import BROKEN, features_without_info
-from .rates import film_rate_fault, true_rate
+from .rates import true_rate
 
 RESTORE = "restore the file from a copy, or let --repair make a dataset of what is whole"
 LEFTOVER = "it was being committed when the recorder was killed: record into the folder again, or delete the file"
@@ -251,11 +251,7 @@ def _fps(root: Path, info: Mapping, data: list[str], films: list[str], faults: l
         faults.append(Fault(INFO, None, f"fps: {error}", "let --repair find it in the rows' timestamps"))
     fps, wrong = true_rate(root, declared, data, films)
     if wrong:
-        faults.append(
-            Fault(INFO, None, wrong, f"set fps to {fps:g} in {INFO}, as --repair does; nothing else is wrong by it")
-        )
-    elif shown := film_rate_fault(root, fps, films):
-        faults.append(Fault("videos", None, shown, "restore the videos from a copy, or encode them again at that rate"))
+        faults.append(Fault(wrong[0], None, *wrong[1:]))
     return fps
 
 

@@ -13,7 +13,8 @@ from ..data.storage.tables import BROKEN, damaged, open_parquet
 
 _BATCH = 64 << 20  # bytes that one piece of numbers may take
 _TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
-_LARGEST, _REPEATED = 4 << 30, 1 << 30  # bytes that a row group may unpack to, and where texts may repeat one another
+_LARGEST, _REPEATED = 4 << 30, 256 << 20  # bytes that a row group may unpack to, and where texts may repeat one another
+_A_BYTE = 4  # of such texts and pictures, for each byte of a larger file
 
 
 def batches(
@@ -25,9 +26,10 @@ def batches(
     """
     texts = any(features[name]["dtype"] in ("image", "string") for name in columns)
     wide = 8 + sum(16 * math.prod(features[name]["shape"]) for name in columns if features[name]["dtype"] != "image")
-    step, most = (_TEXTS, _REPEATED) if texts else (max(1, _BATCH // wide), _LARGEST)
     try:
         file = open_parquet(path)
+        few = max(_REPEATED, _A_BYTE * path.stat().st_size)
+        step, most = (_TEXTS, few) if texts else (max(1, _BATCH // wide), _LARGEST)
     except BROKEN as error:
         raise damaged(path, error) from error
     with file:

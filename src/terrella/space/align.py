@@ -72,7 +72,7 @@ def _round(
     here, _ = _even(first[:, 0], inside)
     there, contrast = _even(there, inside)
     slope_u, slope_v = slope_u / contrast, slope_v / contrast
-    # how u and v change as the eye moves forward, to the left, and turns
+    # how u and v change as the camera moves forward, to the left, and turns
     d_ahead = torch.stack([-c.expand_as(ahead), -s.expand_as(ahead), left], -1)
     d_left = torch.stack([s.expand_as(ahead), -c.expand_as(ahead), -ahead], -1)
     d_u = -fx * (d_left * safe[..., None] - left[..., None] * d_ahead) / safe[..., None] ** 2

@@ -88,8 +88,20 @@ def painted(
     rgb and depth are what stands behind; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
     [B, K] bool, which of them there are.
     """
-    places, pictures, boxes = billboards
-    height, width = depth.shape[-2:]
+    if rgb.device.type != "cpu":
+        return painted_slowly(rgb, depth, billboards, there, pose, camera)
+    order, there, sides, far = _placed(billboards, there, pose, camera, depth.shape[-2:])
+    rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
+    given = arrays(order, there, billboards[1], sides.double(), far.double(), depth + BEHIND_M)
+    parts = [*given, *arrays(rgb, onto, instances)]
+    over_views(len(rgb), lambda first, last: paint_views(first, last, *parts))
+    return rgb, onto, instances
+
+
+def _placed(billboards, there, pose, camera, size) -> tuple[torch.Tensor, ...]:
+    """Of billboards seen in pictures of `size`: their order [B, K], the nearest last, which are in front [B, K], the sides of
+    their boxes [B, K, 4] in pixels (left, right, top, bottom) and how far they are [B, K]."""
+    (places, _, boxes), (height, width) = billboards, size
     where, ahead = project(places, pose, camera)
     there = there & (ahead > NEAREST_M)
     far = torch.where(there, ahead, 1.0)
@@ -99,19 +111,14 @@ def painted(
          where[..., 1] * height - boxes[..., 3] / far * camera[1] * height,
          where[..., 1] * height + boxes[..., 2] / far * camera[1] * height], -1
     )  # fmt: skip
-    order = far.argsort(dim=1, descending=True, stable=True)  # the nearest is painted last
-    if rgb.device.type != "cpu":
-        return painted_slowly(rgb, depth, pictures, order, there, sides, far)
-    rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
-    given = arrays(order, there, pictures, sides.double(), far.double(), depth + BEHIND_M)
-    parts = [*given, *arrays(rgb, onto, instances)]
-    over_views(len(rgb), lambda first, last: paint_views(first, last, *parts))
-    return rgb, onto, instances
+    return far.argsort(dim=1, descending=True, stable=True), there, sides, far
 
 
-def painted_slowly(rgb, depth, pictures, order, there, sides, far) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def painted_slowly(rgb, depth, billboards, there, pose, camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The same as `painted`, in plain tensor algebra, of all views one billboard at a time; the way on a GPU."""
     height, width = depth.shape[-2:]
+    order, there, sides, far = _placed(billboards, there, pose, camera, (height, width))
+    pictures = billboards[1]
     hides, instances = depth + BEHIND_M, torch.zeros_like(depth, dtype=torch.uint8)
     quarters = torch.tensor([0.25, 0.75], device=rgb.device)
     u = (

@@ -1,5 +1,5 @@
 """Estimator: what a picture alone says of space: how far everything is, how the viewer moved since the one before, and whether
-it looks like the pictures that the eye learned from. Trained by learn/eye.py."""
+it looks like the pictures that it learned from. Trained by learn/senses.py."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ class Estimator(nn.Module):
     """A small U-Net that sees a picture in its own brightness and contrast and gives logarithmic depth; motion follows from the
     depth, by direct alignment of two pictures."""
 
+    kind = "network"
     prior: torch.Tensor  # logit of the mean code of the recordings' depth, at each pixel
     pace: torch.Tensor  # of a step of the recordings: metres forward, metres to the left, radians
     usual: torch.Tensor  # mean of the looks of the pictures that it learned from [D]
@@ -54,7 +55,7 @@ class Estimator(nn.Module):
         self.whole = nn.Linear(widths[-1], widths[-1])
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.after = nn.ModuleList(_Block(width) for width in widths[:-1])
-        self.leave = nn.Conv2d(widths[0], 4, 3, padding=1)
+        self.output = nn.Conv2d(widths[0], 4, 3, padding=1)
         looks = widths[0] + widths[1] + 12
         self.register_buffer("prior", torch.zeros(config.size))
         self.register_buffer("pace", torch.ones(3))
@@ -92,7 +93,7 @@ class Estimator(nn.Module):
         for level in reversed(range(len(self.after))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
             x = self.after[level](x)
-        return (self.prior + F.pixel_shuffle(self.leave(F.silu(x)), 2)[:, 0]).sigmoid()
+        return (self.prior + F.pixel_shuffle(self.output(F.silu(x)), 2)[:, 0]).sigmoid()
 
     def looks(self, rgb: torch.Tensor) -> torch.Tensor:
         """Of pictures, uint8 [B, 3, H, W], how much their two finest maps vary, the mean and contrast of each colour and the
@@ -183,7 +184,7 @@ def estimator_weights(estimator: Estimator) -> dict[str, torch.Tensor]:
 
 
 def estimator_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Estimator:
-    """The eye that `asdict(eye.config)` and `estimator_weights` describe."""
+    """The estimator that `asdict(estimator.config)` and `estimator_weights` describe."""
     size, camera = tuple(config["size"]), tuple(config["camera"])
     estimator = Estimator(EstimatorConfig(size, config["near_m"], config["far_m"], tuple(config["channels"]), camera))
     estimator.load_state_dict({name: value.float() for name, value in weights.items()})
@@ -192,7 +193,7 @@ def estimator_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Estima
 
 def save_estimator(estimator: Estimator, path: str | Path) -> None:
     """Writes one safetensors file."""
-    about = {"kind": "eye", "config": asdict(estimator.config)}
+    about = {"kind": "estimator", "config": asdict(estimator.config)}
     save_file(estimator_weights(estimator), str(path), metadata={"terrella": json.dumps(about)})
 
 
@@ -201,9 +202,9 @@ def load_estimator(path: str | Path) -> Estimator:
     try:
         with safe_open(str(path), framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("terrella", "{}"))
-        if about.get("kind") != "eye":
-            raise CheckpointError(f"{path} holds no eye; make one with `terrella train eye`.")
+        if about.get("kind") not in ("estimator", "eye"):  # as it was called at first
+            raise CheckpointError(f"{path} holds no estimator; make one with `terrella train estimator`.")
         return estimator_of(about["config"], load_file(str(path)))
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         first = str(error).splitlines()[0]
-        raise CheckpointError(f"{path} is no eye that can be read ({first}); train it again.") from error
+        raise CheckpointError(f"{path} is no estimator that can be read ({first}); train it again.") from error

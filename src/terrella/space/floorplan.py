@@ -119,13 +119,13 @@ def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     where that crosses another wall, if it ended within 4 cm of it. From millimetres off, walls come to tenths of one.
     """
     real = walls[..., 0] < NOWHERE
-    eye = pose[:, None, :2].expand(-1, walls.shape[1], -1)[real].double()
+    origin = pose[:, None, :2].expand(-1, walls.shape[1], -1)[real].double()
     start, end = walls[real].double().split(2, -1)
     long = (end - start).norm(dim=1) > 0.02
     if not long.any():
         return torch.zeros(0, 4)
-    start, end, eye = start[long], end[long], eye[long]
-    away = ((start + end) / 2 - eye).norm(dim=1).clamp_min(0.5)
+    start, end, origin = start[long], end[long], origin[long]
+    away = ((start + end) / 2 - origin).norm(dim=1).clamp_min(0.5)
     weight = (end - start).norm(dim=1) / away**2
     for _ in range(2):
         parts = [_mean_line(start[some], end[some], start, end, weight) for some in torch.arange(len(start)).split(512)]

@@ -22,7 +22,7 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
 
     One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
     their neighbours' by half, and cross(down, across) points towards the camera that saw them. A patch that would reach
-    over an edge in the depth image keeps to its own pixel; one that is too slanted to be told from a bridge between two
+    over an edge in the depth image keeps to its own pixel; one that is too slanted to be distinguished from a bridge between two
     surfaces shrinks to nothing, lest from the side it be a wall across the room.
     """
     if depth.device.type != "cpu":

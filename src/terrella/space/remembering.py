@@ -23,12 +23,12 @@ from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
 from .estimator import Estimator
 from .keyframes import Glimpse, merge
-from .memory import Memory, remembering_spec
+from .memory import ROWS, Memory, remembering_spec
 from .reproject import least_around
 
 SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
 _INNER = "world_"  # what the names of the inner world's tensors begin with
-_DREAMT = ("gone", "uncertainty")  # what worlds with a doubt note in their states
+_DREAMT = ("gone", "uncertainty")  # what worlds with an uncertainty note in their states
 _OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 
 
@@ -40,10 +40,10 @@ def remember(
 
 
 class Remembering:
-    """The wrapped world. Pose and depth are the inner world's channels; where it lacks one, the eye's: odometry adds up
-    its motions, level and from the origin. Without depth and eye all is taken to lie on a sphere around the viewer.
+    """The wrapped world. Pose and depth are the inner world's channels; where it lacks one, the estimator's: odometry adds up
+    its motions, level and from the origin. Without depth and estimator all is taken to lie on a sphere around the viewer.
 
-    memory_mb: budget of a story's memory; camera: intrinsics, where neither the inner world's spec nor the eye has them.
+    memory_mb: budget of a story's memory; camera: intrinsics, where neither the inner world's spec nor the estimator has them.
     """
 
     def __init__(
@@ -61,10 +61,10 @@ class Remembering:
             raise ContractError(f"{spec.name} does not show and observe rgb, so memory cannot draw into its pictures.")
         if "pose" not in spec.channels and estimator is None:
             raise ContractError(
-                f"{spec.name} shows no pose, so memory cannot know where its pictures belong: give an eye."
+                f"{spec.name} shows no pose, so memory cannot know where its pictures belong: give an estimator."
             )
         if camera is None:
-            raise ContractError(f"{spec.name} has no camera in its spec, nor the eye: give the intrinsics.")
+            raise ContractError(f"{spec.name} has no camera in its spec, nor the estimator: give the intrinsics.")
         height, width, _ = shape_of(spec.channels["rgb"])
         self.world, self.estimator = world, estimator
         self.memory = Memory(camera, (height, width), memory_mb)
@@ -116,10 +116,10 @@ class Remembering:
     def _witnessed(self, inner: State, prior: State | None) -> State:
         """The state in which the inner world's picture is evidence."""
         seen, rgb, depth, pose = self._seen(inner, prior)
-        held = self.memory.empty(len(rgb)) if prior is None else self.memory.of(prior)
-        held |= self.memory.observed(held, rgb, depth, pose)
+        held = State(self.memory.empty(len(rgb)), self.memory.arenas) if prior is None else prior
+        held = held.replace(**self.memory.observed(held, rgb, depth, pose))
         known = torch.full(depth.shape, 255, dtype=torch.uint8)
-        return _joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
+        return self._joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
 
     def _drawn(self, inner: State, before: State, rng: torch.Generator) -> State:
         """The state in which the inner world's invention and what memory knows of the view are one picture."""
@@ -127,15 +127,14 @@ class Remembering:
         glimpse = self.memory.look(before, pose)
         rgb, known = blend(glimpse, rgb)
         depth = torch.where(known > 0.5, glimpse.depth, depth)
-        told = (*self.world.spec.observes, *self.world.spec.may_observe)
-        evidence = self.world.render(inner, [name for name in told if name != "rgb"])
+        evident = (*self.world.spec.observes, *self.world.spec.may_observe)
+        evidence = self.world.render(inner, [name for name in evident if name != "rgb"])
         blended = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
         # a blend is no evidence: how far the dream has gone from any, and what to expect of it, stay as they were
         inner = blended.replace(**{name: inner[name] for name in _DREAMT if name in inner})
-        held = self.memory.of(before)
-        held |= self.memory.dreamt(held, rgb, depth, pose, glimpse.known)
+        held = before.replace(**self.memory.dreamt(before, rgb, depth, pose, glimpse.known))
         known = (known * 255).round().to(torch.uint8)
-        return _joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
+        return self._joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
 
     def _seen(self, inner: State, before: State | None) -> tuple[dict, torch.Tensor, torch.Tensor, torch.Tensor]:
         """What the inner world shows, and of it rgb uint8 [B, 3, H, W], depth [B, H, W] metres and pose [B, 7]."""
@@ -164,6 +163,13 @@ class Remembering:
         x = pose[:, 0] + forward * heading.cos() - left * heading.sin()
         y = pose[:, 1] + forward * heading.sin() + left * heading.cos()
         return planar_pose(x, y, pose[:, 2], heading + turn)
+
+    def _joined(self, inner: State, seen: Mapping, held: State, **own: torch.Tensor) -> State:
+        """The inner world's state, what it shows of reward and end, memory's tensors in `held`, and what is shown."""
+        tensors = {f"{_INNER}{name}": tensor for name, tensor in inner.items()}
+        followed = {name: seen[name] for name in ("reward", "done") if name in seen}
+        arenas = {**{f"{_INNER}{name}": arena for name, arena in inner.arenas.items()}, ROWS: held.arenas[ROWS]}
+        return State({**tensors, **followed, **own, **self.memory.of(held)}, arenas)
 
 
 def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -194,9 +200,6 @@ def _posed_spec(spec: Spec, size: tuple[int, int], estimator: Estimator | None, 
 
 
 def _inner(state: State) -> State:
-    return State({name[len(_INNER) :]: tensor for name, tensor in state.items() if name.startswith(_INNER)})
-
-
-def _joined(inner: State, seen: Mapping, held: Mapping, **own: torch.Tensor) -> State:
-    followed = {name: seen[name] for name in ("reward", "done") if name in seen}
-    return State({**{f"{_INNER}{name}": tensor for name, tensor in inner.items()}, **followed, **own, **held})
+    """The inner world's part of the state."""
+    arenas = {name[len(_INNER) :]: arena for name, arena in state.arenas.items() if name.startswith(_INNER)}
+    return State({name[len(_INNER) :]: state[name] for name in state if name.startswith(_INNER)}, arenas)

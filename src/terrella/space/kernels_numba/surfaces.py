@@ -91,11 +91,12 @@ def cast_one(patch, turn, position, camera, depth):
         lift = n0 * c0 + n1 * c1 + n2 * c2
         if lift >= 0:  # it shows its back
             continue
-        left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
+        left, right, top, bottom, nearest = 1e9, -1e9, 1e9, -1e9, 1e9
         for corner in range(4):
             s = 1.0 if corner & 1 else -1.0
             t = 1.0 if corner & 2 else -1.0
             q0 = max(c0 + s * a0 + t * d0, NEAR_M)
+            nearest = min(nearest, q0)
             u = cx - fx * (c1 + s * a1 + t * d1) / q0
             v = cy - fy * (c2 + s * a2 + t * d2) / q0
             left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
@@ -110,6 +111,8 @@ def cast_one(patch, turn, position, camera, depth):
         for v in range(first_v, last_v + 1):
             up = -(v + 0.5 - cy) / fy
             for u in range(first_u, last_u + 1):
+                if depth[v, u] < nearest:  # no point of the patch is nearer
+                    continue
                 side = -(u + 0.5 - cx) / fx
                 slope = n0 + n1 * side + n2 * up
                 if abs(slope) < 1e-12:

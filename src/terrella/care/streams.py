@@ -1,20 +1,80 @@
-"""The streams of an episode that is mended: their readings within its rows' times, in order, films cut to match."""
+"""Streams beside the rows: what a doctor finds in them, and how a repair cuts them to the pieces of an episode."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from ..core.errors import DatasetError
+from ..data.episodes import Episode
 from ..data.format import STREAM_PATH, TIME, where
 from ..data.source import Sensor
+from ..data.storage import mp4
 from ..data.storage.films import cut, reel, whole_frames
 from ..data.storage.tables import read_whole
 from ..data.writer import NAME
 from .features import BROKEN
 from .pieces import Piece, RowReader, short
-from .survey import Survey
+from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
+
+
+def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
+    """Every stream of every episode: its times ascend, its values are of its shape, its film is as long as its times."""
+    files = set(listed(survey.root, "streams", ".parquet")) | set(listed(survey.root, "streams", ".mp4"))
+    known: set[str] = set()
+    for name, sensor in survey.streams.items():
+        for episode in survey.episodes.values():
+            place, film = _places(name, episode.number)
+            known |= {place, film}
+            if place in files:
+                yield from _stream(survey, sensor, episode, film in files)
+            elif film in files:
+                yield Fault(film, episode.start, "the times of this film are missing", RESTORE)
+        if survey.episodes and not any(_places(name, number)[0] in files for number in survey.episodes):
+            what = f"stream '{name}' is declared in meta/terrella.json, but no episode has any of it"
+            yield Fault(f"streams/{name}", None, what, "restore its files from a copy, or record anew")
+    if survey.complete and not busy:
+        for file in sorted(files - known):
+            yield Fault(file, None, "no episode and no stream of meta/terrella.json uses this file", LEFTOVER)
+
+
+def _stream(survey: Survey, sensor: Sensor, episode: Episode, has_film: bool) -> Iterator[Fault]:
+    place, film = _places(sensor.name, episode.number)
+    try:
+        time_s, _ = _readings(survey.path(place), sensor)
+    except DatasetError:
+        yield Fault(place, episode.start, "the table is missing, truncated or not parquet", RESTORE)
+        return
+    except BROKEN as error:
+        yield Fault(place, episode.start, f"it holds no readings ({error})", RESTORE)
+        return
+    for at in np.flatnonzero(~_in_order(time_s))[:1]:
+        what = f"reading {at} of stream '{sensor.name}' is at {time_s[at]:g} s, which does not ascend"
+        yield Fault(place, episode.start, what, "let --repair leave out the readings that are out of order")
+    if sensor.kind != "image":
+        return
+    if not has_film:
+        yield Fault(film, episode.start, f"the film of stream '{sensor.name}' is missing", RESTORE)
+        return
+    rate = sensor.rate_hz or survey.fps
+    try:
+        packets = reel(survey.path(film), rate)
+    except DatasetError:
+        yield Fault(film, episode.start, "the video is truncated or not mp4", RESTORE)
+        return
+    if packets.count != len(time_s):
+        what = f"the film has {packets.count} frames, its table {len(time_s)} times"
+        yield Fault(film, episode.start, what, "let --repair keep the frames that have a time")
+        return
+    try:
+        if packets.zeroed.any():
+            raise DatasetError("zeros")
+        if len(time_s):
+            mp4.frames_at(survey.path(film), sorted({0, len(time_s) - 1}), rate)
+    except DatasetError:
+        yield Fault(film, episode.start, "frames of the film cannot be decoded", "let --repair keep those before them")
 
 
 class StreamMender:
@@ -51,14 +111,13 @@ class StreamMender:
     def _streams(self, number: int, begin: float, end: float, shift: float) -> tuple[dict, dict]:
         streams, films = {}, {}
         for name, sensor in self.streams.items():
-            place = STREAM_PATH.format(name=name, suffix="parquet", **where(number))
+            place, film = _places(name, number)
             try:
                 if not self.survey.path(place).exists():
                     continue
                 time_s, values = _readings(self.survey.path(place), sensor)
-                keep = _ascending(time_s) & (time_s >= begin) & (time_s < end)
+                keep = _in_order(time_s) & (time_s >= begin) & (time_s < end)
                 if sensor.kind == "image":
-                    film = STREAM_PATH.format(name=name, suffix="mp4", **where(number))
                     at = self._stream_film(name, sensor, film, np.flatnonzero(keep))
                     if not len(at):
                         continue
@@ -95,17 +154,30 @@ def possible(sensor: Sensor) -> bool:
     return bool(NAME.fullmatch(sensor.name)) and bool(sizes) and min(sizes) > 0 and not odd and sensor.dtype != "string"
 
 
+def _places(name: str, number: int) -> tuple[str, str]:
+    """The table and the film of a stream in an episode."""
+    table, film = (STREAM_PATH.format(name=name, suffix=suffix, **where(number)) for suffix in ("parquet", "mp4"))
+    return table, film
+
+
 def _readings(path: Path, sensor: Sensor) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(times, values, [] of a camera); DatasetError or ValueError where they are none of the sensor's."""
     table = read_whole(path)
     time_s = table["time_s"].to_numpy().astype(np.float64)
     if sensor.kind == "image":
         return time_s, []
     value = table["value"].combine_chunks()
+    if value.null_count or value.values.null_count:
+        raise ValueError("a reading is null")
     flat, offsets = value.values.to_numpy(zero_copy_only=False), value.offsets.to_numpy()
+    sizes = np.diff(offsets)
+    each = sensor.shape[1] if sensor.kind == "points" else int(np.prod(sensor.shape))
+    for wrong in np.flatnonzero(sizes % each if sensor.kind == "points" else sizes != each)[:1]:
+        raise ValueError(f"reading {wrong} has {sizes[wrong]} numbers, which is no {sensor.kind} of {sensor.shape}")
     return time_s, [flat[begin:end] for begin, end in zip(offsets, offsets[1:])]
 
 
-def _ascending(time_s: np.ndarray) -> np.ndarray:
+def _in_order(time_s: np.ndarray) -> np.ndarray:
     """bool [n]: the readings that are at a finite time, none of them before one that came earlier."""
     finite = np.isfinite(time_s)
     newest = np.maximum.accumulate(np.where(finite, time_s, -np.inf))

@@ -1,4 +1,4 @@
-"""An eye: the shape and range of its answers, its mirror, its file; and places recognised in a room known exactly."""
+"""An estimator: the shape and range of its answers, its mirror, its file; and places recognised in a room known exactly."""
 
 from __future__ import annotations
 
@@ -73,25 +73,25 @@ def test_what_is_usual_is_learned(estimator):
     assert float(estimator.strangeness(pictures(1))) > 1.5
 
 
-def test_an_eye_is_kept_in_half_precision_and_comes_back(estimator, tmp_path):
+def test_an_estimator_is_kept_in_half_precision_and_comes_back(estimator, tmp_path):
     estimator.learn_usual(estimator.looks(pictures(40)))
-    save_estimator(estimator, tmp_path / "eye.safetensors")
-    again = load_estimator(tmp_path / "eye.safetensors")
+    save_estimator(estimator, tmp_path / "estimator.safetensors")
+    again = load_estimator(tmp_path / "estimator.safetensors")
     rgb = pictures(1)
     assert again.config == estimator.config
     assert torch.allclose(again.depth(rgb).log(), estimator.depth(rgb).log(), atol=0.02)
     assert torch.allclose(again.strangeness(rgb), estimator.strangeness(rgb), rtol=0.02)
 
 
-def test_what_is_no_eye_is_refused(tmp_path):
+def test_what_is_no_estimator_is_refused(tmp_path):
     (tmp_path / "a.safetensors").write_bytes(b"nothing")
     for name in ("a.safetensors", "missing.safetensors"):
-        with pytest.raises(CheckpointError, match="no eye"):
+        with pytest.raises(CheckpointError, match="no estimator"):
             load_estimator(tmp_path / name)
     from terrella.core import State
 
     State({"a": torch.ones(1)}).save(tmp_path / "state.safetensors")
-    with pytest.raises(CheckpointError, match="no eye"):
+    with pytest.raises(CheckpointError, match="no estimator"):
         load_estimator(tmp_path / "state.safetensors")
 
 
