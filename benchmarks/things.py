@@ -15,12 +15,13 @@ import torch
 import tyro
 
 import terrella
+from terrella.core import chance
 from terrella.data import ClipCache
 from terrella.learn.recording import Recording, controls_of
 from terrella.space.billboards import cut_out
 from terrella.space.camera import project
+from terrella.worlds.learned import LearnedWorld
 from terrella.worlds.objects import LOOK, NONE, NUMBER, PLACE, WIDE_M
-from terrella.worlds.video import VideoWorld
 
 CONTEXT = 10
 TALL_M, LOW_M = 1.2, 0.75  # who was taller than the one and is lower than the other has fallen
@@ -43,8 +44,8 @@ def main(
         dreams: Of each story.
     """
     learned = terrella.load(world)
-    if not isinstance(learned, VideoWorld) or learned.cast is None or "ATTACK" not in learned.spec.action_names:
-        raise SystemExit(f"{world} is no world with a cast and a button ATTACK.")
+    if "objects" not in learned.spec.channels or "ATTACK" not in learned.spec.action_names:
+        raise SystemExit(f"{world} is no world with billboards and a button ATTACK.")
     cache = ClipCache.open(data, learned.config.size)
     recording = Recording(cache, np.zeros(cache.length, np.int64), np.ones(cache.length, bool), controls_of(cache))
     rows = np.array([row for a, b in cache.episodes for row in range(a + CONTEXT, b - steps, every)])
@@ -53,7 +54,7 @@ def main(
         seen = recording.evidence(learned.config, rows - back)
         state = learned.observe(seen, state, terrella.make_rng(0))
     cards = state["billboards"]
-    tall = learned.cast.boxes[cards[..., LOOK].long().clamp_min(0), 3]
+    tall = learned.objects.boxes[cards[..., LOOK].long().clamp_min(0), 3]
     standing = (cards[..., NUMBER] > 0) & (cards[..., LOOK] != NONE) & (tall >= TALL_M)
     fell, known, truth = happened(cards[..., NUMBER], recording, rows, steps, learned.config.camera)
     rng, chance, places = terrella.make_rng(0), {}, torch.zeros(0)
@@ -114,9 +115,9 @@ def happened(numbers: torch.Tensor, recording: Recording, rows: np.ndarray, step
 
 
 def shot_at(
-    world: VideoWorld, known: torch.Tensor, truth: torch.Tensor, recording: Recording, rows: np.ndarray
+    world: LearnedWorld, known: torch.Tensor, truth: torch.Tensor, recording: Recording, rows: np.ndarray
 ) -> torch.Tensor:
-    """Who was looked at with ATTACK pressed [B, K], less than worlds/cast.WIDE_M beside its middle, of those in sight (`known`
+    """Who was looked at with ATTACK pressed [B, K], less than worlds/objects.WIDE_M beside its middle, of those in sight (`known`
     [steps, B, K], at `truth` [steps, B, K, 3] after each step)."""
     shot, button = torch.zeros_like(known[0]), world.spec.action_names.index("ATTACK")
     focal, _, centre, _ = world.config.camera
@@ -128,11 +129,10 @@ def shot_at(
 
 
 def dreamt(
-    world: VideoWorld, cards: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int, attack: bool, rng
+    world: LearnedWorld, cards: torch.Tensor, recording: Recording, rows: np.ndarray, steps: int, attack: bool, rng
 ):
     """The same of the cards [B, K, COLUMNS] in a dream: who falls, and where all are after each step."""
-    cast, history = world.cast, world.config.history
-    assert cast is not None
+    objects, history = world.objects, world.config.history
     fell, places = torch.zeros(cards.shape[:2], dtype=torch.bool), []
     button = world.spec.action_names.index("ATTACK")
     for step in range(1, steps + 1):
@@ -141,9 +141,10 @@ def dreamt(
         acts[..., button] *= attack
         pose = recording.pose(rows + step)
         where, ahead = project(cards[..., PLACE], pose, world.config.camera)
-        cards = cast.step(cards, (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.5), pose, acts, rng)
+        seeds = chance.seeds(len(cards), rng)
+        cards = objects.step(cards, (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.5), pose, acts, seeds)
         look = cards[..., LOOK].long()
-        fell |= (cards[..., NUMBER] > 0) & (look != NONE) & (cast.boxes[look.clamp_min(0), 3] < LOW_M)
+        fell |= (cards[..., NUMBER] > 0) & (look != NONE) & (objects.boxes[look.clamp_min(0), 3] < LOW_M)
         places.append(cards[..., PLACE])
     return fell, torch.stack(places)
 

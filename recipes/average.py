@@ -7,22 +7,21 @@ that was pulled halfway.
 
 from __future__ import annotations
 
+import copy
 import sys
 
 import terrella
-from terrella.learn.paired import with_generator
-from terrella.worlds.folder import Learned, save_world
-from terrella.worlds.history import HistoryWorld
-from terrella.worlds.video import VideoWorld
+from terrella.worlds.folder import save_world
+from terrella.worlds.learned import LearnedWorld
 
 
-def average(worlds: list[Learned], weights: list[float]) -> Learned:
-    """Weights are 0 or more and need not add up to 1."""
-    mixed, shares = worlds[0].generator, [weight / sum(weights) for weight in weights]
+def average(worlds: list[LearnedWorld], weights: list[float]) -> LearnedWorld:
+    """Weights are 0 or more and need not add up to 1. The uncertainty is left out: it knew the errors of the old generator."""
+    mixed, shares = copy.deepcopy(worlds[0].generator), [weight / sum(weights) for weight in weights]
     states = [world.generator.state_dict() for world in worlds]
     mixed.load_state_dict({name: sum(s * state[name] for s, state in zip(shares, states)) for name in states[0]})
-    card = {"averaged": [round(share, 3) for share in shares]}
-    return with_generator(worlds[0], mixed, worlds[0].config.steps, card)
+    card = {"averaged": [round(share, 3) for share in shares], "uncertainty": None}
+    return worlds[0].replaced(generator=mixed, uncertainty=None, card=card)
 
 
 def main() -> None:
@@ -34,12 +33,12 @@ def main() -> None:
     if len(parts) < 2 or not (min(weights) >= 0 < sum(weights) < float("inf")):
         sys.exit(__doc__)
     worlds = [terrella.load(run) for run, _ in parts]
-    learned = [world for world in worlds if isinstance(world, (VideoWorld, HistoryWorld))]
+    learned = [world for world in worlds if isinstance(world, LearnedWorld)]
     makes = {str({name: tuple(t.shape) for name, t in world.generator.state_dict().items()}) for world in learned}
     if len(learned) < len(worlds) or len(makes) > 1:
         sys.exit("these are not all learned worlds with generators of one make; give runs that began from one world.")
     mean = average(learned, weights)
-    save_world(mean, sys.argv[1], dict(mean.spec.card))
+    save_world(mean, sys.argv[1])
 
 
 if __name__ == "__main__":

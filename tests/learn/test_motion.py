@@ -17,8 +17,8 @@ from terrella.learn.trainer import Run
 from terrella.space.camera import planar_pose, rays, rotation, yaw
 from terrella.space.floorplan import slide
 from terrella.space.keyframes import Keyframes
-from terrella.worlds.generator import VideoConfig
-from terrella.worlds.motion import Motion, turned
+from terrella.worlds.body import Motion, turned
+from terrella.worlds.config import MotionConfig
 
 CAMERA, HALF_ROOM = (0.5, 0.8, 0.5, 0.5), 3.0
 DRAG, THRUST, TURN, BODY, SHORT = 0.9, 0.01, 0.06, 0.35, 1 / 16
@@ -82,9 +82,8 @@ def walks(episodes: int = 90, length: int = 40) -> Recording:
 
 def test_drag_thrust_turning_and_body_come_out_of_the_recording(tmp_path):
     torch.manual_seed(0)
-    config = VideoConfig(CAMERA, actions=3, size=(48, 64), history=2)
-    motion = Motion(config)
-    found = learn_motion(Run(tmp_path, {}, quiet), motion, walks(), keyframes(), config, 1500)
+    motion = Motion(MotionConfig(actions=3, history=2))
+    found = learn_motion(Run(tmp_path, {}, quiet), motion, walks(), keyframes(), 1500)
     assert found["body_m"] == pytest.approx(BODY, abs=0.01)
     assert found["short"] == SHORT
     assert found["motion_error_m"] < 0.02

@@ -22,10 +22,10 @@ from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
 from terrella.learn.trainer import Now
 from terrella.space.camera import yaw
+from terrella.worlds.body import climbed
+from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import VideoConfig
 from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
-from terrella.worlds.video import VideoWorld
 
 CONFIG = TrainConfig(
     size=(24, 32),
@@ -114,7 +114,7 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path
     train_video(recording, tmp_path, CONFIG, lambda *told: None)
     for memory in (True, False):
         world = load_world(tmp_path / "world", memory=memory)
-        assert isinstance(world, VideoWorld) and (world.starts.depth == 0).any(), "what moves is in no keyframe"
+        assert (world.starts.depth == 0).any(), "what moves is in no keyframe"
         assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
         assert "observes" in check_world(world) and world.spec.may_observe == ("things", "health")
     state = world.start(2, make_rng(0))
@@ -259,13 +259,9 @@ def test_the_other_side_of_a_button():
     assert THINGS == "observation.things"
 
 
-def test_the_eye_rises_with_the_recorded_ground_and_stays_where_it_stands(recording, tmp_path):
-    train_video(recording, tmp_path, CONFIG, lambda *told: None)
-    world = load_world(tmp_path / "world")
-    assert isinstance(world, VideoWorld)
-    pose = torch.tensor([[0.0, 0, 1, 1, 0, 0, 0], [2.0, 0, 2, 1, 0, 0, 0]])  # a step up of a metre within two
-    stairs = world.with_memory(replace(world.memory.at([0, 1]), pose=pose))
+def test_a_body_rises_with_the_recorded_ground_and_stays_where_it_stands():
+    levels = torch.tensor([[0.0, 0, 1], [2.0, 0, 2]])  # a step up of a metre within two
     here, ahead, z = torch.tensor([[0.5, 0.0]]), torch.tensor([[0.8, 0.0]]), torch.tensor([1.4])
-    assert stairs._height(here, here, z).item() == pytest.approx(1.4)
-    assert 1.4 < stairs._height(ahead, ahead + 0.2, z).item() < 1.71
-    assert world.without_memory()._height(here, ahead, z).item() == pytest.approx(1.4)
+    assert climbed(levels, here, here, z).item() == pytest.approx(1.4)
+    assert 1.4 < climbed(levels, ahead, ahead + 0.2, z).item() < 1.71
+    assert climbed(levels + 100, here, ahead, z).item() == pytest.approx(1.4), "none is near"

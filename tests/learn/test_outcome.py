@@ -16,9 +16,11 @@ from terrella.learn.objectives.outcome import Happenings, Pieces, learn_outcome,
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, controls_of
 from terrella.learn.trainer import Now, Run
-from terrella.worlds.folder import load_world, video_spec
-from terrella.worlds.generator import Generator, VideoConfig
-from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.config import VideoConfig
+from terrella.worlds.folder import load_world
+from terrella.worlds.generator import Generator
+from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import Outcome
 
 SIZE, FACTS = (16, 24), {"discrete": True, "action_low": [0], "action_high": [2], "action_names": ["STAY", "L", "R"]}
@@ -91,7 +93,7 @@ def examine_outcome(outcome: Outcome, rgb, happened: Happenings, first: int, sto
 def test_levels_and_shares_are_those_of_the_recording(learned):
     _, seen, happened, outcome = learned
     assert outcome.config.rewards == (0.0, 2.0) and outcome.config.vitals == ("lives",)
-    assert outcome.config.changes == ((-1.0, 0.0),) and seen.controls.told == 3
+    assert outcome.config.changes == ((-1.0, 0.0),) and seen.controls.numbers == 3
     among = torch.tensor([-1.0, 0.0, 4.0])
     values = torch.tensor([-9.0, -0.25, 3.0, 4.0])
     shares = two_hot(values, among)
@@ -128,14 +130,14 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
 def test_a_dream_pays_costs_lives_and_ends(learned):
     _, seen, _, outcome = learned
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8, 8), slots=4, geometry=False)
-    spec = video_spec("row", config, 1 / 15, (), {}, {}, seen.controls, ("lives",))
     starts = replace(Starts.of(torch.zeros(1, 4, 3, *SIZE, dtype=torch.uint8), 3), vitals=torch.full((1, 1), 3.0))
-    world, rng = HistoryWorld(spec, config, Generator(config), starts, 0.0, outcome, seen.controls), make_rng(0)
+    parts = {"scene": FrameHistory(config.frames, starts), "generator": Generator(config.generator), "outcome": outcome}
+    world, rng = LearnedWorld(About("row", seen.controls, 1 / 15), **parts), make_rng(0)
     before, after = (torch.from_numpy(np.stack([picture(place) for place in pair])) for pair in ((1, 4), (0, 5)))
     state = world.observe({"rgb": before, "lives": torch.tensor([1.0, 3.0])}, None, rng)
-    told = world.controls.tell(torch.tensor([1, 2]))[:, None]
-    shown = world.observe({"rgb": after}, state, rng).replace(actions=torch.cat([told, state["actions"][:, 1:]], 1))
-    then = world.followed(state, shown)  # as if these frames had been dreamt
+    numbers = world.controls.encode(torch.tensor([1, 2]))
+    drawn = world.observe({"rgb": after, "lives": torch.tensor([1.0, 3.0])}, state, rng)  # as if it had been dreamt
+    then = world.outcome.followed(state, drawn, world.scene.frame, numbers, torch.zeros(2, dtype=torch.int64))
     assert then["vitals"][:, 0].tolist() == [0.0, 3.0] and then["done"].tolist() == [True, False]
     assert then["reward"][1] > 1.5 and then["reward"][0] < 0.5
     still = world.imagine(then, torch.tensor([2, 2]), rng)

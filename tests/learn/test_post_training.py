@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import Layout, Recorder, record
+from terrella.learn.objectives import distillation
 from terrella.learn.objectives.distillation import Matching, drawn
 from terrella.learn.objectives.dreams import Rollouts, beginnings
 from terrella.learn.paired import paired
@@ -25,7 +27,7 @@ from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.trainer import Now
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
-from terrella.worlds.history import HistoryWorld
+from terrella.worlds.uncertainty import Asked
 
 TEACHER = TrainConfig(
     size=(24, 32),
@@ -87,14 +89,15 @@ def now(seed: int, step: int = 0) -> Now:
 def tame(world):
     """The same world with a generator whose every weight counts a little (a fresh one only copies), and which no step of the
     flow blows up: on any processor, its gradients agree."""
+    generator = copy.deepcopy(world.generator)
     with torch.no_grad():
-        for weight in world.generator.parameters():
+        for weight in generator.parameters():
             weight.add_(0.02 * torch.randn(weight.shape, generator=make_rng(weight.numel())))
-    return world
+    return world.replaced(generator=generator)
 
 
 def test_a_teacher_is_a_history_world_of_many_steps(teacher):
-    assert isinstance(teacher, HistoryWorld) and teacher.config.steps == 4
+    assert not teacher.config.geometry and teacher.config.steps == 4
     assert teacher.config.channels == (8, 8, 8)
 
 
@@ -141,22 +144,23 @@ def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(r
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
     world = tame(request.getfixturevalue(kind))
     pair = paired(world, request.getfixturevalue(data), None, quiet)
-    dreams = Rollouts(world, pair.recording, 4, 2, now(seed))
-    world, state = dreams.world, dreams.state
+    dreams, noted = Rollouts(world, pair.recording, 4, 2, now(seed)), []
+    playing = dreams.world.replaced(uncertainty=Asked(lambda shown, clean, situation: noted.append((shown, clean))))
+    state = dreams.state
     for step in range(4):
-        noise_rng = make_rng(step)
         action = pair.recording.action(dreams.row)
         if kind == "teacher":
-            state = world.imagine(state, action.to(torch.int8), noise_rng)
+            state = playing.imagine(state, action.to(torch.int8), make_rng(step))
         else:
             state = state.replace(actions=torch.cat([state["actions"][:, 1:], action[:, None]], 1))
-            state = world.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, noise_rng)
-        batch = dreams.next_batch()
-        noise = torch.randn(2, 4, *world.config.size, generator=make_rng(step))
-        with torch.inference_mode():
-            clean = generate(world.generator, noise, *batch.shown, world.config.steps)
-        dreams.go_on(clean.clone())
-        assert torch.equal(world.render(state, ("rgb",))["rgb"], world.render(dreams.state, ("rgb",))["rgb"])
+            state = playing.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, make_rng(step))
+        rgb, batch = playing.render(state, ("rgb",))["rgb"], dreams.next_batch()
+        shown, clean = noted.pop()
+        for one, other in ((shown.glimpse.rgb, batch.shown.glimpse.rgb), (shown.last, batch.shown.last)):
+            torch.testing.assert_close(one, other)
+        torch.testing.assert_close(shown.context, batch.shown.context)
+        dreams.go_on(clean)
+        assert torch.equal(rgb, dreams.world.render(dreams.state, ("rgb",))["rgb"])
         truth = pair.recording.rgb(dreams.row).float() / 127.5 - 1
         assert torch.equal(batch.truth[:, :3], truth)
 
@@ -201,24 +205,34 @@ def test_dreams_begin_where_the_episode_lasts(recording, teacher):
         beginnings(pair.recording, 200)
 
 
-def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(recording, teacher):
+@pytest.mark.parametrize("half", [False, True])  # where bfloat16 is native, training uses it
+def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, recording, teacher, monkeypatch):
+    def precision(device):
+        return torch.autocast(device.type, torch.bfloat16, enabled=half)
+
+    monkeypatch.setattr(distillation, "half_precision", precision)
     pair = paired(tame(teacher), recording, None, quiet)
-    generator = pair.world.generator.requires_grad_(True)
+    generator = copy.deepcopy(pair.world.generator).requires_grad_(True)
     batch = pair.real(2, now(0))
-    seen = batch.shown
     noise, exits = torch.randn(batch.truth.shape, generator=make_rng(1)), set()
+
+    def clean_at(x, step):
+        with precision(x.device):
+            return generator(x, torch.full((2,), step / 4), batch.shown).float()
+
     for seed in range(12):
         exit_at = int(np.random.default_rng(seed).integers(4))
         exits.add(exit_at)
         x = noise
         with torch.no_grad():
             for step in range(exit_at):
-                x = x + (generator(x, torch.full((2,), step / 4), *seen) - x) / (4 - step)
-        alone = torch.autograd.grad(generator(x, torch.full((2,), exit_at / 4), *seen).sum(), generator.enter.weight)
+                x = x + (clean_at(x, step) - x) / (4 - step)
+        (alone,) = torch.autograd.grad(clean_at(x, exit_at).sum(), generator.enter.weight)
         clean = drawn(generator, noise, batch.shown, 4, np.random.default_rng(seed))
-        torch.testing.assert_close(torch.autograd.grad(clean.sum(), generator.enter.weight), alone)
-        if exit_at == 3:
-            torch.testing.assert_close(clean, generate(generator, noise, *seen, 4))
+        (found,) = torch.autograd.grad(clean.sum(), generator.enter.weight)
+        assert float((found - alone).norm()) < 1e-2 * float(alone.norm()), "relative: as near as rounding allows"
+        if exit_at == 3 and not half:
+            torch.testing.assert_close(clean, generate(generator, noise, batch.shown, 4), rtol=1e-3, atol=1e-3)
     assert exits == {0, 1, 2, 3}
 
 

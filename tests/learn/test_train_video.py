@@ -17,13 +17,13 @@ from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Layout, Recorder, record
-from terrella.learn.batches import Batch, Conditioning, varied
+from terrella.learn.batches import Batch, varied
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import choose_keyframes, usable_rows
 from terrella.learn.trainer import Trainer
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import context_thumbnail
+from terrella.worlds.generator import Conditioning, context_thumbnail
 
 CONFIG = TrainConfig(
     size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, estimator_steps=0,
@@ -201,27 +201,32 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
 
 def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
     world = load_world(trained[0] / "world")
-    save_world(world.without_memory(), tmp_path / "bare", {})
+    save_world(world.without_memory(), tmp_path / "bare")
     bare = load_world(tmp_path / "bare")
     assert len(bare.memory) == 0 and len(bare.starts) == len(world.starts)
     assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
 
 
-def test_axes_are_learned_from_pictures_and_refused_beside_poses(tmp_path):
-    for name, posed in (("flat", False), ("posed", True)):
-        layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
-        layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
-        with Recorder(tmp_path / name, layout) as recorder:
+@pytest.mark.parametrize("posed", [False, True])
+def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
+    layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
+    layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
+    with Recorder(tmp_path / "set", layout) as recorder:
+        for _ in range(2):
             for step in range(80):
                 seen = {"rgb": np.full((24, 32, 3), 40 + step, np.uint8)}
                 if posed:
-                    seen |= {"depth": np.ones((24, 32)), "pose": np.array([0, 0, 0, 1, 0, 0, 0])}
+                    half = 0.02 * step
+                    pose = np.array([0.05 * step, 0, 0, np.cos(half), 0, 0, np.sin(half)], np.float32)
+                    seen |= {"depth": np.full((24, 32), 3.0), "pose": pose}
                 recorder.add(seen, np.array([0.37 - step / 50]) if step < 79 else None, 0.0, False)
-    train_video(tmp_path / "flat", tmp_path / "run", CONFIG, quiet)
-    space = load_world(tmp_path / "run" / "world").spec.action
+            recorder.end_episode()
+    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    world = load_world(tmp_path / "run" / "world")
+    space = world.spec.action
     assert isinstance(space, spaces.Box) and space.low[0] < -1 and space.high[0] == np.float32(0.37)
-    with pytest.raises(DatasetError, match="no buttons"):
-        train_video(tmp_path / "posed", tmp_path / "other", CONFIG, quiet)
+    assert ("pose" in world.spec.channels) == posed
+    assert "batches" in check_world(world)
 
 
 def test_a_varied_batch_is_the_same_batch_in_another_world():
@@ -234,7 +239,7 @@ def test_a_varied_batch_is_the_same_batch_in_another_world():
     for seed in range(12):
         shown = Conditioning(glimpse, truth, context_thumbnail(pixels))
         batch = varied(Batch(shown, truth), np.random.default_rng(seed))
-        seen, last, context = batch.shown
+        seen, last, context = batch.shown.glimpse, batch.shown.last, batch.shown.context
         assert torch.equal(seen.rgb[:, 0], batch.truth[:, :3]) and torch.equal(last, batch.truth)
         assert torch.equal(seen.depth, batch.truth[:, 3])
         assert torch.allclose(context_thumbnail((batch.truth[:, :3] * 255).to(torch.uint8)), context, atol=1e-5)

@@ -27,7 +27,6 @@ from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
 from terrella.worlds.folder import load_world
 from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
-from terrella.worlds.video import VideoWorld
 
 BARE = TrainConfig(
     size=(24, 32),
@@ -131,7 +130,6 @@ def test_a_world_is_given_an_estimator_and_an_uncertainty(bare, sensing):
 
 def test_a_foreign_picture_begins_in_an_empty_corner(sensing):
     world = load_world(sensing[0])
-    assert isinstance(world, VideoWorld)
     noise = torch.randint(0, 256, (2, 24, 32, 3), generator=make_rng(0), dtype=torch.uint8)
     state = world.observe({"rgb": noise}, None, make_rng(0))
     assert float(state["pose"][:, 0].min()) > float(world.memory.pose[:, 0].max()) + 900
@@ -150,7 +148,6 @@ def test_a_foreign_picture_begins_in_an_empty_corner(sensing):
 
 def test_a_picture_seen_on_the_way_keeps_the_pose(sensing):
     world = load_world(sensing[0])
-    assert isinstance(world, VideoWorld)
     state = world.start(1, make_rng(0))
     noise = torch.randint(0, 256, (1, 24, 32, 3), generator=make_rng(0), dtype=torch.uint8)
     seen = world.observe({"rgb": noise}, state, make_rng(0))

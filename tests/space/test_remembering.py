@@ -17,7 +17,6 @@ from terrella.space.camera import planar_pose, yaw
 from terrella.space.keyframes import Glimpse
 from terrella.space.memory import DREAMT, OBSERVED
 from terrella.space.remembering import Remembering, blend, remember
-from terrella.worlds.video import VideoWorld
 
 from .rooms import CAMERA, SIZE, painted, room_depth
 
@@ -246,7 +245,7 @@ def test_a_seam_between_memory_and_invention_does_not_show():
 
 def test_the_bundled_world_remembers_by_itself():
     world = terrella.load("doom-maze", remember=True, memory_mb=2)
-    assert isinstance(world, VideoWorld) and world.own.nbytes <= 2 * 2**20
+    assert world.scene.own.nbytes <= 2 * 2**20
     with pytest.raises(TerrellaError, match="There is no world"):
         terrella.load("doom-maze", estimator="no such file")
 

@@ -6,25 +6,27 @@ import pytest
 import torch
 
 import terrella
-from terrella.core import check_world, make_rng
+from terrella.core import chance, check_world, make_rng
 from terrella.space.camera import planar_pose
+from terrella.worlds.learned import LearnedWorld
 from terrella.worlds.objects import LOOK, NUMBER, PLACE
-from terrella.worlds.video import VideoWorld
 
 STORIES, STEPS, TALL_M, LOW_M = 48, 80, 1.2, 0.75
 
 
 @pytest.fixture(scope="module")
-def world() -> VideoWorld:
+def world() -> LearnedWorld:
     found = terrella.load("doom-corridor")
-    assert isinstance(found, VideoWorld) and found.objects is not None
+    assert isinstance(found, LearnedWorld) and found.objects
     return found
 
 
-def heights(world: VideoWorld, cards: torch.Tensor) -> torch.Tensor:
-    """How tall cards [..., COLUMNS] are, in metres; nan where there is none."""
-    look = cards[..., LOOK].long()
-    return torch.where((cards[..., NUMBER] > 0) & (look >= 0), world.objects.boxes[look.clamp_min(0), 3], torch.nan)
+def heights(world: LearnedWorld, billboards: torch.Tensor) -> torch.Tensor:
+    """How tall billboards [..., COLUMNS] are, in metres; nan where there is none."""
+    look = billboards[..., LOOK].long()
+    return torch.where(
+        (billboards[..., NUMBER] > 0) & (look >= 0), world.objects.boxes[look.clamp_min(0), 3], torch.nan
+    )
 
 
 def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
@@ -34,7 +36,7 @@ def test_it_keeps_the_contract_and_monsters_wait_in_it(world):
     assert (state["instances"] > 0).flatten(1).any(1).float().mean() > 0.7
 
 
-def test_the_guards_that_stories_begin_with_are_cards_and_nothing_else(world):
+def test_the_guards_that_stories_begin_with_are_billboards_and_nothing_else(world):
     """The picture with which a story begins leaves no thing behind that no card covers: it would stand there for ever."""
     state = world.start(8, make_rng(0))
     things = state["things"] > 0.5
@@ -54,16 +56,20 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
         fell = []
         for attack, beside in ((0.0, 0.0), (1.0, 0.0), (1.0, 0.38), (1.0, -0.38)):
             looks = planar_pose(*pose[:3, None], torch.atan2(apart[1], apart[0])[None] + beside).expand(STORIES, 7)
-            cards, rng = objects.empty(STORIES), make_rng(1)
-            cards[:, 0] = guard
+            billboards, rng = objects.empty(STORIES), make_rng(1)
+            billboards[:, 0] = guard
             acts = torch.zeros(STORIES, world.config.history, 7)
             acts[..., world.spec.action_names.index("ATTACK")] = attack
             low = torch.zeros(STORIES, dtype=torch.bool)
             for _ in range(STEPS):
-                cards = objects.step(
-                    cards, torch.ones(STORIES, objects.config.rows, dtype=torch.bool), looks, acts, rng
+                billboards = objects.step(
+                    billboards,
+                    torch.ones(STORIES, objects.config.rows, dtype=torch.bool),
+                    looks,
+                    acts,
+                    chance.seeds(STORIES, rng),
                 )
-                low |= heights(world, cards[:, 0]) < LOW_M
+                low |= heights(world, billboards[:, 0]) < LOW_M
             fell.append(float(low.float().mean()))
         assert fell[1] > max(fell[0], *fell[2:]) + 0.3, fell
 

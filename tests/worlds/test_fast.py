@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,10 +12,12 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.space.keyframes import Glimpse
 from terrella.worlds import fast
-from terrella.worlds.fast import EAGER, ONNX, compiled, example, quicken, through_onnx
-from terrella.worlds.folder import video_spec
-from terrella.worlds.generator import Generator, VideoConfig, generate
-from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.config import VideoConfig
+from terrella.worlds.controls import Controls
+from terrella.worlds.fast import EAGER, ONNX, compiled, example, quickened, through_onnx
+from terrella.worlds.generator import Conditioning, Generator, generate
+from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.moving import PLANES
 
 PARITY = 2e-6  # of colours in [-1, 1], so far below one level of 255
@@ -32,15 +32,23 @@ def worlds():
     return eager, quick
 
 
-def small_world() -> HistoryWorld:
-    """A world of history alone, its network untrained but not silent."""
+def small_world() -> LearnedWorld:
+    """A frames-only world, its network untrained but not silent."""
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), geometry=False)
     torch.manual_seed(0)
-    generator = Generator(config)
-    torch.nn.init.normal_(generator.leave.weight, std=0.1)
-    spec = video_spec("small", config, 0.1, ("a", "b"), {}, {})
+    generator = Generator(config.generator)
+    torch.nn.init.normal_(generator.output.weight, std=0.1)
     frames = torch.randint(0, 256, (4, 3, 3, 32, 48), dtype=torch.uint8, generator=make_rng(0))
-    return HistoryWorld(spec, config, generator, Starts.of(frames, 2))
+    scene = FrameHistory(config.frames, Starts.of(frames, 2))
+    return LearnedWorld(About("small", Controls.buttons(2), 0.1, ("a", "b")), scene=scene, generator=generator)
+
+
+def repeated(conditioning: Conditioning, batch: int) -> Conditioning:
+    def more(part: torch.Tensor) -> torch.Tensor:
+        return part.repeat(batch, *[1] * (part.ndim - 1))
+
+    glimpse = Glimpse(*map(more, vars(conditioning.glimpse).values()))
+    return Conditioning(glimpse, more(conditioning.last), more(conditioning.context))
 
 
 def walk(world, batch: int, steps: int):
@@ -54,11 +62,9 @@ def walk(world, batch: int, steps: int):
 @pytest.mark.parametrize("batch", [1, 3])
 def test_one_frame_is_that_of_eager_torch(worlds, batch):
     eager, quick = worlds
-    noisy, time, glimpse, last, told = example(eager)
-    glimpse = type(glimpse)(*(part.repeat(batch, *[1] * (part.ndim - 1)) for part in vars(glimpse).values()))
-    rest = [part.repeat(batch, *[1] * (part.ndim - 1)) for part in (time, last, told)]
+    noisy, time, conditioning = example(eager)
     noise = torch.randn(batch, *noisy.shape[1:], generator=make_rng(1))
-    given = (noise, rest[0], glimpse, rest[1], rest[2])
+    given = (noise, time.repeat(batch), repeated(conditioning, batch))
     with torch.inference_mode():
         one, other = eager.generator(*given), quick.generator(*given)
     assert one.shape == other.shape == (batch, 4, 96, 128)
@@ -70,16 +76,16 @@ def test_every_kind_of_generator_is_drawn_alike(kind):
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), **kind)
     torch.manual_seed(0)
-    generator, rng = Generator(config).eval(), make_rng(0)
-    torch.nn.init.normal_(generator.leave.weight, std=0.1)
+    generator, rng = Generator(config.generator).eval(), make_rng(0)
+    torch.nn.init.normal_(generator.output.weight, std=0.1)
 
     def given(batch: int) -> tuple:
         def some(*shape: int) -> torch.Tensor:
             return torch.rand(batch, *shape, generator=rng)
 
         glimpse = Glimpse(some(3, 3, 32, 48), some(3, 32, 48), 1 + 5 * some(32, 48), some(32, 48).round())
-        told = some(generator.before[0].time.in_features - 1)
-        return some(4, 32, 48), some(), glimpse, some(4 + PLANES * config.moving, 32, 48), told
+        conditioning = Conditioning(glimpse, some(4 + PLANES * config.moving, 32, 48), some(config.generator.context))
+        return some(4, 32, 48), some(), conditioning
 
     quick = through_onnx(generator, given(1))
     with torch.inference_mode():
@@ -102,24 +108,26 @@ def test_the_faster_way_is_taken_and_said(monkeypatch):
     for times, way in (((9.0, 4.0), ONNX), ((4.0, 9.0), EAGER)):
         monkeypatch.setattr(fast, "in_turns", lambda ways, taken=times: list(taken))
         world = small_world()
-        choice = quicken(world)
-        assert choice.way == way and world.spec.card["fast"] == str(choice)
-        assert ("forward" in vars(world.generator)) == (way == ONNX)
+        quick, choice = quickened(world)
+        assert choice.way == way and quick.spec.card["fast"] == str(choice)
+        assert ("forward" in vars(quick.generator)) == (way == ONNX)
         assert "eager torch" in str(choice)
+        assert "forward" not in vars(world.generator) and "fast" not in world.spec.card, "the old world is as it was"
 
 
 def test_a_quickened_world_keeps_the_contract_and_its_weights(monkeypatch):
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
     monkeypatch.setattr(fast, "in_turns", lambda ways: [2.0, 1.0])
-    world, eager = small_world(), small_world()
-    quicken(world)
+    eager = small_world()
+    world, _ = quickened(eager)
     assert {"states_are_values", "batches"} <= set(check_world(world))
     assert world.generator.state_dict().keys() == eager.generator.state_dict().keys(), "it can be saved as it was"
     for one, other in zip(walk(eager, 2, 8), walk(world, 2, 8)):
         assert (one["frames"].int() - other["frames"].int()).abs().max() <= 1
-    given = example(world)
-    world.generator(*given).mean().backward()
-    assert world.generator.enter.weight.grad is not None, "a gradient comes from eager torch"
+    noisy, time, conditioning = example(world)
+    noisy.requires_grad_(True)
+    world.generator(noisy, time, conditioning).mean().backward()
+    assert noisy.grad is not None and noisy.grad.abs().max() > 0, "a gradient comes from eager torch"
 
 
 def test_it_keeps_to_the_threads_that_torch_has(worlds):
@@ -141,7 +149,7 @@ def test_without_the_packages_a_sentence_says_what_to_install(monkeypatch):
     for absent, said in ((("onnx",), "needs onnx: "), (("onnx", "onnxruntime"), "needs onnxruntime and onnx: ")):
         monkeypatch.setattr(fast, "find_spec", lambda name, absent=absent: None if name in absent else True)
         with pytest.raises(TerrellaError, match=said + r"pip install 'terrella\[fast\]'"):
-            quicken(world)
+            quickened(world)
 
 
 def test_fast_is_for_learned_worlds(capsys):
@@ -160,15 +168,11 @@ def test_other_batches_than_the_compiled_one_are_drawn_eagerly(monkeypatch):
     monkeypatch.setattr(torch, "compile", compiler)
     world = small_world()
     quick, given = compiled(world.generator), example(world)
-    noisy, time, glimpse, last, told = given
-    two = (noisy.repeat(2, 1, 1, 1), time.repeat(2), replace_all(glimpse), last.repeat(2, 1, 1, 1), told.repeat(2, 1))
+    noisy, time, conditioning = given
+    two = (noisy.repeat(2, 1, 1, 1), time.repeat(2), repeated(conditioning, 2))
     with torch.inference_mode():
         assert quick(*given).shape[0] == 1 and quick(*two).shape[0] == 2 and quick(*given).shape[0] == 1
     assert drawn == [1, 1]
-
-
-def replace_all(glimpse):
-    return replace(glimpse, **{k: v.repeat(2, *[1] * (v.ndim - 1)) for k, v in vars(glimpse).items()})
 
 
 @pytest.mark.gpu
@@ -182,7 +186,7 @@ def test_cuda_graphs_draw_the_same():
 
 def test_several_flow_steps_go_through_it_too(worlds):
     eager, quick = worlds
-    noisy, _, glimpse, last, told = example(eager)
+    noisy, _, conditioning = example(eager)
     with torch.inference_mode():
-        one, other = (generate(world.generator, noisy, glimpse, last, told, 3) for world in worlds)
+        one, other = (generate(world.generator, noisy, conditioning, 3) for world in worlds)
     assert (one - other).abs().max() < 3 * PARITY

@@ -1,4 +1,4 @@
-"""HistoryWorld: a story begins, stands still until it has learned otherwise, and is the same after a save."""
+"""A frames-only world: an episode begins, stands still until it has learned otherwise, and is the same after a save."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ from gymnasium import spaces
 
 from terrella.core import check_world, make_rng
 from terrella.core.errors import ActionError
+from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import AXES, CHOICE, Controls
-from terrella.worlds.folder import load_world, save_world, video_spec
-from terrella.worlds.generator import Generator, VideoConfig
-from terrella.worlds.history import HistoryWorld, Starts
+from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.generator import Generator
+from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import Outcome, OutcomeConfig
 
 SIZE = (16, 24)
 
 
-def made(controls: Controls, vitals: tuple[str, ...] = ()) -> HistoryWorld:
+def made(controls: Controls, vitals: tuple[str, ...] = ()) -> LearnedWorld:
     torch.manual_seed(0)
-    config = VideoConfig((1.0, 1.0, 0.5, 0.5), controls.told, SIZE, (8, 8), slots=4, geometry=False, residual=True)
-    spec = video_spec("made", config, 0.1, (), {}, {}, controls, vitals)
+    config = VideoConfig((1.0, 1.0, 0.5, 0.5), controls.numbers, SIZE, (8, 8), slots=4, geometry=False, residual=True)
     frames = torch.randint(0, 255, (3, 4, 3, *SIZE), dtype=torch.uint8)
-    starts = Starts(frames, torch.rand(3, 4, controls.told), torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)])
-    outcome = Outcome(
-        OutcomeConfig(controls.told, (0.0, 1.0), vitals, ((-1.0, 0.0),) * len(vitals), (3.0,) * len(vitals))
-    )
-    return HistoryWorld(spec, config, Generator(config), starts, 0.0, outcome, controls)
+    starts = Starts(frames, torch.rand(3, 4, controls.numbers), torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)])
+    changes, spans, begins = ((-1.0, 0.0),) * len(vitals), (3.0,) * len(vitals), (2.0,) * len(vitals)
+    outcome = Outcome(OutcomeConfig(controls.numbers, (0.0, 1.0), vitals, changes, spans, begins=begins))
+    scene, generator = FrameHistory(config.frames, starts), Generator(config.generator)
+    return LearnedWorld(About("made", controls, 0.1), scene=scene, generator=generator, outcome=outcome)
 
 
 CHOICES = Controls(CHOICE, (2.0,), (5.0,))
@@ -40,12 +41,12 @@ def test_every_kind_of_action_keeps_the_contract(controls):
     assert "states_are_values" in check_world(world, steps=3) and world.spec.may_observe == ("lives",)
 
 
-def test_what_a_network_is_told_of_an_action():
+def test_what_networks_take_of_an_action():
     assert CHOICES.space() == spaces.Discrete(4, start=2)
-    assert CHOICES.tell(torch.tensor([2, 5, 3])).tolist() == [[1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 0, 0]]
-    assert STEERING.tell(torch.tensor([[-1.0, 4.0], [0.0, 2.0], [1.0, 0.0]])).tolist() == [[-1, 1], [0, 0], [1, -1]]
+    assert CHOICES.encode(torch.tensor([2, 5, 3])).tolist() == [[1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 0, 0]]
+    assert STEERING.encode(torch.tensor([[-1.0, 4.0], [0.0, 2.0], [1.0, 0.0]])).tolist() == [[-1, 1], [0, 0], [1, -1]]
     buttons = torch.tensor([[1, 0, 1]], dtype=torch.int8)
-    assert Controls.buttons(3).tell(buttons).tolist() == [[1, 0, 1]]
+    assert Controls.buttons(3).encode(buttons).tolist() == [[1, 0, 1]]
     with pytest.raises(ActionError):
         made(CHOICES).imagine(made(CHOICES).start(1, make_rng(0)), torch.tensor([1]), make_rng(0))
 
@@ -62,8 +63,8 @@ def test_untrained_it_stands_still():
 def test_a_saved_world_begins_and_goes_on_alike(tmp_path):
     world = made(CHOICES, ("lives",))
     with torch.no_grad():
-        world.generator.leave.weight.normal_(0, 0.05)
-    save_world(world, tmp_path / "world", {})
+        world.generator.output.weight.normal_(0, 0.05)
+    save_world(world, tmp_path / "world")
     loaded = load_world(tmp_path / "world")
     assert loaded.controls == CHOICES and loaded.outcome.config == world.outcome.config
     assert torch.equal(loaded.starts.vitals, world.starts.vitals)

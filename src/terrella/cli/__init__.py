@@ -23,6 +23,7 @@ COMMANDS = {
     "train dreams": ("train:dreams", "go on training a world on its own rollouts"),
     "score": ("score:score", "compare a world's predictions with a recording"),
     "list": ("worlds:list_worlds", "show the worlds at hand"),
+    "convert-world": ("worlds:convert_world", "convert a world that an earlier release saved"),
     "data doctor": ("data:doctor", "look for faults in a recording, and repair them"),
     "data convert": ("data:convert", "convert a recording to another format"),
     "data merge": ("data:merge", "merge recordings of several robots"),

@@ -14,7 +14,8 @@ from ..learn.recipes.uncertainty import SensesConfig, train_uncertainty
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.trainer import device_named
 from ..library import folder_of
-from ..worlds.folder import Learned, load_world
+from ..worlds.folder import load_world
+from ..worlds.learned import LearnedWorld
 from .named import Device
 from .say import Json, result
 
@@ -138,5 +139,5 @@ def dreams(
     result({"run": out, **facts}, json)
 
 
-def _learned(name: str, device: str) -> Learned:
+def _learned(name: str, device: str) -> LearnedWorld:
     return load_world(folder_of(name), device=str(device_named(device)))

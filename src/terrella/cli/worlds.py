@@ -1,4 +1,4 @@
-"""The command `terrella list`: the worlds at hand, with their cards."""
+"""The commands about saved worlds: list them, and convert one of an earlier release."""
 
 from __future__ import annotations
 
@@ -26,3 +26,16 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
         print(f"{entry.name}  [{entry.source}]")
         for fact, value in entry.card.items():
             print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
+
+
+def convert_world(old: Positional[Path], new: Positional[Path]) -> None:
+    """Convert a world that an earlier release saved to the format of this one. Nothing is lost.
+
+    Args:
+        old: Its folder; it stays as it is.
+        new: The folder to write.
+    """
+    from ..worlds import convert
+
+    convert.convert_world(old, new)
+    print(f"{new} is ready: terrella play {new}")

@@ -1,4 +1,4 @@
-"""convert: from any format that Terrella knows into any other; which one a path holds is told from what lies there."""
+"""convert: from any format that Terrella knows into any other; the format of a path is recognised from its content."""
 
 from __future__ import annotations
 

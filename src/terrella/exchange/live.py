@@ -26,7 +26,7 @@ class Live:
     sensors: name -> Sensor, all that will be logged.
     image:   how pictures are sent: "jpeg", "png" or "raw".
 
-    `log` never raises and never waits: errors are told in `notes`, readings that were lost are counted in `dropped`.
+    `log` never raises and never waits: errors are named in `notes`, readings that were lost are counted in `dropped`.
     DatasetError, from the constructor alone, where the target cannot be used.
     """
 

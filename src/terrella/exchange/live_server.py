@@ -2,7 +2,7 @@
 
 That server answers whoever connects (measured: foxglove-sdk 0.30 takes any Origin and Host), so every page of the web that
 a browser here has open could watch a robot's cameras. A door stands before it, which lets in the Foxglove app, local pages
-and programs alone; the server itself listens on an address of this machine that nobody is told.
+and programs alone; the server itself listens on an address of this machine that nobody knows.
 """
 
 from __future__ import annotations

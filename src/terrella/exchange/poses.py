@@ -1,4 +1,4 @@
-"""Which numbers of a vector are a pose on the ground, told by their names."""
+"""Which numbers of a vector are a pose on the ground, found by their names."""
 
 from __future__ import annotations
 

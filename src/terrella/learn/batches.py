@@ -4,28 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from ..space.keyframes import Glimpse, Keyframes, gathered, look, retrieve
-from ..worlds.generator import THUMBNAIL, VideoConfig, context_thumbnail, decode_depth, encode_depth
-from ..worlds.video import carry
+from ..worlds.config import THUMBNAIL, VideoConfig
+from ..worlds.generator import Conditioning, context_thumbnail, decode_depth, encode_depth, pixels
+from ..worlds.places import carry
 from .recording import Recording
 from .trainer import Now
-
-
-class Conditioning(NamedTuple):
-    """What a generator is shown; see Generator.forward."""
-
-    glimpse: Glimpse
-    last: torch.Tensor
-    context: torch.Tensor
-
-    def to(self, device) -> Conditioning:
-        return Conditioning(self.glimpse.to(device), self.last.to(device), self.context.to(device))
-
 
 # Dream(what is shown, now) -> frames [B, 4 or 5, H, W] as the generator under training draws them, on the CPU
 Dream = Callable[[Conditioning, Now], torch.Tensor]
@@ -56,11 +44,6 @@ def as_drawn(truth: torch.Tensor) -> torch.Tensor:
 def coded(rgb: torch.Tensor) -> torch.Tensor:
     """uint8 to the generator's code of colour, -1 to 1."""
     return rgb.float() / 127.5 - 1
-
-
-def pixels(clean: torch.Tensor) -> torch.Tensor:
-    """The generator's code of colour [B, 3 or more, H, W] to uint8 [B, 3, H, W]."""
-    return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
 
 
 @dataclass(frozen=True)
@@ -100,9 +83,9 @@ class Views:
 
     def glimpse(self, rows: np.ndarray) -> Glimpse:
         """What the chosen keyframes know of the views at `rows`."""
-        config = self.config
+        config, pose = self.config, self.recording.pose(rows)
         memory, picks = gathered(self.chosen, config.size)
-        return look(memory, picks, self.recording.pose(rows), config.camera, config.size, config.slots)
+        return look(memory, picks, pose, config.camera, config.size, config.slots)
 
     def carried(self, rgb, depth, from_rows: np.ndarray, to_rows: np.ndarray, glimpse: Glimpse) -> torch.Tensor:
         """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
@@ -149,7 +132,8 @@ def place_batch(
 def varied(batch: Batch, rng: np.random.Generator) -> Batch:
     """The same batch in a mirrored world (half of the time) with other colours (likewise): one map has few rooms, and
     the look of a new one should be taken from what is seen of it, not from the rooms of the recording."""
-    (glimpse, last, context), colours = batch.shown, torch.arange(3)
+    glimpse, last, context = batch.shown.glimpse, batch.shown.last, batch.shown.context
+    colours = torch.arange(3)
     if rng.random() < 0.5:
         colours = torch.from_numpy(rng.permutation(3))
     planes = torch.cat([colours, torch.tensor([3])])

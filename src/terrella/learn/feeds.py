@@ -7,8 +7,8 @@ from typing import Any
 
 from ..data import Clips
 from ..space.keyframes import Keyframes
+from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
-from ..worlds.generator import VideoConfig
 from .batches import Dream, place_batch
 from .history_batches import history_batch, history_clips
 from .moving_batches import moving_batch

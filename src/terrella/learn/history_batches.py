@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from ..data import ClipCache, Clips
+from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
-from ..worlds.generator import VideoConfig, context_thumbnail, encode_depth
+from ..worlds.generator import Conditioning, context_thumbnail, encode_depth, pixels
 from ..worlds.history import past
-from .batches import Batch, Conditioning, Dream, coded, pixels
+from .batches import Batch, Dream, coded
 from .recording import Recording
 from .trainer import Now
 
@@ -58,7 +59,7 @@ def history_batch(
     """
     rgb = torch.from_numpy(np.ascontiguousarray(clips["rgb"])).permute(0, 1, 4, 2, 3)
     batch, length = rgb.shape[:2]
-    actions = controls.tell(torch.from_numpy(np.array(clips["action"], np.float32)).flatten(0, 1))
+    actions = controls.encode(torch.from_numpy(np.array(clips["action"], np.float32)).flatten(0, 1))
     actions = actions.unflatten(0, (batch, length))
     dreamt = int(now.rng.choice(DREAMT, p=OFTEN)) if dream else 0
     begins = now.rng.random(batch) < STILL

@@ -7,10 +7,11 @@ import torch
 import torch.nn.functional as F
 
 from ..space.keyframes import Glimpse, Keyframes
+from ..worlds.config import THUMBNAIL, VideoConfig
 from ..worlds.controls import BUTTONS
-from ..worlds.generator import THUMBNAIL, VideoConfig, context_thumbnail, decode_depth, encode_depth
+from ..worlds.generator import Conditioning, context_thumbnail, decode_depth, encode_depth, pixels
 from ..worlds.moving import Frame, carry_frames
-from .batches import Batch, Conditioning, Dream, Views, coded, pixels
+from .batches import Batch, Dream, Views, coded
 from .recording import Recording
 from .trainer import Now
 
@@ -61,7 +62,8 @@ def worn(rgb: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
 
 def mirrored(batch: Batch, action_names: tuple[str, ...]) -> Batch:
     """The same batch in a mirror: what was done to the left is done to the right."""
-    (glimpse, last, context), cut = batch.shown, 3 * THUMBNAIL[0] * THUMBNAIL[1]
+    glimpse, last, context = batch.shown.glimpse, batch.shown.last, batch.shown.context
+    cut = 3 * THUMBNAIL[0] * THUMBNAIL[1]
     small = context[:, :cut].unflatten(1, (3, *THUMBNAIL)).flip(-1).flatten(1)
     acts = context[:, cut:].unflatten(1, (-1, len(action_names)))[..., other_side(action_names)].flatten(1)
     parts = [part.flip(-1) for part in (glimpse.rgb, glimpse.trust, glimpse.depth, glimpse.known)]

@@ -13,9 +13,9 @@ import torch
 
 from ..core.errors import DatasetError
 from ..space.keyframes import Keyframes
-from ..worlds.controls import Controls
-from ..worlds.folder import Learned, save_world
-from ..worlds.generator import Generator, channels_last
+from ..worlds.folder import save_world
+from ..worlds.generator import Generator
+from ..worlds.learned import LearnedWorld
 from .batches import Batch, Dream
 from .feeds import frames_feed
 from .history_batches import clips_at, history_batch
@@ -30,12 +30,12 @@ TRANSIENT = ("save_every_s", "strip_every_s", "device")  # settings that may cha
 class Paired:
     """A finished world with the part of a recording that it may be trained on."""
 
-    world: Any
+    world: LearnedWorld
     recording: Recording
 
     @property
     def device(self) -> torch.device:
-        return next(self.world.generator.parameters()).device
+        return self.world.device
 
     @property
     def memory(self) -> Keyframes | None:
@@ -51,41 +51,33 @@ class Paired:
             return self.feed(batch, 0).batch(now)
         config, recording = self.world.config, self.recording
         clips = clips_at(recording, config, batch, now.rng)
-        return history_batch(clips, controls_in(self.world), config, now, None)
+        return history_batch(clips, self.world.controls, config, now, None)
 
 
-def controls_in(world: Learned) -> Controls:
-    return getattr(world, "controls", None) or Controls.buttons(world.config.actions)
-
-
-def paired(world: Learned, data: str | Path, keep_out: Box | None, report: Report) -> Paired:
+def paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, report: Report) -> Paired:
     """Opens the recording `data` at the world's size. `keep_out` as in `train video`; None: what the world's card says.
 
     DatasetError where the recording does not fit the world.
     """
-    config, name, controls = world.config, world.spec.name, controls_in(world)
+    config, name, controls = world.config, world.spec.name, world.controls
     needs = ("rgb", *("depth", "pose") * config.geometry, *(THINGS,) * config.moving)
     needs += (OBJECTS, INSTANCES) * config.objects
-    box = box_of(world.spec.card.get("keep_out")) if keep_out is None else keep_out
+    box = box_of(world.about.card.get("keep_out")) if keep_out is None else keep_out
     recording = Recording.open(data, config.size, report, box, needs, f"{name} is shown that: record it as well")
     found = recording.controls
-    if found is None or (found.kind, found.told) != (controls.kind, controls.told):
+    if found is None or (found.kind, found.numbers) != (controls.kind, controls.numbers):
         raise DatasetError(
-            f"{data} has other actions than {name}, which takes {controls.told} {controls.kind} "
+            f"{data} has other actions than {name}, which takes {controls.numbers} {controls.kind} "
             f"({', '.join(world.spec.action_names)}); give a recording of the same game."
         )
     return Paired(world, replace(recording, controls=controls).enough())
 
 
-def with_generator(world: Learned, generator: Generator, steps: int, card: dict) -> Learned:
-    """The same world around another generator, which draws a frame in `steps`; `card` is added to its facts. Its uncertainty
-    is left out, for it knew the errors of the old one: `terrella train uncertainty` learns another."""
-    fresh = world.with_senses(getattr(world, "estimator", None), None)
-    fresh.generator = channels_last(copy.deepcopy(generator).eval().requires_grad_(False))
-    fresh.config = replace(world.config, steps=steps)
-    kept = {name: value for name, value in world.spec.card.items() if name != "uncertainty"}
-    fresh.spec = replace(fresh.spec, card={**kept, **card})
-    return fresh
+def with_generator(world: LearnedWorld, generator: Generator, steps: int, card: dict) -> LearnedWorld:
+    """The same world around a copy of another generator, which draws a frame in `steps`; `card` is added to its facts. Its
+    uncertainty is left out, for it knew the errors of the old one: `terrella train uncertainty` learns another."""
+    fresh = copy.deepcopy(generator)
+    return world.replaced(generator=fresh, steps=steps, uncertainty=None, card={"uncertainty": None, **card})
 
 
 def fingerprint(generator: Generator) -> str:
@@ -102,7 +94,7 @@ def recipe_of(config: Any, pair: Paired, **more: Any) -> Mapping[str, Any]:
     return {**fixed, "world": fingerprint(pair.world.generator), "frames": pair.recording.cache.length, **more}
 
 
-def keep_world(pair: Paired, world: Learned, out: Path, step: int) -> None:
+def keep_world(pair: Paired, world: LearnedWorld, out: Path, step: int) -> None:
     """The world in the run's folder, and a strip of the old world's dream above the new one's."""
-    save_world(world, out / "world", dict(world.spec.card))
+    save_world(world, out / "world")
     draw_strip((pair.world, world), pair.recording, out / f"strip-{step:06d}.png")

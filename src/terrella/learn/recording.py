@@ -17,8 +17,8 @@ from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
 from ..space.reproject import least_around
+from ..worlds.config import VideoConfig
 from ..worlds.controls import AXES, CHOICE, Controls
-from ..worlds.generator import VideoConfig
 from ..worlds.moving import covering, still
 from .trainer import Report
 
@@ -87,6 +87,12 @@ class Recording:
         return [number for number in range(len(self.cache.episodes)) if number not in self.held_out]
 
     @property
+    def ignored(self) -> tuple[str, ...]:
+        """Cameras of the recording that training does not see: it learns from the main one."""
+        source = self.dataset
+        return () if source is None else tuple(name for name in source.cameras if name != source.rgb_key)
+
+    @property
     def posed(self) -> bool:
         """Whether it has depth, poses and a camera."""
         return all(there(self.cache, name) for name in ("depth", "pose", "camera"))
@@ -98,7 +104,7 @@ class Recording:
     def action(self, rows) -> torch.Tensor:
         """float32 [n, A], as networks are given it."""
         action = torch.from_numpy(np.array(self.cache.action[rows], np.float32))
-        return action if self.controls is None else self.controls.tell(action)
+        return action if self.controls is None else self.controls.encode(action)
 
     def actions_before(self, rows: np.ndarray, back: np.ndarray) -> torch.Tensor:
         """float32 [n, len(back), A]: the actions `back` rows before `rows`; zero before an episode's first."""

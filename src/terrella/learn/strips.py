@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from ..core.world import make_rng
-from ..worlds.folder import Learned
+from ..worlds.learned import LearnedWorld
 from .recording import Recording
 
 
-def draw_strip(worlds: Sequence[Learned], recording: Recording, path: Path) -> None:
+def draw_strip(worlds: Sequence[LearnedWorld], recording: Recording, path: Path) -> None:
     """64 steps of the first episode that training does not see, every 8th frame: the truth above a dream of each world."""
     first, last = recording.cache.episodes[(recording.held_out or (0,))[0]]
     rows = np.arange(max(first, min(first + 40, last - 65)), last)[:65]
@@ -29,7 +29,7 @@ def write_lines(lines: Sequence[torch.Tensor], path: Path) -> None:
 
 
 @torch.inference_mode()
-def _dream(world: Learned, recording: Recording, rows: np.ndarray) -> torch.Tensor:
+def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch.Tensor:
     """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
     move, the recorded actions."""
     rng, config = make_rng(1), world.config

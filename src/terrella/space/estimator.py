@@ -38,6 +38,7 @@ class Estimator(nn.Module):
     """A small U-Net that sees a picture in its own brightness and contrast and gives logarithmic depth; motion follows from the
     depth, by direct alignment of two pictures."""
 
+    kind = "network"
     prior: torch.Tensor  # logit of the mean code of the recordings' depth, at each pixel
     pace: torch.Tensor  # of a step of the recordings: metres forward, metres to the left, radians
     usual: torch.Tensor  # mean of the looks of the pictures that it learned from [D]
@@ -54,7 +55,7 @@ class Estimator(nn.Module):
         self.whole = nn.Linear(widths[-1], widths[-1])
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.after = nn.ModuleList(_Block(width) for width in widths[:-1])
-        self.leave = nn.Conv2d(widths[0], 4, 3, padding=1)
+        self.output = nn.Conv2d(widths[0], 4, 3, padding=1)
         looks = widths[0] + widths[1] + 12
         self.register_buffer("prior", torch.zeros(config.size))
         self.register_buffer("pace", torch.ones(3))
@@ -92,7 +93,7 @@ class Estimator(nn.Module):
         for level in reversed(range(len(self.after))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
             x = self.after[level](x)
-        return (self.prior + F.pixel_shuffle(self.leave(F.silu(x)), 2)[:, 0]).sigmoid()
+        return (self.prior + F.pixel_shuffle(self.output(F.silu(x)), 2)[:, 0]).sigmoid()
 
     def looks(self, rgb: torch.Tensor) -> torch.Tensor:
         """Of pictures, uint8 [B, 3, H, W], how much their two finest maps vary, the mean and contrast of each colour and the

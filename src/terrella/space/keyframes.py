@@ -66,6 +66,9 @@ class Keyframes:
             return parts[0]
         return Keyframes(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Keyframes)))
 
+    def to(self, device) -> Keyframes:
+        return Keyframes(*(getattr(self, field.name).to(device) for field in fields(Keyframes)))
+
     def __len__(self) -> int:
         return len(self.pose)
 

@@ -1,8 +1,9 @@
-"""Arrival: where a story stands that begins with one picture, and how deep it sees there."""
+"""Arrival: where an episode stands that begins with one picture, and how deep it sees there."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import torch
 
@@ -11,10 +12,21 @@ from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes, look, retrieve
 from ..space.recognise import recognise
 
-AWAY_M = (
-    1000.0  # from the recordings, of a story whose picture is of elsewhere: nothing that they hold is seen from there
-)
+AWAY_M = 1000.0  # from the recordings, of a picture of elsewhere: nothing that they hold is seen from there
 ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # a picture is of a remembered place from there up (see docs/log.md)
+
+
+@final
+class NoEstimator:
+    """Of a world that cannot see depth in a lone picture."""
+
+    kind, config = "none", None
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to(self, device) -> NoEstimator:
+        return self
 
 
 @dataclass(frozen=True)
@@ -36,8 +48,8 @@ def arrive(
     sources: int,
 ) -> Arrival:
     """Pictures, uint8 [B, 3, H, W], in the place among `memory` (its `thumbnails` are `small`) where they were taken, or
-    else in an empty corner of the world at the height of the `starts`; depth is memory's where it knows it, else the eye's.
-    """
+    else in an empty corner of the world at the height of the `starts`; depth is memory's where it knows it, else the
+    estimator's."""
     depth, found, poses = estimator.depth(rgb), [], []
     corner = starts.pose[:1].clone()
     corner[0, 0] = starts.pose[:, 0].max() + AWAY_M

@@ -1,4 +1,4 @@
-"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how a network is told it."""
+"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how networks take it."""
 
 from __future__ import annotations
 
@@ -8,25 +8,43 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-BUTTONS, CHOICE, AXES = "buttons", "choice", "axes"
+from ..core.errors import ContractError
+from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
+
+AXES = "axes"
 
 
 @dataclass(frozen=True)
 class Controls:
     """kind: "buttons", each 0 or 1; "choice", a whole number from low to high; "axes", numbers between low and high.
-    low and high: limits, one for each number of an action."""
+    low and high: limits, one for each number of an action. What axes mean: mode, units and frame, as in Spec."""
 
     kind: str
     low: tuple[float, ...]
     high: tuple[float, ...]
+    mode: str = ""
+    units: tuple[str, ...] = ()
+    frame: str = ""
 
     @staticmethod
     def buttons(count: int) -> Controls:
         return Controls(BUTTONS, (0.0,) * count, (1.0,) * count)
 
+    @staticmethod
+    def of(spec: Spec) -> Controls:
+        """Those of a world with this spec; ContractError for axes without limits and for actions that are no plain list."""
+        low, high = (np.asarray(limit, np.float64).ravel() for limit in spec.action_limits)
+        if len(shape_of(spec.action)) > 1 or not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise ContractError(
+                f"{spec.name} has actions in {spec.action}; buttons, one choice or limited axes can be learned."
+            )
+        kind = spec.action_mode if spec.action_mode in (BUTTONS, CHOICE) else AXES
+        meaning = spec.action_mode if kind == AXES else "", tuple(spec.action_units), spec.action_frame
+        return Controls(kind, tuple(low.tolist()), tuple(high.tolist()), *meaning)
+
     @property
-    def told(self) -> int:
-        """How many numbers a network is told of an action."""
+    def numbers(self) -> int:
+        """How many numbers networks take of an action."""
         return int(self.high[0] - self.low[0]) + 1 if self.kind == CHOICE else len(self.low)
 
     def space(self) -> spaces.Space:
@@ -34,17 +52,17 @@ class Controls:
         if self.kind == BUTTONS:
             return spaces.MultiBinary(len(self.low))
         if self.kind == CHOICE:
-            return spaces.Discrete(self.told, start=int(self.low[0]))
+            return spaces.Discrete(self.numbers, start=int(self.low[0]))
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
-    def tell(self, action: torch.Tensor) -> torch.Tensor:
-        """[B, ...], as recorded or as `space` has it, to float32 [B, told]: buttons as they are, a choice one-hot (all zero
+    def encode(self, action: torch.Tensor) -> torch.Tensor:
+        """[B, ...], as recorded or as `space` has it, to float32 [B, numbers]: buttons as they are, a choice one-hot (all zero
         would be no choice at all), axes so that their limits are -1 and 1."""
-        numbers = action.reshape(len(action), -1).float()
+        given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
-            picked = (numbers[:, 0].round().long() - int(self.low[0])).clamp(0, self.told - 1)
-            return torch.nn.functional.one_hot(picked, self.told).float()
+            picked = (given[:, 0].round().long() - int(self.low[0])).clamp(0, self.numbers - 1)
+            return torch.nn.functional.one_hot(picked, self.numbers).float()
         if self.kind == AXES:
             low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
-            return (2 * (numbers - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
-        return numbers
+            return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
+        return given

@@ -5,11 +5,12 @@ The graph is made in memory from the weights at hand, when the world is loaded; 
 
 from __future__ import annotations
 
+import copy
 import statistics
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,11 +18,12 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import nn
 
+from ..core import chance
 from ..core.errors import TerrellaError
 from ..core.world import make_rng
 from ..space.keyframes import Glimpse
-from .history import HistoryWorld
-from .video import VideoWorld
+from .generator import Conditioning
+from .learned import LearnedWorld
 
 Forward = Callable[..., torch.Tensor]
 TURNS = 15  # frames that each way draws when they are held against one another
@@ -44,15 +46,15 @@ class Choice:
 EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
 
 
-def quicken(world: VideoWorld | HistoryWorld) -> Choice:
-    """Gives the world's generator the faster way of drawing, ONNX Runtime on a CPU or a compiled graph on a GPU, if it
-    is faster than eager torch when both draw the same frames in turns. Its weights must not change afterwards.
+def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
+    """The same world with the faster way of drawing, ONNX Runtime on a CPU or a compiled graph on a GPU, if it is faster than
+    eager torch when both draw the same frames in turns; and which it is.
 
     TerrellaError where ONNX Runtime is not installed. Eager torch goes on drawing whatever needs a gradient.
     """
-    generator: nn.Module = world.generator
+    generator: nn.Module = copy.deepcopy(world.generator)
     inputs = example(world)
-    on_cpu = next(generator.parameters()).device.type == "cpu"
+    on_cpu = world.device.type == "cpu"
     began = time.perf_counter()
     eager: Forward = generator.forward
     other = through_onnx(generator, inputs) if on_cpu else compiled(generator)
@@ -62,24 +64,33 @@ def quicken(world: VideoWorld | HistoryWorld) -> Choice:
         slow, quick = in_turns([lambda: eager(*inputs), lambda: other(*inputs)])
     wins = quick < slow
     if wins:
-        way_of_drawing = lambda *given: eager(*given) if torch.is_grad_enabled() else other(*given)  # noqa: E731
-        vars(generator)["forward"] = way_of_drawing
+        vars(generator)["forward"] = _Way(eager, other)
     way = EAGER if not wins else ONNX if on_cpu else COMPILED
     choice = Choice(way, slow, quick, prepared)
-    world.spec = replace(world.spec, card={**world.spec.card, "fast": str(choice)})
-    return choice
+    return world.replaced(generator=generator, card={"fast": str(choice)}), choice
 
 
-def example(world: VideoWorld | HistoryWorld) -> tuple:
-    """What the generator is given for a frame of one story."""
-    given: list[tuple] = []
-    hook = world.generator.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
-    try:
-        rng = make_rng(0)
-        world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng)
-    finally:
-        hook.remove()
-    return tuple(part.clone() if isinstance(part, torch.Tensor) else part for part in given[-1])
+@dataclass(frozen=True)
+class _Way:
+    """A generator's way of drawing: `quick`, but where a gradient is needed `eager`."""
+
+    eager: Forward
+    quick: Forward
+
+    def __call__(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+        given = noisy, time, conditioning
+        learns = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in _flat(given))
+        return self.eager(*given) if learns else self.quick(*given)
+
+
+def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioning]:
+    """What the generator is given for a frame of one episode: noise, flow time and conditioning."""
+    rng = make_rng(0)
+    state = world.start(1, rng)
+    numbers = world.controls.encode(world.spec.sample_action(1, rng)).to(world.device)
+    conditioning = world.conditioning(world.asked(state, numbers), state)
+    noise = chance.normal(chance.seeds(1, rng, world.device), (4, *world.size))
+    return noise, torch.zeros(1, device=world.device), conditioning
 
 
 def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
@@ -140,7 +151,6 @@ def in_turns(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float
 
 def _exported(generator: nn.Module, inputs: tuple) -> bytes:
     """The generator as an ONNX graph, the batch free."""
-    glimpses = [isinstance(part, Glimpse) for part in inputs]
 
     class Flat(nn.Module):
         """Tensors in, since a graph knows no dataclasses."""
@@ -150,9 +160,8 @@ def _exported(generator: nn.Module, inputs: tuple) -> bytes:
             self.generator = generator
 
         def forward(self, *tensors: torch.Tensor) -> torch.Tensor:
-            left = iter(tensors)
-            given = (Glimpse(*(next(left) for _ in fields(Glimpse))) if glimpse else next(left) for glimpse in glimpses)
-            return self.generator(*given)
+            noisy, time, *glimpse, last, context = tensors
+            return self.generator(noisy, time, Conditioning(Glimpse(*glimpse), last, context))
 
     tensors = _flat(inputs)
     names = [f"x{number}" for number in range(len(tensors))]
@@ -172,5 +181,6 @@ def _exported(generator: nn.Module, inputs: tuple) -> bytes:
 
 
 def _flat(inputs: tuple) -> list[torch.Tensor]:
-    parts = [list(vars(part).values()) if isinstance(part, Glimpse) else [part] for part in inputs]
-    return [tensor for part in parts for tensor in part]
+    """The tensors of noise, flow time and conditioning, in one row."""
+    noisy, time, conditioning = inputs
+    return [noisy, time, *vars(conditioning.glimpse).values(), conditioning.last, conditioning.context]

@@ -3,68 +3,62 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..space.camera import Intrinsics
 from ..space.keyframes import Glimpse, merge
+from .config import THUMBNAIL, GeneratorConfig
 from .moving import PLANES
 
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
 LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
-THUMBNAIL = (3, 4)  # rows and columns of the tiny picture of the last frame that the generator is always told
 
 
 @dataclass(frozen=True)
-class VideoConfig:
-    """size: (height, width) of the frames; camera: intrinsics as in Spec; actions: numbers in an action."""
+class Conditioning:
+    """What a frame is drawn from: what the scene knows of the view; `last` [B, 4, H, W], the last frame's colour in [0, 1]
+    carried into the view and its trust (where things move [B, 4 + PLANES, H, W], see moving.carry_frames); `context` [B, n],
+    the last frame's thumbnail and, in some worlds, the last actions."""
 
-    camera: Intrinsics
-    actions: int
-    size: tuple[int, int] = (96, 128)
-    channels: tuple[int, ...] = (32, 56, 88, 128)  # of the generator at 1/2, 1/4, 1/8 and 1/16 of the size
-    sources: int = 6  # keyframes that are warped into a view
-    slots: int = 3  # of them, those that the generator sees at each pixel
-    history: int = 8  # actions that the motion model remembers
-    body_m: float = 0.0  # half the width of the body that slides along walls, as recordings show it; 0: none stops it
-    short: float = 0.0  # the share of a step by which it stops short of a wall
-    memory_mb: float = 16.0  # MiB of a story's own memory (space/memory.py); with 0 it holds the last frame alone
-    known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
-    new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
-    geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/history.py)
-    steps: int = 1  # flow-matching steps a frame
-    vitals: tuple[float, ...] = ()  # with which stories begin (names are its outcome's)
-    residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
-    objects: bool = False  # things are cards (worlds/cast.py): the generator neither sees nor draws what they cover
-    moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
+    glimpse: Glimpse
+    last: torch.Tensor
+    context: torch.Tensor
+
+    def to(self, device) -> Conditioning:
+        return Conditioning(self.glimpse.to(device), self.last.to(device), self.context.to(device))
 
 
 class Block(nn.Module):
-    """Two 3x3 convolutions around a SiLU, told the flow time and more (see Generator), with a residual path."""
+    """Two 3x3 convolutions around a SiLU, conditioned on the flow time and the context, with a residual path."""
 
-    def __init__(self, channels: int, told: int):
+    def __init__(self, channels: int, context: int):
         super().__init__()
         self.first, self.second = (nn.Conv2d(channels, channels, 3, padding=1) for _ in range(2))
-        self.time = nn.Linear(told, channels)
+        self.context = nn.Linear(context, channels)
 
-    def forward(self, x: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
-        inner = F.silu(self.first(x) + self.time(told)[:, :, None, None])
+    def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
+        inner = F.silu(self.first(x) + self.context(context)[:, :, None, None])
         return F.silu(x + self.second(inner))
 
 
+@final
 class Generator(nn.Module):
     """A U-Net that, from noise and what memory knows, predicts the clean frame (flow matching, x-prediction).
 
     Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what
     is known comes through as sharp as it was seen. It begins with a 2x pixel-unshuffle: a quarter of the cost.
     With `residual` it is the newest frame and what the net changes in it: where hardly a pixel ever changes, a mixture
-    soon copies, and then no gradient tells it otherwise.
+    soon copies, and then no gradient corrects it.
     """
 
-    def __init__(self, config: VideoConfig):
+    kind = "unet"
+
+    def __init__(self, config: GeneratorConfig):
         super().__init__()
+        self.config = config
         self.slots = config.slots
         self.choices = config.slots + 2  # merged, slots, last frame
         self.moving = config.moving
@@ -72,35 +66,23 @@ class Generator(nn.Module):
         widths = config.channels
         self.enter = nn.Conv2d(4 * inputs, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
-        acts = config.history if config.moving else 0 if config.geometry else config.slots  # actions that it is told
-        told = 1 + 3 * THUMBNAIL[0] * THUMBNAIL[1] + config.actions * acts
-        self.before = nn.ModuleList(Block(width, told) for width in widths)
-        self.after = nn.ModuleList(Block(width, told) for width in widths)
+        self.before = nn.ModuleList(Block(width, 1 + config.context) for width in widths)
+        self.after = nn.ModuleList(Block(width, 1 + config.context) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
-        self.leave = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1 + config.moving), 3, padding=1)
-        nn.init.zeros_(self.leave.weight)
+        self.output = nn.Conv2d(widths[0], 4 * (self.choices + 1 + 3 + 1 + config.moving), 3, padding=1)
+        nn.init.zeros_(self.output.weight)
         bias = torch.zeros(self.choices + 5 + config.moving)
         bias[0] = 0.0 if config.residual else 3.0  # at first, trust the merged colours
         self.residual = config.residual
-        self.leave.bias.data = bias.repeat_interleave(4)
+        self.output.bias.data = bias.repeat_interleave(4)
 
-    def forward(
-        self,
-        noisy: torch.Tensor,
-        time: torch.Tensor,
-        glimpse: Glimpse,
-        last: torch.Tensor,
-        told: torch.Tensor,
-    ) -> torch.Tensor:
-        """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]; last [B, 4, H, W] = the last frame's colour
-        warped into this view and its trust; told [B, n]: the last frame's `mood`, and where there is no geometry to say
-        what they cause, the actions [slots * A], the newest first. Returns the clean frame in the code of `noisy`.
-
-        Where things move, `last` [B, 4 + PLANES, H, W] is what moving.carry_frames makes, told also has the last `history`
-        actions, the newest last, and a fifth plane of the result is the logit that a thing is there."""
+    def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+        """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]. Returns the clean frame in the code of `noisy`; where
+        things move, with a fifth plane, the logit that a thing is there."""
+        glimpse, last = conditioning.glimpse, conditioning.last
         if self.residual:
             noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
-        told = torch.cat([time[:, None], told], 1)
+        context = torch.cat([time[:, None], conditioning.context], 1)
         colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
         merged = merge(glimpse) * 2 - 1
         depth = encode_depth(glimpse.depth)[:, None]
@@ -121,15 +103,15 @@ class Generator(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)  # as the weights are
         kept = []
         for level, block in enumerate(self.before):
-            x = block(x, told)
+            x = block(x, context)
             if level < len(self.down):
                 kept.append(x)
                 x = self.down[level](x)
-        x = self.after[-1](x, told)
+        x = self.after[-1](x, context)
         for level in reversed(range(len(self.down))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level](x, told)
-        out = F.pixel_shuffle(self.leave(x), 2)
+            x = self.after[level](x, context)
+        out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # a thing stays as it was unless the network knows better; what was not seen is not copied
             thing = LASTING * last[:, 5:6] - 1e4 * (last_trust <= 0).float()
@@ -171,13 +153,16 @@ def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
     return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, THUMBNAIL).flatten(1)
 
 
-def generate(
-    generator: Generator, noise: torch.Tensor, glimpse: Glimpse, last: torch.Tensor, told: torch.Tensor, steps: int
-) -> torch.Tensor:
+def pixels(clean: torch.Tensor) -> torch.Tensor:
+    """The colours of a drawn frame [B, 4 or more, H, W] as uint8 [B, 3, H, W]."""
+    return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+
+
+def generate(generator: nn.Module, noise: torch.Tensor, conditioning: Conditioning, steps: int) -> torch.Tensor:
     """Noise to frame in `steps` Euler steps of the straight flow."""
     x = noise
     for step in range(steps):
         now, after = step / steps, (step + 1) / steps
-        clean = generator(x, torch.full((len(x),), now, device=x.device), glimpse, last, told)
+        clean = generator(x, torch.full((len(x),), now, device=x.device), conditioning)
         x = clean if after == 1 else x + (clean[:, :4] - x) * (after - now) / (1 - now)
     return x

@@ -1,31 +1,39 @@
-"""Objects: the things of a place as cards that stand in it, each with a place and a look that change as they did in recordings.
+"""Objects: the things of a place as billboards that stand in it, each with a place and a look that change as in recordings.
 
-A look is one of those that the recording showed (space/cards.py), a move one of those that it saw, and which comes next is
-drawn by chance from what a small network tells: a figure is never the mean of what it could do, so it stays sharp and whole.
+A look is one of those that the recording showed (space/billboards.py), a move one of those that it saw, and which comes next
+is drawn by chance from the logits of a small network: a figure is never the mean of what it could do, so it stays sharp.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, final
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from gymnasium import spaces
 from torch import nn
 
-from ..space.billboards import PICTURE, Cutout, painted
+from ..core import chance
+from ..core.errors import ObservationError
+from ..core.state import State
+from ..space.billboards import PICTURE, Cutout, cut_out, painted
 from ..space.camera import Intrinsics, yaw
+from ..space.floorplan import NOWHERE
+from .parts import GOES, LOOKS, MOVES, Channels, Walls
 
-# A card: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its last
-# move (x, y), steps since that, and its light, of its look's own.
+# A billboard: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its
+# last move (x, y), steps since that, and its light, of its look's own.
 NUMBER, PLACE, LOOK, AGE, BEFORE, GOING, RESTED, LIGHT = 0, slice(1, 4), 4, 5, 6, slice(7, 9), 9, 10
 COLUMNS = 11
 NONE = -1
 ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
 STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
-STOREY_M = 2.0  # between feet and eye, above which a card is on another floor
-ROWS = 16  # cards of a place at most
-STARTS = 32  # casts with which stories begin
+STOREY_M = 2.0  # between feet and viewer, above which a billboard is on another floor
+ROWS = 16  # billboards of a place at most
+STARTS = 32  # sets of billboards with which episodes begin
 AGES = 24  # steps that are counted; more are as many
 WIDE_M = 0.65  # beside its middle, where a thing counts as looked at by 1/e
 UNLIKELY = 0.01  # a look less likely than that in a step does not come: so many of them would fell a man now and then
@@ -34,8 +42,8 @@ FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
 
 @dataclass(frozen=True)
 class ObjectsConfig:
-    """actions: numbers in an action; history: of the last actions that it is told, the present one among them; looks and
-    moves: that it has room for (move 0 is none); hidden: width of the network."""
+    """actions: numbers in an action; history: of the last actions that count, the present one among them; looks and moves:
+    that it has room for (move 0 is none); rows: billboards of a place; starts: sets of them; hidden: width of the network."""
 
     actions: int
     history: int
@@ -46,7 +54,7 @@ class ObjectsConfig:
     hidden: int = 192
 
 
-class Told(NamedTuple):
+class Next(NamedTuple):
     """Logits of the next look [n, looks], of the move [n, moves] and of its being gone [n]."""
 
     look: torch.Tensor
@@ -54,15 +62,18 @@ class Told(NamedTuple):
     gone: torch.Tensor
 
 
+@final
 class Objects(nn.Module):
     """What the things of a place look like, and what they do next."""
 
+    kind = "billboards"
+
     pictures: torch.Tensor  # uint8 [looks, 4, *PICTURE]
     boxes: torch.Tensor  # [looks, 4]
-    solid: torch.Tensor  # [looks] metres to which an eye can come near along x or y; 0: it can walk through
+    solid: torch.Tensor  # [looks] metres to which a body can come near along x or y; 0: it can walk through
     follows: torch.Tensor  # bool [looks + 1, looks], which look was seen to follow which; the first row is that of NONE
     moves: torch.Tensor  # [moves, 3] metres
-    begun: torch.Tensor  # [starts, rows, COLUMNS], the cards with which stories begin
+    begun: torch.Tensor  # [starts, rows, COLUMNS], those with which episodes begin
 
     def __init__(self, config: ObjectsConfig):
         super().__init__()
@@ -83,11 +94,76 @@ class Objects(nn.Module):
         self.goes = nn.Linear(hidden, 1)
 
     def empty(self, batch: int) -> torch.Tensor:
-        """No cards: [batch, rows, COLUMNS]."""
-        return torch.zeros(batch, self.config.rows, COLUMNS)
+        """No billboards: [batch, rows, COLUMNS]."""
+        return self.begun.new_zeros(batch, self.config.rows, COLUMNS)
 
-    def tell(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> Told:
-        """What comes next of cards [n, COLUMNS], seen from `pose` [n, 7] to which the actions [n, history, A], the newest
+    # -- as a part of a world -----------------------------------------------------------------------------------------
+
+    def channels(self, size: tuple[int, int]) -> Channels:
+        rows = self.config.rows
+        shows: dict[str, spaces.Space] = {"instances": spaces.Box(0, rows, size, np.uint8)}
+        shows["objects"] = spaces.Box(-np.inf, np.inf, (rows, 4), np.float32)
+        return Channels(shows, may_observe=tuple(shows))
+
+    def blank(self, batch: int) -> dict[str, torch.Tensor]:
+        return {"billboards": self.empty(batch), "billboards_before": self.empty(batch)}
+
+    def begin(self, state: State, pick: torch.Tensor, draw: Callable[[State], State]) -> State:
+        """A state in which an episode begins at the start `pick` [B], with the billboards of then, in place of the things that
+        its picture shows, which would stand there for ever; `draw` draws the picture again."""
+        billboards, shown = self.begun[pick], state["things"].to(torch.uint8)
+        return draw(state.replace(billboards=billboards, billboards_before=billboards, instances=shown))
+
+    def observed(self, seen: State, observation: Mapping, camera: Intrinsics | None) -> dict[str, torch.Tensor]:
+        """The billboards of the frame of `seen` and their pixels, where the evidence tells things apart; else what is seen is no
+        billboard, and those that there were are gone from sight."""
+        depth, batch = seen["depth"], seen.batch
+        if not {"objects", "instances"} <= set(observation):
+            none, nothing = self.empty(batch), torch.zeros_like(depth, dtype=torch.uint8)
+            return {"billboards": none, "billboards_before": none, "instances": nothing}
+        assert camera is not None
+        listed = torch.as_tensor(observation["objects"]).float().to(depth.device)
+        instances = torch.as_tensor(observation["instances"]).to(depth.device)
+        fits = listed.shape == (batch, self.config.rows, 4) and instances.ndim == 3 and len(instances) == batch
+        if not fits or instances.dtype != torch.uint8 or not torch.isfinite(listed).all():
+            raise ObservationError(
+                f"objects is finite float [B, {self.config.rows}, 4] and instances uint8 [B, h, w]; got "
+                f"{tuple(listed.shape)} and {instances.dtype} {tuple(instances.shape)}."
+            )
+        named = F.pad(
+            (listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows)
+        )  # a pixel of nobody is nobody's
+        instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
+        instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
+        cut = cut_out(seen["rgb"], instances, depth, listed[..., 1:], seen["pose"], camera)
+        billboards = self.recognised(cut, listed, seen["billboards_before"])
+        return {"billboards": billboards, "billboards_before": billboards, "instances": instances}
+
+    def moved(self, before: State, after: State, seeds: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The billboards of `after`, a step after `before`: those that were in sight have done something."""
+        billboards = self.step(before["billboards"], in_sight(before), after["pose"], after["actions"], seeds)
+        return {"billboards": billboards, "billboards_before": before["billboards"]}
+
+    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
+        """`walls` and the sides of those billboards that stop a body of half width `half_m`."""
+        return walls._replace(own=torch.cat([walls.own, self.bodies(state, half_m)], 1))
+
+    def painted(self, state: State, camera: Intrinsics | None) -> State:
+        """`state` with its billboards in its frame."""
+        assert camera is not None
+        parts = state["rgb"].float() / 255, state["depth"], state["pose"], camera
+        rgb, depth, instances = self.paint(state["billboards"], *parts)
+        things = torch.maximum(state["things"], (instances > 0).float())
+        rgb = (rgb * 255).round().to(torch.uint8)
+        return state.replace(rgb=rgb, depth=depth, things=things, instances=instances)
+
+    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+        return {"objects": lambda: state["billboards"][..., :4] * in_sight(state)[..., None]}
+
+    # -- what happens -------------------------------------------------------------------------------------------------
+
+    def foresee(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> Next:
+        """What comes next of billboards [n, COLUMNS], seen from `pose` [n, 7] to which the actions [n, history, A], the newest
         last, have led."""
         apart, heading = billboards[:, PLACE] - pose[:, :3], yaw(pose)
         c, s = heading.cos(), heading.sin()
@@ -100,38 +176,35 @@ class Objects(nn.Module):
         ]  # fmt: skip
         look, before = ((billboards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
         age, rested = (billboards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        aimed = (
-            torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]
-        )  # how straight the eye looks at it now
+        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # how straight it is looked at now
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
-        return Told(next_look, self.next_move(known), self.goes(known)[:, 0])
+        return Next(next_look, self.next_move(known), self.goes(known)[:, 0])
 
-    @torch.no_grad()
     def step(
-        self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, rng: torch.Generator
+        self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor
     ) -> torch.Tensor:
-        """The cards [B, K, COLUMNS] one step later, by chance; seen [B, K] bool: the others wait; pose [B, 7] and acts
-        [B, history, A] as for `tell`."""
-        view, row = (seen & (billboards[..., NUMBER] > 0)).nonzero(as_tuple=True)
-        if not len(view):
-            return billboards
-        some = billboards[view, row]
-        told = self.tell(some, pose[view], acts[view])
-        chance = told.look.softmax(1)
-        chance = torch.where(chance < chance.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0, chance)
-        look = torch.multinomial(chance, 1, generator=rng)[:, 0]
-        move = torch.multinomial(told.move.softmax(1), 1, generator=rng)[:, 0]
-        gone = torch.rand(len(some), generator=rng) < told.gone.sigmoid()
-        after = noted(some, some[:, PLACE] + self.moves[move], look.float())
-        after[gone] = 0.0
-        return billboards.index_put((view, row), after)
+        """The billboards [B, K, COLUMNS] one step later, by chance; seen [B, K] bool: the others wait; pose [B, 7] and acts
+        [B, history, A] as for `foresee`; seeds [B] (core/chance.py)."""
+        rows = billboards.shape[1]
+        flat = billboards.flatten(0, 1)
+        logits = self.foresee(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
+        likely = logits.look.softmax(1)
+        likely = torch.where(likely < likely.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0, likely)
+        drawn = [
+            chance.choice(seeds, part.unflatten(0, (-1, rows)), stream=stream).flatten()
+            for part, stream in ((likely, LOOKS), (logits.move.softmax(1), MOVES))
+        ]
+        gone = chance.uniform(seeds, (rows,), stream=GOES) < logits.gone.sigmoid().unflatten(0, (-1, rows))
+        after = noted(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float()).unflatten(0, (-1, rows))
+        after = torch.where(gone[..., None], 0.0, after)
+        return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
 
     def paint(
         self, billboards: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Frames with cards [B, K, COLUMNS] in them: see space/cards.painted."""
+        """Frames with billboards [B, K, COLUMNS] in them: see space/billboards.painted."""
         look = billboards[..., LOOK].long()
         there = (billboards[..., NUMBER] > 0) & (look != NONE)
         look = look.clamp_min(0)
@@ -140,81 +213,132 @@ class Objects(nn.Module):
         pictures = (self.pictures[look].float() / 255 * lit).clamp_max(1)
         return painted(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), there, pose, camera)
 
-    def bodies(self, billboards: torch.Tensor, position: torch.Tensor, half_m: float) -> torch.Tensor:
-        """The sides [S, 4] of those cards [K, COLUMNS] that stop a body of half width `half_m` with its eye at `eye` [3], as
-        walls (space/floorplan.py)."""
-        known = (billboards[:, NUMBER] > 0) & (billboards[:, LOOK] != NONE)
-        reach = self.solid[billboards[:, LOOK].long().clamp_min(0)]
-        apart = (billboards[:, PLACE] - position).abs()
-        level = apart[:, 2] < STOREY_M
-        stops = known & level & (reach > half_m) & (apart[:, :2].amax(1) >= reach - 0.02)  # who stands in one may leave
-        (x, y), half = billboards[stops][:, PLACE][:, :2].unbind(1), reach[stops] - half_m
+    def bodies(self, state: State, half_m: float) -> torch.Tensor:
+        """The sides [B, 4 K, 4] of those billboards that stop a body of half width `half_m` at the pose of `state`, as walls
+        (space/floorplan.py); those of the others are NOWHERE."""
+        billboards, position = state["billboards"], state["pose"][:, None, :3]
+        known = (billboards[..., NUMBER] > 0) & (billboards[..., LOOK] != NONE)
+        reach = self.solid[billboards[..., LOOK].long().clamp_min(0)]
+        apart = (billboards[..., PLACE] - position).abs()
+        level = apart[..., 2] < STOREY_M
+        stops = (
+            known & level & (reach > half_m) & (apart[..., :2].amax(-1) >= reach - 0.02)
+        )  # who stands in one may leave
+        (x, y), half = billboards[..., PLACE][..., :2].unbind(-1), reach - half_m
         left, right, low, high = x - half, x + half, y - half, y + half
         sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
-        return torch.cat([torch.stack(side, 1) for side in sides])
+        walls = torch.stack([torch.stack(side, -1) for side in sides], 1)
+        return torch.where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
 
-    def recognised(self, cut: Cutout, told: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-        """The cards [B, K, COLUMNS] that evidence shows, each in its row of told [B, K, 4] = number and place; of those `before`
-        [B, K, COLUMNS] that it does not tell of, as many as there is room for wait where they were."""
-        batch, rows = told.shape[:2]
+    def recognised(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+        """The billboards [B, K, COLUMNS] that evidence shows, each in its row of `listed` [B, K, 4] = number and place; of those
+        `before` [B, K, COLUMNS] that it does not list, as many as there is room for wait where they were."""
+        batch, rows = listed.shape[:2]
         pictures = self.pictures.float() / 255
-        off = torch.full((batch, rows, self.config.looks), torch.inf)  # what is not seen is like nothing
+        off = before.new_full((batch, rows, self.config.looks), torch.inf)  # what is not seen is like nothing
         off[cut.view, cut.row] = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes))
-        bright, whole = torch.zeros(batch, rows), torch.zeros(batch, rows, dtype=torch.bool)
+        bright, whole = before.new_zeros(batch, rows), torch.zeros(batch, rows, dtype=torch.bool, device=before.device)
         bright[cut.view, cut.row], whole[cut.view, cut.row] = brightness(cut.picture), cut.whole
         usual = brightness(pictures).clamp_min(1e-3)
-        billboards = self.empty(batch)
-        for story in range(batch):
-            kept = {float(billboard[NUMBER]): billboard for billboard in before[story] if billboard[NUMBER] > 0}
-            for row in (told[story, :, 0] > 0).nonzero()[:, 0].tolist():
-                number, place, away = float(told[story, row, 0]), told[story, row, 1:], off[story, row]
-                old = kept.pop(number, None)
-                was = NONE if old is None else int(old[LOOK])
-                look = likest(away, was) if whole[story, row] else NONE
-                if look == NONE:  # what is seen in part, or is like none, looks as it did, or else as it may
-                    look = was if was != NONE or bool(away.isinf().all()) else int(away.argmin())
-                billboard = (
-                    fresh(number, place, look)
-                    if old is None
-                    else noted(old[None], place[None], torch.tensor([float(look)]))[0]
-                )
-                if look != NONE and (old is None or whole[story, row]):
-                    billboard[LIGHT] = (bright[story, row] / usual[look]).clamp(0.25, 4)
-                billboards[story, row] = billboard
-            free = (billboards[story, :, NUMBER] == 0).nonzero()[:, 0].tolist()
-            for row, billboard in zip(free, kept.values()):
-                billboards[story, row] = billboard
-        return billboards
+        number, shown = listed[..., 0], listed[..., 0] > 0
+        same = (number[:, :, None] == before[:, None, :, NUMBER]) & shown[:, :, None]  # [B, K of now, K of before]
+        known = same.any(2)
+        old = before.gather(1, same.float().argmax(2)[..., None].expand(-1, -1, COLUMNS))
+        was = torch.where(known, old[..., LOOK].long(), NONE)
+        look = torch.where(whole, likest(off, was), NONE)
+        guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
+        look = torch.where(
+            look == NONE, guess, look
+        )  # seen in part, or like none, it looks as it did, or else as it may
+        now = torch.where(
+            known[..., None], noted(old, listed[..., 1:], look.float()), fresh(number, listed[..., 1:], look)
+        )
+        light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
+        lit = (look != NONE) & (~known | whole)
+        now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)
+        rest = (before[..., NUMBER] > 0) & ~same.any(1)
+        place, turn = (~shown).cumsum(1), rest.cumsum(1)
+        fills = (~shown & (place <= turn[:, -1:]))[:, :, None] & rest[:, None] & (place[:, :, None] == turn[:, None])
+        waiting = before.gather(1, fills.float().argmax(2)[..., None].expand(-1, -1, COLUMNS))
+        waiting = torch.where(fills.any(2)[..., None], waiting, 0.0)
+        return torch.where(shown[..., None], now, waiting)
 
 
-def likest(off: torch.Tensor, was: int) -> int:
-    """Of looks `off` [looks] away the one that a thing has which looked like `was`: that one, unless another is clearly nearer;
-    NONE where all are far."""
-    best = int(off.argmin())
-    if off[best] > ALIKE:
-        return NONE
-    return was if was != NONE and off[was] < off[best] + STICKS else best
+@final
+class NoObjects:
+    """Of a world whose things, if it has any, are drawn as the rest."""
+
+    kind, config = "none", None
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to(self, device) -> NoObjects:
+        return self
+
+    def channels(self, size: tuple[int, int]) -> Channels:
+        return Channels()
+
+    def blank(self, batch: int) -> dict[str, torch.Tensor]:
+        return {}
+
+    def begin(self, state: State, pick: torch.Tensor, draw: Callable[[State], State]) -> State:
+        return state
+
+    def observed(self, seen: State, observation: Mapping, camera: Intrinsics | None) -> dict[str, torch.Tensor]:
+        return {}
+
+    def moved(self, before: State, after: State, seeds: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {}
+
+    def painted(self, state: State, camera: Intrinsics | None) -> State:
+        return state
+
+    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
+        return walls
+
+    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+        return {}
 
 
-def fresh(number: float, place: torch.Tensor, look: torch.Tensor | float) -> torch.Tensor:
-    """A card [COLUMNS] that is seen for the first time, at place [3]."""
-    billboard = torch.zeros(COLUMNS)
-    billboard[NUMBER], billboard[PLACE], billboard[LOOK], billboard[BEFORE] = number, place, look, NONE
-    billboard[AGE] = billboard[RESTED] = AGES
-    billboard[LIGHT] = 1.0
-    return billboard
+def in_sight(state: State) -> torch.Tensor:
+    """Which of the billboards [B, K] the last frame shows."""
+    rows = torch.arange(1, state["billboards"].shape[1] + 1, device=state["instances"].device)
+    return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
+
+
+def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
+    """Of looks `off` [..., looks] away the one [...] that a thing has which looked like `was` [...]: that one, unless another is
+    clearly nearer; NONE where all are far."""
+    least, best = off.min(-1)
+    before = torch.as_tensor(was, device=off.device)
+    stays = (before != NONE) & (off.gather(-1, before.clamp_min(0)[..., None])[..., 0] < least + STICKS)
+    return torch.where(least > ALIKE, NONE, torch.where(stays, before, best))
+
+
+def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
+    """Billboards [..., COLUMNS] that are seen for the first time: number and look [...], place [..., 3]."""
+    billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
+    billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
+    billboards[..., BEFORE], billboards[..., AGE], billboards[..., RESTED], billboards[..., LIGHT] = (
+        NONE,
+        AGES,
+        AGES,
+        1.0,
+    )
+    return billboards
 
 
 def noted(billboards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
-    """Cards [n, COLUMNS] one step later, at place [n, 3] with look [n]: their ages and last moves go on."""
+    """Billboards [..., COLUMNS] one step later, at place [..., 3] with look [...]: their ages and last moves go on."""
     after = billboards.clone()
-    moved = place - billboards[:, PLACE]
-    went, other = moved[:, :2].norm(dim=1) > 1e-3, look != billboards[:, LOOK]
-    after[:, PLACE], after[:, LOOK] = place, look
-    after[:, BEFORE] = torch.where(other, billboards[:, LOOK], billboards[:, BEFORE])
-    after[:, AGE] = torch.where(other, 0.0, (billboards[:, AGE] + 1).clamp_max(AGES))
-    after[:, GOING] = torch.where(went[:, None], moved[:, :2], billboards[:, GOING])
-    after[:, RESTED] = torch.where(went, 0.0, (billboards[:, RESTED] + 1).clamp_max(AGES))
+    moved = place - billboards[..., PLACE]
+    went, other = moved[..., :2].norm(dim=-1) > 1e-3, look != billboards[..., LOOK]
+    after[..., PLACE], after[..., LOOK] = place, look
+    after[..., BEFORE] = torch.where(other, billboards[..., LOOK], billboards[..., BEFORE])
+    after[..., AGE] = torch.where(other, 0.0, (billboards[..., AGE] + 1).clamp_max(AGES))
+    after[..., GOING] = torch.where(went[..., None], moved[..., :2], billboards[..., GOING])
+    after[..., RESTED] = torch.where(went, 0.0, (billboards[..., RESTED] + 1).clamp_max(AGES))
     return after
 
 

@@ -2,22 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, final
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from gymnasium import spaces
 from torch import nn
 
+from ..core import chance
 from ..core.errors import ObservationError
+from ..core.spec import DONE, REWARD
+from ..core.state import State
+from .parts import CHANGES, Channels, Evidence
+
+VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
+
+
+@dataclass(frozen=True)
+class ConstantConfig:
+    """The reward of every step, and what the last one pays beside it."""
+
+    usual: float = 0.0
+    ending: float = 0.0
+
+
+@final
+class Constant:
+    """The same reward for every step, and another for the last: where an episode ends is the body's to say."""
+
+    kind, begins = "constant", ()
+
+    def __init__(self, config: ConstantConfig):
+        self.config = config
+
+    def to(self, device) -> Constant:
+        return self
+
+    def channels(self) -> Channels:
+        return Channels({"reward": REWARD, "done": DONE})
+
+    def blank(self, batch: int, device) -> dict[str, torch.Tensor]:
+        return _going(batch, device)
+
+    def observed(self, prior: State, evidence: Evidence, observation: Mapping) -> dict[str, torch.Tensor]:
+        return _going(evidence.batch, evidence.device)
+
+    def placed(self, before: State, ends: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Reward and end of a step that `ends` [B] or does not."""
+        return {"done": before["done"] | ends, "reward": self.config.usual + self.config.ending * ends.float()}
+
+    def followed(
+        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
+    ) -> State:
+        return after
+
+    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+        return {}
 
 
 @dataclass(frozen=True)
 class OutcomeConfig:
-    """actions: numbers in an action as it is told to networks; rewards: the values between which a reward is told,
-    ascending; vitals: names of the numbers that belong to the player ("health", "lives"); changes: for each of them the
-    changes that a step may bring, ascending; spans: the usual size of each; side: larger frames are shrunk to it."""
+    """actions: numbers in an action; rewards: the values between which a reward is told apart, ascending; vitals: names of the
+    numbers that belong to the player ("health", "lives"); changes: for each of them the changes that a step may bring,
+    ascending; spans: the usual size of each; begins: their values where an episode begins; side: larger frames are shrunk to
+    it."""
 
     actions: int
     rewards: tuple[float, ...]
@@ -26,6 +77,7 @@ class OutcomeConfig:
     spans: tuple[float, ...] = ()
     hidden: int = 64
     side: int = 64
+    begins: tuple[float, ...] = ()
 
 
 class Happened(NamedTuple):
@@ -46,13 +98,16 @@ class Logits(NamedTuple):
     known: torch.Tensor
 
 
+@final
 class Outcome(nn.Module):
     """A small convolutional network over the frame before and the frame after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values that the recording knows (two-hot between them, as in Dreamer 3):
-    a reward is the expectation, a vital changes by the likeliest, so that a count of lives stays whole. Whether it is over
-    is told from all that and from the vitals after the step: most games end when one of them is used up.
+    a reward is the expectation; a vital changes by one of them, drawn by chance, so that a count of lives stays whole. Whether
+    it is over is judged from all that and from the vitals after the step: most games end when one of them is used up.
     """
+
+    kind = "frames"
 
     rewards: torch.Tensor
 
@@ -70,9 +125,51 @@ class Outcome(nn.Module):
         self.changed = nn.ModuleList(nn.Linear(inner, len(levels)) for levels in config.changes)
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
+    @property
+    def begins(self) -> tuple[float, ...]:
+        """The vitals with which an episode begins."""
+        return self.config.begins or (0.0,) * len(self.config.vitals)
+
     def begin(self, batch: int) -> torch.Tensor:
-        """The hidden state in which a story begins: [batch, hidden]."""
-        return torch.zeros(batch, self.config.hidden)
+        """The hidden state in which an episode begins: [batch, hidden]."""
+        return self.rewards.new_zeros(batch, self.config.hidden)
+
+    # -- as a part of a world -----------------------------------------------------------------------------------------
+
+    def channels(self) -> Channels:
+        vitals = self.config.vitals
+        return Channels({"reward": REWARD, "done": DONE, **dict.fromkeys(vitals, VITAL)}, may_observe=vitals)
+
+    def blank(self, batch: int, device) -> dict[str, torch.Tensor]:
+        vitals = torch.tensor(self.begins, device=device).expand(batch, -1)
+        return {**_going(batch, device), "vitals": vitals, "hidden": self.begin(batch)}
+
+    def observed(self, prior: State, evidence: Evidence, observation: Mapping) -> dict[str, torch.Tensor]:
+        """An episode that goes on, with the vitals [B, V] that evidence gives, and those of `prior` where it is silent."""
+        vitals = evidence.seen.get("vitals", prior["vitals"]).clone()
+        for column, name in enumerate(self.config.vitals):
+            if name in observation:
+                given = torch.as_tensor(observation[name]).float()
+                if given.shape != (len(vitals),) or not torch.isfinite(given).all():
+                    raise ObservationError(f"{name} is finite float [B]; got {tuple(given.shape)}.")
+                vitals[:, column] = given
+        return {**_going(evidence.batch, evidence.device), "vitals": vitals}
+
+    def placed(self, before: State, ends: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {}
+
+    def followed(
+        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
+    ) -> State:
+        """`after`, the step from `before`, with the reward, end and vitals that are read off the two frames."""
+        found = self(frame(before), frame(after), action, before["vitals"], before["hidden"], seeds)
+        return after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=found.done > 0)
+
+    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+        names = enumerate(self.config.vitals)
+        return {name: lambda column=column: state["vitals"][:, column].clone() for column, name in names}
+
+    # -- the network --------------------------------------------------------------------------------------------------
 
     def logits(
         self,
@@ -106,7 +203,6 @@ class Outcome(nn.Module):
         used_up = 4.0 * (vitals <= 0)  # loud, so that it is learned from few ends
         return self.ending(torch.cat([known, vitals / spans, used_up], 1))[:, 0]
 
-    @torch.inference_mode()
     def forward(
         self,
         before: torch.Tensor,
@@ -114,26 +210,24 @@ class Outcome(nn.Module):
         action: torch.Tensor,
         vitals: torch.Tensor,
         hidden: torch.Tensor,
-        rng: torch.Generator | None = None,
+        seeds: torch.Tensor | None = None,
     ) -> Happened:
-        """The outcome of a step; arguments as for `logits`, on any device: the network's own is used, the CPU given back.
-        With `rng` (of the CPU) each vital changes by chance, as likely as told; without, by the likeliest."""
-        there = self.rewards.device
-        told = self.logits(*(part.to(there) for part in (before, after, action, vitals, hidden)))
-        reward = (told.reward.float().softmax(1) * self.rewards).sum(1)
-        levels = (torch.tensor(values, device=there) for values in self.config.changes)
-        moved = [values[_picked(logits, rng)] for logits, values in zip(told.changes, levels)]
-        left = vitals.float() + torch.stack(moved, 1).cpu() if moved else vitals
-        done = self.ends(told.known, left.to(there))
-        return Happened(reward.cpu(), done.float().cpu(), left, told.hidden.float().cpu())
+        """The outcome of a step; arguments as for `logits`. With `seeds` [B] (core/chance.py) each vital changes by chance, as
+        likely as it should; without, by the likeliest."""
+        found = self.logits(before, after, action, vitals, hidden)
+        reward = (found.reward.float().softmax(1) * self.rewards).sum(1)
+        moved = []
+        for column, (logits, values) in enumerate(zip(found.changes, self.config.changes)):
+            levels, chances = torch.tensor(values, device=logits.device), logits.float().softmax(1)
+            picked = logits.argmax(1) if seeds is None else chance.choice(seeds, chances, stream=CHANGES + column)
+            moved.append(levels[picked])
+        left = vitals.float() + torch.stack(moved, 1) if moved else vitals
+        return Happened(reward, self.ends(found.known, left).float(), left, found.hidden.float())
 
 
-def _picked(logits: torch.Tensor, rng: torch.Generator | None) -> torch.Tensor:
-    """One of the choices [B, L] for each: [B]."""
-    if rng is None:
-        return logits.argmax(1)
-    chances = logits.float().softmax(1).cpu()
-    return torch.multinomial(chances, 1, generator=rng)[:, 0].to(logits.device)
+def _going(batch: int, device) -> dict[str, torch.Tensor]:
+    """An episode that is not over, and of which nothing was paid yet."""
+    return {"reward": torch.zeros(batch, device=device), "done": torch.zeros(batch, dtype=torch.bool, device=device)}
 
 
 def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:
@@ -143,16 +237,3 @@ def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:
     size = [max(8, 2 * round(length * share / 2)) for length in (height, width)]
     picture = frame.float() / 127.5 - 1
     return picture if size == [height, width] else F.interpolate(picture, size, mode="area")
-
-
-def told_vitals(outcome: Outcome, observation: Mapping[str, torch.Tensor], before: torch.Tensor) -> torch.Tensor:
-    """The vitals [B, V] that evidence tells, and those of `before` [B, V] where it is silent; ObservationError for what is
-    not one finite number a story."""
-    vitals = before.clone()
-    for column, name in enumerate(outcome.config.vitals):
-        if name in observation:
-            told = torch.as_tensor(observation[name]).float()
-            if told.shape != (len(before),) or not torch.isfinite(told).all():
-                raise ObservationError(f"{name} is finite float [B]; got {tuple(told.shape)}.")
-            vitals[:, column] = told
-    return vitals

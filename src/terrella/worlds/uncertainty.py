@@ -1,4 +1,4 @@
-"""Uncertainty: how wrong a world expects the frame that it has just drawn to be, learned from its own dreams (learn/doubt.py).
+"""Uncertainty: how wrong a world expects the frame that it has just drawn to be, learned from its own dreams.
 
 One small network beside the generator, no ensemble: it reads what memory knew, what was drawn, and how far the dream has
 gone since it last saw anything, and answers with the mean absolute error that such frames had.
@@ -6,8 +6,9 @@ gone since it last saw anything, and answers with the mean absolute error that s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 import torch
@@ -15,11 +16,15 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from ..core.spec import Spec
-from ..space.keyframes import Glimpse, merge
+from ..core.state import State
+from ..space.camera import yaw
+from ..space.keyframes import merge
+from .generator import Conditioning
+from .parts import Channels
 
-GONE = ("steps", "metres", "radians", "lone", "strange")  # of a story: steps since a picture was seen, the way and the
-# turns since a pose was, whether it began with a lone picture of elsewhere, and how strange that was (0..1)
+# Of an episode: steps since a picture was seen, the way and the turns since a pose was, whether it began with a lone picture
+# of elsewhere, and how strange that was (0..1).
+GONE = ("steps", "metres", "radians", "lone", "strange")
 SITUATION = (
     len(GONE) - 1 + 2
 )  # these but the last, how far the next recorded keyframe is, and how many of its own it holds
@@ -36,9 +41,11 @@ class UncertaintyConfig:
     channels: tuple[int, int] = (24, 40)
 
 
+@final
 class Uncertainty(nn.Module):
     """The network, and a monotone map (isotonic regression on other dreams) from its answer to the error that was found."""
 
+    kind = "network"
     found: torch.Tensor  # KNOTS answers of the network, ascending
     meant: torch.Tensor  # the mean error at each
     sure: torch.Tensor  # the error usual where memory knows the place
@@ -52,28 +59,32 @@ class Uncertainty(nn.Module):
         self.situate = nn.Sequential(nn.Linear(config.situation, 32), nn.SiLU(), nn.Linear(32, 2 * second))
         self.wide = nn.Conv2d(first, second, 3, 1, 1)
         self.wider = nn.Conv2d(second, second, 3, 1, 2, 2)
-        self.leave = nn.Conv2d(second, 1, 1)
-        self.leave.bias = nn.Parameter(torch.tensor([-3.0]))
+        self.output = nn.Conv2d(second, 1, 1)
+        self.output.bias = nn.Parameter(torch.tensor([-3.0]))
         line = torch.linspace(0, 1, KNOTS)
         for name, value in (("found", line), ("meant", line)):
             self.register_buffer(name, value.clone())
         self.register_buffer("sure", torch.tensor(0.02))
         self.register_buffer("invents", torch.tensor(0.08))
 
+    def channels(self) -> Channels:
+        unit = "expected mean absolute error of the picture, intensity 0..1"
+        return Channels({"uncertainty": spaces.Box(0, 1, (), np.float32)}, {"uncertainty": unit})
+
     def forward(self, maps: torch.Tensor, situation: torch.Tensor) -> torch.Tensor:
         """maps [B, CLUES, h, w] of `clues`; situation [B, S] -> expected error of each cell, 0..1: [B, h/2, w/2]."""
         gain, shift = self.situate(situation)[:, :, None, None].chunk(2, 1)
         x = F.silu(self.wide(F.silu(self.enter(maps))) * (1 + gain) + shift)
         x = F.silu(x + self.wider(x))
-        return F.softplus(self.leave(x)[:, 0]) + 1e-4
+        return F.softplus(self.output(x)[:, 0]) + 1e-4
 
     def expected(
-        self, glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor, situation: torch.Tensor, strange: torch.Tensor
+        self, conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor, strange: torch.Tensor
     ) -> torch.Tensor:
-        """The calibrated mean absolute error expected of the frames `clean` [B, 4, H, W] that the generator drew from
-        `glimpse` and `last` (see Generator), in units of intensity from 0 to 1: [B]. Of a story that began with a picture
-        unlike the recordings (`strange` [B], 0..1) no less is expected than of invention."""
-        learned = self.calibrated(self(clues(glimpse, last, clean), situation).mean((1, 2)))
+        """The calibrated mean absolute error expected of the frames `clean` [B, 4, H, W] that were drawn from `conditioning`, in
+        units of intensity from 0 to 1: [B]. Of an episode that began with a picture unlike the recordings (`strange` [B], 0..1)
+        no less is expected than of invention."""
+        learned = self.calibrated(self(clues(conditioning, clean), situation).mean((1, 2)))
         return torch.maximum(learned, self.invents * strange)
 
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
@@ -86,8 +97,61 @@ class Uncertainty(nn.Module):
         return (inside * below.clamp_max(1) * above.clamp_min(1)).clamp(0, 1)
 
 
-def clues(glimpse: Glimpse, last: torch.Tensor, clean: torch.Tensor) -> torch.Tensor:
+@final
+class NoUncertainty:
+    """Of a world that does not say how wrong it expects to be."""
+
+    kind, config = "none", None
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to(self, device) -> NoUncertainty:
+        return self
+
+    def channels(self) -> Channels:
+        return Channels()
+
+    def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
+        return torch.zeros_like(strange)
+
+
+@final
+class Asked:
+    """In the place of an uncertainty: notes what one would be asked, for those who teach it."""
+
+    kind, config = "asked", None
+
+    def __init__(self, note: Callable[[Conditioning, torch.Tensor, torch.Tensor], None]):
+        self.note = note
+
+    def to(self, device) -> Asked:
+        return self
+
+    def channels(self) -> Channels:
+        return Channels()
+
+    def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
+        self.note(conditioning, clean, situation)
+        return torch.zeros_like(strange)
+
+
+def gone_on(before: State, after: State, led: bool) -> torch.Tensor:
+    """`gone` [B, len(GONE)] of `after`, one step further from its evidence than `before`; `led`: its pose was given."""
+    gone = before["gone"]
+    steps, way = gone[:, :1] + 1, gone[:, 1:3]
+    if led:
+        way = torch.zeros_like(way)
+    elif "pose" in after:
+        turn = yaw(after["pose"]) - yaw(before["pose"])
+        moved = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
+        way = way + torch.stack([moved, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
+    return torch.cat([steps, way, gone[:, 3:]], 1)
+
+
+def clues(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     """What a drawn frame and its sources look like, in cells of CELLS pixels: [B, CLUES, H / CELLS, W / CELLS]."""
+    glimpse, last = conditioning.glimpse, conditioning.last
     drawn, merged = clean[:, :3].clamp(-1, 1), merge(glimpse) * 2 - 1
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)
     second = glimpse.rgb[:, min(1, glimpse.rgb.shape[1] - 1)]
@@ -109,17 +173,7 @@ def uncertainty_weights(uncertainty: Uncertainty) -> dict[str, torch.Tensor]:
 
 
 def uncertainty_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Uncertainty:
-    """The doubt that `asdict(doubt.config)` and `uncertainty_weights` describe."""
+    """What `asdict(uncertainty.config)` and `uncertainty_weights` describe."""
     uncertainty = Uncertainty(UncertaintyConfig(config["situation"], tuple(config["channels"])))
     uncertainty.load_state_dict({name: value.float() for name, value in weights.items()})
     return uncertainty.eval().requires_grad_(False)
-
-
-def uncertain_spec(spec: Spec, doubts: bool) -> Spec:
-    """The spec of a world with the channel `uncertainty`, or without."""
-    channels = {name: space for name, space in spec.channels.items() if name != "uncertainty"}
-    units = {name: unit for name, unit in spec.units.items() if name != "uncertainty"}
-    if doubts:
-        channels["uncertainty"] = spaces.Box(0, 1, (), np.float32)
-        units["uncertainty"] = "expected mean absolute error of the picture, intensity 0..1"
-    return replace(spec, channels=channels, units=units)

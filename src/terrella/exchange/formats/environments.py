@@ -72,8 +72,8 @@ def _rate(env: gymnasium.Env) -> float | None:
         dt_s = getattr(env.unwrapped, name, None)
         if isinstance(dt_s, int | float) and dt_s > 0:
             return 1 / dt_s
-    told = env.metadata.get("render_fps")
-    return float(told) if isinstance(told, int | float) and told > 0 else None
+    stated = env.metadata.get("render_fps")
+    return float(stated) if isinstance(stated, int | float) and stated > 0 else None
 
 
 def _rollout(env: gymnasium.Env, draw: np.ndarray, max_steps: int) -> dict[str, list]:

@@ -45,7 +45,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     Values are decoded when they are looked at; only where they lie is kept in memory (24 bytes a message). Time is the
     log time, in seconds from the first message of the file; `fps` is not asked for. A file that was cut is read as far as
     it is whole, and of a damaged one all but the damaged chunks; of video, what cannot be decoded without them is left
-    out, too. What is not understood, cut or damaged is told in `notes`.
+    out, too. What is not understood, cut or damaged is named in `notes`.
 
     DatasetError where nothing there is MCAP, or nothing in it is understood.
     """
@@ -120,12 +120,12 @@ class _Group:
 
     def fields(self, i: int) -> dict[str, Any]:
         data = self.index.data(int(self.channel[i]), int(self.number[i]))
-        with _telling(self, i):
+        with _naming(self, i):
             return self.unpack(data)
 
 
 @contextmanager
-def _telling(group: _Group, i: int) -> Iterator[None]:
+def _naming(group: _Group, i: int) -> Iterator[None]:
     """Adds to a DatasetError which message it is about."""
     try:
         yield
@@ -251,14 +251,14 @@ class _File:
 
         def reading(i: int) -> messages.Reading:
             fields = group.fields(i)
-            with _telling(group, i):
+            with _naming(group, i):
                 return messages.decode(name, fields)
 
         sensor = self._declared_for(group) or _sensed(self._sample(group, reading))
 
         def value(i: int) -> np.ndarray:
             found = reading(i)
-            with _telling(group, i):
+            with _naming(group, i):
                 return messages.fit(found, sensor)
 
         return [(group.topic, _Stream(sensor, group.log_ns, value))]
@@ -302,7 +302,7 @@ class _File:
         chosen = sensor
 
         def value(i: int) -> np.ndarray:
-            with _telling(group, int(good[i])):
+            with _naming(group, int(good[i])):
                 return messages.fit(messages.Reading("image", decoder(i)), chosen)
 
         return [(group.topic, _Stream(sensor, group.log_ns[good], value))]
@@ -359,7 +359,7 @@ class _File:
         for topic, calibration in self._calibrations:
             name = _camera_of(topic, str(calibration["frame_id"]), cameras, self.sensors)
             if name is None:
-                self._note(topic, "no one camera can be told that this calibration is of")
+                self._note(topic, "it is not clear which camera this calibration is of")
                 continue
             stream = self.streams[name]
             if "calibration" not in stream.sensor.facts:
@@ -419,9 +419,9 @@ def _camera_of(topic: str, frame: str, cameras: Mapping[str, str], sensors: Mapp
     parent = topic.rpartition("/")[0]
     if parent in cameras:
         return cameras[parent]
-    beside = [name for other, name in cameras.items() if other.rpartition("/")[0] == parent]
+    near = [name for other, name in cameras.items() if other.rpartition("/")[0] == parent]
     same = [name for name in cameras.values() if frame and sensors[name].frame == frame]
-    for found in (beside, same, list(cameras.values())):
+    for found in (near, same, list(cameras.values())):
         images = [name for name in found if sensors[name].kind == "image"]
         if len(images or found) == 1:
             return (images or found)[0]

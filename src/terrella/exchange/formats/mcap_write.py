@@ -58,7 +58,7 @@ def _write_take(source: Source, take: Take, path: Path, image: str, progress) ->
     zero_ns = take.start_ns if take.start_ns is not None else max(0, -first)
     if not 0 <= zero_ns + first < 2**63:
         raise DatasetError(
-            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot tell; mend its start."
+            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot hold; mend its start."
         )
     whose = np.concatenate([np.full(len(time_ns), i) for i, time_ns in enumerate(times)] or [np.zeros(0, int)])
     which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
@@ -109,8 +109,8 @@ class Recording:
         about = {"name": source.name, "fps": source.fps, "robot": source.robot, "notes": list(source.notes)}
         self._add_metadata(SOURCE, {**about, "facts": dict(source.facts)})
         self._add_metadata(SENSORS, {name: {**_plain(sensors[name]), "topic": topic[name]} for name in sensors})
-        told = {"start_ns": take.start_ns, "task": take.task}
-        self._add_metadata(TAKE, {**told, "facts": dict(take.facts), "zero_ns": zero_ns})
+        known = {"start_ns": take.start_ns, "task": take.task}
+        self._add_metadata(TAKE, {**known, "facts": dict(take.facts), "zero_ns": zero_ns})
         self._schemas: dict[str, int] = {}
         self._channels = {name: self._channel(topic[name], self._encoders[name].schema) for name in sensors}
         self._calibrations = {

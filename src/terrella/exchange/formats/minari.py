@@ -38,17 +38,8 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     fps: rows a second; Minari keeps none, so without it (and where the dataset is not ours) rows.FPS_UNKNOWN is taken.
     DatasetError where files are missing or damaged, or spaces are of unknown types.
     """
-    data = Path(path)
-    data = data / "data" if (data / "data").is_dir() else data
     rows.check_fps(fps, str(path))
-    if not (data / "metadata.json").is_file():
-        raise DatasetError(
-            f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name a dataset's folder."
-        )
-    meta = rows.read_json(data / "metadata.json")
-    count = meta.get("total_episodes")
-    if not isinstance(count, int) or not 0 < count <= 1 << 32:
-        raise DatasetError(f"{data} claims {count} episodes; there is nothing to read.")
+    data, meta, count = _opened(Path(path))
     given = {"observations": _space(meta, "observation_space", data), "actions": _space(meta, "action_space", data)}
     described = rows.sensors_described(meta["terrella"], str(data)) if isinstance(meta.get("terrella"), dict) else {}
     leaves: dict[tuple, spaces.Leaf] = {}
@@ -87,6 +78,20 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         notes=notes,
         facts=facts,
     )
+
+
+def _opened(path: Path) -> tuple[Path, dict, int]:
+    """The folder that has the data, its metadata, and how many episodes it claims."""
+    data = path / "data" if (path / "data").is_dir() else path
+    if not (data / "metadata.json").is_file():
+        raise DatasetError(
+            f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name a dataset's folder."
+        )
+    meta = rows.read_json(data / "metadata.json")
+    count = meta.get("total_episodes")
+    if not isinstance(count, int) or not 0 < count <= 1 << 32:
+        raise DatasetError(f"{data} claims {count} episodes; there is nothing to read.")
+    return data, meta, count
 
 
 def _space(meta: dict, key: str, data: Path) -> dict:
@@ -283,8 +288,8 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
         rows_here = steps + (place[0] == "observations")
         if name is None:
             texts = take.facts.get("texts")
-            told = texts.get("/".join(map(str, place))) if isinstance(texts, Mapping) else None
-            texts = told if isinstance(told, list) and len(told) == rows_here else [take.task] * rows_here
+            given = texts.get("/".join(map(str, place))) if isinstance(texts, Mapping) else None
+            texts = given if isinstance(given, list) and len(given) == rows_here else [take.task] * rows_here
             group.create_dataset(keys, data=texts, dtype=hdf5.TEXT)
         else:
             _write_rows(group, keys, source.sensors[name], take.readings[name], rows_here, where)

@@ -102,8 +102,10 @@ class TableEpisode:
                 kind = field.type.value_type if pa.types.is_fixed_size_list(field.type) else field.type
                 if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
                     size = (field.type.list_size,) if pa.types.is_fixed_size_list(field.type) else ()
-                    told = (field.metadata or {}).get(b"shape")  # "2,3", or nothing where a row is one number
-                    shape = size if told is None else tuple(int(part) for part in told.split(b",") if part.isdigit())
+                    stated = (field.metadata or {}).get(b"shape")  # "2,3", or nothing where a row is one number
+                    shape = (
+                        size if stated is None else tuple(int(part) for part in stated.split(b",") if part.isdigit())
+                    )
                     found[place] = (shape if math.prod(shape) == math.prod(size) else size, kind.to_pandas_dtype())
         return {place: (shape, np.dtype(dtype)) for place, (shape, dtype) in found.items()}
 

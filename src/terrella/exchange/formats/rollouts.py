@@ -14,7 +14,7 @@ from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import rows
 
-ABOUT = "terrella.json"  # names, units and frames of what we wrote, beside the episodes
+ABOUT = "terrella.json"  # names, units and frames of what we wrote, in the folder of the episodes
 TIME, TASK, START = "time_s", "task", "start_ns"
 _SPELLINGS = {  # the first is what `write` writes
     rows.OBSERVATION: ("observations", "observation", "obs"),

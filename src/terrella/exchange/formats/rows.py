@@ -242,7 +242,7 @@ def rate_of(given: float | None, known: object, what: str) -> tuple[float, tuple
     )
 
 
-# -- descriptions kept beside the arrays, so that what we wrote comes back with its names, units and frames
+# -- descriptions kept with the arrays, so that what we wrote comes back with its names, units and frames
 
 
 def describe(source: Source) -> dict:

@@ -77,13 +77,13 @@ class _Video:
             self.rate_hz = float(stream.average_rate) if stream.average_rate else None
             shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
         self._ticks = sorted({pts for pts, _ in shown if pts is not None})
-        self._told = len(self._ticks) == len(shown)  # whether each frame has a time of its own
-        self._keys = [i for i, pts in enumerate(self._ticks) if (pts, True) in set(shown)] if self._told else []
+        self._timed = len(self._ticks) == len(shown)  # whether each frame has a time of its own
+        self._keys = [i for i, pts in enumerate(self._ticks) if (pts, True) in set(shown)] if self._timed else []
         first = next(self._decoded(None), None)
         if first is None:
             raise DatasetError(f"the video {path} has no frames; remove it, or restore it from a copy.")
         self.shape = self._upright(first).shape
-        times = [float(pts * tick) for pts in self._ticks] if self._told else self._times_by_decoding()
+        times = [float(pts * tick) for pts in self._ticks] if self._timed else self._times_by_decoding()
         self.time_s = np.array(times, np.float64)
 
     def frame(self, i: int) -> np.ndarray:
@@ -114,7 +114,7 @@ class _Video:
     def _advance(self, i: int) -> av.VideoFrame | None:
         """Decodes up to frame i; None where it does not come."""
         for frame in self._frames or ():
-            number = self._number(frame) if self._told else self._following
+            number = self._number(frame) if self._timed else self._following
             if number is not None:
                 self._following = number + 1
                 if number >= i:
@@ -139,9 +139,9 @@ class _Video:
 
     def _times_by_decoding(self) -> list[float]:
         times = [frame.time for frame in self._decoded(None)]
-        told = [time for time in times if time is not None]
-        if len(told) == len(times) and all(a < b for a, b in zip(told, told[1:])):
-            return told
+        known = [time for time in times if time is not None]
+        if len(known) == len(times) and all(a < b for a, b in zip(known, known[1:])):
+            return known
         return [i / (self.rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
 
 

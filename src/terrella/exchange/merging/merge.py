@@ -1,4 +1,25 @@
-"""merge: several robots' recordings as one source of common named numbers and cameras, padded, with masks."""
+"""merge: several robots' recordings as one source of common named numbers and cameras, padded, with masks.
+
+A take of T rows, `mapping.rows.fps` a second, has
+  action                  float32 [D], the named numbers of `mapping.action`; 0 where the robot has none. Its readings
+                          end with the last row in which anything was done: T - 1 of T rows where the original kept
+                          a terminal observation, none in a take without actions.
+  action_mask             bool [T, D], True where this robot did that number in this row.
+  observation.state       float32 [T, S], of `mapping.state`; 0 where it has none.
+  observation.state_mask  bool [T, S], True where it has that number here and now.
+  every merged camera     uint8 [H, W, 3], fitted with its aspect kept, black around and where there is none;
+                          depth float32 [H, W] metres, nearest pixels, inf around and where there is none.
+  observation.cameras_mask  bool [T, cameras], True where a camera (in the order of `names`) shows something.
+  embodiment              int64 [T, 1], the robot's place in `facts["embodiments"]`.
+  what is kept whole      with `NAME_mask`, bool [T, 1]: whether there was any in this row. Points keep their own
+                          clock (what was newest at the first row is dated there); vectors are zero where not
+                          there. What followed: next.reward float32 [1], the sum of all rewards from this row until the next
+                          (so that a return is kept at any fps); bools: whether any was true; others: the newest.
+                          Like actions, they end with their last valid row.
+The instruction and the facts of a take are kept; start_ns moves to the first row. Numbers are resampled by the policies
+of `mapping.rows` (`resample`), by which a value is absent in gaps; an action lasts, at the end, for one row of its own
+clock. Numbers that are not finite, also as float32, are absent. A take of fewer than two rows is skipped.
+"""
 
 from __future__ import annotations
 
@@ -36,26 +57,6 @@ def merge(
     terminal: bool = True,
 ) -> Source:
     """One source of all takes of the mapping's sources (path -> Source), in the mapping's order, made as they are read.
-
-    A take of T rows, `mapping.rows.fps` a second, has
-      action                  float32 [D], the named numbers of `mapping.action`; 0 where the robot has none. Its readings
-                              end with the last row in which anything was done: T - 1 of T rows where the original kept
-                              a terminal observation, none in a take without actions.
-      action_mask             bool [T, D], True where this robot did that number in this row.
-      observation.state       float32 [T, S], of `mapping.state`; 0 where it has none.
-      observation.state_mask  bool [T, S], True where it has that number here and now.
-      every merged camera     uint8 [H, W, 3], fitted with its aspect kept, black around and where there is none;
-                              depth float32 [H, W] metres, nearest pixels, inf around and where there is none.
-      observation.cameras_mask  bool [T, cameras], True where a camera (in the order of `names`) shows something.
-      embodiment              int64 [T, 1], the robot's place in `facts["embodiments"]`.
-      what is kept whole      with `NAME_mask`, bool [T, 1]: whether there was any in this row. Points keep their own
-                              clock (what was newest at the first row is dated there); vectors are zero where not
-                              there. What followed: next.reward float32 [1], the sum of all rewards from this row until the next
-                              (so that a return is kept at any fps); bools: whether any was true; others: the newest.
-                              Like actions, they end with their last valid row.
-    The instruction and the facts of a take are kept; start_ns moves to the first row. Numbers are resampled by the policies
-    of `mapping.rows` (`resample`), by which a value is absent in gaps; an action lasts, at the end, for one row of its own
-    clock. Numbers that are not finite, also as float32, are absent. A take of fewer than two rows is skipped.
 
     terminal: False to give the last rows an action (zeros, masked) too, for formats in which all takes end alike.
     report:   filled while the takes are read. DatasetError where the mapping does not suit the sources.

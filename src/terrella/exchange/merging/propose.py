@@ -1,4 +1,4 @@
-"""propose: the mapping of several robots into one set, as far as names, units and frames tell it; a person does the rest."""
+"""propose: the mapping of several robots into one set, as far as names, units and frames allow; a person does the rest."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def propose(
 
     fps:  of the merged rows; None: the slowest of the sources'.
     size: (height, width) of every merged image; None: as above.
-    DatasetError without a source, or where no fps can be told.
+    DatasetError without a source, or where no fps is known.
     """
     if not sources:
         raise DatasetError("there is nothing to merge; name at least one recording.")
@@ -246,7 +246,7 @@ def _share(places: list[_Place], filled: dict[_Place, str], notes: _Notes) -> di
         for name, part in parted.items():
             dimension = Dimension(_common_unit(part), next((place.frame for place in part if place.frame), ""))
             _fill(part, name, dimension, found, filled)
-            _doubts(part, dimension, filled, notes)
+            _unstated(part, dimension, filled, notes)
     return found
 
 
@@ -258,7 +258,7 @@ def _fill(part: list[_Place], name: str, dimension: Dimension, found: dict, fill
     filled.update(dict.fromkeys(part, free))
 
 
-def _doubts(part: list[_Place], dimension: Dimension, filled: Mapping[_Place, str], notes: _Notes) -> None:
+def _unstated(part: list[_Place], dimension: Dimension, filled: Mapping[_Place, str], notes: _Notes) -> None:
     if len({place.source for place in part}) < 2:
         return
     for place in part:

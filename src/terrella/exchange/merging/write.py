@@ -33,7 +33,7 @@ def merge_into(
     fps:     rows a second, before what the mapping says.
     dry:     stop when the mapping is written.
 
-    Beside the rows lie meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
+    The folder also has meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
     "embodiments", each robot's statistics.
     """
     out = Path(out)

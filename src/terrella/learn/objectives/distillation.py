@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ...worlds.generator import Generator, generate
-from ..batches import Batch, Conditioning
+from ...worlds.generator import Conditioning, Generator, generate
+from ..batches import Batch
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, sharpened, total, truth_losses
 from ..trainer import Average, Learner, Loss, Now, half_precision
 
@@ -34,7 +34,7 @@ class Matching:
         clean = clean[:, :4]
         with torch.no_grad(), half_precision(clean.device):
             noisy, time = _noised(clean.detach(), rng)
-            likely, own = (net(noisy, time, *shown)[:, :4].float() for net in (self.teacher, self.mimic))
+            likely, own = (net(noisy, time, shown)[:, :4].float() for net in (self.teacher, self.mimic))
             away = (clean.detach() - likely).abs().mean((1, 2, 3), keepdim=True).clamp_min(1e-3)
             pull = (own - likely) / away
         return (clean * pull).mean()
@@ -43,7 +43,7 @@ class Matching:
         """Of the mimic, on drawn frames."""
         with half_precision(clean.device):
             noisy, time = _noised(clean.detach()[:, :4], rng)
-            again = self.mimic(noisy, time, *shown)[:, :4].float()
+            again = self.mimic(noisy, time, shown)[:, :4].float()
             losses = flow_losses(again, clean.detach()[:, :4], time)
         return Loss("mimic", losses["rgb"] + 0.5 * losses["depth"], {"mimic": losses["rgb"]})
 
@@ -55,7 +55,7 @@ def drawn(generator: Generator, noise: torch.Tensor, shown: Conditioning, steps:
     for step in range(exit_at + 1):
         now = step / steps
         with torch.set_grad_enabled(step == exit_at), half_precision(noise.device):
-            clean = generator(x, torch.full((len(x),), now, device=x.device), *shown).float()
+            clean = generator(x, torch.full((len(x),), now, device=x.device), shown).float()
         x = x + (clean.detach()[:, :4] - x) / (steps - step)
     return clean
 
@@ -93,7 +93,7 @@ class Distillation:
         batch, _, height, width = shown.last.shape
         noise = now.randn(batch, 4, height, width)
         with now.half():
-            return generate(self.student, noise, *shown.to(now.device), self.flow_steps).float().cpu()
+            return generate(self.student, noise, shown.to(now.device), self.flow_steps).float().cpu()
 
     def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
         batch = batch.to(now.device)

@@ -11,71 +11,67 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import torch
 
 from ...core.errors import DatasetError
 from ...worlds.generator import Generator, encode_depth
-from ..batches import Batch, Conditioning, as_drawn, coded
+from ...worlds.learned import LearnedWorld
+from ..batches import Batch, as_drawn, coded
 from ..history_batches import changing
 from ..losses import Critic, critic_learner, critic_loss, sharpened, total, truth_losses
 from ..recording import Recording
 from ..trainer import Average, Learner, Loss, Now
 from .distillation import Matching, drawn, trusted
 
-Learned = Any  # a learned world of pictures
 CONTEXT = 10  # recorded frames before a dream
 
 
 class Rollouts:
     """`batch` dreams that follow recorded rows: what the generator is shown next, and the frame that was recorded."""
 
-    def __init__(self, world: Learned, recording: Recording, horizon: int, batch: int, now: Now):
+    def __init__(self, world: LearnedWorld, recording: Recording, horizon: int, batch: int, now: Now):
         """Of a world with a memory every other batch of dreams is without it: there most must be invented."""
-        self.recording, self.world = recording, world
-        if world.config.geometry and now.rng.random() < 0.5:
+        self.recording, self.world, self.config = recording, world, world.config
+        if self.config.geometry and now.rng.random() < 0.5:
             self.world = world.without_memory()
         rows = now.rng.choice(beginnings(recording, horizon), batch)
         self.row = rows - CONTEXT + 1
-        self.state = self.world.observe(recording.evidence(self.world.config, self.row), None, now.noise)
-        if self.world.config.objects:  # these dreams are of what stands still
+        self.state = self.world.observe(recording.evidence(self.config, self.row), None, now.noise)
+        if self.config.objects:  # these dreams are of what stands still
             self.state = self.state.replace(billboards=torch.zeros_like(self.state["billboards"]))
         while (self.row < rows).all():
             self.go_on(as_drawn(self.next_batch().truth))
-            if self.world.config.objects:
-                self.state = self.state.replace(instances=recording.instances(self.row))
+            if self.config.objects:
+                self.state = self.state.replace(instances=recording.instances(self.row).to(self.world.device))
 
     def next_batch(self) -> Batch:
-        """What the generator is shown of the next frame, and the truth."""
-        recording, world, before = self.recording, self.world, self.state
+        """What the generator is shown of the next frame, and the truth; on the world's device."""
+        recording, world, there = self.recording, self.world, self.world.device
         self.row = self.row + 1
         found, weight = recording.rgb(self.row), None
-        led = recording.action(self.row - 1)[:, None]
-        if not world.config.geometry:
-            self.state = before.replace(actions=torch.cat([led, before["actions"][:, :-1]], 1))
-            self.shown = Conditioning(*world.shown(self.state))
-            depth = self.shown.glimpse.depth
-            weight = changing(found, torch.stack([before["frames"][:, 0], recording.rgb(self.row - 1)], 1))
-        else:
-            acts = torch.cat([before["actions"][:, 1:], led], 1)
-            self.state = world.aged(before.replace(pose=recording.pose(self.row), actions=acts), before)
-            self.shown = Conditioning(*world.shown(self.state, before))
+        numbers = recording.action(self.row - 1).to(there)
+        pose = recording.pose(self.row).to(there) if self.config.geometry else None
+        self.asked = world.asked(self.state, numbers, pose)
+        self.shown = world.conditioning(self.asked, self.state)
+        if self.config.geometry:
             depth = recording.depth(self.row)
+        else:
+            depth = self.shown.glimpse.depth.cpu()
+            newest = world.scene.frame(self.state).cpu()
+            weight = changing(found, torch.stack([newest, recording.rgb(self.row - 1)], 1))
         truth = torch.cat([coded(found), encode_depth(depth)[:, None]], 1)
-        if world.config.moving:
+        if self.config.moving:
             truth = torch.cat([truth, recording.things(self.row)[:, None]], 1)
-        if world.config.objects:
+        if self.config.objects:
             weight = (~recording.covered(self.row))[:, None].float()
-        return Batch(self.shown, truth, weight)
+        return Batch(self.shown, truth, weight).to(there)
 
     @torch.no_grad()
     def go_on(self, clean: torch.Tensor) -> None:
         """The dream continues from the frame that was drawn."""
-        clean = clean.detach().cpu()
-        seen = (self.shown.glimpse,) if self.world.config.geometry else ()
-        self.state = self.world.drawn(self.state, *seen, clean)
+        self.state = self.world.drawn(self.asked, self.state, self.shown, clean.detach())
 
 
 def beginnings(recording: Recording, horizon: int) -> np.ndarray:

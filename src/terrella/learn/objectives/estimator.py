@@ -71,7 +71,7 @@ def _fresh(recording: Recording, some: np.ndarray, seed: int) -> Estimator:
         fx, fy, cx, cy = recording.cache.world["camera"]
         reach = {"near_m": 0.8 * near, "far_m": max(1.25 * far, 1.6 * near)}
         estimator = Estimator(EstimatorConfig(_size(recording), **reach, camera=(fx, fy, cx, cy)))
-        nn.init.zeros_(estimator.leave.weight)
+        nn.init.zeros_(estimator.output.weight)
     usual = estimator.code(_sized(recording.depth(some[:500]), _size(recording))).mean(0)
     estimator.prior.copy_(((usual + usual.flip(-1)) / 2).clamp(0.02, 0.98).logit())
     estimator.pace.copy_(motion_between(recording, some).abs().mean(0).clamp_min(1e-4) * 2)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ...worlds.generator import Generator, channels_last, generate
-from ..batches import Batch, Conditioning
+from ...worlds.generator import Conditioning, Generator, channels_last, generate
+from ..batches import Batch
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, frame_losses, sharpened, total
 from ..trainer import Average, Learner, Loss, Now, cosine
 
@@ -42,14 +42,14 @@ class Flow:
         batch, _, height, width = shown.last.shape
         noise = now.randn(batch, 4, height, width)
         with now.half():
-            return generate(self.generator, noise, *shown.to(now.device), 1).float().cpu()
+            return generate(self.generator, noise, shown.to(now.device), 1).float().cpu()
 
     def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
         batch = batch.to(now.device)
         truth, shown = batch.truth, batch.shown
         noisy, time = self._noisy(batch, now)
         with now.half():
-            clean = batch.judged(self.generator(noisy, time, *shown).float())
+            clean = batch.judged(self.generator(noisy, time, shown).float())
             drawn, found = clean[:, :4], truth[:, :4]
             parts = frame_losses(drawn, found, batch.weight) if self.one_step else flow_losses(drawn, found, time)
         if clean.shape[1] > 4:

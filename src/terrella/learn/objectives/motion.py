@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from ...space.camera import yaw
 from ...space.floorplan import floor_plan, slide
 from ...space.keyframes import Keyframes
-from ...worlds.generator import VideoConfig
-from ...worlds.motion import Motion
+from ...worlds.body import Motion
+from ...worlds.config import MotionConfig
 from ..feeds import Drawn
 from ..recording import Recording
 from ..trainer import Learner, Loss, Now, Run
@@ -23,10 +23,10 @@ _WINDOWS, _LENGTH = 512, 24  # walks, and steps of each, on which the body is fi
 _BATCH, _RARE = 512, 64  # steps a batch, and those of them with which an episode ended
 
 
-def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyframes, config: VideoConfig, steps: int):
+def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyframes, steps: int):
     """Fits `motion` in place; returns the body that fits best (`body_m`, `short`), and how far off it is after 24 steps
     (mean, metres)."""
-    seen = Steps.of(recording, config)
+    seen = Steps.of(recording, motion.config)
     motion.middle.copy_((seen.place.amin(0) + seen.place.amax(0)) / 2)
     motion.span.copy_((seen.place.amax(0) - seen.place.amin(0)).max().clamp_min(1e-3))
     objective, ended = Moving(motion, seen), bool(seen.ended.any())
@@ -36,7 +36,7 @@ def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyfram
         last = list(motion.ending.parameters())[-2:]
         last[0].data.zero_()
         last[1].data.fill_(-20.0)
-    return trainer.once("body", lambda: fit_body(motion.eval(), recording, memory, config, run.seed))
+    return trainer.once("body", lambda: fit_body(motion.eval(), recording, memory, run.seed))
 
 
 class Steps(NamedTuple):
@@ -52,7 +52,7 @@ class Steps(NamedTuple):
     ended: torch.Tensor
 
     @staticmethod
-    def of(recording: Recording, config: VideoConfig) -> Steps:
+    def of(recording: Recording, config: MotionConfig) -> Steps:
         cache = recording.cache
         pose = torch.from_numpy(np.array(cache.pose))
         place, heading, number = pose[:, :2], yaw(pose), np.arange(cache.length)
@@ -114,9 +114,7 @@ def _actions(recording: Recording, rows: np.ndarray, history: int) -> torch.Tens
 
 
 @torch.no_grad()
-def fit_body(
-    motion: Motion, recording: Recording, memory: Keyframes, config: VideoConfig, seed: int
-) -> dict[str, float]:
+def fit_body(motion: Motion, recording: Recording, memory: Keyframes, seed: int) -> dict[str, float]:
     """The body whose walks end nearest to the recorded ones: coarse widths first, then finer ones around the best."""
     usable = np.append(0, np.cumsum(recording.usable & np.array(recording.cache.action_valid)))
     first = np.arange(2, recording.cache.length - _LENGTH)
@@ -130,7 +128,7 @@ def fit_body(
 
     def off(half: float, short: float) -> float:
         if (half, short) not in errors:
-            errors[half, short] = _walked_off(motion, recording, config, first, walls, half, short)
+            errors[half, short] = _walked_off(motion, recording, first, walls, half, short)
         return errors[half, short]
 
     best, short = min((off(half, 0.0), half) for half in np.linspace(0.0, 1.0, 21).tolist())[1], 0.0
@@ -141,13 +139,13 @@ def fit_body(
     return {"body_m": best, "short": short, "motion_error_m": error}
 
 
-def _walked_off(motion, recording: Recording, config, first: np.ndarray, walls, half: float, short: float) -> float:
+def _walked_off(motion: Motion, recording: Recording, first: np.ndarray, walls, half: float, short: float) -> float:
     """Mean distance in metres from the recorded places after `_LENGTH` steps from the rows `first`."""
     pose = recording.pose(first)
     place, heading = pose[:, :2], yaw(pose)
     speed = place - recording.pose(first - 1)[:, :2]
     for step in range(_LENGTH):
-        heading, wish = motion(heading, speed, _actions(recording, first + step, config.history))
+        heading, wish = motion(heading, speed, _actions(recording, first + step, motion.config.history))
         moved, speed = slide(walls, place, wish, half, short)
         place = place + moved
     return float((place - recording.pose(first + _LENGTH)[:, :2]).norm(dim=-1).mean())

@@ -350,7 +350,7 @@ class Next:
     def losses(self, batch: torch.Tensor, now: Now) -> Iterator[Loss]:
         weight = 1 / len(self.often) / self.often[batch]
         cards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
-        said = self.objects.tell(cards, pose, self.actions[batch])
+        said = self.objects.foresee(cards, pose, self.actions[batch])
         possible = (look != NONE) & self.objects.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
         error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +20,14 @@ from safetensors.torch import load_file, save_file
 from ...core.errors import DatasetError
 from ...core.state import State
 from ...core.world import Observation, make_rng
-from ...worlds.uncertainty import CELLS, KNOTS, Uncertainty, UncertaintyConfig, clues
+from ...worlds.generator import Conditioning
+from ...worlds.learned import LearnedWorld
+from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyConfig, clues
 from ..feeds import Drawn
 from ..recording import Recording
 from ..run_folder import resume_file
 from ..trainer import Learner, Loss, Now, Report, Run, cosine
 
-Learned = Any  # a learned world of pictures
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
 SHOWN = (1, 3, 10)  # frames that a dream may be shown before it goes on alone
@@ -70,7 +70,7 @@ class Rollout:
         return max(2, math.ceil(self.frames / (self.batch * self.horizon)))
 
 
-def learn_uncertainty(run: Run, world: Learned, recording: Recording, frames: int) -> tuple[Uncertainty, dict]:
+def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frames: int) -> tuple[Uncertainty, dict]:
     """The uncertainty of `world` and what is known of it: its `sure` and `invents` levels, and of episodes that neither
     trained nor calibrated it the mean error and the mean that was expected."""
     horizon = min(64, max(8, frames // 40), int(_ahead(recording).max()) - max(SHOWN))
@@ -101,7 +101,7 @@ def forget(out: Path) -> None:
     resume_file(out, "uncertainty").unlink(missing_ok=True)
 
 
-def _kept(folder: Path, world: Learned, recording: Recording, rollout: Rollout, report: Report) -> Dreamt:
+def _kept(folder: Path, world: LearnedWorld, recording: Recording, rollout: Rollout, report: Report) -> Dreamt:
     """All dreams, each batch kept in `folder` as soon as it is whole: a run that is stopped goes on with the next."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = []
@@ -120,19 +120,8 @@ def _kept(folder: Path, world: Learned, recording: Recording, rollout: Rollout, 
     return Dreamt.joined(parts)
 
 
-class _Notebook:
-    """In the place of an uncertainty: keeps what it would be asked."""
-
-    def __init__(self):
-        self.asked: list[tuple[torch.Tensor, torch.Tensor]] = []
-
-    def expected(self, glimpse, last, clean, situation, strange) -> torch.Tensor:
-        self.asked.append((clues(glimpse, last, clean).half(), situation))
-        return torch.zeros(len(clean))
-
-
 @torch.inference_mode()
-def dream(world: Learned, recording: Recording, rollout: Rollout, number: int) -> Dreamt:
+def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: int) -> Dreamt:
     """One batch of episodes from the recording, dreamt again; the same seed and number give the same."""
     rng = np.random.default_rng([rollout.seed, 7, number])
     arms = ARMS if world.config.geometry else (MEMORY,)
@@ -143,8 +132,12 @@ def dream(world: Learned, recording: Recording, rollout: Rollout, number: int) -
     shown = 1 if alone else int(rng.choice(SHOWN))
     begins = _begins(recording, shown + horizon, rollout.batch, rng)
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
-    book = _Notebook()
-    dreamer = _noted(world, recording, begins, horizon, arm, book, rng)
+    noted: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def note(conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor) -> None:
+        noted.append((clues(conditioning, clean).half().cpu(), situation.cpu()))
+
+    dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=Asked(note))
     chance = make_rng(int(rng.integers(2**62)))
     state = dreamer.observe(_evidence(dreamer, recording, begins, alone), None, chance)
     for row in range(1, shown):
@@ -154,9 +147,9 @@ def dream(world: Learned, recording: Recording, rollout: Rollout, number: int) -
     for step in range(horizon):
         rows = begins + shown + step
         state = _onward(dreamer, state, recording, rows, posed, chance)
-        book.asked, (maps, situation) = [], book.asked[-1]
-        truth = recording.rgb(rows).float() / 255
-        off = (dreamer.render(state, ("rgb",))["rgb"].permute(0, 3, 1, 2).float() / 255 - truth).abs().mean(1)
+        drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float() / 255
+        maps, situation = noted.pop()
+        off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)
         cells = F.avg_pool2d(off, 2 * CELLS, ceil_mode=True, count_include_pad=False)
         kind = torch.full((len(begins),), ARMS.index(arm))
         parts.append(Dreamt(maps, situation, cells, off.mean((1, 2)), episodes, kind))
@@ -164,27 +157,26 @@ def dream(world: Learned, recording: Recording, rollout: Rollout, number: int) -
 
 
 def _onward(
-    world: Learned, state: State, recording: Recording, rows: np.ndarray, pose: bool, chance: torch.Generator
+    world: LearnedWorld, state: State, recording: Recording, rows: np.ndarray, pose: bool, chance: torch.Generator
 ) -> State:
     if pose:
         return world.observe({"pose": recording.pose(rows)}, state, chance)
     return world.imagine(state, recording.played(world.spec, rows - 1), chance)
 
 
-def _noted(world: Learned, recording: Recording, begins, horizon: int, arm: str, book: _Notebook, rng) -> Learned:
-    """`world` with the memory that is left in this arm, and with `book` for its uncertainty."""
-    estimator = getattr(world, "estimator", None)
+def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int, arm: str, rng) -> LearnedWorld:
+    """`world` with the memory that is left in this arm."""
     if arm == MEMORY:
-        return world.with_senses(estimator, book)
+        return world
     if arm in (NONE, LONE):
-        return world.without_memory().with_senses(estimator, book)
-    middle = recording.pose(begins + int(rng.integers(0, horizon)))[:, :2]
+        return world.without_memory()
+    middle = recording.pose(begins + int(rng.integers(0, horizon)))[:, :2].to(world.device)
     away = (world.memory.pose[None, :, :2] - middle[:, None]).norm(dim=-1).amin(0)
     left = (away > float(rng.uniform(2.0, 8.0))).nonzero()[:, 0]
-    return world.with_memory(world.memory.at(left)).with_senses(estimator, book)
+    return world.with_memory(world.memory.at(left))
 
 
-def _evidence(world: Learned, recording: Recording, rows: np.ndarray, alone: bool) -> Observation:
+def _evidence(world: LearnedWorld, recording: Recording, rows: np.ndarray, alone: bool) -> Observation:
     seen = recording.evidence(world.config, rows)
     return {"rgb": seen["rgb"]} if alone else seen
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from ...core.errors import TrainingError
-from ...worlds.folder import Learned
+from ...worlds.learned import LearnedWorld
 from ..objectives.distillation import Distillation
 from ..paired import keep_world, paired, recipe_of, with_generator
 from ..recording import Box
@@ -47,7 +47,7 @@ class DistilConfig:
     seed: int = 0
 
 
-def distil(teacher: Learned, data: str | Path, out: str | Path, config: DistilConfig, report: Report) -> dict:
+def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report) -> dict:
     """Trains, or goes on with, the student in the folder `out`; its world lies in `out`/world. Returns the run's facts."""
     name, steps = teacher.spec.name, teacher.config.steps
     if steps == 1:

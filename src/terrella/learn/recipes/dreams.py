@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from ...core.errors import TrainingError
-from ...worlds.folder import Learned
+from ...worlds.learned import LearnedWorld
 from ..feeds import Drawn
 from ..objectives.dreams import Dreams, Rollouts, beginnings
 from ..paired import fingerprint, keep_world, paired, recipe_of, with_generator
@@ -49,12 +49,12 @@ class DreamsConfig:
 
 
 def train_dreams(
-    world: Learned,
+    world: LearnedWorld,
     data: str | Path,
     out: str | Path,
     config: DreamsConfig,
     report: Report,
-    teacher: Learned | None = None,
+    teacher: LearnedWorld | None = None,
 ) -> dict:
     """Trains, or goes on with, the run in the folder `out`; the world lies in `out`/world. Returns the run's facts.
 
@@ -92,11 +92,11 @@ def train_dreams(
     return {"world": str(run.out / "world"), **trainer.told}
 
 
-def like(world: Learned, teacher: Learned) -> Learned:
+def like(world: LearnedWorld, teacher: LearnedWorld) -> LearnedWorld:
     """The teacher; TrainingError unless its generator takes what that of `world` does."""
-    layers = ("enter.weight", "before.0.time.weight")
     taken = [
-        (one.config.size, *(one.generator.state_dict()[layer].shape[1] for layer in layers)) for one in (world, teacher)
+        (make.size, make.slots, make.context, make.moving)
+        for make in (world.generator.config, teacher.generator.config)
     ]
     if taken[0] == taken[1] and teacher.config.steps > 1:
         return teacher

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import torch
 
 from ...core.errors import TrainingError
-from ...worlds.folder import load_world, save_again
+from ...space.keyframes import Keyframes
+from ...worlds.folder import load_world, save_world
 from ...worlds.objects import Objects, ObjectsConfig
 from ..objectives.objects import learn_objects
 from ..paired import paired
@@ -34,19 +35,20 @@ def train_objects(
 ) -> dict:
     """Gives the world in the folder `world` the objects of the recording `data`, in place of its own, and writes it to
     `out`/world; returns its facts."""
-    learned: Any = load_world(world)
+    learned = load_world(world)
     if not learned.config.moving:
         raise TrainingError(
             f"{learned.spec.name} knows of no things that move; `terrella train video` makes worlds that do."
         )
-    learned.config = replace(learned.config, objects=True)
-    pair = paired(learned, data, None, report)
-    recipe = {**asdict(config), "frames": pair.recording.cache.length}
     torch.manual_seed(config.seed)
     objects = Objects(ObjectsConfig(learned.config.actions, learned.config.history))
-    run = Run(Path(out), recipe, report, config.seed)
-    rgb, starts = pair.recording.dataset.rgb_at, learned.starts.pose
-    facts = learn_objects(run, objects, pair.recording, rgb, starts, learned.config.camera, config.steps)
-    learned.objects = objects
-    save_again(learned, run.out / "world", {**learned.spec.card, **facts}, world)
+    pair = paired(learned.replaced(objects=objects), data, None, report)
+    recipe = {**asdict(config), "frames": pair.recording.cache.length}
+    run, recording = Run(Path(out), recipe, report, config.seed), pair.recording
+    objects.requires_grad_(True)
+    starts = cast(Keyframes, learned.starts).pose
+    facts = learn_objects(
+        run, objects, recording, recording.dataset.rgb_at, starts, learned.config.camera, config.steps
+    )
+    save_world(learned.replaced(objects=objects, card=facts), run.out / "world", remembered=world)
     return {"world": str(run.out / "world"), **facts}

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import DatasetError
-from ...worlds.folder import Learned, load_world, save_again
+from ...worlds.folder import load_world, save_world
+from ...worlds.learned import LearnedWorld
 from ..objectives.estimator import learn_estimator, sight
 from ..objectives.uncertainty import learn_uncertainty
 from ..paired import fingerprint, paired
@@ -37,35 +38,35 @@ def train_uncertainty(
     """Gives the world in the folder `world` an estimator and an uncertainty, learned from its own recording `data`, and writes
     it to `out`/world; returns its facts. What was kept out of its training is kept out here too."""
     learned = load_world(world)
-    box = box_of(learned.spec.card.get("keep_out"))
+    box = box_of(learned.about.card.get("keep_out"))
     pair = paired(learned, data, box, report)
     recipe = {**asdict(config), "world": fingerprint(learned.generator), "frames": pair.recording.cache.length}
     run = Run(Path(out), recipe, report, config.seed)
     sensing, facts = learn_senses(run, learned, pair.recording, box, config)
-    save_again(sensing, run.out / "world", {**learned.spec.card, **facts}, world)
+    save_world(sensing.replaced(card=facts), run.out / "world", remembered=world)
     return {"world": str(run.out / "world"), **facts}
 
 
 def learn_senses(
-    run: Run, world: Learned, recording: Recording, keep_out: Box | None, config: SensesConfig
-) -> tuple[Learned, dict]:
+    run: Run, world: LearnedWorld, recording: Recording, keep_out: Box | None, config: SensesConfig
+) -> tuple[LearnedWorld, dict]:
     """`world` with an estimator (where it has geometry) and an uncertainty, and what its card says of them."""
     facts: dict[str, Any] = {}
-    estimator = getattr(world, "estimator", None)
+    sensing = world
     if world.config.geometry and config.estimator_steps:
         estimator = learn_estimator(run, recording, config.estimator_steps)
+        sensing = sensing.replaced(estimator=estimator)
         facts["estimator"] = {
             place: {name: round(value, 4) for name, value in errors.items()}
             for place, errors in sight(estimator, recording.cache, list(recording.held_out), keep_out).items()
             if errors
         }
-    sensing = world.with_senses(estimator, world.uncertainty)
     if config.uncertainty_frames:
         try:
             frames = config.uncertainty_frames
-            uncertainty, found = learn_uncertainty(run, world.with_senses(estimator, None), recording, frames)
+            uncertainty, found = learn_uncertainty(run, sensing, recording, frames)
         except DatasetError as error:  # the world is as good without it
             return sensing, {**facts, "uncertainty": f"none: {error}"}
         facts["uncertainty"] = {name: round(value, 4) for name, value in found.items()}
-        sensing = sensing.with_senses(estimator, uncertainty)
+        sensing = sensing.replaced(uncertainty=uncertainty)
     return sensing, facts

@@ -5,21 +5,21 @@ from __future__ import annotations
 import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from ...core.errors import DatasetError, TrainingError
 from ...space.keyframes import Keyframes
-from ...worlds.controls import BUTTONS
-from ...worlds.folder import Learned, save_world, video_spec
-from ...worlds.generator import Generator, VideoConfig
-from ...worlds.history import HistoryWorld, Starts
-from ...worlds.motion import Motion
+from ...worlds.body import Motion, MotionBody
+from ...worlds.config import VideoConfig
+from ...worlds.folder import save_world
+from ...worlds.generator import Generator
+from ...worlds.history import FrameHistory, Starts
+from ...worlds.learned import About, LearnedWorld
 from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
-from ...worlds.outcome import Outcome
-from ...worlds.video import VideoWorld
+from ...worlds.outcome import Constant, ConstantConfig, Outcome
+from ...worlds.places import KeyframeScene
 from ..feeds import frames_feed
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
@@ -113,11 +113,6 @@ def plan(recording: Recording, config: TrainConfig) -> VideoConfig:
     """What kind of world can be learned of a recording."""
     cache, controls = recording.cache, recording.controls
     posed = config.geometry and recording.posed
-    if posed and controls.kind != BUTTONS:
-        raise DatasetError(
-            f"{recording.name} has actions that are no buttons (0 or 1 each), from which a world with depth and poses is "
-            "learned; --no-geometry learns one from pictures and any actions."
-        )
     moving = posed and config.moving and THINGS in cache.arrays
     objects = moving and there(cache, OBJECTS) and there(cache, INSTANCES) and config.objects_steps > 0
     if objects and cache.arrays[OBJECTS].shape[1:] != (ROWS, 4):
@@ -127,7 +122,7 @@ def plan(recording: Recording, config: TrainConfig) -> VideoConfig:
         )
     return VideoConfig(
         tuple(cache.world["camera"]) if posed else (1.0, 1.0, 0.5, 0.5),
-        controls.told,
+        controls.numbers,
         config.size,
         config.channels,
         slots=3 if posed else config.frames,
@@ -157,12 +152,13 @@ class _Learned:
         self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable)
         self.outcome: Outcome | None = None
         if self.happened.tells_something and (self.video.moving or not self.video.geometry):
-            self.video = replace(self.video, vitals=_at_first(self.happened.vitals, recording))
-            self.outcome = Outcome(self.happened.config()).to(run.device)
+            begins = _at_first(self.happened.vitals, recording)
+            self.video = replace(self.video, vitals=begins)
+            self.outcome = Outcome(replace(self.happened.config(), begins=begins)).to(run.device)
         self.memory = self._memory() if self.video.geometry else None
         parts = config.flow_steps, config.learning_rate, config.critic_from, config.critic_weight
-        self.flow = Flow(Generator(self.video), *parts)
-        self.motion = Motion(self.video)
+        self.flow = Flow(Generator(self.video.generator), *parts)
+        self.motion = Motion(self.video.motion)
         self.facts: dict = {}
 
     def _memory(self) -> Keyframes:
@@ -178,7 +174,7 @@ class _Learned:
         feed = frames_feed(recording, self.memory, self.video, batch, config.seed, dream)
         trainer = run.stage("flow", feed, self.flow, config.steps, config.hours)
         if self.memory is not None:
-            self.facts |= learn_motion(run, self.motion, recording, self.memory, self.video, config.motion_steps)
+            self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
         if self.outcome is not None:
             pieces = Pieces(self.outcome, recording.rgb, self.happened)
             self.facts |= learn_outcome(run, pieces, config.outcome_steps)
@@ -204,33 +200,36 @@ class _Learned:
         world = self.world(trainer)
         settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
         sensing, facts = learn_senses(self.run, world, self.recording, config.keep_out, settings)
-        save_world(sensing, self.run.out / "world", {**world.spec.card, **facts})
+        save_world(sensing.replaced(card=facts), self.run.out / "world")
         trainer.once("senses", lambda: facts)
 
-    def world(self, trainer: Trainer) -> Learned:
-        """The world as it now is."""
-        recording, cache = self.recording, self.recording.cache
-        card, about = self._card(trainer), cache.world
-        outcome = None if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
-        vitals = () if outcome is None else outcome.config.vitals
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""
+        recording, cache, about = self.recording, self.recording.cache, self.recording.cache.world
         names = about.get("action_names") or cache.action_names  # of a choice, the recording names each
-        named = (about.get("dt_s", 1 / cache.fps), names, about.get("keys", {}), card)
-        spec = video_spec(self.config.name, self.video, *named, recording.controls, vitals)
-        usual = float(np.median(self.happened.reward))
+        named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
+        assert recording.controls is not None  # see NEEDS
+        what = About(self.config.name, recording.controls, *named, ignored=recording.ignored)
         generator = copy.deepcopy(self.flow.smooth.module).cpu().float()
+        usual = float(np.median(self.happened.reward))
         if self.memory is None:
-            return HistoryWorld(spec, self.video, generator, self._starts(), usual, outcome, recording.controls)
+            outcome = self._outcome(ConstantConfig(usual))
+            scene = FrameHistory(self.video.frames, self._starts())
+            return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
         ends = self.happened.done & np.array(cache.action_valid)
-        rewards = (usual, _ending_pays(self.happened.reward - usual, ends))
+        outcome = self._outcome(ConstantConfig(usual, _ending_pays(self.happened.reward - usual, ends)))
         starts = open_views(self.memory, 32)
         if self.video.moving:  # monsters wait where episodes begin, and the player is well
             first = self._beginnings()
             starts = recording.sharp_keyframes(first, self.video.camera) if len(first) else starts
-        body = {name: value for name, value in self.facts.items() if name in ("body_m", "short")}
-        return VideoWorld(
-            spec, replace(self.video, **body), generator, self.motion, self.memory, starts, rewards,
-            outcome=outcome, objects=None if self.objects is None else copy.deepcopy(self.objects),
-        )  # fmt: skip
+        fitted = {name: self.facts[name] for name in ("body_m", "short")}
+        body = MotionBody(copy.deepcopy(self.motion), replace(self.video.motion, **fitted))
+        scene = KeyframeScene(self.video.keyframes, self.memory, starts)
+        objects = copy.deepcopy(self.objects)
+        return LearnedWorld(what, scene=scene, generator=generator, body=body, objects=objects, outcome=outcome)
+
+    def _outcome(self, constant: ConstantConfig) -> Outcome | Constant:
+        return Constant(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
 
     def _card(self, trainer: Trainer) -> dict:
         recording, parts = self.recording, [self.flow.generator] + [self.motion] * (self.memory is not None)
@@ -270,10 +269,10 @@ class _Learned:
     def draw_strip(self, trainer: Trainer) -> None:
         """Truth above dream, with the memory and without; and the world as it now is, so that it can be played while it
         learns."""
-        world: Any = self.world(trainer)
+        world = self.world(trainer)
         worlds = (world, world.without_memory()) if self.video.geometry else (world,)
         draw_strip(worlds, self.recording, self.run.out / f"strip-{trainer.facts['step']:06d}.png")
-        save_world(world, self.run.out / "world", dict(world.spec.card))
+        save_world(world, self.run.out / "world")
 
 
 def _at_first(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:

@@ -1,0 +1,152 @@
+"""Body: how an action moves the viewer of a world with poses: learned motion, walls that stop it, steps up and down."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import final
+
+import torch
+from torch import nn
+
+from ..core.spec import POSE, POSE_UNIT
+from ..core.state import State
+from ..space.camera import planar_pose, yaw
+from ..space.floorplan import slide
+from .config import MotionConfig
+from .parts import Channels, Walls
+
+FASTEST_M = 1.0  # a step; what evidence moves by more has been put there, and has no speed
+
+
+class Motion(nn.Module):
+    """How a viewer moves where nothing is in its way: it turns by the actions, and glides by drag and thrust in its own
+    frame. Walls come after (space/floorplan.slide)."""
+
+    middle: torch.Tensor  # of the recorded places, and how far they reach, in metres
+    span: torch.Tensor
+
+    def __init__(self, config: MotionConfig):
+        super().__init__()
+        self.config = config
+        acts = config.actions * (config.history + 1)
+        self.turn = nn.Sequential(nn.Linear(acts, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, 1))
+        self.glide = nn.Linear(2 + config.actions, 2)
+        self.ending = nn.Sequential(
+            nn.Linear(2 + config.actions, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
+        )
+        self.register_buffer("middle", torch.zeros(2))
+        self.register_buffer("span", torch.ones(()))
+
+    def forward(self, heading, speed, actions):
+        """heading [B] radians; speed [B, 2] metres a step, world frame; actions [B, history + 1, A], the newest last.
+        Returns the new heading [B] and the displacement that this step wishes for [B, 2]."""
+        heading = heading + 0.1 * self.turn(actions.flatten(1))[:, 0]
+        glide = self.glide(torch.cat([10 * turned(speed, -heading), actions[:, -1]], -1))
+        return heading, 0.1 * turned(glide, heading)
+
+    def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Logit that the episode ends at `place` [B, 2]: [B]."""
+        where = 2 * (place - self.middle) / self.span
+        logit = self.ending(torch.cat([where, action], -1))[:, 0]
+        return torch.where(where.abs().amax(1) < 1.2, logit, -20.0)  # what lies further away was never seen to end
+
+
+@final
+class MotionBody:
+    """The viewer as an upright box that `motion` moves, and walls stop."""
+
+    kind = "motion"
+
+    def __init__(self, motion: Motion, config: MotionConfig | None = None):
+        self.motion, self.config = motion.eval().requires_grad_(False), config or motion.config
+
+    @property
+    def history(self) -> int:
+        """Actions before the present one that it needs."""
+        return self.config.history
+
+    def to(self, device) -> MotionBody:
+        return MotionBody(copy.deepcopy(self.motion).to(device), self.config)
+
+    def channels(self) -> Channels:
+        return Channels({"pose": POSE}, {"pose": POSE_UNIT}, ("pose",))
+
+    def blank(self, batch: int, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        """A body that stands still at `pose` [B, 7]."""
+        assert pose is not None
+        still = pose.new_zeros(batch, 2), torch.zeros(batch, dtype=torch.bool, device=pose.device)
+        return {"pose": pose, "speed": still[0], "dreamt": still[1]}
+
+    def observed(self, prior: State, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        """The body at `pose` [B, 7], where evidence says that it is: as fast as it was dreamt, and as that was wrong."""
+        assert pose is not None
+        speed = pose[:, :2] - prior["pose"][:, :2] + torch.where(prior["dreamt"][:, None], prior["speed"], 0.0)
+        speed = torch.where((speed.norm(dim=-1) < FASTEST_M)[:, None], speed, 0.0)
+        return {"pose": pose, "speed": speed, "dreamt": torch.zeros_like(prior["dreamt"])}
+
+    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The body one step on: actions [B, history + 1, A], the newest last; `levels` [K, 3], recorded places, whose height it
+        follows where there are stairs."""
+        pose = state["pose"]
+        heading, wish = self.motion(yaw(pose), state["speed"], actions)
+        moved, speed = slide(walls.shared, pose[:, :2], wish, self.config.body_m, self.config.short, walls.own)
+        place, height = pose[:, :2] + moved, pose[:, 2]
+        if self.config.stairs and len(levels):
+            height = climbed(levels, pose[:, :2], place, height)
+        return {
+            "pose": planar_pose(place[:, 0], place[:, 1], height, heading),
+            "speed": speed,
+            "dreamt": torch.ones_like(state["dreamt"]),
+        }
+
+    def ends(self, after: Mapping[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
+        """Whether an episode ends where a step led, bool [B]."""
+        return self.motion.ends(after["pose"][:, :2], action) > 0
+
+
+@final
+class NoBody:
+    """Of a frames-only world: nobody knows where its pictures were taken."""
+
+    kind, config, history = "none", None, 0
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to(self, device) -> NoBody:
+        return self
+
+    def channels(self) -> Channels:
+        return Channels()
+
+    def blank(self, batch: int, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        return {}
+
+    def observed(self, prior: State, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        return {}
+
+    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {}
+
+    def ends(self, after: Mapping[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(action), dtype=torch.bool, device=action.device)
+
+
+def climbed(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    """The viewer's height [B] after a step from place `before` to `after` [B, 2], coming from `z` [B]: it rises as the recorded
+    places around, `levels` [K, 3], do, as far as a step up or down leads there, and leans towards them as it walks."""
+    reached = []
+    for place in (before, after):
+        near = torch.cdist(place, levels[:, :2])
+        weight = 1 / (near**2 + 0.01) ** 2 * ((near < 2.5) & ((levels[:, 2] - z[:, None]).abs() < 1.5))
+        total = weight.sum(1)
+        reached.append(torch.where(total > 0, (weight * levels[:, 2]).sum(1) / total.clamp_min(1e-9), z))
+    lean = (0.5 * (after - before).norm(dim=-1)).clamp(max=1.0)
+    return z + (reached[1] - reached[0] + lean * (reached[1] - z)).clamp(-0.3, 0.3)
+
+
+def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """[B, 2] rotated counter-clockwise by [B] radians."""
+    c, s = angle.cos(), angle.sin()
+    return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)

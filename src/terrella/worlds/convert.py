@@ -1,0 +1,105 @@
+"""convert_world: a world folder of format version 2 (one config for all, weights by older names) as one of version 3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+
+from ..core.errors import CheckpointError
+from .config import VideoConfig
+from .folder import KIND, MEMORY_FILE, VERSION, WEIGHTS_FILE, _plain, load_world, read_about, write_folder
+
+OLD_KIND, OLD_VERSION = "video", 2
+PARTS = {"motion": "body", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}  # the others keep their names
+LAYERS = {"leave": "output", "time": "context"}  # of generator, estimator and uncertainty
+RETIRED = ("own_keyframes",)  # settings that mean nothing any more
+
+
+def convert_world(old: str | Path, new: str | Path) -> None:
+    """Writes the world in the folder `old`, of format version 2, to the folder `new`. Nothing is lost: weights are copied, and
+    the remembered pictures stay byte for byte.
+
+    CheckpointError where `old` is no such world, or `new` exists and is another folder with files in it.
+    """
+    old, new = Path(old), Path(new)
+    about = read_about(old)
+    if (about.get("kind"), about.get("version")) != (OLD_KIND, OLD_VERSION):
+        found = f"kind {about.get('kind')!r}, version {about.get('version')}"
+        raise CheckpointError(f"{old} is {found}; only kind '{OLD_KIND}' of version {OLD_VERSION} needs converting.")
+    if new != old and new.exists() and any(new.iterdir()):
+        raise CheckpointError(f"{new} is not empty; name a new folder.")
+    try:
+        weights, remembered = load_file(old / WEIGHTS_FILE), (old / MEMORY_FILE).read_bytes()
+        starts = load_file(old / MEMORY_FILE)
+        told = _described(about, starts)
+        write_folder(new, told, {_renamed(name): value for name, value in weights.items()}, remembered)
+    except (OSError, SafetensorError, LookupError, TypeError, ValueError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{old} cannot be converted ({first}); copy or train it again.") from error
+    load_world(new)
+
+
+def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
+    """What world.json of version 3 says of such a world."""
+    config = _config(about["config"])
+    usual, ending = about["rewards"]
+    outcome: dict[str, Any] = {
+        "kind": "constant",
+        "config": {"usual": usual, "ending": ending if config.geometry else 0.0},
+    }
+    if about.get("outcome"):
+        begins = list(config.vitals)
+        if (
+            not config.geometry and "starts.vitals" in starts
+        ):  # such worlds took those that recordings usually begin with
+            begins = starts["starts.vitals"].median(0).values.tolist()
+        outcome = {"kind": "frames", "config": {**about["outcome"], "begins": begins}}
+    posed = config.geometry
+    parts = {
+        "body": {"kind": "motion", "config": _plain(config.motion)} if posed else _absent(),
+        "scene": {"kind": "keyframes", "config": _plain(config.keyframes)}
+        if posed
+        else {"kind": "history", "config": _plain(config.frames)},
+        "generator": {"kind": "unet", "config": _plain(config.generator)},
+        "objects": {"kind": "billboards", "config": about["cast"]} if about.get("cast") else _absent(),
+        "outcome": outcome,
+        "uncertainty": {"kind": "network", "config": about["doubt"]} if about.get("doubt") else _absent(),
+        "estimator": {"kind": "network", "config": about["eye"]} if about.get("eye") else _absent(),
+    }
+    controls = about.get("controls") or {
+        "kind": "buttons",
+        "low": [0.0] * config.actions,
+        "high": [1.0] * config.actions,
+    }
+    said = {name: about[name] for name in ("dt_s", "action_names", "keys")}
+    card = {
+        {"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()
+    }
+    return {
+        "kind": KIND,
+        "version": VERSION,
+        "name": about["name"],
+        "about": {"controls": controls, **said, "ignored": []},
+        "parts": parts,
+        "card": card,
+    }
+
+
+def _config(told: dict) -> VideoConfig:
+    known = {{"cast": "objects"}.get(name, name): value for name, value in told.items() if name not in RETIRED}
+    return VideoConfig(**{name: tuple(value) if isinstance(value, list) else value for name, value in known.items()})
+
+
+def _absent() -> dict:
+    return {"kind": "none", "config": None}
+
+
+def _renamed(name: str) -> str:
+    part, *rest = name.split(".")
+    if part in ("generator", "eye", "doubt"):
+        rest = [LAYERS.get(word, word) for word in rest]
+    return ".".join([PARTS.get(part, part), *rest])

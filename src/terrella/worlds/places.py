@@ -1,0 +1,309 @@
+"""KeyframeScene: what is known of a view, from posed RGB-D keyframes of the recordings and of an episode's own memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+
+from ..core import chance
+from ..core.errors import ObservationError
+from ..core.state import State
+from ..space.camera import Intrinsics, yaw
+from ..space.floorplan import floor_plan
+from ..space.keyframes import Glimpse, Keyframes
+from ..space.memory import RECORDED, Memory, keyframe_table
+from ..space.patches import FAR_M
+from ..space.recognise import thumbnails
+from ..space.reproject import carry_unknown, fill_holes
+from .arrival import AWAY_M, arrive
+from .config import KeyframesConfig
+from .generator import Conditioning, context_thumbnail, decode_depth, pixels
+from .moving import Frame, carry_frames, covering, still
+from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
+
+SEEN = (
+    "rgb",
+    "depth",
+    "things",
+    "pose",
+    "instances",
+)  # of a frame that is still needed two steps later, where things move
+NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
+CELL_M = 0.25  # side of the cells of the map in which that is looked up
+EXACTLY = "donot_use_mm_for_euclid_dist"
+
+
+@final
+class KeyframeScene:
+    """`recorded`: the recordings' keyframes (may be empty); `starts`: those that an episode may begin from."""
+
+    kind, posed, history = "keyframes", True, 0  # actions that its conditioning needs beside the body's
+
+    def __init__(self, config: KeyframesConfig, recorded: Keyframes, starts: Keyframes):
+        self.config, self.recorded, self.starts = config, recorded, starts
+        self.own = own_memory(config, str(recorded.pose.device))
+
+    def to(self, device) -> KeyframeScene:
+        return KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
+
+    def with_memory(self, recorded: Keyframes) -> KeyframeScene:
+        return KeyframeScene(self.config, recorded, self.starts)
+
+    def with_memory_of(self, budget_mb: float) -> KeyframeScene:
+        return KeyframeScene(replace(self.config, memory_mb=budget_mb), self.recorded, self.starts)
+
+    @property
+    def device(self) -> torch.device:
+        return self.starts.pose.device
+
+    @property
+    def camera(self) -> Intrinsics:
+        return self.config.camera
+
+    @cached_property
+    def _table(self) -> torch.Tensor:
+        """The recordings' part of the channel `keyframes`."""
+        kinds = torch.full((len(self.recorded),), RECORDED, device=self.device)
+        return keyframe_table(self.recorded.pose, kinds)
+
+    @cached_property
+    def _small(self) -> torch.Tensor:
+        """By which a lone picture's place is sought."""
+        return thumbnails(self.recorded.rgb)
+
+    @cached_property
+    def _plan(self) -> torch.Tensor:
+        return floor_plan(self.recorded.walls, self.recorded.pose)
+
+    @cached_property
+    def _cells(self) -> torch.Tensor:
+        """The cells of the map that lie within NEAR_M of a recorded keyframe, ascending; never none."""
+        reach = int(NEAR_M / CELL_M) + 1
+        steps = CELL_M * torch.arange(-reach, reach + 1, device=self.device)
+        around = torch.cartesian_prod(steps, steps)
+        around = around[around.norm(dim=1) <= NEAR_M]
+        codes = _cell_codes((self.recorded.pose[:, None, :2] + around).flatten(0, 1))
+        return torch.cat([codes, codes.new_full((1,), 2**62)]).unique()
+
+    def channels(self) -> Channels:
+        height, width = self.config.size
+        shows: dict[str, spaces.Space] = {
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": spaces.Box(0, 100, (height, width), np.float32),
+            "known": spaces.Box(0, 1, (height, width), np.float32),
+        }
+        units = {"depth": "m"}
+        if self.config.moving:
+            shows["things"] = spaces.Box(0, 1, (height, width), np.bool_)  # pyright: ignore
+        if count := len(self.recorded) + self.own.capacity:
+            shows["keyframes"] = spaces.Box(-np.inf, np.inf, (count, 4), np.float32)
+            units["keyframes"] = "x and y in m, heading in rad, kind"
+        return Channels(shows, units, ("rgb", "depth"), ("things",) * self.config.moving)
+
+    # -- evidence -----------------------------------------------------------------------------------------------------
+
+    def begin(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
+        """Evidence of places where recordings were, by chance; which of the starts they are [B]."""
+        pick = (chance.uniform(seeds, (), stream=STARTS) * len(self.starts)).long()
+        keys = self.starts.at(pick)
+        rgb, depth = F.interpolate(keys.rgb.float(), self.config.size, mode="area"), keys.depth
+        seen = {"rgb": rgb.round().to(torch.uint8), "depth": depth}
+        if self.config.moving:  # of what moves, a keyframe keeps the place only
+            seen["depth"] = fill_holes(torch.where(depth > 0, depth, FAR_M))
+            seen["things"] = (depth <= 0).float()
+        return Evidence(len(pick), self.device, keys.pose, seen), pick
+
+    def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
+        """Evidence: rgb, depth and pose together; a pose alone, from which a frame is dreamt (it needs a prior); or a picture
+        alone, seen from the prior's pose, or without a prior from the remembered place that it shows, else from an empty
+        corner (arrival.py), its depth then being the estimator's."""
+        lone = None
+        if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and estimator:
+            observation, lone = self._arrived(observation, prior, estimator)
+        if "pose" not in observation:
+            alone = ", a picture alone" if estimator else ""
+            blind = "" if estimator else " For a picture alone it needs an estimator of depth: `terrella train senses`."
+            raise ObservationError(
+                f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
+            )
+        pose = torch.as_tensor(observation["pose"]).float().to(self.device)
+        batch = len(pose)
+        if pose.shape != (batch, 7) or not torch.isfinite(pose).all():
+            raise ObservationError(f"pose is finite float [B, 7] (x, y, z, quaternion wxyz); got {tuple(pose.shape)}.")
+        if prior is not None:
+            check_prior(prior.batch, batch)
+        if not {"rgb", "depth"} <= set(observation):
+            if prior is None:
+                raise ObservationError(
+                    "a pose alone says nothing of what is seen there: give rgb and depth, or a prior."
+                )
+            return Evidence(batch, self.device, pose)
+        rgb, depth = picture_of(observation, self.config.size, self.device), torch.as_tensor(observation["depth"])
+        depth = depth.to(self.device).float()
+        if depth.shape != (batch, *self.config.size) or len(rgb) != batch:
+            raise ObservationError(
+                f"depth is [B, {self.config.size[0]}, {self.config.size[1]}]; got {tuple(depth.shape)}."
+            )
+        if not (torch.isfinite(depth).all() and (depth > 0).all()):
+            raise ObservationError("depth must be finite and above 0 metres.")
+        return Evidence(
+            batch, self.device, pose, {"rgb": rgb, "depth": depth, **self._things(observation, prior, depth)}, lone
+        )
+
+    def _things(self, observation: Mapping, prior: State | None, depth: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Where things are: as the evidence says, else where they were dreamt."""
+        if not self.config.moving:
+            return {}
+        if "things" not in observation:
+            return {"things": torch.zeros_like(depth) if prior is None else prior["things"]}
+        things = torch.as_tensor(observation["things"]).float().to(self.device)
+        if things.shape != depth.shape:
+            raise ObservationError(f"things is bool {list(depth.shape)}; got {tuple(things.shape)}.")
+        return {"things": things}
+
+    def _arrived(self, observation: Mapping, prior: State | None, estimator: Any) -> tuple[dict, torch.Tensor | None]:
+        """The observation of a lone picture with the pose and the depth that it is given, and which are of elsewhere [B]."""
+        rgb = picture_of(observation, self.config.size, self.device)
+        if prior is not None:
+            check_prior(prior.batch, len(rgb))
+            lone = prior["gone"][:, 3] > 0 if "gone" in prior else None
+            return {**observation, "pose": prior["pose"], "depth": estimator.depth(rgb)}, lone
+        config = self.config
+        seen = arrive(rgb, estimator, self.recorded, self._small, self.starts, config.camera, config.sources)
+        return {**observation, "pose": seen.pose, "depth": seen.depth}, ~seen.found
+
+    # -- the state ----------------------------------------------------------------------------------------------------
+
+    @property
+    def drawn_names(self) -> tuple[str, ...]:
+        """The tensors of a state that follow from drawing its frame."""
+        moving = ("things", "instances", *(f"earlier_{part}" for part in SEEN)) if self.config.moving else ()
+        return "rgb", "depth", "known", *moving, *self.own.empty(1)
+
+    def blank(self, evidence: Evidence) -> State:
+        """A state in which nothing was seen yet."""
+        batch, there, (height, width) = evidence.batch, self.device, self.config.size
+        plane = torch.zeros(batch, height, width, device=there)
+        mask = plane.to(torch.uint8)
+        tensors = {"rgb": mask[:, None].expand(-1, 3, -1, -1), "depth": plane + 1, "known": mask, "pose": evidence.pose}
+        if self.config.moving:
+            tensors |= {"things": plane, "instances": mask}
+            tensors |= {f"earlier_{part}": tensors[part] for part in SEEN}
+        state = State({**tensors, **self.own.empty(batch)}, self.own.arenas)
+        return state.replace(observed_walls=self.own.walls(state, dreamt=False))
+
+    def pictured(self, state: State, evidence: Evidence) -> State:
+        """`state` with the picture of the evidence."""
+        return state.replace(**evidence.seen, known=torch.full_like(state["known"], 255))
+
+    def kept(self, state: State, begins: bool) -> State:
+        """`state`, whose memory keeps the picture that was observed; an episode that begins has stood still."""
+        kept = self.own.observed(state, state["rgb"], self._lasting(state), state["pose"])
+        state = state.replace(**kept)
+        state = state.replace(observed_walls=self.own.walls(state, dreamt=False))
+        return self.aged(state, state) if begins else state
+
+    def aged(self, state: State, before: State) -> State:
+        """`state`, in which the frame of `before` is the one before the last, where things move."""
+        return state.replace(**{f"earlier_{part}": before[part] for part in SEEN}) if self.config.moving else state
+
+    def frame(self, state: State) -> torch.Tensor:
+        """The newest frame, uint8 [B, 3, H, W]."""
+        return state["rgb"]
+
+    def walls(self, state: State) -> Walls:
+        """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
+        own, away = state["observed_walls"], ~self._known_ground(state["pose"])
+        if away.any():
+            own = torch.where(away[:, None, None], self.own.walls(state), own)
+        return Walls(self._plan, own)
+
+    def _known_ground(self, pose: torch.Tensor) -> torch.Tensor:
+        """Whether `pose` [B, 7] is in a cell of the map that recorded keyframes are near: bool [B]."""
+        cells, codes = self._cells, _cell_codes(pose[:, :2])
+        return cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] == codes
+
+    def familiar(self, state: State) -> torch.Tensor:
+        """How far the next recorded keyframe is, a radian counting two metres, and how much of its own memory is in use; as
+        logarithm and share: [B, 2]."""
+        pose, kept = state["pose"], self.recorded.pose
+        angle = (yaw(kept) - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
+        apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY) + 2 * angle.abs()
+        nearest = F.pad(apart, (0, 1), value=AWAY_M).amin(1)
+        own = self.own.count(state).float() / max(1, self.own.capacity)
+        return torch.stack([nearest.clamp_max(20).log1p(), own], 1)
+
+    def conditioning(self, state: State, before: State) -> Conditioning:
+        """What the generator gets to draw the frame at `state`'s pose, `before` being the last."""
+        config, pose = self.config, state["pose"]
+        glimpse = self.own.look(state, pose, config.sources, config.slots, self.recorded)
+        context = context_thumbnail(before["rgb"])
+        if not config.moving:
+            last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
+            return Conditioning(glimpse, last, context)
+        frames = []
+        for age in ("", "earlier_"):
+            rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
+            frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
+        context = torch.cat([context, state["actions"].flatten(1)], 1)
+        return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context)
+
+    def drawn(
+        self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
+    ) -> State:
+        """`state` with the frame `clean` [B, 4 or 5, H, W] that was drawn of it, what `paint` adds to it, remembered if new."""
+        known = conditioning.glimpse.known
+        state = state.replace(rgb=pixels(clean), depth=decode_depth(clean[:, 3]))
+        if self.config.moving:
+            state = paint(state.replace(things=clean[:, 4].sigmoid()))
+            known = known * (state["things"] < 0.5)
+        kept = self.own.dreamt(state, state["rgb"], self._lasting(state), state["pose"], known)
+        return state.replace(**kept, known=(known * 255).round().to(torch.uint8))
+
+    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+        return {
+            "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
+            "known": lambda: state["known"].float() / 255,
+            "things": lambda: state["things"] > 0.5,
+            "keyframes": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
+        }
+
+    def _lasting(self, state: State) -> torch.Tensor:
+        """What a keyframe may keep of the frame's depth."""
+        return still(state["depth"], state["things"]) if self.config.moving else state["depth"]
+
+
+def _cell_codes(places: torch.Tensor) -> torch.Tensor:
+    """The number of the cell of the map in which places [N, 2] lie: int64 [N]."""
+    column, row = (places / CELL_M).floor().clamp(-(2**30), 2**30).long().unbind(-1)
+    return column * 2**31 + row
+
+
+def own_memory(config: KeyframesConfig, device: str) -> Memory:
+    """The memory of an episode's own; where its budget has no room, one of the last frame, which each new one replaces."""
+    rules = config.memory_mb, config.new_view, config.known_enough
+    whole = Memory(config.camera, config.size, *rules, device=device)
+    if whole.capacity:
+        return whole
+    frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
+    return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0, device=device)
+
+
+def carry(
+    rgb: torch.Tensor,
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    glimpse: Glimpse,
+    target_pose: torch.Tensor,
+    camera: Intrinsics,
+) -> torch.Tensor:
+    """The last frame (rgb uint8 [B, 3, H, W]) warped into the new view where no keyframe knows it, and its trust:
+    [B, 4, H, W], 0 elsewhere. A frame that is warped again at every step blurs; a keyframe is warped once."""
+    return carry_unknown(rgb, depth, pose, glimpse.known, glimpse.depth, target_pose, camera)

@@ -1,0 +1,137 @@
+"""Learned worlds of parts: any kind of action, frames that are drawn when somebody looks, and parts that are exchanged."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import terrella
+from terrella.core import check_world, make_rng
+from terrella.core.errors import ContractError
+from terrella.worlds import learned
+from terrella.worlds.controls import AXES, CHOICE, Controls
+from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.generator import Generator
+from terrella.worlds.learned import LearnedWorld
+from terrella.worlds.uncertainty import Asked, Uncertainty, UncertaintyConfig
+
+from .made import place
+
+STEERING = Controls(AXES, (-1.0, 0.0), (1.0, 4.0), "velocity", ("m/s", "rad/s"), "body")
+KINDS = {"buttons": Controls.buttons(3), "choice": Controls(CHOICE, (2.0,), (5.0,)), "axes": STEERING}
+
+
+@pytest.mark.parametrize("controls", KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize(
+    "more", [{}, {"moving": True}, {"moving": True, "objects": True}], ids=["still", "moving", "things"]
+)
+def test_every_kind_of_action_and_of_parts_keeps_the_contract(controls, more):
+    world = place(controls, **more)
+    held = check_world(world, steps=3)
+    assert {"a_batch_equals_its_singles", "forks_and_puts", "states_can_be_saved"} <= set(held)
+    assert world.spec.cameras["rgb"].pose == "pose" and {"rgb", "depth", "pose"} <= set(world.spec.observes)
+
+
+def test_controls_are_those_of_a_spec_and_the_spec_says_what_axes_mean():
+    world = place(STEERING)
+    assert Controls.of(world.spec) == STEERING
+    assert (world.spec.action_mode, world.spec.action_units, world.spec.action_frame) == (
+        "velocity",
+        ("m/s", "rad/s"),
+        "body",
+    )
+    assert Controls.of(place(KINDS["choice"]).spec) == KINDS["choice"]
+
+
+def walk(world: LearnedWorld, look: bool, steps: int = 6, batch: int = 2):
+    rng = make_rng(1)
+    state = world.start(batch, rng)
+    for _ in range(steps):
+        state = world.imagine(state, world.spec.sample_action(batch, rng), rng)
+        if look:
+            world.render(state, ("rgb",))
+    return state
+
+
+def test_a_frame_is_drawn_when_somebody_looks_and_looking_changes_nothing(monkeypatch):
+    world, drawn = place(KINDS["buttons"]), []
+    real = learned.generate
+    monkeypatch.setattr(learned, "generate", lambda *given: (drawn.append(len(given[1])), real(*given))[1])
+    state = walk(world, look=False)
+    world.render(state, ("pose", "reward", "done"))
+    assert not drawn, "pose, reward and done cost no pixels"
+    looked = walk(world, look=True)
+    for name in world.spec.channels:
+        assert torch.equal(world.render(state, (name,))[name], world.render(looked, (name,))[name]), name
+
+
+def test_on_unknown_ground_the_walls_of_the_dream_count():
+    """The rule of docs/decisions/0008: without recordings an episode has nothing but its own keyframes."""
+    world = place(KINDS["buttons"])
+    state = walk(world, look=False)
+    known = world.scene.walls(state)
+    assert state.deferred is not None, "among recorded keyframes nobody needs the dreamt ones"
+    alone = world.without_memory()
+    walls = alone.scene.walls(state)
+    assert state.deferred is None and len(walls.shared) == 0 and walls.own.shape[1] >= known.own.shape[1]
+
+
+def test_gradients_are_the_callers():
+    """No verb forces a mode: in grad mode tensors are ordinary, in inference mode they are not."""
+    world, rng = place(KINDS["buttons"], moving=True, objects=True), make_rng(0)
+    with torch.inference_mode():
+        inside = world.render(
+            world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng), ("rgb", "pose")
+        )
+    outside = world.render(world.imagine(world.start(1, rng), world.spec.sample_action(1, rng), rng), ("rgb", "pose"))
+    assert inside["pose"].is_inference() and not outside["pose"].is_inference() and not outside["rgb"].is_inference()
+    assert not outside["pose"].requires_grad and not world.spec.differentiable, "weights of a finished world need none"
+
+
+def test_parts_are_exchanged_and_the_old_world_stays():
+    world = place(KINDS["buttons"])
+    asked = []
+    noted = world.replaced(uncertainty=Asked(lambda *given: asked.append(given)), card={"more": 1})
+    state = walk(noted, look=True, steps=2)
+    assert len(asked) == 2 and "uncertainty" not in noted.spec.channels and noted.spec.card["more"] == 1
+    judged = world.replaced(uncertainty=Uncertainty(UncertaintyConfig()), steps=3, card={"what": None})
+    assert "uncertainty" in judged.spec.channels and "uncertainty" not in world.spec.channels
+    assert judged.config.steps == 3 and world.config.steps == 1 and "what" not in judged.spec.card
+    assert not judged.replaced(uncertainty=None).uncertainty and "more" not in world.spec.card
+    assert float(judged.render(walk(judged, look=True, steps=1), ("uncertainty",))["uncertainty"].max()) > 0
+    with pytest.raises(ContractError, match="has no part eye"):
+        world.replaced(eye=None)
+    assert state.batch == 2
+
+
+@pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
+def test_a_saved_world_is_the_same(tmp_path, more):
+    world = place(KINDS["axes"], **more).replaced(uncertainty=Uncertainty(UncertaintyConfig()), card={"note": "ö"})
+    save_world(world, tmp_path / "one")
+    first = load_world(tmp_path / "one")
+    save_world(first, tmp_path / "two", remembered=tmp_path / "one")
+    again = load_world(tmp_path / "two")
+    assert first.spec == again.spec == world.spec and first.config == again.config == world.config
+    for file in ("memory.safetensors", "world.json"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+    ways = [walk(one, look=True) for one in (first, again)]
+    for name in world.spec.channels:
+        assert torch.equal(*(one.render(state, (name,))[name] for one, state in zip((first, again), ways))), name
+
+
+def test_channels_that_were_not_learned_are_named_in_the_card():
+    world = place(KINDS["buttons"])
+    about = learned.replace(world.about, ignored=("rgb.wrist", "depth.wrist"))
+    told = LearnedWorld(about, **world.parts)
+    assert told.spec.card["ignored channels"] == "rgb.wrist, depth.wrist"
+
+
+def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
+    """No loop over the batch: the bundled world's generator runs as often for eight episodes as for one."""
+    world, calls = terrella.load("doom-maze"), []
+    real = Generator.forward
+    monkeypatch.setattr(
+        Generator, "forward", lambda self, noisy, *rest: (calls.append(len(noisy)), real(self, noisy, *rest))[1]
+    )
+    walk(world, look=True, steps=1, batch=8)
+    assert sum(calls) == 8 and len(calls) <= 2
