@@ -13,7 +13,8 @@ from gymnasium import spaces
 from terrella import library
 from terrella.cli import main
 from terrella.core import Spec, State, make_rng
-from terrella.data import Layout, Recorder
+from terrella.core.policy import Random
+from terrella.data import Layout, Recorder, record
 from terrella.sim.gymnasium import GymnasiumWorld
 
 
@@ -254,3 +255,54 @@ def test_the_still_world_is_a_world():
     world = Still()
     state = world.imagine(world.start(1, make_rng(0)), torch.zeros(1, 2), make_rng(0))
     assert world.render(state, ("rgb",))["rgb"].shape == (1, 24, 32, 3)
+
+
+class Rig:
+    """A robot on two axes with two cameras of different sizes and a pose; its pictures show where it looks."""
+
+    def __init__(self):
+        limit, pose = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-np.inf, np.inf, (7,), np.float32)
+        sizes = {"rgb": (24, 32, 3), "rgb.wrist": (16, 16, 3)}
+        pictures = {name: spaces.Box(0, 255, size, np.uint8) for name, size in sizes.items()}
+        channels = {**pictures, "pose": pose}
+        self.spec = Spec("rig", limit, channels, tuple(channels), 0.1, action_names=("forward", "turn"))
+
+    def start(self, batch, rng):
+        return State({"at": torch.zeros(batch), "yaw": torch.zeros(batch)})
+
+    def observe(self, observation, prior, rng):
+        pose = observation["pose"]
+        return State({"at": pose[:, 0].clone(), "yaw": 2 * torch.atan2(pose[:, 6], pose[:, 3])})
+
+    def imagine(self, state, action, rng):
+        action = self.spec.check_action(action, state.batch)
+        return State({"at": state["at"] + 0.05 * action[:, 0], "yaw": state["yaw"] + 0.1 * action[:, 1]})
+
+    def render(self, state, channels):
+        self.spec.check_channels(channels)
+        return {name: self._seen(state, name) for name in channels}
+
+    def _seen(self, state, name):
+        half, none = state["yaw"] / 2, torch.zeros(state.batch)
+        if name == "pose":
+            return torch.stack([state["at"], none, none, half.cos(), none, none, half.sin()], 1)
+        height, width, _ = self.spec.channels[name].shape
+        down, across = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
+        turned = across + state["yaw"][:, None, None] + (0.5 if name == "rgb.wrist" else 0.0)
+        waves = torch.sin(3 * turned) * torch.cos(2 * down + state["at"][:, None, None])
+        return (127 + 100 * waves)[..., None].expand(-1, -1, -1, 3).round().to(torch.uint8)
+
+
+def test_two_cameras_axes_and_poses_are_scored_from_what_was_recorded(tmp_path, monkeypatch, capsys):
+    rig = Rig()
+    record(rig, Random(rig.spec, (3, 9)), tmp_path / "set", 200, make_rng(0), max_episode_steps=50, pictures="png")
+    monkeypatch.setattr(library, "load", lambda name, **options: Rig())
+    given = ["score", "rig", "--data", str(tmp_path / "set"), "--out", str(tmp_path / "out"), "--fresh", "--quick"]
+    assert main([*given, "--horizons", "1", "8", "16", "--json"]) == 0
+    card = json.loads(capsys.readouterr().out)
+    found = {row["channel"]: row for row in card["rows"] if (row["what"], row["horizon"]) == ("PSNR", 16)}
+    assert found["rgb"]["figure"]["value"] > 40 and found["rgb.wrist"]["figure"]["value"] > 40
+    assert found["rgb.wrist"]["baselines"]["copy last"]["value"] < 40
+    assert any(row["probe"] == "pose" and row["what"] == "distance" for row in card["rows"])
+    assert any(row["probe"] == "memory" and "yaw" in row["what"] for row in card["rows"]), "it takes poses"
+    assert "rig is better than copying the last frame at every horizon" in card["verdict"][0]

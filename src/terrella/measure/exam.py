@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
+from ..core.errors import ObservationError
 from ..core.world import World, make_rng
 from .album import Album
 from .clips import Clip
-from .roll import Results, Watch, can_idle, dream, true_motion_works
+from .roll import Results, Watch, can_idle, dream, fold_context, poses_at
 from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report
 from .work import Unit
 
@@ -95,8 +97,18 @@ class Exam:
 
     def follows_poses(self, world: World) -> bool:
         """Whether the world draws what is seen from a pose that it is given."""
-        clip = next(iter(self.places.values()))[0]
-        return self.once(f"poses {id(world)}", lambda: true_motion_works(world, clip, self.rng()))
+        clips, rng = next(iter(self.places.values()))[:1], self.rng()
+
+        def works() -> bool:
+            if "pose" not in world.spec.observes or clips[0].pose is None:
+                return False
+            try:
+                world.observe({"pose": poses_at(clips, clips[0].context)}, fold_context(world, clips, rng), rng)
+            except ObservationError:
+                return False
+            return True
+
+        return self.once(f"poses {id(world)}", works)
 
     def fingerprint(self, identity: str = "") -> str:
         """What must be the same for kept results to count."""
@@ -170,32 +182,33 @@ def motions_of(exam: Exam, world: World, of: str, clips: Sequence[Clip]) -> dict
 
 def dreams(exam: Exam, probes: Sequence[Probe]) -> list[Unit]:
     """The dreams that the probes watch, in batches; arms see the same clips, random numbers and "other" actions."""
-    units = []
-    for of, places in exam.sets.items():
-        for place, clips in places.items():
-            order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
-            turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
-            others = [clips[turn[number]] for number in range(len(clips))]
-            for arm, world in exam.arms.items():
-                for motion, steps in motions_of(exam, world, of, clips).items():
-                    for number, (first, some) in enumerate(batches(exam, world, clips)):
-                        watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
-                        if watches:
-                            hands = others[first : first + len(some)]
-                            key = f"dream|{of}|{arm}|{place}|{motion}|{number}"
-                            units.append(_dream(exam, key, arm, world, some, motion, steps, first, watches, hands))
+    asked = ((of, place, clips) for of, places in exam.sets.items() for place, clips in places.items())
+    return [
+        unit
+        for of, place, clips in asked
+        for arm, world in exam.arms.items()
+        for motion, steps in motions_of(exam, world, of, clips).items()
+        for unit in _dreams(exam, (of, arm, place, motion), world, clips, steps, probes)
+    ]
+
+
+def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Clip], steps: int, probes) -> list[Unit]:
+    of, arm, place, motion = names
+    order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
+    turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
+    units, verb = [], "pose" if motion == TRUE else "imagine"
+    words = f"{arm}, {place} places, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
+    for number, (first, some) in enumerate(batches(exam, world, clips)):
+        watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
+        others = [clips[turn[first + at]] for at in range(len(some))]
+        calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * steps}
+        run = partial(_dream, exam, world, some, motion, steps, first, watches, others)
+        units += [Unit(f"dream|{'|'.join(names)}|{number}", words, calls, run)] if watches else []
     return units
 
 
-def _dream(exam, key, arm, world, clips, motion, steps, first, watches, others) -> Unit:
-    verb = "pose" if motion == TRUE else "imagine"
-    calls = {(arm, "observe"): len(clips) * clips[0].context, (arm, verb): len(clips) * steps}
-    place = key.split("|")[3]
-    words = f"{arm}, {place} places, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
-    return Unit(
-        key, words, calls,
-        lambda tick: dream(world, clips, motion, steps, exam.rng(1000 + first), watches, others, tick),
-    )  # fmt: skip
+def _dream(exam, world, clips, motion, steps, first, watches, others, tick) -> Results:
+    return dream(world, clips, motion, steps, exam.rng(1000 + first), watches, others, tick)
 
 
 def _sum(values: np.ndarray) -> float:

@@ -159,7 +159,7 @@ def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
 
     lead = (
         "The same at every step of longer clips. A dot marks the last step up to which the squared error stays within twice "
-        "that of the dream's own first step, which is where the curve has fallen by 3 dB; the table adds the same from "
+        "that of its own first step, which is where the curve has fallen by 3 dB; the table adds the same from "
         "copy-last's first step, one yardstick for all."
     )
     return Probe("drift", "How far can it be used?", lead, _long_missing, found)

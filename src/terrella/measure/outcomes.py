@@ -17,9 +17,9 @@ from .scorecard import COPY_LAST, PREDICTED, Report, Row
 from .statistics import Figure, mean_interval
 
 LEAD = (
-    "What dreams say of rewards, of numbers such as health, and of the end: the mean absolute error of the reward summed over "
-    "the steps, and its correlation with the recorded sum; how well the dreamt sum tells stretches that paid more than usual, "
-    "and the dream's end tells stretches that ended (area under the ROC curve: 1 always, 0.5 by chance). Half of the stretches "
+    "What is predicted of rewards, of numbers such as health, and of the end: the mean absolute error of the reward summed over "
+    "the steps, and its correlation with the recorded sum; how well the predicted sum tells stretches that paid more than usual, "
+    "and the predicted end tells stretches that ended (area under the ROC curve: 1 always, 0.5 by chance). Half of the stretches "
     "are taken from shortly before an end, where there are ends."
 )
 USUAL = "the usual reward"

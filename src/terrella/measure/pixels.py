@@ -21,8 +21,8 @@ from .statistics import mean_interval, ratio_band, ratio_interval
 from .work import Unit
 
 LEAD = (
-    "How close each dreamt frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
-    "are 95% intervals. Sharpness is gradient energy, dream over game: below 1 is blurred, above 1 too rough. The Frechet "
+    "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
+    "are 95% intervals. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. The Frechet "
     "distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
 )
 _LEAST_SSIM = 11  # pixels: the size of its window

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..core.errors import DatasetError, ObservationError
+from ..core.errors import DatasetError
 from ..core.policy import Idle, Policy, Replay, act
 from ..core.spec import Spec
 from ..core.state import State
@@ -60,17 +60,6 @@ def policy_of(
         return Idle(world.spec)
     hands, first = (others or clips) if motion == OTHERS else clips, clips[0].context - 1
     return Replay(torch.stack([actions_at(world, hands, first + step) for step in range(steps)]))
-
-
-def true_motion_works(world: World, clip: Clip, rng: torch.Generator) -> bool:
-    """Whether the world draws what is seen from a pose that it is given: `observe({"pose": ...}, state)`."""
-    if "pose" not in world.spec.observes or clip.pose is None:
-        return False
-    try:
-        world.observe({"pose": poses_at([clip], clip.context)}, fold_context(world, [clip], rng), rng)
-    except ObservationError:
-        return False
-    return True
 
 
 def dream(

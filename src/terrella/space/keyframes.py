@@ -125,8 +125,9 @@ def retrieve(
     shared: Keyframes, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int,
     own: Keyframes | None = None, rows: torch.Tensor | None = None,
 ) -> torch.Tensor:  # fmt: skip
-    """Which keyframes to use for the views of `size` from `pose` [B, 7], `count` each, best first: int64 [B, count], numbers
-    of shared ones, or len(shared) + those of own ones, of which a view may use its `rows` [B, n] (0: none); -1: no more.
+    """Which keyframes to use for the views of `size` from `pose` [B, 7], `count` each at most: int64 [B, count], numbers of
+    shared ones, the best first, then len(shared) + those of own ones, of which a view may use its `rows` [B, n] (0: none);
+    -1: no more.
 
     Coverage-greedy: a keyframe's vote at a point is how alike its distance is (1 equal, 1/2 at twice or half), 0 where
     it saw something else there; each pick adds what the picks before it lack.
@@ -158,6 +159,8 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
     picks = pick_slowly(votes * (numbers >= 0)[..., None], count)
     if not numbers.shape[1]:
         return picks
+    lots = torch.where(picks >= 0, (picks - len(shared)).clamp_min(-1) // kernels.LOT, count + numbers.shape[1])
+    picks = picks.gather(1, lots.argsort(dim=1, stable=True))
     return torch.where(picks >= 0, numbers.gather(1, picks.clamp_min(0)), -1)
 
 

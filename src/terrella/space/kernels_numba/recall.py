@@ -9,6 +9,8 @@ from ..camera import FAR_M, NEAR_M, SAME
 from .planes import between
 from .surfaces import cast_one
 
+LOT = 16  # of a story's slots, in whose order keyframes that are trusted alike show
+
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def vote(points, distance, depth, turn, position, camera, votes):
@@ -102,7 +104,14 @@ def choose(first, last, shared, own, rows, turns, positions, camera, size, step,
             else:
                 row = key - known
                 vote(points, distance, own_depths[row], own_turns[row], own_poses[row, :3], camera, votes[n])
-        for n in range(pick(votes[:count], anyway, picks[view])):
+        chosen = pick(votes[:count], anyway, picks[view])
+        for n in range(1, chosen):  # shared ones first, then own ones, LOT of their slots after the other
+            at, mine = n, picks[view, n]
+            while at > 0 and max(picks[view, at - 1] - known, -1) // LOT > max(mine - known, -1) // LOT:
+                picks[view, at] = picks[view, at - 1]
+                at -= 1
+            picks[view, at] = mine
+        for n in range(chosen):
             picks[view, n] = keys[picks[view, n]]
 
 
