@@ -29,12 +29,12 @@ CAP, GAP, MARGIN = 34, 4, 14
 def main(
     out: Positional[Path] = Path("docs/images/play.webp"),
     world: str = "doom-maze",
-    seed: int = 0,
+    seed: int = 3,
     skip: int = 40,
     seconds: float = 9.0,
     every: int = 2,
     scale: int = 4,
-    quality: int = 52,
+    quality: int = 74,
 ) -> None:
     """Args:
     skip: Steps before the first frame shown.
@@ -47,7 +47,7 @@ def main(
     frames = [draw(picture, keys, played.spec, scale) for picture, keys in zip(pictures[::every], pressed[::every])]
     frames = looped(frames, 8)
     pause_ms = round(1000 * played.spec.dt_s * every)
-    frames[0].save(out, save_all=True, append_images=frames[1:], duration=pause_ms, loop=0, quality=quality, method=6)
+    frames[0].save(out, save_all=True, append_images=frames[1:], duration=pause_ms, loop=0, quality=quality, method=4)
     print(f"{out}: {len(frames)} frames, {len(frames) * pause_ms / 1000:.1f} s, {out.stat().st_size / 2**20:.2f} MiB")
 
 
