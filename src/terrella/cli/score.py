@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..measure import Exam, ExamConfig, Scorecard
 
 CONTEXT = 10  # frames that a world is shown before it predicts: longer than the effect of a key lasts
-DRIFT_STEPS, DRIFT_CLIPS = 256, 24
+DRIFT_STEPS, DRIFT_CLIPS, ENDING_CLIPS = 256, 24, 24
 QUICK_CLIPS, QUICK_HORIZONS, HORIZONS = 6, (1, 8, 32), (1, 8, 32, 64)
 
 Quick = Annotated[bool, arg(help="An answer in about a minute: few clips, short horizons, one setting of the world.")]
@@ -143,7 +143,7 @@ def _exam(
             say(
                 f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
-        drawn = passages(*asked, max(config.horizons), clips, make_rng(seed + 2), where)
+        drawn = passages(*asked, max(config.horizons), min(clips, ENDING_CLIPS), make_rng(seed + 2), where)
         sets[ENDINGS][place], going[place] = drawn
     album = None if cache.pose is None or cache.rgb is None else Album.of_cache(cache)
     paths = " ".join(str(source.path) for source, _, _ in sources.values())
