@@ -90,7 +90,7 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
 
 
 def _config(told: dict) -> VideoConfig:
-    known = {{"cast": "objects"}.get(name, name): value for name, value in told.items() if name not in RETIRED}
+    known = {("objects" if name == "cast" else name): value for name, value in told.items() if name not in RETIRED}
     settings: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in known.items()
     }
