@@ -69,7 +69,7 @@ def pictures(height: int, width: int) -> list[np.ndarray]:
 def told(recorder: Recorder, given: int) -> dict:
     """What the folder holds against what was given, counted in the files themselves."""
     dataset = Dataset(recorder.root)
-    films = sum(mp4.count_frames(dataset.files.local(e.videos[dataset.rgb_key].file)) for e in dataset.episodes)
+    films = sum(mp4.count_whole(dataset.files.local(e.videos[dataset.rgb_key].file)) for e in dataset.episodes)
     pressure = recorder.pressure
     return {
         "given": given,

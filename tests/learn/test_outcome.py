@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from tests.learn.stopping import quiet
 
 from terrella.core import check_world, make_rng
@@ -120,7 +121,7 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
     )
     train_video(recording, tmp_path, config, quiet)
     world = load_world(tmp_path / "world")
-    assert world.spec.action.n == 3 and world.spec.action_names == ("STAY", "L", "R")
+    assert world.spec.action == spaces.Discrete(3) and world.spec.action_names == ("STAY", "L", "R")
     assert {"reward", "done", "lives"} <= set(world.spec.channels)
     assert "states_can_be_saved" in check_world(world)
     began = world.render(world.start(16, make_rng(0)), ("lives",))["lives"]

@@ -76,6 +76,17 @@ def test_on_unknown_ground_the_walls_of_the_dream_count():
     assert state.deferred is None and len(walls.shared) == 0 and walls.own.shape[1] >= known.own.shape[1]
 
 
+def test_of_equally_trusted_keyframes_the_recorded_one_comes_first():
+    world = place(KINDS["buttons"])
+    scene, pose = world.scene, world.memory.pose[:1]
+    dark, depth = torch.zeros(1, 3, *world.size, dtype=torch.uint8), torch.full((1, *world.size), 3.0)
+    held = scene.own.empty(1)
+    held |= scene.own.observed(held, dark, depth, pose)
+    alone, both = (scene.own.look(kept, pose, 6, 3, scene.recorded) for kept in (scene.own.empty(1), held))
+    assert (both.trust[:, 1] > 0).any(), "both know the view"
+    assert torch.equal(both.rgb[:, 0], alone.rgb[:, 0])
+
+
 def test_gradients_are_the_callers():
     """No verb forces a mode: in grad mode tensors are ordinary, in inference mode they are not."""
     world, rng = place(KINDS["buttons"], moving=True, objects=True), make_rng(0)
@@ -135,3 +146,15 @@ def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
     )
     walk(world, look=True, steps=1, batch=8)
     assert sum(calls) == 8 and len(calls) <= 2
+
+
+@pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
+def test_a_whole_step_stays_on_the_worlds_device(more):
+    """`meta` stands for any second device: what it gives to the CPU, or mixes with tensors of the CPU, is an error."""
+    world = place(KINDS["axes"], **more).replaced(uncertainty=Uncertainty(UncertaintyConfig())).to("meta")
+    rng = make_rng(0)
+    state = world.start(2, rng)
+    for _ in range(2):
+        state = world.imagine(state, world.spec.sample_action(2, rng).to("meta"), rng)
+    shown = world.render(state, tuple(world.spec.channels))
+    assert {tensor.device.type for tensor in (*shown.values(), *state.values())} == {"meta"}

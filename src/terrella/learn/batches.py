@@ -26,14 +26,15 @@ class Batch:
     shown: Conditioning
     truth: torch.Tensor
     weight: torch.Tensor | None = None  # [B, 1, H, W], how much each pixel counts; None: all alike
+    instruction: torch.Tensor | None = None  # [B, D], the embedding of what was asked for, where the recording says it
 
     def judged(self, clean: torch.Tensor) -> torch.Tensor:
         """Drawn frames `clean`, with the truth where nothing counts: no loss and no critic sees what was drawn there."""
         return clean if self.weight is None else torch.where(self.weight > 0, clean, as_drawn(self.truth))
 
     def to(self, device) -> Batch:
-        weight = None if self.weight is None else self.weight.to(device)
-        return Batch(self.shown.to(device), self.truth.to(device), weight)
+        weight, instruction = (None if part is None else part.to(device) for part in (self.weight, self.instruction))
+        return Batch(self.shown.to(device), self.truth.to(device), weight, instruction)
 
 
 def as_drawn(truth: torch.Tensor) -> torch.Tensor:

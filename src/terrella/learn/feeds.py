@@ -49,22 +49,12 @@ class Streamed:
 
 
 def frames_feed(
-    recording: Recording,
-    memory: Keyframes | None,
-    config: VideoConfig,
-    size: int,
-    seed: int,
-    dream: Dream | None,
-    far: Mapping[str, Any] | None = None,
+    recording: Recording, memory: Keyframes | None, config: VideoConfig, size: int, seed: int, dream: Dream | None
 ) -> Feed:
-    """Batches of `size` for a generator: of places, where things may move, with a `memory`; of clips without one.
-
-    far: the `source` of clips that lie far away, and how they are read (see data.Clips); None: the recording's cache.
-    """
+    """Batches of `size` for a generator: of places, where things may move, with a `memory`; of clips without one."""
     if memory is not None:
         of_place = moving_batch if config.moving else place_batch
         return Drawn(lambda now: of_place(recording, memory, config, size, now, dream))
-    where = dict(far) if far else {"source": recording.cache, "episodes": recording.seen}
-    clips = history_clips(config=config, batch=size, seed=seed, **where)
+    clips = history_clips(recording.cache, config, size, seed, recording.seen)
     controls = recording.controls or Controls.buttons(config.actions)
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +19,6 @@ from .trainer import Now
 DREAMT, OFTEN = (0, 1, 2, 4), (0.4, 0.3, 0.2, 0.1)  # frames of a history that are dreamt, and in what share of batches
 CHANGED = 20.0  # see `changing`
 STILL = 0.05  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
-CHANNELS = ("rgb", "action")
 
 
 def clip_length(config: VideoConfig) -> int:
@@ -29,11 +26,10 @@ def clip_length(config: VideoConfig) -> int:
     return config.slots + max(DREAMT) + 1
 
 
-def history_clips(
-    source: ClipCache | str | Path, config: VideoConfig, batch: int, seed: int, episodes: list[int], **where: Any
-) -> Clips:
-    """Clips for `history_batch`, of a cache or from afar; `where`: the budget and folder of what is far (see Clips)."""
-    return Clips(source, clip_length(config), CHANNELS, batch, config.size, seed=seed, episodes=episodes, **where)
+def history_clips(cache: ClipCache, config: VideoConfig, batch: int, seed: int, episodes: list[int]) -> Clips:
+    """Clips for `history_batch`, with what was asked for where the recording says it."""
+    channels = ("rgb", "action", *("instruction",) * ("task" in cache.arrays))
+    return Clips(cache, clip_length(config), channels, batch, config.size, seed=seed, episodes=episodes)
 
 
 def clips_at(recording: Recording, config: VideoConfig, batch: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -41,12 +37,10 @@ def clips_at(recording: Recording, config: VideoConfig, batch: int, rng: np.rand
     length = clip_length(config)
     whole = recording.usable & (np.arange(len(recording.usable)) - recording.start >= length - 1)
     rows = rng.choice(np.flatnonzero(whole), batch)[:, None] + np.arange(1 - length, 1)
-    return {name: np.asarray(recording.cache.arrays[name][rows.ravel()]).reshape(*rows.shape, *_shape(recording, name))
-            for name in CHANNELS}  # fmt: skip
-
-
-def _shape(recording: Recording, name: str) -> tuple[int, ...]:
-    return recording.cache.arrays[name].shape[1:]
+    arrays = {"rgb": recording.cache.rgb, "action": recording.cache.action}
+    return {
+        name: np.asarray(array[rows.ravel()]).reshape(*rows.shape, *array.shape[1:]) for name, array in arrays.items()
+    }
 
 
 def history_batch(
@@ -54,8 +48,8 @@ def history_batch(
 ) -> Batch:
     """Next frames; of those that are shown the newest 0 to 4 are dreamt, each from those before it (none without `dream`).
 
-    clips: rgb uint8 [B, T, H, W, 3] and action [B, T, ...]. Before an episode's first frame it stood still, and nobody
-    acted. Pixels that change count for more.
+    clips: rgb uint8 [B, T, H, W, 3], action [B, T, ...] and perhaps instruction [B, T, D]. Before an episode's first frame
+    it stood still, and nobody acted. Pixels that change count for more.
     """
     rgb = torch.from_numpy(np.ascontiguousarray(clips["rgb"])).permute(0, 1, 4, 2, 3)
     batch, length = rgb.shape[:2]
@@ -76,7 +70,9 @@ def history_batch(
     truth = torch.cat([coded(found), encode_depth(glimpse.depth)[:, None]], 1)
     weight = changing(found, torch.stack([frames[:, 0], rgb[index, target - 1]], 1))
     context = _context(actions, target, frames)
-    return Batch(Conditioning(glimpse, torch.zeros_like(truth), context), truth, weight)
+    wanted = clips.get("instruction")
+    instruction = None if wanted is None else torch.from_numpy(np.array(wanted[:, -1], np.float32))
+    return Batch(Conditioning(glimpse, torch.zeros_like(truth), context), truth, weight, instruction)
 
 
 def changing(found: torch.Tensor, before: torch.Tensor, often: float = CHANGED) -> torch.Tensor:

@@ -47,7 +47,8 @@ class Recording:
         needs: tuple[str, ...] = ("rgb",),
         why: str = "a world of pictures is learned from them",
     ) -> Recording:
-        """The recording `data` with pictures at `size` (height, width). Every 20th episode is held out, and so are the rows
+        """The recording `data`, a folder or an address, with pictures at `size` (height, width); of what is far a clip cache
+        within its budget is kept here, for places are read in any order. Every 20th episode is held out, and so are the rows
         from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or rows."""
         dataset = Dataset(data)
         cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
@@ -194,7 +195,11 @@ def controls_of(cache: ClipCache) -> Controls | None:
         buttons = str(cache.world.get("action_space")).startswith("MultiBinary")
     if buttons:
         return Controls.buttons(cache.action.shape[1])
-    return Controls(CHOICE if whole else AXES, tuple(map(float, low)), tuple(map(float, high)))
+    limits = tuple(map(float, low)), tuple(map(float, high))
+    if whole:
+        return Controls(CHOICE, *limits)
+    mode, frame = (str(cache.world.get(f"action_{name}") or "") for name in ("mode", "frame"))
+    return Controls(AXES, *limits, mode, tuple(cache.world.get("action_units") or ()), frame)
 
 
 def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:

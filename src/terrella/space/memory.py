@@ -223,6 +223,10 @@ class Memory:
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)
         picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
+        turn = torch.where(
+            picks < 0, 2, (picks >= len(shared)).long()
+        )  # of equally trusted ones a recorded one comes first
+        picks = picks.gather(1, turn.argsort(dim=1, stable=True))
         return look(shared, picks, pose, self.camera, self.size, slots, own)
 
     def _arena_of(self, held: Held) -> Arena:

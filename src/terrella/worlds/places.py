@@ -51,7 +51,9 @@ class KeyframeScene:
         self.own = own_memory(config, str(recorded.pose.device))
 
     def to(self, device) -> KeyframeScene:
-        return KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
+        moved = KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
+        vars(moved).update({name: getattr(self, name).to(device) for name in ("_plan", "_cells", "_table", "_small")})
+        return moved
 
     def with_memory(self, recorded: Keyframes) -> KeyframeScene:
         return KeyframeScene(self.config, recorded, self.starts)
@@ -129,7 +131,11 @@ class KeyframeScene:
             observation, lone = self._arrived(observation, prior, estimator)
         if "pose" not in observation:
             alone = ", a picture alone" if estimator else ""
-            blind = "" if estimator else " For a picture alone it needs an estimator of depth: `terrella train senses`."
+            blind = (
+                ""
+                if estimator
+                else " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
+            )
             raise ObservationError(
                 f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
             )
@@ -221,7 +227,7 @@ class KeyframeScene:
     def walls(self, state: State) -> Walls:
         """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
         own, away = state["observed_walls"], ~self._known_ground(state["pose"])
-        if away.any():
+        if away.is_meta or away.any():  # tensors of `meta` have no values to ask for
             own = torch.where(away[:, None, None], self.own.walls(state), own)
         return Walls(self._plan, own)
 

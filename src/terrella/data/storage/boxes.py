@@ -1,9 +1,11 @@
-"""The boxes of an mp4 file, walked before FFmpeg makes room for the frames that they claim."""
+"""The boxes of an mp4 file: walked before FFmpeg makes room for the frames that they claim, and up to the last whole one."""
 
 from __future__ import annotations
 
+import io
 import os
 import struct
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
@@ -22,19 +24,25 @@ def check(path: Path) -> None:
 @lru_cache(1024)
 def _checked(path: str, size: int, _changed_ns: int) -> None:
     with open(path, "rb") as file:
-        at = 0
-        while at + 8 <= size:
-            file.seek(at)
-            length, kind = struct.unpack(">I4s", file.read(8))
-            if length == 1:
-                length = int.from_bytes(file.read(8), "big")
+        for at, length, kind in _walk(file, size):
             if kind == b"moof":
                 if length > _LARGEST:
                     raise ValueError(f"a fragment's table claims {length:,} bytes")
                 _fragment(file, at, min(at + length, size), size)
-            if length < 8:  # 0: up to the end of the file
-                return
-            at += length
+
+
+def _walk(file: BinaryIO | io.FileIO, size: int) -> Iterator[tuple[int, int, bytes]]:
+    """(place, bytes, kind) of the boxes of a file; the last may be cut, or claim what no box can have."""
+    at = 0
+    while at + 8 <= size:
+        file.seek(at)
+        length, kind = struct.unpack(">I4s", file.read(8))
+        if length == 1:
+            length = int.from_bytes(file.read(8), "big")
+        yield at, length, kind
+        if length < 8:  # 0: up to the end of the file
+            return
+        at += length
 
 
 def _fragment(file: BinaryIO, start: int, end: int, size: int) -> None:
@@ -54,3 +62,45 @@ def _fragment(file: BinaryIO, start: int, end: int, size: int) -> None:
         if length < 8:
             return
         at += length
+
+
+class Whole(io.RawIOBase):
+    """A growing file up to its last whole fragment; other files as they are. A half-written header would spoil the rest."""
+
+    def __init__(self, path: Path):
+        self._file = open(path, "rb", buffering=0)
+        self._end = _whole_bytes(self._file)
+        self._file.seek(0)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer) -> int:
+        room = max(0, self._end - self._file.tell())
+        return self._file.readinto(memoryview(buffer)[:room]) or 0
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._file.seek(self._end + offset) if whence == 2 else self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _whole_bytes(file: io.FileIO) -> int:
+    """Bytes up to the end of the last fragment (moof and mdat) that is whole; all of them where there are no fragments."""
+    end, whole, fragments = file.seek(0, 2), 0, False
+    for at, length, kind in _walk(file, end):
+        if not fragments and (length < 8 or (at + length > end and kind != b"moof")):
+            return end  # not in fragments, or damaged: whoever reads it will tell
+        if length < 8 or at + length > end or (fragments and kind not in (b"moof", b"mdat")):
+            break  # cut; after a power cut what follows may be zeros
+        fragments |= kind == b"moof"
+        whole = whole if kind == b"moof" else at + length
+    return whole

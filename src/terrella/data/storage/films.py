@@ -7,21 +7,18 @@ import hashlib
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
 from ...core.errors import DatasetError
-from . import boxes, durable, mp4
+from . import durable, mp4
 from .mp4 import Mp4Writer
 
-_BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MOST = 50_000_000  # frames of one file; more is damage
 _PACKED, _ZEROS = ("h264", "hevc", "av1", "libdav1d", "vp9"), bytes(24)  # entropy coding leaves no such run of zeros
-_FINISHED = {"movflags": "+faststart"}
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,8 @@ def reel(path: Path, fps: float) -> Reel:
     """Reads the packets, decodes nothing; DatasetError where the file is none."""
     found, keys, digests, zeroed = [], [], [], []
     try:
-        boxes.check(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+        with mp4.opened(path) as (container, stream):
+            a_tick = mp4.ticks(stream, fps)
             codec = stream.codec_context.name if stream.codec_context else ""
             for packet in container.demux(stream):
                 if packet.size == 0 or packet.is_corrupt or packet.pts is None or len(found) == _MOST:
@@ -63,9 +58,9 @@ def reel(path: Path, fps: float) -> Reel:
                 raw = bytes(packet)
                 digests.append(hashlib.blake2b(raw, digest_size=8).digest())
                 zeroed.append(codec in _PACKED and _ZEROS in raw)
-    except _BROKEN as error:
+    except mp4.BROKEN as error:
         if not found:
-            raise _broken(path, str(error)) from error
+            raise mp4.broken(path, str(error)) from error
     frames = np.array(found, np.int64) if all(abs(at) < 2**62 for at in found) else np.full(len(found), -1)
     return Reel(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
 
@@ -104,8 +99,8 @@ def mp4_frames(path: Path, fps: float) -> np.ndarray:
 def _copy(path: Path, at: int, count: int, target: Path) -> None:
     """Packets number `at` .. `at + count - 1` of the file."""
     try:
-        with av.open(str(path)) as source, av.open(str(target), "w", format="mp4", options=_FINISHED) as copy:
-            stream = source.streams.video[0]
+        options = mp4.FINISHED
+        with mp4.opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
             out = copy.add_stream_from_template(stream, opaque=True)
             begin = None
             for number, packet in enumerate(source.demux(stream)):
@@ -118,10 +113,10 @@ def _copy(path: Path, at: int, count: int, target: Path) -> None:
                 packet.dts = None if packet.dts is None else packet.dts - begin
                 packet.stream = out
                 copy.mux(packet)
-    except _BROKEN as error:
+    except mp4.BROKEN as error:
         if getattr(error, "errno", None) in _FULL:
             raise
-        raise _broken(path, str(error)) from error
+        raise mp4.broken(path, str(error)) from error
 
 
 def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:
@@ -149,11 +144,9 @@ def whole_frames(path: Path, first: int, count: int, fps: float) -> np.ndarray:
     """bool [count]: which of the frames can be decoded, all that they refer to included. Every one is tried."""
     good = np.zeros(count, bool)
     try:
-        boxes.check(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
+        with mp4.opened(path) as (container, stream):
             mp4.bound(stream)
-            a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+            a_tick = mp4.ticks(stream, fps)
             if first:
                 container.seek(round(first / a_tick), stream=stream)
             lost = False
@@ -169,10 +162,6 @@ def whole_frames(path: Path, first: int, count: int, fps: float) -> np.ndarray:
                             return good
                 except av.FFmpegError:
                     lost = True
-    except _BROKEN:
+    except mp4.BROKEN:
         pass
     return good
-
-
-def _broken(path: Path, why: str) -> DatasetError:
-    return DatasetError(f"the video {path} is missing, truncated or not mp4 ({why}); restore it from a copy.")

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import queue
-import struct
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
+from av.container import InputContainer
 from av.video.reformatter import VideoReformatter
+from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
 from . import boxes, durable
 
+BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
 KEYFRAME_EVERY = 8
 _CODEC = {
     "preset": "veryfast",
@@ -30,7 +32,7 @@ _CODEC = {
 }
 # While it is recorded every frame is a fragment that stands alone, so that a cut file is whole up to its last frame.
 _GROWING = {"movflags": "frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
-_FINISHED = {"movflags": "+faststart"}  # the index first: a cut file still plays up to the cut
+FINISHED = {"movflags": "+faststart"}  # the index first: a cut file still plays up to the cut
 _WAITING = 64  # frames that may wait for the encoder; then `add` waits, no frame is ever dropped
 _LARGEST = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
 
@@ -100,51 +102,17 @@ class Mp4Writer:
             container.mux(stream.encode())
 
 
-class _Whole(io.RawIOBase):
-    """A growing file up to its last whole fragment; other files as they are. A half-written header would spoil the rest."""
-
-    def __init__(self, path: Path):
-        self._file = open(path, "rb", buffering=0)
-        self._end = _whole_bytes(self._file)
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def readinto(self, buffer) -> int:
-        room = max(0, self._end - self._file.tell())
-        return self._file.readinto(memoryview(buffer)[:room]) or 0
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(self._end + offset) if whence == 2 else self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+@contextmanager
+def opened(path: Path, growing: bool = False) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """A video's container and its first stream; `growing`: up to the last frame that is whole. One of BROKEN where it is none."""
+    boxes.check(path)
+    with boxes.Whole(path) if growing else nullcontext(str(path)) as file, av.open(file, "r") as container:
+        yield container, container.streams.video[0]
 
 
-def _whole_bytes(file) -> int:
-    """Bytes up to the end of the last fragment (moof and mdat) that is whole; all of them where there are no fragments."""
-    end = file.seek(0, 2)
-    at = whole = 0
-    fragments = False
-    while at + 8 <= end:
-        file.seek(at)
-        size, kind = struct.unpack(">I4s", file.read(8))
-        if not fragments and (size < 8 or (at + size > end and kind != b"moof")):
-            return end  # not in fragments, or damaged: whoever reads it will tell
-        if size < 8 or at + size > end or (fragments and kind not in (b"moof", b"mdat")):
-            break  # cut; after a power cut what follows may be zeros
-        fragments |= kind == b"moof"
-        at += size
-        whole = whole if kind == b"moof" else at
-    file.seek(0)
-    return whole if fragments or at < end else end
+def ticks(stream: VideoStream, fps: float) -> Fraction:
+    """Frames of a video of `fps` that one tick of its stream's clock is."""
+    return (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
 
 
 def finish(growing: Path, target: Path, frames: int | None = None) -> int:
@@ -154,13 +122,10 @@ def finish(growing: Path, target: Path, frames: int | None = None) -> int:
     """
     count = 0
     try:
-        boxes.check(growing)
         with (
-            _Whole(growing) as grown,
-            av.open(grown, "r") as source,
-            av.open(str(target), "w", format="mp4", options=_FINISHED) as copy,
+            opened(growing, growing=True) as (source, stream),
+            av.open(str(target), "w", format="mp4", options=FINISHED) as copy,
         ):
-            stream = source.streams.video[0]
             out = copy.add_stream_from_template(stream)
             for packet in source.demux(stream):
                 if packet.size == 0 or packet.is_corrupt or count == frames:
@@ -172,9 +137,9 @@ def finish(growing: Path, target: Path, frames: int | None = None) -> int:
         if isinstance(error, OSError) and error.errno and not isinstance(error, av.InvalidDataError):
             raise
         if not count:
-            raise _broken(growing, str(error)) from error
+            raise broken(growing, str(error)) from error
     if not count:
-        raise _broken(growing, "it holds no frame")
+        raise broken(growing, "it holds no frame")
     durable.sync_file(target)
     return count
 
@@ -186,13 +151,11 @@ def frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -
     """
     expected = first
     try:
-        boxes.check(path)
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
+        with opened(path) as (container, stream):
             bound(stream)
             if stream.width * stream.height > _LARGEST:
-                raise _broken(path, f"it claims pictures of {stream.height}x{stream.width}")
-            frames_a_tick = (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
+                raise broken(path, f"it claims pictures of {stream.height}x{stream.width}")
+            frames_a_tick = ticks(stream, fps)
             stream.thread_count = 1  # of several episodes at once, each has a thread
             reformatter = VideoReformatter()
             if first:
@@ -204,14 +167,14 @@ def frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -
                 if at > expected:
                     break
                 if (frame.width, frame.height) != (stream.width, stream.height):
-                    raise _broken(path, f"frame {expected} has another size than it claims")
+                    raise broken(path, f"frame {expected} has another size than it claims")
                 yield reformatter.reformat(frame, format="gray16le" if deep else "rgb24").to_ndarray()
                 expected += 1
                 if expected == first + count:
                     return
-    except (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError) as error:
-        raise _broken(path, str(error)) from error
-    raise _broken(path, f"frame {expected} is missing, {first + count} are needed")
+    except BROKEN as error:
+        raise broken(path, str(error)) from error
+    raise broken(path, f"frame {expected} is missing, {first + count} are needed")
 
 
 def bound(stream) -> None:
@@ -264,32 +227,21 @@ class Frames(Sequence):
         return frame
 
 
-def count_frames(path: Path) -> int:
-    """How many frames the file holds (read from its packets, nothing is decoded)."""
-    try:
-        boxes.check(path)
-        with av.open(str(path)) as container:
-            return sum(packet.size > 0 for packet in container.demux(video=0))
-    except (av.FFmpegError, OSError, IndexError, ValueError) as error:
-        raise _broken(path, str(error)) from error
-
-
 def count_whole(growing: Path) -> int:
-    """How many frames of a growing file, whole or cut, are whole; 0 where there is none."""
+    """How many frames of a file, growing or not, whole or cut, are whole; 0 where there is none. Nothing is decoded."""
     count = 0
     try:
-        boxes.check(growing)
-        with _Whole(growing) as grown, av.open(grown, "r") as container:
+        with opened(growing, growing=True) as (container, _):
             for packet in container.demux(video=0):
                 if packet.size == 0 or packet.is_corrupt:
                     break
                 count += 1
-    except (av.FFmpegError, OSError, IndexError, ValueError):
+    except BROKEN:
         pass
     return count
 
 
-def _broken(path: Path, why: str) -> DatasetError:
+def broken(path: Path, why: str) -> DatasetError:
     return DatasetError(
         f"the video {path} is missing, truncated or not H.264 mp4 ({why}); restore it from a copy, or remove its episode."
     )

@@ -26,8 +26,9 @@ BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowE
 _BATCH = 64 << 20  # bytes that one batch of numbers may take
 _TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
 _TABLE = 64  # the same, of tables whose rows are short
-_LARGEST = 4 << 30  # bytes that one reading of numbers may unpack to
-_REPEATED = 1 << 30  # the same, where texts are among them: a few bytes of a file can repeat one without end
+_SLACK = 64 << 20  # bytes that any reading may unpack to
+_LONG = 64 << 10  # bytes of each row beyond these: a few bytes of a file can repeat a text without end
+_WIDEST = 64 << 20  # bytes of one reading of a stream
 _LARGEST_JSON = 256 << 20  # bytes; stats.json of many cameras is long, but not so long
 _ROWS_A_BYTE = 64  # more rows than these for each byte of a file are a bomb: at least their counters differ
 _FEW_ROWS = 1_000_000
@@ -40,7 +41,7 @@ def read_whole(path: Path, columns: list[str] | None = None, most_rows: int | No
             rows = file.metadata.num_rows
             if most_rows is not None and rows > most_rows:
                 raise ValueError(f"it claims {rows:,} rows where at most {most_rows:,} can be")
-            return _bounded(file, range(file.num_row_groups), columns, _table_step(file, columns), _REPEATED)
+            return _bounded(file, range(file.num_row_groups), columns, _table_step(file, columns), _LONG)
     except BROKEN as error:
         raise damaged(path, error) from error
 
@@ -95,13 +96,12 @@ def _found_groups(path: str, _size: int, _changed_ns: int) -> tuple[tuple[int, i
 
 def _features(file: pq.ParquetFile, groups: Sequence[int], columns: list[str], features: Mapping[str, dict]):
     """Columns of a data file; ValueError where they unpack to more than the features promise."""
-    wide, texts = 8, False
+    wide, texts = 16, False
     for name in columns:
-        dtype = features[name]["dtype"] if name in features else "int64"
+        dtype, shape = (features[name]["dtype"], features[name]["shape"]) if name in features else ("int64", [1])
         texts |= dtype in ("image", "string")
-        wide += 16 * math.prod(features[name]["shape"]) if dtype not in ("image", "string", "video") else 0
-    step = _TEXTS if texts else max(1, _BATCH // wide)
-    return _bounded(file, groups, columns, step, _REPEATED if texts else _LARGEST)
+        wide += _LONG + 2 * math.prod(shape) if dtype in ("image", "string") else 16 * math.prod(shape)
+    return _bounded(file, groups, columns, _TEXTS if texts else max(1, _BATCH // wide), wide)
 
 
 def _table_step(file: pq.ParquetFile, columns: list[str] | None) -> int:
@@ -112,13 +112,13 @@ def _table_step(file: pq.ParquetFile, columns: list[str] | None) -> int:
     return _FEW_ROWS if numbers else _TABLE
 
 
-def _bounded(file: pq.ParquetFile, groups: Iterable[int], columns: list[str] | None, step: int, most: int) -> pa.Table:
-    """Whole row groups, `step` rows at a time; ValueError where they unpack to more than `most` bytes."""
-    parts, total = [], 0
+def _bounded(file: pq.ParquetFile, groups: Iterable[int], columns: list[str] | None, step: int, wide: int) -> pa.Table:
+    """Whole row groups, `step` rows at a time; ValueError where they unpack to more than `wide` bytes a row."""
+    parts, rows, total = [], 0, 0
     for batch in file.iter_batches(step, row_groups=list(groups), columns=columns):
-        total += batch.nbytes
-        if total > most:
-            raise ValueError(f"it unpacks to more than {most:,} bytes")
+        rows, total = rows + batch.num_rows, total + batch.nbytes
+        if total > _SLACK + rows * wide:
+            raise ValueError(f"{rows:,} of its rows unpack to {total:,} bytes")
         parts.append(batch)
     form = parts[0].schema if parts else file.schema_arrow
     table = pa.Table.from_batches(parts, form)
@@ -173,7 +173,7 @@ class ValuesOf(Sequence):
             raise damaged(self._path, error) from error
 
     def _read(self, file: pq.ParquetFile, group: int) -> Any:
-        return _bounded(file, [group], [self._column], _TABLE, _LARGEST)[self._column]
+        return _bounded(file, [group], [self._column], _TEXTS, _WIDEST)[self._column]
 
     def _value(self, row: int) -> Any:
         assert self._group is not None
