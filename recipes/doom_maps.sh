@@ -12,7 +12,7 @@ terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 8
 terrella record doom --height 96 --scenario deadly_corridor --skill 3 --frames 16000 --seed 7 --out recordings/fights-test
 terrella train video recordings/monsters --out runs/monsters --name doom-corridor --steps 3500 --motion-steps 4000 \
     --keyframes 200 --critic-from 900 --estimator-steps 0 --uncertainty-frames 2000
-terrella train things runs/monsters/world --data recordings/fights --out runs/monsters/things
+terrella train objects runs/monsters/world --data recordings/fights --out runs/monsters/things
 terrella score runs/monsters/things --data recordings/monsters-test --fresh --out scores/monsters --horizons 1 8 32 \
     --clips 24 --drift 0 --long-steps 0
 python benchmarks/things.py runs/monsters/things recordings/fights-test

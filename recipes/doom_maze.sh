@@ -7,9 +7,9 @@ terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out recor
 # The west room and its corridor (x below 11.9 m) are never seen in training: they are the "new places" of the scorecard.
 OMP_NUM_THREADS=1 terrella train video recordings/doom-maze --out runs/doom-maze --name doom-maze \
     --keep-out 0 -30 11.9 10 --steps 9000 --motion-steps 5000
-# The run ends with its senses: an eye for lone pictures and a doubt that says when it invents. Those of the bundled world were
+# The run ends with an estimator for lone pictures and an uncertainty that says when it invents. Those of the bundled world were
 # given to it afterwards, in 11 minutes beside other work, from a recording made by the line above:
-#   terrella train senses doom-maze --data recordings/doom-maze --out runs/sensing --estimator-steps 1600 --uncertainty-frames 3500
+#   terrella train uncertainty doom-maze --data recordings/doom-maze --out runs/sensing --estimator-steps 1600 --uncertainty-frames 3500
 mkdir -p src/terrella/bundled
 rm -rf src/terrella/bundled/doom-maze
 cp -r runs/doom-maze/world src/terrella/bundled/doom-maze

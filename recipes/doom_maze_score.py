@@ -45,8 +45,9 @@ DRIFT, DRIFT_CLIPS = 256, 24
 class Average(torch.nn.Module):
     """In the place of the generator: what memory knows, averaged, and the last frame where it knows nothing."""
 
-    def __init__(self):
+    def __init__(self, config):
         super().__init__()
+        self.config = config
         self.where = torch.nn.Parameter(torch.zeros(()))  # a world asks its generator which device it is on
 
     def forward(self, noisy, time, conditioning):
@@ -106,7 +107,7 @@ def main() -> None:
     given = parser.parse_args()
     world = terrella.load(given.world)
     bare = terrella.load(given.world, memory=False)
-    arms = {"memory": world, "no memory": bare, "no network": world.replaced(generator=Average())}
+    arms = {"memory": world, "no memory": bare, "no network": world.replaced(generator=Average(world.generator.config))}
     cache = ClipCache.open(given.data, world.spec.channels["rgb"].shape[:2])
     sets = {
         CLIPS: places(world, cache, given.clips, 0, max(HORIZONS)),

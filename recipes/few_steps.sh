@@ -5,7 +5,7 @@
 set -e
 PATH=.venv/bin:$PATH
 export OMP_NUM_THREADS=1
-# A teacher is not played: it needs no doubt, which would take longer to learn than all its students.
+# A teacher is not played: it needs no uncertainty, which would take longer to learn than all its students.
 data=recordings/doom-maze
 [ -d $data ] || terrella record doom --scenario my_way_home --frames 100000 --seed 0 --out $data
 terrella train video $data --out runs/few-teacher --name teacher --no-geometry --size 48 64 \

@@ -114,7 +114,7 @@ def sensing(recording, bare, tmp_path_factory):
 def test_a_world_is_given_an_estimator_and_an_uncertainty(bare, sensing):
     world = load_world(bare)
     picture = world.render(world.start(1, make_rng(0)), ("rgb",))["rgb"]
-    with pytest.raises(ObservationError, match="train senses"):
+    with pytest.raises(ObservationError, match="train uncertainty"):
         world.observe({"rgb": picture}, None, make_rng(0))
     out, facts = sensing
     assert facts["uncertainty"]["invents"] > facts["uncertainty"]["sure"] > 0
