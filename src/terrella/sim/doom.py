@@ -267,25 +267,9 @@ def _open_game(
     config: DoomConfig, scenario: str, maps: tuple[str, ...]
 ) -> tuple[vizdoom.DoomGame, tuple[str, ...], bool]:
     """The running game, its buttons, and whether it tells the player's health."""
-    if config.skill is not None and not 1 <= config.skill <= 5:
-        raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); {config.skill} is not one.")
-    settings = Path(vizdoom.scenarios_path) / f"{scenario}.cfg"
-    games = sorted(path.stem for path in Path(vizdoom.__file__).parent.glob("freedoom*.wad"))
-    if not scenario or Path(scenario).name != scenario or not settings.exists():
-        known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
-        raise TerrellaError(f"ViZDoom has no scenario '{scenario}'; it has {', '.join(known)}.")
-    if maps or scenario in games:
-        have = map_names(Path(vizdoom.__file__).parent / f"{scenario}.wad") if scenario in games else []
-        if not have:
-            raise TerrellaError(
-                f"'{scenario}' has no maps to choose from here; the games that have are {', '.join(games)}."
-            )
-        if not maps or set(maps) - set(have):
-            wrong = ", ".join(sorted(set(maps) - set(have))) or "none was named"
-            example = f"{scenario}/{have[0]} or {scenario}/{have[0]},{have[1]}"
-            raise TerrellaError(f"{scenario} has the maps {have[0]} to {have[-1]} ({wrong}); say {example}.")
+    _check_scenario(config, scenario, maps)
     game = vizdoom.DoomGame()
-    game.load_config(str(settings))
+    game.load_config(str(Path(vizdoom.scenarios_path) / f"{scenario}.cfg"))
     button, variable = vizdoom.Button, vizdoom.GameVariable
     more = [name for name in MORE_BUTTONS if getattr(button, name) in game.get_available_buttons()]
     alive = bool(maps) or variable.HEALTH in game.get_available_game_variables()
@@ -324,6 +308,30 @@ def _open_game(
     game.set_episode_timeout(config.timeout_tics)
     _begin(game, scenario)
     return game, buttons, alive
+
+
+def _check_scenario(config: DoomConfig, scenario: str, maps: tuple[str, ...]) -> None:
+    """Refuses what ViZDoom does not have, naming what it has."""
+    if config.skill is not None and not 1 <= config.skill <= 5:
+        raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); {config.skill} is not one.")
+    games = sorted(path.stem for path in Path(vizdoom.__file__).parent.glob("freedoom*.wad"))
+    if (
+        not scenario
+        or Path(scenario).name != scenario
+        or not (Path(vizdoom.scenarios_path) / f"{scenario}.cfg").exists()
+    ):
+        known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
+        raise TerrellaError(f"ViZDoom has no scenario '{scenario}'; it has {', '.join(known)}.")
+    if maps or scenario in games:
+        have = map_names(Path(vizdoom.__file__).parent / f"{scenario}.wad") if scenario in games else []
+        if not have:
+            raise TerrellaError(
+                f"'{scenario}' has no maps to choose from here; the games that have are {', '.join(games)}."
+            )
+        if not maps or set(maps) - set(have):
+            wrong = ", ".join(sorted(set(maps) - set(have))) or "none was named"
+            example = f"{scenario}/{have[0]} or {scenario}/{have[0]},{have[1]}"
+            raise TerrellaError(f"{scenario} has the maps {have[0]} to {have[-1]} ({wrong}); say {example}.")
 
 
 def _begin(game: vizdoom.DoomGame, scenario: str) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def cast_prisms(lines, solid, first, heights, sky, x, y, eye, yaw, camera, farthest, depth, sector):
-    """Fills `depth` [H, W] and `sector` int32 [H, W] of the view from x, y and height `eye` along `yaw` (radians).
+def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthest, depth, sector):
+    """Fills `depth` [H, W] and `sector` int32 [H, W] of the view from x, y and height z along `yaw` (radians).
 
     lines [N, 4] = x1, y1, x2, y2, sector by sector: those of sector s are rows first[s] to first[s + 1]; solid [N] where
     nothing is behind; heights [S, 2] = floor, ceiling; sky [S] where the ceiling is the open sky. Depth is along the optical
@@ -25,7 +25,7 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, eye, yaw, camera, farth
         for end in range(2):
             px, py = lines[n, 2 * end] - x, lines[n, 2 * end + 1] - y
             ahead[n, end], right[n, end] = px * cosine + py * sine, px * sine - py * cosine
-    near = np.zeros(len(first) - 1, np.bool_)  # sectors of which a line lies before the eye
+    near = np.zeros(len(first) - 1, np.bool_)  # sectors of which a line lies before the camera
     for s in range(len(near)):
         for n in range(first[s], first[s + 1]):
             near[s] |= max(ahead[n, 0], ahead[n, 1]) > 0 and min(ahead[n, 0], ahead[n, 1]) < farthest
@@ -44,42 +44,47 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, eye, yaw, camera, farth
         for s in range(len(near)):
             if not near[s]:
                 continue
-            count = 0
-            for n in range(first[s], first[s + 1]):
-                cut = crossing(ahead, right, n, side)
-                if cut < np.inf:
-                    at = count
-                    while at > 0 and cuts[at - 1] > cut:
-                        cuts[at] = cuts[at - 1]
-                        at -= 1
-                    cuts[at] = cut
-                    count += 1
-            if count == 0:
-                continue
-            if count % 2 == 1:  # the eye is in this sector
-                for at in range(count, 0, -1):
-                    cuts[at] = cuts[at - 1]
-                cuts[0] = 0.0
-                count += 1
+            count = sorted_cuts(ahead, right, first[s], first[s + 1], side, cuts)
             floor, ceiling = heights[s, 0], heights[s, 1]
             for pair in range(0, count, 2):
                 enter, leave = cuts[pair], cuts[pair + 1]
                 if enter >= wall:
                     break
                 for v in range(rows):
-                    high = (
-                        eye - down[v] * enter
-                    )  # where the ray enters: on the edge of a floor or ceiling, or between them
+                    # where the ray enters: on the edge of a floor or ceiling, or between them
+                    high = z - down[v] * enter
                     if high <= floor or high >= ceiling:
                         hit = enter
                     else:
-                        hit = (eye - floor) / down[v] if down[v] > 0 else (eye - ceiling) / down[v]
+                        hit = (z - floor) / down[v] if down[v] > 0 else (z - ceiling) / down[v]
                     if hit <= leave and hit < depth[v, u]:
-                        open_air = sky[s] and eye - down[v] * hit > ceiling - 1e-3
+                        open_air = sky[s] and z - down[v] * hit > ceiling - 1e-3
                         depth[v, u], sector[v, u] = hit, -2 if open_air else s
         for v in range(rows):
             if sector[v, u] == -2:
                 depth[v, u], sector[v, u] = farthest, -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sorted_cuts(ahead, right, low, high, side, cuts):
+    """Where a column, `side` to the right for each unit ahead, enters and leaves the sector of lines low to high, in turn, into
+    `cuts`; gives how many there are. One that stands in the sector enters at 0."""
+    count = 0
+    for n in range(low, high):
+        cut = crossing(ahead, right, n, side)
+        if cut < np.inf:
+            at = count
+            while at > 0 and cuts[at - 1] > cut:
+                cuts[at] = cuts[at - 1]
+                at -= 1
+            cuts[at] = cut
+            count += 1
+    if count % 2 == 1:
+        for at in range(count, 0, -1):
+            cuts[at] = cuts[at - 1]
+        cuts[0] = 0.0
+        count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -90,10 +90,10 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
 
 
 def _config(told: dict) -> VideoConfig:
-    known = {{"cast": "objects"}.get(name, name): value for name, value in told.items() if name not in RETIRED}
-    settings: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in known.items()
-    }
+    settings: dict[str, Any] = {}
+    for name, value in told.items():
+        if name not in RETIRED:
+            settings["objects" if name == "cast" else name] = tuple(value) if isinstance(value, list) else value
     return VideoConfig(**settings)
 
 

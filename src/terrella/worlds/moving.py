@@ -17,8 +17,8 @@ PLANES = 6  # that `carry_frames` adds to the last frame's colour and trust
 
 class Frame(NamedTuple):
     """B frames as they were seen: rgb uint8 [B, 3, H, W]; depth [B, H, W] metres; things [B, H, W] in 0..1, where something
-    is that may move or vanish; pose [B, 7]; covered bool [B, H, W], where a card was painted (worlds/cast.py), which hides what
-    is there."""
+    is that may move or vanish; pose [B, 7]; covered bool [B, H, W], where a billboard was painted (worlds/objects.py), which
+    hides what is there."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -28,7 +28,7 @@ class Frame(NamedTuple):
 
 
 def covering(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
-    """The pixels bool [B, H, W] that cards cover: those of `instances` [B, H, W], and what of `things` [B, H, W] is around
+    """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and what of `things` [B, H, W] is around
     them, for a rim is theirs in part."""
     bare = (instances == 0).float()
     return (bare == 0) | ((least_around(bare) == 0) & (things > 0.5))
@@ -40,7 +40,7 @@ def still(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
 
 
 def carry_frames(last: Frame, earlier: Frame, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """The last two frames as they would look from `pose` [B, 7], had nothing moved but the eye: [B, 4 + PLANES, H, W] =
+    """The last two frames as they would look from `pose` [B, 7], had nothing moved but the camera: [B, 4 + PLANES, H, W] =
     colour in [0, 1] and trust of the last; its depth in metres and its things; colour and trust of the one before."""
     rgb, depth, things, at, covered = map(torch.cat, zip(last, earlier))
     now, before = carry_things(rgb, depth, things, covered, at, torch.cat([pose, pose]), camera).chunk(2)

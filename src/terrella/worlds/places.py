@@ -131,7 +131,11 @@ class KeyframeScene:
             observation, lone = self._arrived(observation, prior, estimator)
         if "pose" not in observation:
             alone = ", a picture alone" if estimator else ""
-            blind = "" if estimator else " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
+            blind = (
+                ""
+                if estimator
+                else " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
+            )
             raise ObservationError(
                 f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
             )

@@ -58,6 +58,34 @@ def lift(depth, turn, position, camera, stride, slant, patch):
 
 
 @numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
+def cover(plane, centre, sides, nearest, block, camera, depth):
+    """Lowers the pixels of `block` (first row, stop, first column, stop) of `depth` that a patch covers: its plane's normal and
+    distance, its centre and both half sides in the camera's frame; camera = fx, fy, cx, cy in pixels."""
+    n0, n1, n2, lift = plane
+    c0, c1, c2 = centre
+    a0, a1, a2, d0, d1, d2 = sides
+    fx, fy, cx, cy = camera
+    aa, ad, dd = a0 * a0 + a1 * a1 + a2 * a2, a0 * d0 + a1 * d1 + a2 * d2, d0 * d0 + d1 * d1 + d2 * d2
+    determinant = max(aa * dd - ad * ad, 1e-20)
+    for v in range(block[0], block[1]):
+        up = -(v + 0.5 - cy) / fy
+        for u in range(block[2], block[3]):
+            if depth[v, u] < nearest:  # no point of the patch is nearer
+                continue
+            side = -(u + 0.5 - cx) / fx
+            slope = n0 + n1 * side + n2 * up
+            if abs(slope) < 1e-12:
+                slope = -1e-12
+            along = lift / slope
+            if along <= NEAR_M or along >= depth[v, u]:
+                continue
+            o0, o1, o2 = along - c0, along * side - c1, along * up - c2
+            oa, od = o0 * a0 + o1 * a1 + o2 * a2, o0 * d0 + o1 * d1 + o2 * d2
+            if abs(oa * dd - od * ad) <= determinant and abs(od * aa - oa * ad) <= determinant:
+                depth[v, u] = along
+
+
+@numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")
 def cast_one(patch, turn, position, camera, depth):
     """patch [N, 9], turn [3, 3] and position [3] of T_world_cam, camera intrinsics; lowers `depth` [H, W] to what they show."""
     height, width = depth.shape
@@ -106,24 +134,9 @@ def cast_one(patch, turn, position, camera, depth):
         first_v, last_v = max(int(math.ceil(top - 0.5)), 0), min(int(math.floor(bottom - 0.5)), height - 1)
         if first_u > last_u or first_v > last_v:
             continue
-        aa, ad, dd = a0 * a0 + a1 * a1 + a2 * a2, a0 * d0 + a1 * d1 + a2 * d2, d0 * d0 + d1 * d1 + d2 * d2
-        determinant = max(aa * dd - ad * ad, 1e-20)
-        for v in range(first_v, last_v + 1):
-            up = -(v + 0.5 - cy) / fy
-            for u in range(first_u, last_u + 1):
-                if depth[v, u] < nearest:  # no point of the patch is nearer
-                    continue
-                side = -(u + 0.5 - cx) / fx
-                slope = n0 + n1 * side + n2 * up
-                if abs(slope) < 1e-12:
-                    slope = -1e-12
-                along = lift / slope
-                if along <= NEAR_M or along >= depth[v, u]:
-                    continue
-                o0, o1, o2 = along - c0, along * side - c1, along * up - c2
-                oa, od = o0 * a0 + o1 * a1 + o2 * a2, o0 * d0 + o1 * d1 + o2 * d2
-                if abs(oa * dd - od * ad) <= determinant and abs(od * aa - oa * ad) <= determinant:
-                    depth[v, u] = along
+        plane, sides = (n0, n1, n2, lift), (a0, a1, a2, d0, d1, d2)
+        block = (first_v, last_v + 1, first_u, last_u + 1)
+        cover(plane, (c0, c1, c2), sides, nearest, block, (fx, fy, cx, cy), depth)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
