@@ -187,7 +187,7 @@ class State(Mapping):
         deferred = self.deferred
         if deferred is None:
             return self.at(rows)
-        return State({name: tensor[rows] for name, tensor in self._tensors.items()}, self._arenas, deferred.at(rows))
+        return State({name: tensor[rows] for name, tensor in self._tensors.items()}, self._arenas, deferred.at(rows, self._arenas))
 
     def save(self, path: str | Path) -> None:
         """Writes one safetensors file, with the rows that the state points at."""
