@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .errors import ContractError
+
 if TYPE_CHECKING:
     from .arena import Arena
     from .state import State
@@ -87,6 +89,11 @@ class Pick:
         """The tensors; nothing that they need waits any more."""
         if not len(self.index):
             return {name: self.sources[0][name][:0] for name in names}
+        kinds = {name: {tuple(source[name].shape[1:]) for source in self.sources} for name in names}
+        for name in (name for name in names if len(kinds[name]) > 1):
+            raise ContractError(
+                f"'{name}' has the shapes {sorted(kinds[name])} in these states; join those of one world."
+            )
         return {name: torch.cat([source[name] for source in self.sources])[self.index] for name in names}
 
 
