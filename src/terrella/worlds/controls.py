@@ -58,9 +58,10 @@ class Controls:
         if self.kind == BUTTONS:
             return spaces.MultiBinary(len(self.low))
         if self.kind == CHOICE:
-            if len(self.low) > 1:
-                return spaces.MultiDiscrete(self._counts, start=[int(low) for low in self.low])
-            return spaces.Discrete(self.numbers, start=int(self.low[0]))
+            starts = [int(low) for low in self.low]
+            if len(starts) == 1:
+                return spaces.Discrete(self.numbers, start=starts[0])
+            return spaces.MultiDiscrete(self._counts, start=starts)
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
     def encode(self, action: torch.Tensor) -> torch.Tensor:
