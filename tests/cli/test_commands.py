@@ -12,6 +12,7 @@ import pytest
 
 import terrella
 from terrella.cli import COMMANDS, main
+from terrella.core import make_rng
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
@@ -108,6 +109,37 @@ def test_a_simulator_without_a_display_is_said(capsys, monkeypatch):
 
     monkeypatch.setattr("terrella.library.load", broken)
     assert "MUJOCO_GL=egl" in refusal(["play", "gym:Ant-v5"], capsys)
+
+
+def test_only_a_renderer_has_no_display(capsys, monkeypatch):
+    def load(error, name="terrella"):
+        """A `library.load` that raises `error` in the module `name`."""
+        space = {"__name__": name, "error": error}
+        exec("def load(*_, **__): raise error", space)
+        monkeypatch.setattr("terrella.library.load", space["load"])
+
+    load(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
+    assert "terrella[mujoco]" in refusal(["play", "gym:Ant-v5"], capsys)
+    load(ImportError("Cannot initialize a EGL device display."), "mujoco.egl")
+    assert "MUJOCO_GL=egl" in refusal(["play", "gym:Ant-v5"], capsys)
+    for error in (ValueError("the weights of mujoco-ant lack REGEL"), KeyError("glfw")):
+        load(error)
+        with pytest.raises(type(error)):
+            main(["play", "gym:Ant-v5"])
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_recording_of_nothing_is_refused(rows, tmp_path, capsys, monkeypatch):
+    def serve(worlds, sink_factory, **_):
+        world, rng, sink = worlds[0], make_rng(0), sink_factory()
+        shown = world.render(world.start(1, rng), list(world.spec.channels))
+        for _ in range(rows):
+            sink.add({name: value[0].numpy() for name, value in shown.items()}, None, 0.0, False)
+        sink.close()
+
+    monkeypatch.setattr("terrella.serve.serve", serve)
+    said = refusal(["record", "world", "gym:CartPole-v1", "--human", "--out", tmp_path / "set"], capsys)
+    assert "nothing was recorded" in said
 
 
 def test_help_imports_nothing_heavy():

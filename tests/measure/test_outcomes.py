@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from terrella.core import Spec, State, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.spec import DONE, REWARD
 from terrella.measure import CLIPS, ENDINGS, Exam, ExamConfig, examine
-from terrella.measure.outcomes import auc, correlation, passages
+from terrella.measure.outcomes import auc, correlation, outcomes, passages
 
 HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -69,7 +70,7 @@ def exam_rows(clips, real, horizons=(4, 16)):
 
 
 def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
-    shown = passages(recording(), (0, 1, 2), 5, 16, 24, make_rng(0))
+    shown = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
     rows = exam_rows(*shown)
     for horizon in (4, 16):
         assert rows["right", horizon, "return error"].figure.value == rows["right", horizon, "error"].figure.value == 0
@@ -86,13 +87,49 @@ def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
 
 
 def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
-    shown = passages(recording(), (0, 1, 2), 5, 16, 20, make_rng(1))
+    shown = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 20, make_rng(1))
     short = [(clip, real) for clip, real in zip(*shown) if not real.all()]
     assert len(short) >= 10
     for clip, real in short:
         after = clip.channels["health"][int(real.sum()) :]
         assert (after == after[0]).all() and (clip.action[~real] == 0).all()
         assert real[:5].all()
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(3, start=1), spaces.Box(0.5, 1, (1,), np.float32)])
+def test_after_an_end_the_actions_are_legal(space):
+    cache = recording()
+    cache.action = np.ones_like(cache.action)
+    for clip, _ in zip(*passages(cache, replace(Game().spec, action=space), (0, 1, 2), 5, 16, 20, make_rng(1))):
+        assert all(space.contains(row.astype(space.dtype).reshape(space.shape)[()]) for row in clip.action)
+
+
+def test_nothing_but_the_end_is_judged_after_an_end():
+    clips, real = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
+    exam = Exam({"right": Game()}, {CLIPS: {"recorded": clips}}, ExamConfig((4, 16), ()))
+    going = torch.from_numpy(np.stack(real))
+    dreamt = {name: torch.from_numpy(np.stack([clip.channels[name][5:] for clip in clips])) for name in ("health",)}
+    dreamt["health"] = dreamt["health"].reshape(24, 16).clone()
+    dreamt["reward"] = torch.from_numpy(np.stack([clip.channels["reward"][4:-1] for clip in clips]))
+    after = ~going[:, 4:-1]
+    assert after.any()
+    dreamt = {name: torch.where(after, 99.0, values) for name, values in dreamt.items()}
+    rows = [
+        row
+        for row in outcomes(exam, "recorded", "right", clips, going, dreamt)
+        if row.what in ("error", "return error")
+    ]
+    assert len(rows) == 4 and all(row.figure.value == 0 for row in rows)
+    assert min(row.figure.count for row in rows if row.what == "error") < 24
+
+
+def test_results_of_another_recording_do_not_count():
+    clips, real = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 4, make_rng(0))
+    brighter = [replace(clip, channels={**clip.channels, "rgb": clip.channels["rgb"] + 1}) for clip in clips]
+    prints = [
+        Exam({"right": Game()}, {CLIPS: {"recorded": some}}, ExamConfig()).fingerprint() for some in (clips, brighter)
+    ]
+    assert prints[0] != prints[1]
 
 
 def test_auc_counts_pairs():
@@ -110,14 +147,16 @@ def test_correlation_is_pearsons():
 
 def test_what_is_too_short_is_refused():
     with pytest.raises(DatasetError, match="longer than"):
-        passages(recording((4, 5)), (0, 1), 5, 8, 4, make_rng(0))
+        passages(recording((4, 5)), Game().spec, (0, 1), 5, 8, 4, make_rng(0))
 
 
 def test_passages_stay_where_they_may():
     cache = recording()
     allowed = np.zeros(cache.length, bool)
     allowed[cache.episodes[1][0] + 3 : cache.episodes[1][1] - 2] = True
-    shown = passages(cache, (0, 1, 2), 2, 4, 12, make_rng(0), lambda cache, first, stop: allowed[first:stop])
+    shown = passages(
+        cache, Game().spec, (0, 1, 2), 2, 4, 12, make_rng(0), lambda cache, first, stop: allowed[first:stop]
+    )
     for clip, real in zip(*shown):
         rows = clip.start + np.arange(len(real) + 1)
         assert allowed[rows[:-1][real]].all() and allowed[clip.start]

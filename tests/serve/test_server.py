@@ -181,14 +181,18 @@ def test_the_rules_of_refusal():
     assert not refusal({"host": "10.0.0.2:1"}, "0.0.0.0", "t", "t") and refusal(
         {"host": "10.0.0.2:1"}, "0.0.0.0", "t", None
     )
+    for headers in ({"host": "["}, {"host": "localhost:1", "origin": "http://["}):
+        assert refusal(headers, "127.0.0.1", None, None) and refusal(headers, "0.0.0.0", "t", "t")
+    assert not refusal({"host": "10.0.0.2:1"}, "0.0.0.0", "", None), "an empty token is none"
 
 
-def test_an_address_that_others_reach_gets_a_token(serve_world, monkeypatch):
+@pytest.mark.parametrize("token", [None, ""])
+def test_an_address_that_others_reach_gets_a_token(token, serve_world, monkeypatch):
     seen = []
     monkeypatch.setattr("uvicorn.Server.run", lambda server, sockets: seen.append(server.config.app))
     monkeypatch.setattr("terrella.serve.server.is_loopback", lambda host: False)
     monkeypatch.setattr("terrella.serve.server.page_address", lambda host, port, token: seen.append(token))
-    serve([Panorama()], port=0)
+    serve([Panorama()], port=0, token=token)
     assert isinstance(seen[0], str) and len(seen[0]) > 16
 
 

@@ -8,6 +8,7 @@ import torch
 from gymnasium import spaces
 
 from terrella.core import Spec, State, check_world, make_rng
+from terrella.core.arena import Arena
 from terrella.core.errors import DatasetError, ServeError
 from terrella.serve.actions import action_of
 from terrella.serve.history import History, Moment
@@ -145,6 +146,19 @@ def test_shared_memory_counts_once():
     assert history.state_bytes == 4000 + 5 * 8
     history.forget_after(0)
     assert history.state_bytes == 4000 + 8
+
+
+def test_rows_of_an_arena_count_once_and_bound_the_history():
+    arena = Arena({"rgb": (torch.uint8, (1000,))})
+    history, rows = History(frames=100, state_bytes=20_000), torch.zeros(1, 10, dtype=torch.int64)
+    for step in range(50):  # each step replaces one of ten keyframes
+        rows = rows.clone()
+        rows[0, step % 10] = arena.keep({"rgb": torch.zeros(1, 1000, dtype=torch.uint8)})[0]
+        history.push(Moment(step, (), states=(State({"rows": rows}, {"rows": arena}),)))
+    kept = history.newest.step - history.oldest_step + 1
+    assert 5 < kept < 15 and history.state_bytes == 1000 * (10 + kept - 1) + 80 * kept <= 20_000
+    history.forget_after(history.oldest_step)
+    assert history.state_bytes == 10 * 1000 + 80
 
 
 def test_turning_left_moves_the_picture_right():

@@ -18,6 +18,7 @@ from terrella.core.errors import DatasetError
 from terrella.data.source import Lazy, Readings, Source, Take
 from terrella.exchange.browse import Browse
 from terrella.serve import readings
+from terrella.serve.viewer import view
 
 from . import rig
 from .viewed import asked
@@ -160,6 +161,11 @@ def test_what_is_not_there_is_said(client, path, status):
     assert answer.status_code == status and "Traceback" not in answer.text
 
 
+@pytest.mark.parametrize("buckets", ["inf", "-inf", "1e300"])
+def test_buckets_keep_to_their_limits(client, buckets):
+    assert client.get(f"/series/0/{STATE}?buckets={buckets}").status_code == 200
+
+
 def test_every_file_of_the_page_is_served_and_guarded(client):
     page = client.get("/").text
     assert "<script>" not in page and "style=" not in page, "the policy forbids both"
@@ -175,6 +181,16 @@ def test_foreign_pages_are_refused(client, headers):
     assert client.post("/mark", json={"episode": 0, "bad": True}, headers=headers).status_code == 403
     assert client.post("/export", headers=headers).status_code == 403
     assert client.get("/about").json()["bad"] == []
+
+
+@pytest.mark.parametrize("token", [None, ""])
+def test_an_address_that_others_reach_gets_a_token(token, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr("uvicorn.Server.run", lambda server, sockets: None)
+    monkeypatch.setattr("terrella.serve.viewer.is_loopback", lambda host: False)
+    monkeypatch.setattr("terrella.serve.viewer.page_address", lambda host, port, token: seen.append(token))
+    view(browse_of(tmp_path), port=0, token=token)
+    assert isinstance(seen[0], str) and len(seen[0]) > 16
 
 
 def test_the_token_is_asked_of_everything(tmp_path):

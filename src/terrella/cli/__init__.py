@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
@@ -40,7 +41,16 @@ RENAMED = {
 }
 
 _THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
-_DRAWING = ("mujoco", "glfw", "OpenGL", "EGL", "gladLoadGL", "GLFW")  # in the errors of a renderer without a display
+_DRAWERS = (
+    "mujoco.egl",
+    "mujoco.glfw",
+    "mujoco.osmesa",
+    "mujoco.cgl",
+    "mujoco.gl_context",
+    "glfw",
+    "OpenGL",
+    "gymnasium.envs.mujoco.mujoco_rendering",
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -147,9 +157,18 @@ def _sentence(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in _THEIRS:
         where = f" ({error.filename})" if error.filename else ""
         return f"{error.strerror}{where}; choose another folder, or free some space."
-    source = f"{type(error).__module__} {error}"
-    if any(word in source for word in _DRAWING):
+    if isinstance(error, ModuleNotFoundError) and error.name in ("mujoco", "glfw", "OpenGL"):
+        return f"{error.name} is not installed; `pip install 'terrella[mujoco]'` installs what MuJoCo's worlds need."
+    if _of_a_renderer(error):
         sys.unraisablehook = lambda _: None  # half-made renderers complain again when they are thrown away
         what = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
         return f"the simulator cannot draw without a display ({what}); set MUJOCO_GL=egl or MUJOCO_GL=osmesa and try again."
     return None
+
+
+def _of_a_renderer(error: Exception) -> bool:
+    """Whether MuJoCo's drawing, or a library that it draws with, raised the error or called what did."""
+    if type(error).__module__ == "mujoco" and any(word in str(error) for word in ("OpenGL", "gladLoadGL", "EGL")):
+        return True
+    frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(f"{name}.".startswith(f"{drawer}.") for name in (type(error).__module__, *frames) for drawer in _DRAWERS)

@@ -112,14 +112,17 @@ def _record(
 
             sink = lambda: Recorder(out, layout, "play", live=live)  # noqa: E731
             serve([world], port=port, sink_factory=sink, on_ready=ready, seed=seed)
-            if not out.exists():
-                raise DatasetError("nothing was recorded: press the record button on the page before you play.")
         else:
             with progress.shown("recording") as report:
                 player, rng = Explorer(world.spec), make_rng(seed)
                 done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
-    dataset = Dataset(out)
+    dataset = Dataset(out) if out.exists() else None
+    if dataset is None or not dataset.length:
+        raise DatasetError(
+            "nothing was recorded: an episode has two frames or more"
+            + ("; press the record button on the page before you play." if human else "; ask for more --frames.")
+        )
     facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
     if dataset.has("rgb"):
         facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))

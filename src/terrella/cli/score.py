@@ -143,7 +143,9 @@ def _exam(
             say(
                 f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
-        drawn = passages(*asked, max(config.horizons), min(clips, ENDING_CLIPS), make_rng(seed + 2), where)
+        drawn = passages(
+            source, world.spec, *asked[1:], max(config.horizons), min(clips, ENDING_CLIPS), make_rng(seed + 2), where
+        )
         sets[ENDINGS][place], going[place] = drawn
     album = None if cache.pose is None or cache.rgb is None else Album.of_cache(cache)
     paths = " ".join(str(source.path) for source, _, _ in sources.values())

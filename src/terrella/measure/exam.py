@@ -111,10 +111,11 @@ class Exam:
         return self.once(f"poses {id(world)}", works)
 
     def fingerprint(self, identity: str = "") -> str:
-        """What must be the same for kept results to count."""
+        """What must be the same for kept results to count; of every clip its actions and the last row that a world is shown."""
         drawn = {
             f"{kind} {place}": [
-                (int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action)) for clip in some
+                (int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action), _last_shown(clip))
+                for clip in some
             ]
             for kind, places in self.sets.items()
             for place, some in places.items()
@@ -209,6 +210,10 @@ def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Cl
 
 def _dream(exam, world, clips, motion, steps, first, watches, others, tick) -> Results:
     return dream(world, clips, motion, steps, exam.rng(1000 + first), watches, others, tick)
+
+
+def _last_shown(clip: Clip) -> dict[str, float]:
+    return {name: _sum(array[clip.context - 1]) for name, array in clip.channels.items()}
 
 
 def _sum(values: np.ndarray) -> float:

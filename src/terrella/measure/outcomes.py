@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..core.errors import DatasetError
+from ..core.spec import Spec, neutral_action
 from ..core.world import World
 from .clips import Clip, Where, recorded_channels
 from .exam import ENDINGS, Exam, Found, Probe
@@ -27,6 +28,7 @@ USUAL = "the usual reward"
 
 def passages(
     cache,
+    spec: Spec,
     episodes: Sequence[int],
     context: int,
     horizon: int,
@@ -34,9 +36,10 @@ def passages(
     rng: torch.Generator,
     where: Where | None = None,
 ) -> tuple[list[Clip], list[np.ndarray]]:
-    """`count` clips that may run into the end of their episode, from where they stand still, and of each which rows' actions
-    were played, bool [T]. Of rows that `where` allows, half of them shortly before an end where there are ends; DatasetError
-    without any."""
+    """`count` clips that may run into the end of their episode, and of each which rows' actions were played, bool [T].
+
+    After the end they stand still under neutral actions of the world's `spec`. They are of rows that `where` allows, half of
+    them shortly before an end where there are ends; DatasetError without any."""
     spans = [cache.episodes[number] for number in episodes]
     whole = [part for first, stop in spans for part in _allowed(cache, first, stop, where)]
     long = [(first, stop) for first, stop in whole if stop - first > context + 1]
@@ -44,13 +47,13 @@ def passages(
     ending = [(first, stop) for first, stop in long if ends and bool(np.asarray(cache.done[first:stop]).any())]
     if not long:
         raise DatasetError(f"no episode is longer than the {context} rows of context; record longer ones.")
-    found = []
+    found, neutral = [], neutral_action(spec)
     for number in range(count):
         pool = ending if ending and number % 2 == 0 else long
         first, stop = pool[_whole(rng, len(pool))]
         last = stop - context - 2  # a window has a step after its context
         least = max(first, last - horizon + 2) if pool is ending else first
-        found.append(_passage(cache, least + _whole(rng, last - least + 1), stop, context, horizon))
+        found.append(_passage(cache, neutral, least + _whole(rng, last - least + 1), stop, context, horizon))
     return [clip for clip, _ in found], [real for _, real in found]
 
 
@@ -58,7 +61,7 @@ def outcomes(
     exam: Exam, place: str, arm: str, shown: Sequence[Clip], going: torch.Tensor, dreamt: Results
 ) -> list[Row]:
     """Figures of reward, of single numbers, and of the end, of clips that a world dreamt on from their context; going: bool
-    [n, T], rows whose action was played."""
+    [n, T], rows whose action was played; what was dreamt after those is not judged, but for `done`."""
     context, rng = shown[0].context, exam.rng
     channels = {name: np.stack([clip.channels[name] for clip in shown]) for name in dreamt}
     truth = {name: torch.from_numpy(array.reshape(*array.shape[:2])).double() for name, array in channels.items()}
@@ -69,7 +72,9 @@ def outcomes(
         tail = place, arm, PREDICTED, step
         if "reward" in dreamt:
             usual = float((truth["reward"][going]).median())
-            true, mine = (truth["reward"][:, part] * live).sum(1), dreamt["reward"][:, :step].double().sum(1)
+            true, mine = (
+                (paid * live).sum(1) for paid in (truth["reward"][:, part], dreamt["reward"][:, :step].double())
+            )
             plain = usual * live.double().sum(1)
             beside = {USUAL: mean_interval((plain - true).abs(), rng())}
             error, gain = (mine - true).abs(), mean_interval((plain - true).abs() - (mine - true).abs(), rng())
@@ -83,9 +88,10 @@ def outcomes(
             note = f"{int(ended.sum())} of {len(shown)} stretches ended"
             figure = _plain(auc(dreamt["done"][:, :step].double().sum(1), ended), len(shown))
             rows.append(Row("outcomes", "done", "ends: AUC", "", *tail, figure, 1, note=note))
-        for name in (name for name in dreamt if name not in ("reward", "done")):
-            now, then = truth[name][:, context - 1], truth[name][:, context - 1 + step]
-            error, copied = (dreamt[name][:, step - 1].double() - then).abs(), (now - then).abs()
+        there = live[:, -1]  # the episode got as far as this step
+        for name in (name for name in dreamt if name not in ("reward", "done") and there.any()):
+            now, then = truth[name][there, context - 1], truth[name][there, context - 1 + step]
+            error, copied = (dreamt[name][there, step - 1].double() - then).abs(), (now - then).abs()
             figures = mean_interval(error, rng()), -1, {COPY_LAST: mean_interval(copied, rng())}
             rows.append(Row("outcomes", name, "error", "", *tail, *figures, mean_interval(copied - error, rng())))
     return rows
@@ -160,11 +166,11 @@ def _allowed(cache, first: int, stop: int, where: Where | None) -> list[tuple[in
     return [(first + int(a), first + int(b)) for a, b in zip(begins, ends)]
 
 
-def _passage(cache, start: int, stop: int, context: int, horizon: int) -> tuple[Clip, np.ndarray]:
+def _passage(cache, neutral: np.ndarray, start: int, stop: int, context: int, horizon: int) -> tuple[Clip, np.ndarray]:
     wanted = start + np.arange(context + horizon)
     rows, real = np.minimum(wanted, stop - 1), wanted < stop - 1
-
-    action = np.asarray(cache.action[rows]) * real.reshape(-1, *[1] * (np.ndim(cache.action) - 1))
+    played = np.asarray(cache.action[rows])
+    action = np.where(real[:, None], played, neutral.reshape(-1).astype(played.dtype))
     channels = {name: np.asarray(array[rows]) for name, array in recorded_channels(cache).items()}
     return Clip(channels, action, context, 0, start), real
 

@@ -40,13 +40,17 @@ def refusal(headers: dict[str, str], host: str, token: str | None, given: str | 
     A server on this machine only answers to this machine's names (a page elsewhere cannot reach it by pointing a name
     of its own here), a browser must come from our own page (`Origin` is our `Host`), and the token must be right.
     """
-    asked = headers.get("host", "")
-    if is_loopback(host) and not is_loopback(urlsplit(f"//{asked}").hostname or ""):
+    asked, origin = headers.get("host", ""), headers.get("origin")
+    try:
+        name = urlsplit(f"//{asked}").hostname or ""
+        page = None if origin is None else urlsplit(origin)
+    except ValueError:  # such as "["
+        return "the Host or Origin header is no address; open the address that the server printed."
+    if is_loopback(host) and not is_loopback(name):
         return "this server answers to localhost only; open the address that it printed."
-    origin = headers.get("origin")
-    if origin is not None and (urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc != asked):
+    if page is not None and (page.scheme not in ("http", "https") or page.netloc != asked):
         return "another site's page may not use this server; open the address that it printed."
-    if token is not None and not hmac.compare_digest(token.encode(), (given or "").encode()):
+    if token and not hmac.compare_digest(token.encode(), (given or "").encode()):
         return "the token is missing or wrong; open the whole address that the server printed, with ?token=."
     return ""
 

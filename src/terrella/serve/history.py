@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -36,7 +37,8 @@ class Moment:
 class History:
     """Moments in order. At most `frames` pictures; states only for the newest moments that fit in `state_bytes`.
 
-    Memory that states share (a cache appended to, keyframes) is counted once, by storage.
+    What a state keeps alive is counted: the storages of its tensors, and the rows of an arena that it points at (keyframes).
+    What several states share is counted once.
     """
 
     def __init__(self, frames: int, state_bytes: int):
@@ -45,7 +47,7 @@ class History:
         self._frames, self._budget = frames, state_bytes
         self._pictures: deque[Moment] = deque()
         self._stateful: deque[Moment] = deque()
-        self._storages: dict[int, list[int]] = {}  # address -> [moments that use it, bytes]
+        self._held: dict[Hashable, list[int]] = {}  # a storage or row -> [moments that hold it, bytes]
         self.state_bytes = 0
 
     def __len__(self) -> int:
@@ -93,7 +95,7 @@ class History:
     def clear(self) -> None:
         self._pictures.clear()
         self._stateful.clear()
-        self._storages.clear()
+        self._held.clear()
         self.state_bytes = 0
 
     def _drop_oldest_state(self) -> None:
@@ -104,16 +106,24 @@ class History:
             self._pictures[index] = replace(gone, states=None, rngs=None)
 
     def _count(self, moment: Moment, sign: int) -> None:
-        seen = {}
-        for state in moment.states or ():
-            for tensor in state.values():
-                storage = tensor.untyped_storage()
-                seen[storage.data_ptr()] = storage.nbytes()
-        for address, size in seen.items():
-            entry = self._storages.setdefault(address, [0, size])
+        for key, size in _held(moment.states or ()).items():
+            entry = self._held.setdefault(key, [0, size])
             if sign > 0 and entry[0] == 0:
                 self.state_bytes += size
             entry[0] += sign
             if entry[0] == 0:
                 self.state_bytes -= entry[1]
-                del self._storages[address]
+                del self._held[key]
+
+
+def _held(states: Sequence[State]) -> dict[Hashable, int]:
+    """The bytes of every storage, by its address, and of every row of an arena that states keep alive."""
+    held: dict[Hashable, int] = {}
+    for state in states:
+        for tensor in state.values():
+            storage = tensor.untyped_storage()
+            held[storage.data_ptr()] = storage.nbytes()
+        for name, arena in state.arenas.items():
+            rows = torch.unique(state[name]).tolist()
+            held |= {(id(arena), row): arena.row_bytes for row in rows if row}  # row 0 is nothing
+    return held

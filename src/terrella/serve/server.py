@@ -275,7 +275,7 @@ def serve(
     check_playable(offer.worlds)
     # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
     torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
-    if token is None and not is_loopback(host):
+    if not token and not is_loopback(host):
         token = secrets.token_urlsafe(16)
     listener = open_port(host, port)
     with contextlib.closing(listener):

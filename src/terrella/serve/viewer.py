@@ -160,7 +160,7 @@ class _Desk:
     def series(self, request: Request) -> Response:
         number, sensor = request.path_params["number"], self._sensor(request)
         start, stop = (_number(request, name, default) for name, default in (("from", -math.inf), ("to", math.inf)))
-        buckets = min(max(int(_number(request, "buckets", 1024)), 1), _BUCKETS)
+        buckets = int(min(max(_number(request, "buckets", 1024), 1), _BUCKETS))
         time_s, values = self._viewable.times(number, sensor), self._viewable.series(number, sensor)
         return _bytes(readings.series(time_s, values, start, stop, buckets, "pick" in request.query_params))
 
@@ -327,7 +327,7 @@ def view(
     yet. On any address but this machine's own a token is mandatory: where none is given one is made, and the address
     carries it. ServeError where the port is taken.
     """
-    if token is None and not is_loopback(host):
+    if not token and not is_loopback(host):
         token = secrets.token_urlsafe(16)
     with contextlib.closing(open_port(host, port)) as listener:
         server = make_viewer(viewable, listener, host, token, export_to, on_ready)
