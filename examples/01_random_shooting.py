@@ -10,6 +10,7 @@ import torch
 from gymnasium import spaces
 
 from terrella.core import Spec, State, World, make_rng, rollout
+from terrella.core.policy import Reactive
 from terrella.core.spec import DONE, REWARD
 from terrella.sim.gymnasium import GymnasiumWorld
 
@@ -105,9 +106,7 @@ def main(steps: int = 200, episodes: int = 2, seed: int = 0) -> dict[str, float]
     rng = make_rng(seed)
     truth = GymnasiumWorld("CartPole-v1", rgb=False)
 
-    def stumble(seen, rng: torch.Generator) -> torch.Tensor:
-        return truth.spec.sample_action(400, rng)
-
+    stumble = Reactive(lambda seen, rng: truth.spec.sample_action(400, rng))
     stumbling = rollout(truth, truth.start(400, rng), stumble, rng, ("observation", "done"), steps=80)
     seen, done = stumbling.observations["observation"], stumbling.observations["done"]
     learned = LearnedCartPole(truth)

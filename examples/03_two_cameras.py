@@ -8,6 +8,7 @@ terrella play gym:03_two_cameras:TwoCameras-v0                  # from examples/
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -125,4 +126,5 @@ def main(out: Path = Path("recordings/two-cameras"), frames: int = 200) -> dict[
 
 
 if __name__ == "__main__":
-    main()
+    given = sys.argv[1:]
+    main(*(kind(value) for kind, value in zip((Path, int), given)))

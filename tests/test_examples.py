@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 import terrella
+from terrella.data import Dataset
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 BUNDLED = Path(terrella.__file__).parent / "bundled" / "doom-maze"
@@ -48,10 +52,16 @@ def test_a_world_as_a_gymnasium_environment():
 
 
 def test_a_robot_with_two_cameras_is_recorded(tmp_path):
-    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
-    try:
-        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-    except Exception as error:  # a machine without OpenGL
-        pytest.skip(f"MuJoCo cannot draw here ({error}): install libegl1 and set MUJOCO_GL=egl")
-    found = example("03_two_cameras.py")["main"](tmp_path / "robot", 40)
-    assert found["rows"] == 40 and len(found["cameras"]) == 2
+    """In a process of its own: a renderer without a display fails in ways that outlive a test."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
+    surroundings = {"MUJOCO_GL": "egl", **os.environ}
+    probe = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    drawn = subprocess.run([sys.executable, "-c", probe], env=surroundings, capture_output=True, text=True)
+    if drawn.returncode:
+        pytest.skip("MuJoCo cannot draw here: install libegl1 (and libgl1-mesa-dri), or set MUJOCO_GL")
+    command = [sys.executable, str(EXAMPLES / "03_two_cameras.py"), str(tmp_path / "robot"), "40"]
+    subprocess.run(command, env=surroundings, check=True, capture_output=True)
+    dataset = Dataset(tmp_path / "robot")
+    assert dataset.length == 40 and len(dataset.cameras) == 2
+    assert set(dataset.camera_models) == {"rgb", "rgb.left"}
+    assert dataset.world["action_units"] == ["m/s", "rad/s"]

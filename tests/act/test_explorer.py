@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from corridor import CELL_M, WALLS, Corridor
 from gymnasium import spaces
 
 from terrella.act import Explorer
 from terrella.core import Camera, Spec, make_rng
 from terrella.space.camera import planar_pose
+
+from ..data.corridor import CELL_M, WALLS, Corridor
 
 
 def _walk(seed: int, steps: int):

@@ -39,7 +39,7 @@ def test_pictures_of_any_size_are_answered_at_their_own(estimator, shape):
 def test_depth_stays_within_the_range_of_the_recordings_whatever_is_shown(estimator, value):
     with torch.no_grad():
         for bias in (-1000.0, 1000.0):
-            estimator.leave.bias.fill_(bias)
+            estimator.output.bias.fill_(bias)
             depth = estimator.depth(torch.full((1, 3, 48, 64), value, dtype=torch.uint8))
             assert torch.isfinite(depth).all() and depth.min() >= 0.3 and depth.max() <= 20.0
 
