@@ -1,7 +1,7 @@
 """Which shift of the actions best explains the motion: a test of recordings in which actions and rows slipped apart.
 
 Motion i is what happened between rows i and i + 1. For each shift s, motion i is regressed (ridge, over half of the
-stretches) on action i + s beside what is known without it: the motion before, and the state; the gain is the share of
+stretches) on action i + s compared with what is known without it: the motion before, and the state; the gain is the share of
 what is left unexplained there that the action explains on the other half. A sound recording gains most at 0.
 """
 
@@ -52,11 +52,11 @@ def judge(runs: Sequence[Run], fps: float) -> Verdict | None:
         left, base = _left(parts)  # [parts, shifts, targets], [parts, targets]
     total, total_base = left.sum(0), base.sum(0)
     most = (1 - total / np.maximum(total_base, 1e-12)).max(0)
-    told = most > max(_LEAST_GAIN, 0.5 * most.max(initial=0))  # what actions do not move would only blur the rest
-    told &= total_base > 1e-9 * sum(len(part.motion) for part in parts)
-    if not told.any():
+    stated = most > max(_LEAST_GAIN, 0.5 * most.max(initial=0))  # what actions do not move would only blur the rest
+    stated &= total_base > 1e-9 * sum(len(part.motion) for part in parts)
+    if not stated.any():
         return None
-    share = left[:, :, told] / np.maximum(total_base[told], 1e-12)  # each target counts alike
+    share = left[:, :, stated] / np.maximum(total_base[stated], 1e-12)  # each target counts alike
     gains = 1 - share.sum(0).mean(-1)
     shifts = range(-FARTHEST, FARTHEST + 1)
     best = int(np.argmax(gains))

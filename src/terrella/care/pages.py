@@ -37,25 +37,25 @@ def page_at(file: BinaryIO, at: int) -> Page:
         file.seek(at)
         data = file.read(size)
         try:
-            told, length = thrift.read_struct(data)
+            stated, length = thrift.read_struct(data)
             break
         except IndexError:
             if len(data) < size or size > _LONGEST_HEADER:
                 raise ValueError(f"no page begins at byte {at}") from None
             size *= 16
-    kind = _number(told, 1)
+    kind = _number(stated, 1)
     if kind not in (DATA, INDEX, DICTIONARY, DATA_V2):
         raise ValueError(f"no page begins at byte {at}")
-    about = told.get(_FIELD.get(kind, 0), (thrift.STRUCT, {}))[1]
+    about = stated.get(_FIELD.get(kind, 0), (thrift.STRUCT, {}))[1]
     values, encoding = (_number(about, 1), _number(about, 4 if kind == DATA_V2 else 2)) if about else (0, 0)
-    page = Page(kind, at, length, _number(told, 3), _number(told, 2), values, encoding)
+    page = Page(kind, at, length, _number(stated, 3), _number(stated, 2), values, encoding)
     if min(page.packed, page.unpacked, page.values) < 0:
         raise ValueError(f"the page at byte {at} claims less than nothing")
     return page
 
 
-def _number(told: object, field: int) -> int:
-    kind, value = told.get(field, (0, None)) if isinstance(told, dict) else (0, None)
+def _number(stated: object, field: int) -> int:
+    kind, value = stated.get(field, (0, None)) if isinstance(stated, dict) else (0, None)
     if kind != thrift.I32 or not isinstance(value, int):
         raise ValueError(f"a page header lacks its field {field}")
     return value

@@ -30,7 +30,7 @@ from .survey import Survey, cameras_of, survey
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read
-_MOST_PIECES = 8  # episodes that a repair may make beside two of each without asking
+_MOST_PIECES = 8  # episodes that a repair may make on top of two of each without asking
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Streams beside the rows: what a doctor finds in them, and how a repair cuts them to the pieces of an episode."""
+"""Streams next to the rows: what a doctor finds in them, and how a repair cuts them to the pieces of an episode."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Dataset:
     info:         meta/info.json.
     features:     its features.
     sensors:      the same as Sensors, without those that every LeRobot dataset has.
-    streams:      sensors with clocks of their own, kept beside the rows.
+    streams:      sensors with clocks of their own, kept next to the rows.
     cameras:      names of the features that are pictures.
     channels:     channel of a World ("rgb", "rgb.wrist", "depth", "pose", "health", …) -> feature that holds it.
     fps:          rows a second.
@@ -304,10 +304,10 @@ class Dataset:
         return found
 
     def _channels(self) -> dict[str, str]:
-        told, found = {feature: channel for channel, feature in self.about.get("channels", {}).items()}, {}
+        stated, found = {feature: channel for channel, feature in self.about.get("channels", {}).items()}, {}
         main = {"rgb": self.rgb_key} if self.rgb_key else {}
         for name, sensor in self.sensors.items():
-            channel = told.get(name) or channel_of(name, sensor.names)
+            channel = stated.get(name) or channel_of(name, sensor.names)
             kind = {"image": "rgb", "depth": "depth"}.get(sensor.kind)
             if kind and kind_of(channel) != kind:  # a stranger's own way of naming it
                 channel = f"{kind}.{name.rsplit('.', 1)[-1]}"
@@ -329,7 +329,7 @@ class Dataset:
                     first = self._table(self.episodes[0], [name])[name]
                     self.sensors[name] = as_depth(sensor) if len(first) and is_deep(first[0].as_py()) else sensor
                 except DatasetError:
-                    pass  # whoever reads it is told
+                    pass  # whoever reads it gets an error
 
     def _film(self, episode: Episode, camera: str) -> tuple[Path, int]:
         film = episode.videos[camera]

@@ -143,9 +143,9 @@ def _is_depth_map(about: Mapping) -> bool:
 
 def _unit_m(feature: Mapping) -> float:
     """Metres that one step of a depth feature is, as far as it says."""
-    for told in (feature, _about(feature)):
+    for stated in (feature, _about(feature)):
         for key in _UNIT_KEYS:
-            unit = told.get(key)
+            unit = stated.get(key)
             unit = _METRES.get(unit) if isinstance(unit, str) else unit
             if isinstance(unit, int | float) and not isinstance(unit, bool) and 0 < unit < math.inf:
                 return float(unit)

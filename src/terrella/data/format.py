@@ -40,8 +40,8 @@ class Layout:
 
     fps:      rows a second.
     sensors:  what each row has: images, depth, vectors of any shape; "action", "next.reward" and "next.done" are among them.
-    streams:  what has a clock of its own and is kept beside the rows with true times, under streams/.
-    clock:    whether each row keeps its true time too (TIME), beside LeRobot's frame_index / fps.
+    streams:  what has a clock of its own and is kept next to the rows with true times, under streams/.
+    clock:    whether each row keeps its true time too (TIME), next to LeRobot's frame_index / fps.
     pictures: "video" (H.264, lossy) or "png" (exact; for small worlds).
     robot:    LeRobot's robot_type.
     world:    free facts about the recorded world, kept in meta/terrella.json.
@@ -175,21 +175,21 @@ def sensor_json(sensor: Sensor) -> dict:
     }
 
 
-def sensor_from_json(name: str, told: Mapping) -> Sensor:
+def sensor_from_json(name: str, stated: Mapping) -> Sensor:
     """The inverse of `sensor_json`; KeyError, TypeError or ValueError where it is not one."""
-    if told["kind"] not in ("image", "depth", "points", "vector"):
-        raise ValueError(f"{name} is of kind {told['kind']!r}")
-    rate = told.get("rate_hz")
+    if stated["kind"] not in ("image", "depth", "points", "vector"):
+        raise ValueError(f"{name} is of kind {stated['kind']!r}")
+    rate = stated.get("rate_hz")
     return Sensor(
         name,
-        told["kind"],
-        tuple(int(n) for n in told["shape"]),
-        str(np.dtype(told["dtype"])) if told["dtype"] != "string" else "string",
-        tuple(str(n) for n in told.get("names", ())),
-        {str(key): str(unit) for key, unit in dict(told.get("units", {})).items()},
-        str(told.get("frame", "")),
+        stated["kind"],
+        tuple(int(n) for n in stated["shape"]),
+        str(np.dtype(stated["dtype"])) if stated["dtype"] != "string" else "string",
+        tuple(str(n) for n in stated.get("names", ())),
+        {str(key): str(unit) for key, unit in dict(stated.get("units", {})).items()},
+        str(stated.get("frame", "")),
         None if rate is None else float(rate),
-        dict(told.get("facts", {})),
+        dict(stated.get("facts", {})),
     )
 
 

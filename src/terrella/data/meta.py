@@ -51,7 +51,7 @@ def read_about(root: Path, files: LocalFiles | Files) -> dict:
 def read_sensors(root: Path, about: Mapping, kind: str) -> dict[str, Sensor]:
     """What meta/terrella.json says of the sensors of a kind ("sensors", "streams")."""
     try:
-        return {name: sensor_from_json(name, told) for name, told in dict(about.get(kind, {})).items()}
+        return {name: sensor_from_json(name, stated) for name, stated in dict(about.get(kind, {})).items()}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"{root / WORLD} is not readable ({error}); restore it from a copy.") from error
 

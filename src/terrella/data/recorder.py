@@ -291,8 +291,8 @@ class Recorder:
                 self._recover("keep")
             fresh(self._staging)
             self._number, self._start_ns, self._began_ns = self.episodes, time.time_ns(), time.monotonic_ns()
-            told = about(self.layout, self._number, self.task, self._start_ns)
-            self._journal = Journal(self._staging / LOG, told)
+            stated = about(self.layout, self._number, self.task, self._start_ns)
+            self._journal = Journal(self._staging / LOG, stated)
             layout, folder = self.layout, self._staging
             for name, sensor in layout.sensors.items():
                 if sensor.kind == "image":

@@ -59,11 +59,11 @@ class Staged:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        told = journal.about(folder / LOG)
-        self.number, self.task, self.start_ns = int(told["episode"]), str(told["task"]), int(told["start_ns"])
-        self.fps, self.pictures = float(told["fps"]), str(told["pictures"])
-        self.rows = {name: sensor_from_json(name, sensor) for name, sensor in told["rows"].items()}
-        self.streams = {name: sensor_from_json(name, sensor) for name, sensor in told["streams"].items()}
+        stated = journal.about(folder / LOG)
+        self.number, self.task, self.start_ns = int(stated["episode"]), str(stated["task"]), int(stated["start_ns"])
+        self.fps, self.pictures = float(stated["fps"]), str(stated["pictures"])
+        self.rows = {name: sensor_from_json(name, sensor) for name, sensor in stated["rows"].items()}
+        self.streams = {name: sensor_from_json(name, sensor) for name, sensor in stated["streams"].items()}
         video = self.pictures == "video"
         self.cameras = [name for name, sensor in self.rows.items() if sensor.kind == "image" and video]
         self._packed = [sensor for name, sensor in self.rows.items() if name not in self.cameras]
@@ -75,7 +75,7 @@ class Staged:
         same = {"rows": self.rows, "streams": self.streams}
         return all(
             {name: _form(sensor) for name, sensor in same[kind].items()}
-            == {name: _form(sensor_from_json(name, told)) for name, told in mine[kind].items()}
+            == {name: _form(sensor_from_json(name, stated)) for name, stated in mine[kind].items()}
             for kind in same
         )
 

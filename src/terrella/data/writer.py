@@ -185,10 +185,10 @@ class Writer:
         if not info.exists():
             facts = {"pose": POSE_CONVENTION, "depth_unit_m": DEPTH_UNIT_M, "depth_beyond": DEPTH_BEYOND}
             layout = self.layout
-            told = {"world": dict(layout.world), "sensors": _json(layout.sensors), "streams": _json(layout.streams)}
-            told |= {"channels": dict(layout.channels)} if layout.channels else {}
+            stated = {"world": dict(layout.world), "sensors": _json(layout.sensors), "streams": _json(layout.streams)}
+            stated |= {"channels": dict(layout.channels)} if layout.channels else {}
             try:
-                durable.write_json(self.root / WORLD, {**layout.facts, "version": 2, **told, **facts})
+                durable.write_json(self.root / WORLD, {**layout.facts, "version": 2, **stated, **facts})
             except (TypeError, ValueError) as error:
                 raise DatasetError(f"the facts of {self.root} are no JSON values ({error}); leave them out.") from error
             durable.write_json(self.root / INFO, self._info(0, 0, 0))
@@ -202,8 +202,8 @@ class Writer:
         for kind, sensors in (("streams", self.layout.streams), ("sensors", self.layout.sensors)):
             now = json.loads(json.dumps(_json(sensors)))
             was = world.get(kind, {} if kind == "streams" else now)  # recordings of version 1 do not tell
-            told = sorted(name for name in {*was, *now} if not _alike(was.get(name), now.get(name)))
-            changed += [name for name in told if name not in changed]
+            stated = sorted(name for name in {*was, *now} if not _alike(was.get(name), now.get(name)))
+            changed += [name for name in stated if name not in changed]
         if changed or info["fps"] != self.layout.fps:
             what = ", ".join(changed) if changed else f"{info['fps']} frames/s"
             raise DatasetError(f"{self.root} was recorded with another layout ({what}); record to a new folder.")
@@ -342,7 +342,7 @@ class Writer:
 
 
 def stream_schema(sensor: Sensor) -> pa.Schema:
-    """Of a stream's table: its true times, and (but for cameras, whose mp4 lies beside it) its numbers, flattened.
+    """Of a stream's table: its true times, and (but for cameras, whose mp4 lies next to it) its numbers, flattened.
 
     The Sensor is kept in the table's metadata too, for the day on which meta/terrella.json is lost.
     """
@@ -408,7 +408,7 @@ def _stream(name: str, number: int, suffix: str) -> str:
 
 
 def _alike(was: Mapping | None, now: Mapping | None) -> bool:
-    """Whether a sensor is what it was, units and frame that were not told then apart."""
+    """Whether a sensor is what it was, units and frame that were not stated then apart."""
     if was is None or now is None:
         return was is now
     return all(was.get(key) == value or (key in ("units", "frame") and not was.get(key)) for key, value in now.items())

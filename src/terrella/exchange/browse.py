@@ -19,7 +19,7 @@ from ..data.storage.durable import write_json
 from .convert import open_source, write_source
 from .poses import pose_columns
 
-MARKS = ".terrella-marks.json"  # beside the recording, in its folder
+MARKS = ".terrella-marks.json"  # in the folder of the recording
 _OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
 

@@ -1,4 +1,4 @@
-"""H.264 video files: an encoder that runs beside the world, and exact frame reading (PyAV)."""
+"""H.264 video files: an encoder that runs in parallel with the world, and exact frame reading (PyAV)."""
 
 from __future__ import annotations
 

@@ -134,13 +134,13 @@ class Clips:
     def resume(self, state: Mapping) -> Clips:
         """Goes on after `state`, whatever the number of workers; DatasetError where it belongs to other clips."""
         try:
-            epoch, batch, told = int(state["epoch"]), int(state["batch"]), dict(state["of"])
+            epoch, batch, stated = int(state["epoch"]), int(state["batch"]), dict(state["of"])
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"this is no state of Clips ({error!r}); pass what `state()` gave.") from error
         for name, mine in self._shelf.facts().items():
-            if told.get(name) != mine:
+            if stated.get(name) != mine:
                 raise DatasetError(
-                    f"the state was saved with {name}={told.get(name)} and these clips have {name}={mine}; "
+                    f"the state was saved with {name}={stated.get(name)} and these clips have {name}={mine}; "
                     "make them from the same recording with the same arguments."
                 )
         if epoch < 0 or not 0 <= batch < self._batches(epoch):

@@ -106,9 +106,9 @@ class Plan:
 
     def facts(self, counts: np.ndarray) -> dict:
         """JSON values that, with the epoch, decide the order of clips, of which counts[i] begin in episode i."""
-        told = {name: value for name, value in asdict(self).items() if name != "rank"}
+        stated = {name: value for name, value in asdict(self).items() if name != "rank"}
         digest = hashlib.sha256(np.ascontiguousarray(counts, np.int64).tobytes()).hexdigest()
-        return told | {"clips": int(counts.sum()), "episodes": digest[:16]}
+        return stated | {"clips": int(counts.sum()), "episodes": digest[:16]}
 
 
 def chosen(episodes: Sequence[int] | None, count: int) -> np.ndarray | None:
