@@ -20,6 +20,7 @@ from test_doctor import DATA, VIDEO, change, cut, put, small_video, twin
 from test_interrupted import LAYOUT, LIDAR, SIDE, drive
 
 from terrella.care import doctor, repair
+from terrella.cli import main
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
 from terrella.data.storage.films import reel
@@ -404,5 +405,44 @@ def test_a_full_disk_is_said_clearly(recording, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(durable, "move_into_place", full)
-    with pytest.raises(DatasetError, match="No space left"):
+    with pytest.raises(DatasetError, match="the disk is full"):
         repair(recording, tmp_path / "out")
+
+
+@pytest.mark.parametrize("error", ["stopped", "full"])
+def test_a_repair_that_ends_early_leaves_nothing_and_can_be_done_again(recording, tmp_path, error):
+    raised = KeyboardInterrupt() if error == "stopped" else OSError(28, "No space left on device")
+    before = sorted(path.name for path in tmp_path.iterdir())
+
+    def stop(done, of):
+        if done == 2:
+            raise raised
+
+    with pytest.raises(KeyboardInterrupt if error == "stopped" else DatasetError):
+        repair(recording, tmp_path / "out", progress=stop)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    repair(recording, tmp_path / "out")
+    assert len(Dataset(tmp_path / "out").episodes) == 4
+
+
+def test_ctrl_c_in_a_repair_says_that_nothing_was_written(recording, tmp_path, monkeypatch, capsys):
+    def stopped(*given, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("terrella.data.storage.durable.move_into_place", stopped)
+    with pytest.raises(SystemExit) as ended:
+        main(["data", "doctor", str(recording), "--repair", "--out", str(tmp_path / "out")])
+    assert ended.value.code == 130 and "nothing was written" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_with_nan_in_them_stay_and_numbers_that_are_none_become_null(recording, tmp_path):
+    _info(recording, maker={"NaNo": "NaN or -Infinity", "gain": [float("nan"), float("inf"), 2.5]})
+    repair(recording, tmp_path / "out")
+    told = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert told["maker"] == {"NaNo": "NaN or -Infinity", "gain": [None, None, 2.5]}
+
+
+def test_a_repair_of_chosen_episodes_says_nothing_of_the_others(recording, tmp_path):
+    said = repair(recording, tmp_path / "out", keep=[1, 3])
+    assert said[0].startswith("2 whole episodes (40 rows)") and not any("episode 0" in sentence for sentence in said)

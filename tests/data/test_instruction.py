@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrella.core.instruction import INSTRUCTION_SIZE, embed, embed_all
-from terrella.data import ClipCache, Clips, Layout, Recorder
+from terrella.data import ClipCache, Clips, Dataset, Layout, Recorder
 
 
 @given(st.text(max_size=40))
@@ -45,3 +45,16 @@ def test_every_row_of_a_batch_says_what_it_is_about(tmp_path):
             texts = [expected[row] for row in batch["row"].reshape(-1)]
             assert [clips.tasks[number] for number in batch["task"].reshape(-1)] == texts
             assert np.array_equal(batch["instruction"].reshape(12, -1), embed_all(texts))
+
+
+def test_what_is_said_before_the_first_row_is_what_the_episode_is_about(tmp_path):
+    with Recorder(tmp_path / "recording", Layout.of_channels(10, ("go",), pose=True)) as recorder:
+        recorder.task = "none"
+        for said in ("lift the cup", None):
+            if said:
+                recorder.say(said)
+            for i in range(3):
+                recorder.add({"pose": np.arange(7) + i}, [i])
+            recorder.end_episode()
+    dataset = Dataset(tmp_path / "recording")
+    assert [episode.tasks for episode in dataset.episodes] == [("lift the cup",), ("none",)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,5 +186,15 @@ def test_an_export_from_the_viewer_is_a_recording(tmp_path):
     calls = []
     browse(tmp_path / "one").export(tmp_path / "good", [0], lambda *done: None)
     assert Dataset(tmp_path / "good").length == 6
-    browse(tmp_path / "one", carry=lambda *given: calls.append(given[:3])).export(tmp_path / "bits", [0], print)
+    browse(tmp_path / "one", carry=lambda *given: calls.append(given[:3]) or []).export(tmp_path / "bits", [0], print)
     assert calls == [(tmp_path / "one", tmp_path / "bits", [0])]
+
+
+def test_an_export_counts_what_it_wrote_and_says_what_it_left_out(tmp_path):
+    (whole,) = _talking().takes()
+    single = Take({name: Readings(it.time_s[:1], it.values[:1]) for name, it in whole.readings.items()}, "one row")
+    source = replace(_talking(), takes=lambda: [whole, whole, single])
+    write_source(source, tmp_path / "log", "mcap")
+    count, notes = browse(tmp_path / "log").export(tmp_path / "good", [1, 2], lambda *done: None)
+    assert count == len(Dataset(tmp_path / "good").episodes) == 1
+    assert any("was left out: it has 1 row" in note for note in notes)

@@ -13,8 +13,10 @@ from PIL import Image
 from robots import arm, robot, rover
 
 from terrella.core.errors import DatasetError
+from terrella.data import Dataset
 from terrella.data.resample import resample
 from terrella.data.source import Readings, Sensor, Source, Take
+from terrella.data.storage import durable
 from terrella.exchange.merging.mapping import Number, Rows, Vector, affine
 from terrella.exchange.merging.mapping_file import read_mapping, write_mapping
 from terrella.exchange.merging.merge import letterbox, merge
@@ -534,3 +536,43 @@ def test_text_cannot_be_kept():
     kept = replace(mapping.sources[0], out={}, keep={"observation.label": "observation.label"})
     with pytest.raises(DatasetError, match="text cannot be kept"):
         merge(source, replace(mapping, sources=(kept,)))
+
+
+def test_instructions_keep_their_rows_when_a_merge_begins_later(tmp_path):
+    """The rows begin where all sensors have begun: what was said then moves with them."""
+    a, b = Sensor("observation.a", "vector", (1,), names=("a",)), Sensor("observation.b", "vector", (1,), names=("b",))
+    early, late = np.arange(21) / 10, np.arange(10, 21) / 10
+    take = Take(
+        {a.name: Readings(early, np.zeros((21, 1))), b.name: Readings(late, np.zeros((11, 1)))},
+        "one",
+        facts={"language": [[0.0, "one"], [1.5, "two"]], "weather": "rain"},
+    )
+    source = Source("r", {a.name: a, b.name: b}, lambda: [take], 10.0, robot="r")
+    _, (merged,) = merged_takes({"A": source})
+    shift = 21 - len(merged.readings["embodiment"].time_s)
+    expected = [[0.0 - shift / 10, "one"], [1.5 - shift / 10, "two"]]
+    assert shift == 10 and merged.facts["weather"] == "rain"
+    for (when, words), (at, text) in zip(merged.facts["language"], expected, strict=True):
+        assert words == text and when == pytest.approx(at)
+    merge_into({"A": source}, tmp_path / "set")
+    dataset = Dataset(tmp_path / "set")
+    assert [dataset.tasks[number] for number in dataset.episode(0, ["task_index"])["task_index"].ravel()] == (
+        ["one"] * 5 + ["two"] * 6
+    )
+
+
+@pytest.mark.parametrize("stage", ["write_json", "takes"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_a_merge_that_is_stopped_leaves_nothing(tmp_path, monkeypatch, stage, error):
+    """Also after the last row, while the report and the statistics of robots are written."""
+
+    def stop(target, value):
+        if stage == "takes" or "merge.json" in str(target):
+            raise error
+        real(target, value)
+
+    real = durable.write_json
+    monkeypatch.setattr(durable, "write_json", stop)
+    with pytest.raises((KeyboardInterrupt, DatasetError)):
+        merge_into({"A": arm()}, tmp_path / "all")
+    assert list(tmp_path.iterdir()) == []

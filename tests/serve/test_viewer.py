@@ -251,6 +251,15 @@ def test_export_writes_the_good_ones_where_the_server_said(tmp_path):
     assert len(calls) == 1
 
 
+def test_an_export_that_left_something_out_says_so(tmp_path):
+    browse = browse_of(tmp_path, export=lambda path, keep, report: ())
+    browse.export = lambda path, keep, report: (2, ["take 1 was left out: it has 1 row"])
+    with asked(browse, export_to=tmp_path / "good") as client:
+        client.post("/export")
+        text = settled(client)["text"]
+    assert text.startswith("2 episodes written") and "from 4" in text and "take 1 was left out" in text
+
+
 def test_an_export_that_fails_is_told(tmp_path):
     def full(path, keep, report):
         raise DatasetError("the disk is full; free some space.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -59,7 +59,7 @@ def repair(
     the episodes of these numbers. `progress(pieces, of)` is called after each piece of rows is written. `allow_loss`: what
     is done where most rows would be lost or episodes be cut to many pieces: True goes on, a function is asked with a
     sentence, and without either DatasetError is raised and nothing is written. DatasetError, too, where `root` holds
-    nothing whole, or `out` is in use, or the disk is full.
+    nothing whole, or `out` is in use, or the disk is full. However it ends, `out` is whole or not there.
     """
     root, out = Path(root), Path(out)
     found = survey(root)
@@ -67,10 +67,8 @@ def repair(
         raise DatasetError(f"the mended copy cannot lie in {root} itself; choose another folder for it.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} is not empty; choose another folder for the mended copy.")
-    try:
-        return _Mender(found, out, keep, progress, allow_loss).mend()
-    except OSError as error:
-        raise DatasetError(f"the mended copy at {out} cannot be written ({error}); free some space there.") from error
+    with durable.in_whole(out) as staged:
+        return _Mender(found, staged, keep, progress, allow_loss).mend()
 
 
 class _Mender:
@@ -138,7 +136,6 @@ class _Mender:
         why = next(iter(self.why.values()), "others are damaged")
         sentence = f"of {of} rows in {episodes} episodes only {rows} would be kept, in {len(kept)} pieces ({why})"
         if not callable(self.allow_loss) or not self.allow_loss(f"{sentence}."):
-            shutil.rmtree(self.out, ignore_errors=True)
             raise DatasetError(
                 f"{sentence}; mend what the doctor names first, or allow the loss (--yes, in Python allow_loss=True)."
             )
@@ -302,7 +299,7 @@ class _Mender:
             kept = self.kept.get(number, [])
             if kept == [(0, length)]:
                 whole, rows = whole + 1, rows + length
-            elif self.staged is None or number < self.staged:
+            elif (self.only is None or number in self.only) and (self.staged is None or number < self.staged):
                 spans = ", ".join(f"{begin} to {end - 1}" for begin, end in kept)
                 what = f"its rows {spans} of {length} are kept" if kept else f"none of its {length} rows is kept"
                 why = self.why.get(number, "others are missing, damaged or hold what is no finite number")
@@ -344,7 +341,16 @@ class _Mender:
             kept = {key: value for key, value in self.found.info.items() if key not in info}
             if self.found.info.get("total_episodes") == info["total_episodes"] and "splits" in self.found.info:
                 kept["splits"] = self.found.info["splits"]
-            durable.write_json(self.out / INFO, json.loads(json.dumps({**info, **kept}).replace("NaN", "null")))
+            durable.write_json(self.out / INFO, _finite({**info, **kept}))
+
+
+def _finite(value: object) -> object:
+    """A JSON value with null for each number that is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _staged(found: Survey) -> int | None:

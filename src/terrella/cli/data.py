@@ -20,10 +20,24 @@ Policy = Annotated[
 ]
 
 
+@contextmanager
+def _whole_or_nothing(target: Path) -> Iterator[None]:
+    """Says what Ctrl-C leaves of a command that writes all of `target` or nothing."""
+    before = target.exists()
+    try:
+        yield
+    except KeyboardInterrupt:
+        left = f"{target} was written whole" if target.exists() and not before else f"nothing was written at {target}"
+        say(f"terrella: stopped; {left}, and what was read is untouched.")
+        raise SystemExit(130) from None
+
+
 def doctor(
     folder: Positional[Path], repair: bool = False, out: Path | None = None, yes: bool = False, json: Json = False
 ) -> int:
-    """Look for faults in a recording and say how to repair each. The exit code is 1 if there are any.
+    """Look for faults in a recording and say how to repair each.
+
+    The exit code is 1 if there are any, and 0 after a repair.
 
     Args:
         folder: A LeRobot v3 dataset, recorded by Terrella or by any other program.
@@ -45,7 +59,7 @@ def doctor(
     lines = [found.report(str(folder))]
     if repair:
         target = out or folder.resolve().with_name(f"{folder.resolve().name}-mended")
-        with progress.shown("mending") as report:
+        with _whole_or_nothing(target), progress.shown("mending") as report:
             done = mend(folder, target, progress=lambda pieces, of: report(pieces, of), allow_loss=yes or allowed)
         facts |= {"mended": str(target), "done": done}
         lines += [*done, f"the mended copy: {target}"]
@@ -87,16 +101,6 @@ def convert(
     result(
         facts, json, "\n".join([*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"])
     )
-
-
-@contextmanager
-def _whole_or_nothing(target: Path) -> Iterator[None]:
-    """Says what Ctrl-C leaves of a command that writes all of `target` or nothing."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        say(f"terrella: stopped; nothing was written at {target}, and what was read is untouched.")
-        raise SystemExit(130) from None
 
 
 def merge(

@@ -107,17 +107,17 @@ class Staged:
         return Draft(length, rows, videos, seen, self.task, streams, films, start_ns, tasks, counts)
 
     def _counted(self, length: int) -> tuple[dict[str, int], list[str]]:
-        """Rows up to the last that has a sensor, where that is not the last of all; the task of each row, [] where one."""
+        """Rows up to the last that has a sensor, where that is not the last of all; each row's task, [] where all have `task`."""
         newest = np.zeros(len(self.rows), int)
-        tasks, said, task = [], False, self.task
+        tasks, task = [], self.task
         for number, _, raw in journal.readings(self.folder / LOG):
             if number == WORDS:
-                task, said = raw.decode(), True
+                task = raw.decode()
             elif number == ROW and len(tasks) < length:
                 tasks.append(task)
                 newest[self._given(raw)] = len(tasks)
         counts = {name: int(count) for name, count in zip(self.rows, newest) if count != length}
-        return counts, tasks if said and len(set(tasks)) > 1 else []
+        return counts, tasks if set(tasks) != {self.task} else []
 
     def _given(self, raw: bytes) -> np.ndarray:
         bits = np.frombuffer(raw, np.uint8, (len(self.rows) + 7) // 8)

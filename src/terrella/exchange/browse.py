@@ -24,7 +24,7 @@ _OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
 
 Report = Callable[[int, int], None]  # (episodes done, episodes in all)
-Export = Callable[[Path, Sequence[int], Report], object]
+Export = Callable[[Path, Sequence[int], Report], Sequence[str] | None]  # gives notes on what was left out
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Browse:
     entries: the list of episodes; without it, every take is opened once to learn its length.
     take:    opens one episode by its number; without it, `source.takes()[number]` where that is a sequence, else takes
              are walked from the first on.
-    export:  writes the episodes of the given numbers into a new folder, and calls `report` as it goes along.
+    export:  writes the episodes of the given numbers into a new folder, and calls `report` as it goes along; returns
+             sentences on what it left out or changed.
 
     At most two takes are kept open. DatasetError where the marks are unreadable, an episode, sensor or reading does not
     exist, or one does not decode. Not for several threads at once.
@@ -152,17 +153,21 @@ class Browse:
             write_json(self._marks_path, {"version": _MARKS_VERSION, "bad": sorted(marked)})
         except OSError as error:
             raise DatasetError(
-                f"the mark cannot be kept in {self._marks_path} ({error.strerror}); name another file with --marks."
+                f"the mark cannot be kept in {self._marks_path} ({error.strerror}); make that folder writable, or view a copy."
             ) from error
         self._bad = marked
 
-    def export(self, path: Path, keep: Sequence[int], report: Report) -> None:
-        """Writes the episodes `keep` into a new folder `path`; may run beside the other methods, in its own thread."""
+    def export(self, path: Path, keep: Sequence[int], report: Report) -> tuple[int, list[str]]:
+        """Writes the episodes `keep` into a new folder `path`; may run while other methods do, in its own thread.
+
+        Returns how many episodes the folder has, and sentences on what was left out or changed.
+        """
         if self._export is None:
             raise DatasetError(f"{self.source.name} was opened for looking only; it cannot be exported from here.")
         for number in keep:
             self._check(number)
-        self._export(path, list(keep), report)
+        notes = list(self._export(path, list(keep), report) or ())
+        return len(Dataset(path).episodes) if (path / INFO).exists() else len(keep), notes
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
@@ -369,7 +374,9 @@ def _read_marks(path: Path) -> frozenset[int]:
     return frozenset(bad)
 
 
-def browse(path: str | Path, carry: Callable[[Path, Path, Sequence[int], Report], object] | None = None) -> Browse:
+def browse(
+    path: str | Path, carry: Callable[[Path, Path, Sequence[int], Report], Sequence[str]] | None = None
+) -> Browse:
     """A recording of any format, to be looked through.
 
     carry(from, to, episodes, report): writes episodes of a LeRobot folder into a new one bit for bit, for the export;
@@ -381,10 +388,10 @@ def browse(path: str | Path, carry: Callable[[Path, Path, Sequence[int], Report]
     else:
         marks = where / MARKS if where.is_dir() else where.with_name(f".{where.name}{MARKS}")
 
-    def write(out: Path, keep: Sequence[int], report: Report) -> None:
+    def write(out: Path, keep: Sequence[int], report: Report) -> list[str]:
         wanted = set(keep)
         chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
-        write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
+        return write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
 
     if not (where / INFO).exists():
         return Browse(source, marks, export=write)

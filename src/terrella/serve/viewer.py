@@ -81,9 +81,10 @@ class Viewable(Protocol):
         """Marks an episode bad or good, for good."""
         ...
 
-    def export(self, path: Path, keep: Sequence[int], report: Callable[[int, int], None]) -> None:
+    def export(self, path: Path, keep: Sequence[int], report: Callable[[int, int], None]) -> tuple[int, list[str]]:
         """Writes the episodes `keep` as a new recording into the folder `path`, which does not exist; calls
-        `report(done, of)` now and then, lets what that raises pass, and leaves nothing half-written behind."""
+        `report(done, of)` now and then, lets what that raises pass, and leaves nothing half-written behind. Returns
+        how many episodes were written, and sentences on what was left out or changed."""
         ...
 
 
@@ -123,9 +124,11 @@ class Exporting:
 
     def _run(self, path: Path, keep: Sequence[int]) -> None:
         try:
-            self._viewable.export(path, keep, self._report)
-            words = f"{len(keep)} episode{'s' * (len(keep) != 1)} written to {path}"
-            self.status = {**self.status, "state": "done", "text": words, "done": len(keep), "of": len(keep)}
+            count, notes = self._viewable.export(path, keep, self._report)
+            words = f"{count} episode{'s' * (count != 1)} written to {path}"
+            words += f" from {len(keep)} that were to be kept" if count != len(keep) else ""
+            text = "; ".join([words, *(note.rstrip(".") for note in notes)])
+            self.status = {**self.status, "state": "done", "text": text, "done": len(keep), "of": len(keep)}
         except (TerrellaError, OSError) as error:
             self.status = {**self.status, "state": "failed", "text": str(error)}
         except Exception as error:  # shown by the page; the trace goes to the terminal

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from ...core.errors import DatasetError
 
 
 def sync_file(path: Path) -> None:
@@ -46,3 +51,42 @@ def write_json(target: Path, value: object) -> None:
     """Replaces `target` by `value` as indented JSON, durably."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
     write_whole(target, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+@contextmanager
+def in_whole(path: str | Path) -> Iterator[Path]:
+    """A hidden neighbour of `path` (a folder to be made, or a file), renamed to `path` when all went well.
+
+    However it ends, nothing half-written stays. DatasetError where something is at `path`, or the disk is full or fails.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise DatasetError(f"{path} exists already; write to another path, or remove it first.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staged = path.with_name(f".{path.name}.new")
+        _remove(staged)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    try:
+        yield staged
+        if path.is_dir():
+            path.rmdir()
+        move_into_place(staged, path)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    finally:
+        _remove(staged)
+
+
+def unwritten(path: Path, error: OSError) -> DatasetError:
+    """What to raise where writing failed on the disk: nothing of it is kept."""
+    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+    return DatasetError(f"{path} was not written: {why}; free some space, or choose another place, and try again.")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

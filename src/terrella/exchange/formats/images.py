@@ -12,6 +12,7 @@ from PIL import Image
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
+from ...data.storage import durable
 from . import folders, rows
 from .suffixes import IMAGES
 
@@ -143,7 +144,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     """
     cameras, left_out = folders.cameras(source, ("image", "depth"), "images")
     notes = dict.fromkeys(left_out)
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         staged.mkdir()
         for number, take in folders.numbered(source, cameras, progress):
             for name, readings in take.readings.items():

@@ -16,7 +16,7 @@ from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
 from ...data.source import Readings, Sensor, Source, Take, follows
-from . import rows
+from ...data.storage import durable
 
 
 def read(root: str | Path, fps: float | None = None) -> Source:
@@ -43,12 +43,17 @@ class Rows:
 
 
 def write(
-    source: Source, root: str | Path, progress: Callable[[int, int], None] | None = None, how: Rows = Rows()
+    source: Source,
+    root: str | Path,
+    progress: Callable[[int, int], None] | None = None,
+    how: Rows = Rows(),
+    finish: Callable[[Path, list[str]], object] | None = None,
 ) -> list[str]:
     """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
 
     Sensors whose clocks are not the rows' are kept twice: resampled in the rows, where every LeRobot reader finds them,
-    and with their true times as streams; points are streams alone. `progress(takes, 0)` is called after each take.
+    and with their true times as streams; points are streams alone. `progress(takes, 0)` is called after each take;
+    `finish(folder, sentences)` may add files at the end, before the folder is moved to `root`.
     """
     root = Path(os.path.abspath(root))
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
@@ -58,13 +63,16 @@ def write(
         raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
     lead = _lead(source, first, how)
     layout, notes = _layout(source, first, lead, how)
-    with rows.fresh(root) as staged:
+    with durable.in_whole(root) as staged:
         try:
-            return notes + _write(source, layout, staged, lead, how, progress)
+            notes += _write(source, layout, staged, lead, how, progress)
+            if finish:
+                finish(staged, notes)
         except DatasetError as error:
             if not isinstance(error.__cause__, OSError):
                 raise
-            raise rows.unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
+            raise durable.unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
+    return notes
 
 
 def _write(source: Source, layout: Layout, root: Path, lead: str, how: Rows, progress) -> list[str]:

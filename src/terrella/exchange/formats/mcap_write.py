@@ -36,7 +36,7 @@ def write(
     taken, the disk is full, or a reading is not what its sensor declares.
     """
     path, notes = Path(path), dict[str, None]()
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         for number, take in rows.numbered(source, None):
             if path.suffix == ".mcap" and number:
                 raise DatasetError(f"'{source.name}' has more than one take, and '{path}' is one file; name a folder.")

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage import durable
 from . import rows, spaces
 from .minari_stored import Episode, joined, open_storage
 
@@ -201,7 +202,7 @@ def write(
     for name in source.sensors:
         if rows.role_of(name) == "" or source.sensors[name].kind == "points":
             notes[f"'{name}' has no place in Minari's layout and was left out."] = None
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         data = staged / "data"
         data.mkdir(parents=True)
         steps, number = 0, 0

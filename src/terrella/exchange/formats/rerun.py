@@ -12,6 +12,7 @@ import simplejpeg
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage import durable
 from ...data.storage.durable import sync_file
 from ..poses import pose_columns
 from . import rows
@@ -34,7 +35,7 @@ def write(source: Source, path: str | Path) -> list[str]:
     DatasetError where `path` exists, or a single file is asked for and there is no take or more than one.
     """
     path = Path(path)
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         for number, take in rows.numbered(source, None):
             if path.suffix == ".rrd" and number:
                 raise DatasetError(f"{source.name} has more than one episode; name a folder for Rerun's files.")

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
+from ...data.storage import durable
 from . import hdf5, rows
 
 STATES = "info.states"
@@ -200,7 +201,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     """
     notes: dict[str, None] = {}
     known = _facts(source)
-    with rows.fresh(path) as staged, hdf5.File(staged, "w") as file:
+    with durable.in_whole(path) as staged, hdf5.File(staged, "w") as file:
         data, total = file.create_group("data"), 0
         for number, take in rows.numbered(source, progress):
             demo = data.create_group(_demo_name(take, data))

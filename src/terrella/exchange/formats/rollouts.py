@@ -12,6 +12,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
+from ...data.storage import durable
 from . import rows
 
 ABOUT = "terrella.json"  # names, units and frames of what we wrote, in the folder of the episodes
@@ -220,7 +221,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     """
     notes: dict[str, None] = {}
     keys = _keys(source, notes)
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         staged.mkdir()
         for number, take in rows.numbered(source, progress):
             _write_take(staged / f"episode_{number}.npz", source, take, keys, f"take {number}")

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -16,7 +13,6 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
-from ...data.storage.durable import move_into_place
 
 OBSERVATION, ACTION, INFO = "observation", "action", "info"
 REWARD, DONE, TRUNCATED = "next.reward", "next.done", "next.truncated"
@@ -315,9 +311,6 @@ def json_or_none(value: object) -> object:
     return value
 
 
-# -- files that are either whole or not there
-
-
 def numbered(source: Source, progress: Callable[[int, int], None] | None) -> Iterator[tuple[int, Take]]:
     """The takes with their numbers; `progress(takes, 0)` after each is written. DatasetError where there are none."""
     number = -1
@@ -327,42 +320,3 @@ def numbered(source: Source, progress: Callable[[int, int], None] | None) -> Ite
             progress(number + 1, 0)
     if number < 0:
         raise DatasetError(f"{source.name or 'the source'} has no takes; there is nothing to write.")
-
-
-@contextmanager
-def fresh(path: str | Path) -> Iterator[Path]:
-    """A hidden neighbour of `path` (a folder to be made, or a file), renamed to `path` when all went well.
-
-    However it ends, nothing half-written stays. DatasetError where something is at `path`, or the disk is full or fails.
-    """
-    path = Path(path)
-    try:
-        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise DatasetError(f"{path} exists already; write to another path, or remove it first.")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        staged = path.with_name(f".{path.name}.new")
-        _remove(staged)
-    except OSError as error:
-        raise unwritten(path, error) from error
-    try:
-        yield staged
-        if path.is_dir():
-            path.rmdir()
-        move_into_place(staged, path)
-    except OSError as error:
-        raise unwritten(path, error) from error
-    finally:
-        _remove(staged)
-
-
-def unwritten(path: Path, error: OSError) -> DatasetError:
-    """What to raise where a conversion failed on the disk: nothing of it is kept."""
-    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-    return DatasetError(f"{path} was not written: {why}; free some space, or choose another place, and convert again.")
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

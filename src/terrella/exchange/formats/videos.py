@@ -15,6 +15,7 @@ from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
+from ...data.storage import durable
 from . import folders, rows
 from .suffixes import VIDEOS
 
@@ -179,7 +180,7 @@ def write(
             raise DatasetError(
                 f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write it lossless."
             )
-    with rows.fresh(path) as staged:
+    with durable.in_whole(path) as staged:
         staged.mkdir()
         for number, take in folders.numbered(source, cameras, progress):
             begin = min(float(take.readings[name].time_s[0]) for name in cameras if name in take.readings)

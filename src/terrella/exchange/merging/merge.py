@@ -84,8 +84,8 @@ def merge(
                 if merged is None:
                     count.skipped.append(f"take {number}: what is mapped of it makes fewer than two rows")
                 else:
-                    facts = {**take.facts, "embodiment": source.embodiment, "source": source.path, "take": number}
-                    yield replace(merged, facts=facts)
+                    whence = {"embodiment": source.embodiment, "source": source.path, "take": number}
+                    yield replace(merged, facts={**take.facts, **merged.facts, **whence})
         report.complete = True
 
     robots = set(mapping.embodiments)

@@ -34,7 +34,7 @@ def merge_into(
     dry:     stop when the mapping is written.
 
     The folder also has meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
-    "embodiments", each robot's statistics.
+    "embodiments", each robot's statistics. Where merging fails or is stopped, neither it nor a guessed mapping is left.
     """
     out = Path(out)
     path = out.parent / f"{out.name}.toml" if mapping is None else Path(mapping)
@@ -56,11 +56,19 @@ def merge_into(
     report = Report()
     terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
     merged = merge(sources, found, report, out.name, terminal)
-    notes = lerobot.write(merged, out, progress=progress)
-    about = json.loads((out / WORLD).read_text(encoding="utf-8"))
-    durable.write_json(out / WORLD, {**about, "embodiments": report.embodiments()})
-    durable.write_json(out / "meta" / "merge.json", {**report.to_json(), "notes": notes})
-    write_mapping(found, out / "meta" / "merge.toml")
+
+    def finish(folder: Path, notes: list[str]) -> None:
+        about = json.loads((folder / WORLD).read_text(encoding="utf-8"))
+        durable.write_json(folder / WORLD, {**about, "embodiments": report.embodiments()})
+        durable.write_json(folder / "meta" / "merge.json", {**report.to_json(), "notes": notes})
+        write_mapping(found, folder / "meta" / "merge.toml")
+
+    try:
+        notes = lerobot.write(merged, out, progress=progress, finish=finish)
+    except BaseException:
+        if mapping is None:
+            path.unlink(missing_ok=True)
+        raise
     new, notes = [f"note: {note}" for note in notes], [*merged.notes, *notes]
     text = "\n".join([report.text().rstrip(), *new, f"{len(sources)} recordings are now {out}, merged by {path}"])
     return {"out": str(out), "mapping": str(path), "notes": notes, **report.to_json()}, text
