@@ -45,10 +45,10 @@ def load(
     options: for a learned world what its `load` takes (memory=False, device="cuda") and fast=True (ONNX Runtime or a
              compiled graph where that is faster here: worlds/fast.py), for the game the fields of
              DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
-    remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `eye`, a file that
+    remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `estimator`, a file that
              `terrella train estimator` wrote or a world that has one, gives pose and depth where the world does not (to give one
              asks to remember).
-    memory_mb: the budget in MiB of what a story remembers; as its world was saved, or 16.
+    memory_mb: the budget in MiB of what an episode remembers; as its world was saved, or 16.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
     if remember or estimator is not None:

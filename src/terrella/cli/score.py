@@ -196,8 +196,8 @@ def _lines(card: Scorecard) -> list[str]:
     lines = []
     for row in last.values():
         sure = f" [{row.figure.low:.3g}, {row.figure.high:.3g}]" if math.isfinite(row.figure.low) else ""
-        beside = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
+        baselines = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
         about = " ".join(part for part in (row.channel, row.what) if part)
-        figure = f"{row.figure.value:.3g} {row.unit}".rstrip() + sure + beside
+        figure = f"{row.figure.value:.3g} {row.unit}".rstrip() + sure + baselines
         lines.append(f"{row.probe:>12}  {about}, {row.place} places, {row.horizon} steps: {figure}")
     return [*lines, *(f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm)]

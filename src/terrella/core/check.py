@@ -33,7 +33,7 @@ def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
     """Runs every law; gives the names of those that held, raises ContractError at the first that does not.
 
     The laws begin several episodes, so a world that cannot fork is left at a place of its own. `steps` is the length
-    of an episode; laws about `done` are only proven where a story gets there.
+    of an episode; laws about `done` are only proven where an episode gets there.
     """
     if not isinstance(world, World) or not isinstance(world.spec, Spec):
         raise ContractError("a World has `spec` (a terrella.Spec) and the verbs start, observe, imagine, render.")

@@ -1,4 +1,4 @@
-"""The fixed eye of the scorecard: a small convnet, shipped and never trained again, that turns frames into features.
+"""The fixed encoder of the scorecard: a small convnet, shipped and never trained again, that turns frames into features.
 
 It was trained by self-supervision to tell how a picture has been spoilt and which picture it is
 (recipes/frame_encoder.py). Its features are what `frechet` compares. It is not trained together with any world, and a

@@ -1,4 +1,4 @@
-"""What any measure of likeness is reported as: figures and curves beside copy-last, other actions, no action; drift."""
+"""What any measure of likeness is reported as: figures and curves compared with copy-last, other actions, no action; drift."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ def _row(
     exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]
 ) -> Row:
     at, rng = step - 1, exam.rng
-    beside = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
+    baselines = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
     if motion == PREDICTED:
         reach = {name: other.values for name, other in strangers.items() if at < other.values.shape[1]}
-        beside |= {name: mean_interval(values[:, at], rng()) for name, values in reach.items()}
+        baselines |= {name: mean_interval(values[:, at], rng()) for name, values in reach.items()}
     figure, gain = mean_interval(series.values[:, at], rng()), mean_interval(series.gain[:, at], rng())
-    return Row(*where, arm, motion, step, figure, series.better, beside, gain)
+    return Row(*where, arm, motion, step, figure, series.better, baselines, gain)
 
 
 def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor) -> Curve:

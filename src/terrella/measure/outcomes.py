@@ -76,9 +76,9 @@ def outcomes(
                 (paid * live).sum(1) for paid in (truth["reward"][:, part], dreamt["reward"][:, :step].double())
             )
             plain = usual * live.double().sum(1)
-            beside = {USUAL: mean_interval((plain - true).abs(), rng())}
+            baselines = {USUAL: mean_interval((plain - true).abs(), rng())}
             error, gain = (mine - true).abs(), mean_interval((plain - true).abs() - (mine - true).abs(), rng())
-            rows.append(Row(*where, "return error", "", *tail, mean_interval(error, rng()), -1, beside, gain))
+            rows.append(Row(*where, "return error", "", *tail, mean_interval(error, rng()), -1, baselines, gain))
             rows.append(Row(*where, "return correlation", "", *tail, correlation(mine, true), 1))
             more = true > plain + 1e-6
             note = f"{int(more.sum())} of {len(shown)} stretches paid more"
@@ -121,7 +121,7 @@ def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
     return float(above.mean())
 
 
-def _told(exam: Exam, world: World) -> list[str]:
+def _compared(exam: Exam, world: World) -> list[str]:
     """reward, done, and the single numbers that both the world and the passages say."""
     shown = next(iter(exam.sets.get(ENDINGS, {}).values()), None)
     if not shown or not world.spec.observes:
@@ -131,7 +131,7 @@ def _told(exam: Exam, world: World) -> list[str]:
 
 
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
-    names = _told(exam, world) if of == ENDINGS else []
+    names = _compared(exam, world) if of == ENDINGS else []
     flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
     return [Watch(tuple(names), flat)] if names else []
 
@@ -150,7 +150,9 @@ def _missing(exam: Exam, world: World) -> str:
     if not world.spec.observes:
         return "needs a world that takes evidence"
     return (
-        "" if _told(exam, world) else "needs reward, done or a number such as health, of the world and of the recording"
+        ""
+        if _compared(exam, world)
+        else "needs reward, done or a number such as health, of the world and of the recording"
     )
 
 

@@ -80,9 +80,9 @@ def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
 
 
 def _cell(row: Row) -> str:
-    beside = "".join(f"<small>{escape(name)} {number(fig.value)}</small>" for name, fig in row.baselines.items())
+    baselines = "".join(f"<small>{escape(name)} {number(fig.value)}</small>" for name, fig in row.baselines.items())
     note = f"<small>{escape(row.note)}</small>" if row.note else ""
-    return ("void" if row.void else figure_text(row.figure)) + beside + note
+    return ("void" if row.void else figure_text(row.figure)) + baselines + note
 
 
 def bar_table(bars: Sequence[Bar]) -> str:

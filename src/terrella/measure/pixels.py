@@ -132,19 +132,19 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
     rows, mine, real = [], dreamt[f"{name}/energy"], truth[f"{name}/energy"]
     for number, step in enumerate(config.horizons):
         if f"{name}/ssim" in dreamt:
-            beside = {COPY_LAST: mean_interval(truth[f"{name}/copied_ssim"][:, number], exam.rng())}
+            baselines = {COPY_LAST: mean_interval(truth[f"{name}/copied_ssim"][:, number], exam.rng())}
             figure = mean_interval(dreamt[f"{name}/ssim"][:, number], exam.rng())
-            rows.append(Row(probe, name, "SSIM", "", place, arm, motion, step, figure, 1, beside))
+            rows.append(Row(probe, name, "SSIM", "", place, arm, motion, step, figure, 1, baselines))
         still = truth[f"{name}/first"].flatten()
-        beside = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
+        baselines = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
-        rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, beside))
+        rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
         if f"{name}/features" in dreamt:
             looks = truth[f"{name}/features"][:, number]
             others = {COPY_LAST: truth[f"{name}/last"][:, 0], "blurred by 1 pixel": truth[f"{name}/blurred"][:, number]}
-            beside = {words: frechet_interval(looks, features) for words, features in others.items()}
+            baselines = {words: frechet_interval(looks, features) for words, features in others.items()}
             figure = frechet_interval(looks, dreamt[f"{name}/features"][:, number])
-            rows.append(Row(probe, name, "Frechet distance", "", place, arm, motion, step, figure, -1, beside))
+            rows.append(Row(probe, name, "Frechet distance", "", place, arm, motion, step, figure, -1, baselines))
     first, last = config.drop
     if last <= max(config.horizons):
         loss = mean_interval(dreamt[f"{name}/psnr"][:, first - 1] - dreamt[f"{name}/psnr"][:, last - 1], exam.rng())

@@ -35,26 +35,26 @@ def risk(
     """Of errors (mean absolute, intensities 0 to 1) and uncertainties [n, T] of the frames of n clips; in %, intervals over
     clips. `order worth`: how much of the way from chance to the oracle its order goes."""
     clips, steps = error.shape
-    wrong, doubt = 100 * error.flatten().double(), 100 * uncertainty.flatten().double()
+    wrong, expected = 100 * error.flatten().double(), 100 * uncertainty.flatten().double()
     clip = torch.arange(clips).repeat_interleave(steps)
     picks = torch.randint(clips, (RESAMPLES, clips), generator=rng)
     weights = torch.zeros(RESAMPLES + 1, clips, dtype=torch.float64)
     weights[0] = 1  # the clips as they are
     weights[1:].scatter_add_(1, picks, torch.ones(RESAMPLES, clips, dtype=torch.float64))
-    orders = [by.argsort(stable=True) for by in (doubt, wrong)]
+    orders = [by.argsort(stable=True) for by in (expected, wrong)]
     areas, least = (_area(weights[:, clip[order]], wrong[order]) for order in orders)
     shares = weights / weights.sum(1, keepdim=True) / steps
-    chance, expected = shares[:, clip] @ wrong, shares[:, clip] @ doubt
+    chance, mean_expected = shares[:, clip] @ wrong, shares[:, clip] @ expected
     off = torch.zeros(len(weights), dtype=torch.float64)
     for part in orders[0].tensor_split(BINS):
-        off += (shares[:, clip[part]] @ (wrong[part] - doubt[part])).abs()
+        off += (shares[:, clip[part]] @ (wrong[part] - expected[part])).abs()
     where, found = ("calibration", "rgb"), Report()
-    beside = {"by chance": _figure(chance, clips), "by an oracle": _figure(least, clips)}
+    reference = {"by chance": _figure(chance, clips), "by an oracle": _figure(least, clips)}
     closed = 100 * (chance - areas) / (chance - least).clamp_min(1e-12)
     for what, values, better, baselines in (
-        ("AURC", areas, -1, beside),
+        ("AURC", areas, -1, reference),
         ("order worth", closed, 1, {}),
-        ("error expected", expected, 0, {"error found": _figure(chance, clips)}),
+        ("error expected", mean_expected, 0, {"error found": _figure(chance, clips)}),
         ("calibration error", off, -1, {}),
     ):
         figure = _figure(values, clips)
@@ -84,11 +84,14 @@ def _report(exam: Exam, found: Found) -> Report:
     for arm in exam.arms:
         for motion in (PREDICTED, TRUE):
             parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
-            told = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
-            if len(told) > 1:
-                pairs = list(told.values())
-                told["all"] = torch.cat([error for error, _ in pairs]), torch.cat([doubt for _, doubt in pairs])
-            for place, (error, uncertainty) in told.items():
+            known = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
+            if len(known) > 1:
+                pairs = list(known.values())
+                known["all"] = (
+                    torch.cat([error for error, _ in pairs]),
+                    torch.cat([uncertainty for _, uncertainty in pairs]),
+                )
+            for place, (error, uncertainty) in known.items():
                 one = risk(place, arm, motion, error, uncertainty, exam.rng())
                 whole.rows += one.rows
                 whole.curves += one.curves if motion == PREDICTED else []

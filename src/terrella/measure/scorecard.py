@@ -1,4 +1,4 @@
-"""The scorecard as data: figures with 95% intervals beside what knows nothing, curves, pictures, and what was not asked."""
+"""The scorecard as data: figures with 95% intervals and baselines, curves, pictures, and what was not asked."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Bar:
-    """A target beside its figure: low <= figure <= high. `sure`: its whole interval lies on the same side."""
+    """A target and its figure: low <= figure <= high. `sure`: its whole interval lies on the same side."""
 
     name: str
     row: Row | None
@@ -200,7 +200,7 @@ def verdict(card: Scorecard) -> list[str]:
 
 
 def compared(card: Scorecard) -> list[Row]:
-    """The rows of the first arm, under actions alone, that stand beside copying the last frame."""
+    """The rows of the first arm, under actions alone, that are compared with copying the last frame."""
     arm = next(iter(card.worlds))
     mine = [row for row in card.rows if row.gain is not None and (row.arm, row.motion) == (arm, PREDICTED)]
     return [row for row in mine if COPY_LAST in row.baselines]

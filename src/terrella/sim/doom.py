@@ -3,7 +3,7 @@
 Doom's own depth buffer has 8 bits (about 7 map units a level), so depth is cast exactly from the map's sectors, and
 the buffer is used only where it shows something else (a sprite). One metre is 32 map units, the usual reading.
 What may move or vanish (monsters, shots, pick-ups, doors, lifts) is marked in the channel `things`: no memory of the
-place should hold it. Each sprite among it is told apart: `cast` says where it stands, `instances` which pixels it covers.
+place should hold it. Each sprite among it is told apart: `objects` says where it stands, `instances` which pixels it covers.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ KEYS = {
 CAMERA = (0.5, 0.8, 0.5, 0.5)
 MAP_SPACING_M = 1024.0  # from one map of a game to the next: see `map_origin`
 HEALTH = spaces.Box(0, 1000, (), np.float32)
-CAST = 16  # sprites that are told apart at most, the nearest
+OBJECTS = 16  # sprites that are told apart at most, the nearest
 PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
 _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map units + offset), fitted on my_way_home
 
 
 @dataclass(frozen=True)
 class DoomConfig:
-    """scenario: a ViZDoom scenario's name, or maps of a game ("freedoom2/MAP01,MAP02"), of which each story takes one;
+    """scenario: a ViZDoom scenario's name, or maps of a game ("freedoom2/MAP01,MAP02"), of which each episode takes one;
     size: rgb (height, width), 4:3; depth_size: likewise; timeout_tics: when an episode ends by itself, 0 for never;
     skill: 1 to 5, how hard it is; None for the scenario's own, 3 on the maps of a game."""
 
@@ -66,13 +66,13 @@ class DoomConfig:
 
 
 class Doom:
-    """The game as a World. One process, one story: not forkable, batch 1; a state is a ticket for the present.
+    """The game as a World. One process, one episode: not forkable, batch 1; a state is a ticket for the present.
 
     A scenario that tells the player's health has the channels `health` and `things` (bool [h, w]: what may move or
-    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. `cast` [CAST, 4] holds
+    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. `objects` [OBJECTS, 4] holds
     of the sprites in sight, the nearest first, a number that stays its own (0: none) and where its feet are (x, y, z in
-    metres); `instances` uint8 [h, w] is at each pixel the row of `cast` that is seen there, counted from 1. On a map of a game
-    a kill and the exit pay 1, death costs 1, and stories begin at the map's start or where a pick-up lies.
+    metres); `instances` uint8 [h, w] is at each pixel the row of `objects` that is seen there, counted from 1. On a map of a game
+    a kill and the exit pay 1, death costs 1, and episodes begin at the map's start or where a pick-up lies.
     """
 
     def __init__(self, config: DoomConfig | None = None):
@@ -95,8 +95,8 @@ class Doom:
         }
         if alive:
             channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
-            channels["instances"] = spaces.Box(0, CAST, config.depth_size, np.uint8)
-            channels["objects"] = spaces.Box(-np.inf, np.inf, (CAST, 4), np.float32)
+            channels["instances"] = spaces.Box(0, OBJECTS, config.depth_size, np.uint8)
+            channels["objects"] = spaces.Box(-np.inf, np.inf, (OBJECTS, 4), np.float32)
             channels["health"] = HEALTH
         self.spec = Spec(
             name=f"doom:{config.scenario}",
@@ -166,7 +166,7 @@ class Doom:
         self._walls.began = self._walls.heights
 
     def _step_in(self, rng: torch.Generator) -> None:
-        """A map is wide and has one start: in three stories of four the player stands where a pick-up lay."""
+        """A map is wide and has one start: in three episodes of four the player stands where a pick-up lay."""
         found = [thing for thing in self._game.get_state().objects if thing.category in PICK_UPS]
         if found and float(torch.rand(1, generator=rng)) < 0.75:
             place = found[int(torch.randint(len(found), (1,), generator=rng))]
@@ -236,16 +236,16 @@ class Doom:
         )
 
     def _told_apart(self, x: float, y: float) -> dict[str, np.ndarray]:
-        """`cast` and `instances` as seen from (x, y), in map units."""
+        """`objects` and `instances` as seen from (x, y), in map units."""
         labels = [label for label in self._present.labels if label.object_name != "DoomPlayer"]
         labels.sort(key=lambda label: np.hypot(label.object_position_x - x, label.object_position_y - y))
-        cast, row_of = np.zeros((CAST, 4), np.float32), np.zeros(256, np.uint8)
-        for row, label in enumerate(labels[:CAST]):
+        objects, row_of = np.zeros((OBJECTS, 4), np.float32), np.zeros(256, np.uint8)
+        for row, label in enumerate(labels[:OBJECTS]):
             feet = np.array([label.object_position_x, label.object_position_y, label.object_position_z]) / UNITS_PER_M
-            cast[row] = (label.object_id + 1, *(feet + (*self._origin, 0.0)))
+            objects[row] = (label.object_id + 1, *(feet + (*self._origin, 0.0)))
             row_of[label.value] = row + 1
         return {
-            "objects": cast,
+            "objects": objects,
             "instances": row_of[_sampled(np.asarray(self._present.labels_buffer), self.config.depth_size)],
         }
 

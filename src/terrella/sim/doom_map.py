@@ -56,7 +56,7 @@ def skies(wad: Path, name: str) -> np.ndarray:
 
 class Sectors:
     """The map as prisms. Floors and ceilings move: `update` reads them again, and `moved` says whose differ from how the
-    story began (an open door, a lift on its way), or have no height at all (a closed door)."""
+    episode began (an open door, a lift on its way), or have no height at all (a closed door)."""
 
     def __init__(self, sectors, sky: np.ndarray):
         lines = [np.array([(w.x1, w.y1, w.x2, w.y2) for w in s.lines], np.float64).reshape(-1, 4) for s in sectors]

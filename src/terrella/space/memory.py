@@ -1,4 +1,4 @@
-"""Memory: what a story has seen and dreamt, as posed RGB-D keyframes that its State points at, within a byte budget.
+"""Memory: what an episode has seen and dreamt, as posed RGB-D keyframes that its State points at, within a byte budget.
 
 It keeps a dreamt frame that shows a new view of which much had to be invented; evidence it keeps always, in the place of
 what it held of that view. When it is full it forgets the keyframe whose view the others cover best (evidence is covered by
@@ -31,15 +31,15 @@ PAGE = 16  # a memory has room for a multiple of so many keyframes, if for as ma
 _EVERY = 11  # every so-manyth coarse patch of a keyframe is a point that another may cover
 _ALIKE = 0.02  # views whose covered shares differ by less are covered equally well
 
-ROWS = "memory_rows"  # the pointer into the arena: where a story's keyframes lie
+ROWS = "memory_rows"  # the pointer into the arena: where an episode's keyframes lie
 Held = Mapping[str, torch.Tensor]  # a State, or the part of one that is memory's: the tensors of `Memory.empty`
 
 
 @dataclass(frozen=True)
 class Memory:
-    """The rules of a memory. What a story holds is in its State, by the row of an arena that all stories share.
+    """The rules of a memory. What an episode holds is in its State, by the row of an arena that all episodes share.
 
-    camera: intrinsics of all keyframes; size: height and width of their pictures; budget_mb: MiB that one story may take;
+    camera: intrinsics of all keyframes; size: height and width of their pictures; budget_mb: MiB that one episode may take;
     new_view: metres and radians from the nearest keyframe, whose sum of shares makes a view new; known_enough: share of a
     dreamt frame that memory knew, above which it is not kept; device: where the arena lies.
     """
@@ -83,7 +83,7 @@ class Memory:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of one story's memory when it is full."""
+        """Bytes of one episode's memory when it is full."""
         return self.capacity * self.keyframe_bytes
 
     def empty(self, batch: int) -> dict[str, torch.Tensor]:
@@ -100,7 +100,7 @@ class Memory:
         return {name: state[name] for name in self.empty(0)}
 
     def count(self, held: Held) -> torch.Tensor:
-        """Keyframes held by each story: [B]."""
+        """Keyframes held by each episode: [B]."""
         return (held["memory_kind"] > EMPTY).sum(1)
 
     def table(self, held: Held) -> torch.Tensor:
@@ -200,12 +200,12 @@ class Memory:
     # -- recalling ----------------------------------------------------------------------------------------------------
 
     def keyframes(self, held: Held, view: int) -> Keyframes:
-        """The keyframes of one story, copied, as memory keeps them: without fine patches."""
+        """The keyframes of one episode, copied, as memory keeps them: without fine patches."""
         rows = held[ROWS][view][held["memory_kind"][view] > EMPTY]
         return self._keyframes(held).at(rows)
 
     def walls(self, held: Held, dreamt: bool = True) -> torch.Tensor:
-        """The walls [B, n, 4] that the keyframes of each story saw (floorplan.py), with `dreamt` those of dreams, too; NOWHERE
+        """The walls [B, n, 4] that the keyframes of each episode saw (floorplan.py), with `dreamt` those of dreams, too; NOWHERE
         for those that are none."""
         rows, kind = held[ROWS], held["memory_kind"]
         counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
@@ -215,7 +215,7 @@ class Memory:
     def look(
         self, held: Held, pose: torch.Tensor, sources: int = 6, slots: int = 3, recorded: Keyframes | None = None
     ) -> Glimpse:
-        """What memory, and `recorded` keyframes that all stories share, know of the views from `pose` [B, 7].
+        """What memory, and `recorded` keyframes that all episodes share, know of the views from `pose` [B, 7].
 
         `sources` keyframes are found for a view by their votes on its surfaces; `slots` of them show at each pixel.
         """

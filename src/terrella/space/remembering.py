@@ -43,7 +43,7 @@ class Remembering:
     """The wrapped world. Pose and depth are the inner world's channels; where it lacks one, the estimator's: odometry adds up
     its motions, level and from the origin. Without depth and estimator all is taken to lie on a sphere around the viewer.
 
-    memory_mb: budget of a story's memory; camera: intrinsics, where neither the inner world's spec nor the estimator has them.
+    memory_mb: budget of an episode's memory; camera: intrinsics, where neither the inner world's spec nor the estimator has them.
     """
 
     def __init__(

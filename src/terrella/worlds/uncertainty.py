@@ -6,7 +6,7 @@ gone since it last saw anything, and answers with the mean absolute error that s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -163,17 +163,3 @@ def clues(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     soft = F.avg_pool2d(whole, CELLS)
     here = soft[:, :3] - F.avg_pool2d(F.pad(soft[:, :3], (1, 1, 1, 1), mode="replicate"), 3, 1)
     return torch.cat([soft, here.abs().mean(1, keepdim=True)], 1)
-
-
-def uncertainty_weights(uncertainty: Uncertainty) -> dict[str, torch.Tensor]:
-    """What was learned by descent in half precision, the calibration as it is."""
-    learned = dict(uncertainty.named_parameters())
-    kept = {name: value.detach().cpu().contiguous() for name, value in uncertainty.state_dict().items()}
-    return {name: value.half() if name in learned else value for name, value in kept.items()}
-
-
-def uncertainty_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Uncertainty:
-    """What `asdict(uncertainty.config)` and `uncertainty_weights` describe."""
-    uncertainty = Uncertainty(UncertaintyConfig(config["situation"], tuple(config["channels"])))
-    uncertainty.load_state_dict({name: value.float() for name, value in weights.items()})
-    return uncertainty.eval().requires_grad_(False)

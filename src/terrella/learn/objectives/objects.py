@@ -34,7 +34,7 @@ WITHOUT = ", or train without (train video --objects-steps 0)"
 
 
 class Sightings(NamedTuple):
-    """The n cards that frames show: frame and row of its list [n]; marks [n, D] (worlds/cast.py) and box [n, 4]; share [n] of
+    """The n cards that frames show: frame and row of its list [n]; marks [n, D] (worlds/objects.py) and box [n, 4]; share [n] of
     the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their pictures
     uint8 [m, 4, *PICTURE]."""
 
@@ -173,7 +173,7 @@ def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
 
 
 def _reach(objects: Objects, tokens: Tokens) -> torch.Tensor:
-    """How near [looks], along x or y in metres, an eye can come to what looks upright: as near as it ever did (the nearest
+    """How near [looks], along x or y in metres, a camera can come to what looks upright: as near as it ever did (the nearest
     few of a thousand left out); 0 for what is low, and for all where it came into them."""
     look = tokens.cards[:, LOOK].long()
     upright = (objects.boxes[:, 3] >= UPRIGHT_M) & (objects.boxes[:, 3] < NEVER_M)
@@ -314,7 +314,7 @@ def _in_sight(numbers: list[float], cards: dict[float, torch.Tensor], pose: torc
 
 
 def _open(card: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
-    """Whether the eye of `row` saw as far as the place of `card`, a little above the ground."""
+    """Whether the camera of `row` saw as far as the place of `card`, a little above the ground."""
     pose = torch.from_numpy(np.array(cache.pose[row], np.float32))
     where, ahead = project(card[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
     (u, v), far = where[0].tolist(), float(ahead[0])

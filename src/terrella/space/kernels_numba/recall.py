@@ -9,7 +9,7 @@ from ..camera import FAR_M, NEAR_M, SAME
 from .planes import between
 from .surfaces import cast_one
 
-LOT = 16  # of a story's slots, in whose order keyframes that are trusted alike show
+LOT = 16  # of an episode's slots, in whose order keyframes that are trusted alike show
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
