@@ -142,3 +142,32 @@ def test_a_step_that_gives_something_else_is_refused():
         State({"place": torch.zeros(1)}, None, late)["frame"]
     with pytest.raises(KeyError):
         State({"place": torch.zeros(1)}, None, late)["nothing"]
+
+
+@pytest.mark.parametrize("nothing", [[], torch.zeros(3, dtype=torch.bool)], ids=["list", "mask"])
+def test_no_entry_of_what_waits_is_nothing_of_its_shape(nothing):
+    state = step(State.stack([step(begin(3), torch.arange(3)), begin(1)]), torch.arange(4)).at([0, 1, 2])
+    assert state.at(nothing)["frame"].shape == (0,) and state.at(nothing).at([])["frame"].dtype == torch.float64
+    joined = State.stack([state.at(nothing), state.at([1])])
+    assert torch.equal(joined["frame"], state["frame"][1:2])
+
+
+def test_what_another_thread_computes_meanwhile_keeps_its_rows(monkeypatch):
+    arena = Arena({"v": (torch.float64, ())}, room=3)
+
+    def remember(before: State, now) -> dict[str, torch.Tensor]:
+        return {"frame": before["frame"] + 7, "rows": arena.keep({"v": before["frame"] + 7})[:, None]}
+
+    start = State({"frame": torch.arange(2).double(), "rows": torch.zeros(2, 1, dtype=torch.int64)}, {"rows": arena})
+    state = State({}, start.arenas, Deferred(["frame", "rows"], Step(remember, start, {})))
+    planned = Deferred.at
+    monkeypatch.setattr(Deferred, "at", lambda self, *given: (self.values(), planned(self, *given))[1])
+    one = state.at([1]).at([0])  # reading it narrows the state
+    row = one["rows"]
+    assert one.arenas["rows"] is arena and arena.read("v")[row].tolist() == [[8.0]]
+    kept = one.replace(frame=torch.zeros(1).double())
+    del one, state, row
+    gc.collect()
+    for _ in range(8):
+        arena.keep({"v": torch.full((1,), -1.0).double()})
+    assert arena.read("v")[kept["rows"]].tolist() == [[8.0]]

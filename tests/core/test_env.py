@@ -14,8 +14,10 @@ from gymnasium.utils.passive_env_checker import check_action_space, check_observ
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 
-from terrella.core import WorldEnv, as_env, make_rng
+from terrella.core import Spec, State, WorldEnv, as_env, check_world, make_rng
 from terrella.core.errors import ActionError, ChannelError, TerrellaError
+from terrella.core.policy import Random
+from terrella.data import record
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.sim.replay import Replay
 
@@ -241,3 +243,38 @@ def test_bad_requests_are_answered_in_one_sentence(cartpole):
     for junk in (np.array([0, 2]), np.array([0]), np.array([0.0, np.nan])):
         with pytest.raises(ActionError):
             env.step(junk)
+
+
+class Trained:
+    """A world that anybody may write: its weights want gradients."""
+
+    def __init__(self):
+        self.weight = torch.nn.Parameter(torch.ones(2))
+        shown = {"observation": spaces.Box(-np.inf, np.inf, (2,), np.float32)}
+        shown["reward"] = spaces.Box(-np.inf, np.inf, (), np.float32)
+        self.spec = Spec("trained", spaces.Box(-1, 1, (2,), np.float32), shown, (), 0.1)
+
+    def start(self, batch, rng):
+        if batch < 1:
+            raise TerrellaError("one or more")
+        return State({"place": torch.zeros(batch, 2)})
+
+    def observe(self, observation, prior, rng):
+        return prior or self.start(1, rng)
+
+    def imagine(self, state, action, rng):
+        return state.replace(place=state["place"] + self.weight * self.spec.check_action(action, state.batch))
+
+    def render(self, state, channels):
+        self.spec.check_channels(channels)
+        seen = {"observation": state["place"] * self.weight, "reward": (state["place"] * self.weight).sum(1)}
+        return {name: seen[name] for name in channels}
+
+
+def test_a_world_whose_weights_want_gradients_is_stepped_checked_and_recorded(tmp_path):
+    world = Trained()
+    env = as_env(world, num_envs=2, seed=0)
+    env.reset()
+    env.step(np.ones((2, 2), np.float32))
+    assert "acts_deterministically" in check_world(world)
+    assert record(world, Random(world.spec), tmp_path / "r", 4, make_rng(0)).rows == 4

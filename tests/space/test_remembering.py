@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from tests.worlds.test_history import made
 
 import terrella
 from terrella.core import Camera, Spec, State, check_world, make_rng
 from terrella.core.errors import ContractError, ObservationError, TerrellaError
 from terrella.space.camera import planar_pose, yaw
+from terrella.space.estimator import Estimator, EstimatorConfig
 from terrella.space.keyframes import Glimpse
 from terrella.space.memory import DREAMT, OBSERVED
 from terrella.space.remembering import Remembering, blend, remember
+from terrella.worlds.controls import Controls
 
 from .rooms import CAMERA, SIZE, painted, room_depth
 
@@ -274,3 +277,42 @@ def test_the_budget_that_is_advised_has_room():
 def test_the_truth_has_no_budget_of_its_own():
     with pytest.raises(TerrellaError, match="remembers nothing"):
         terrella.load("gym:CartPole-v1", memory_mb=4)
+
+
+class Glancing(Fickle):
+    """It draws from chance when it observes, too."""
+
+    def observe(self, observation, prior, rng):
+        told = super().observe(observation, prior, rng)
+        return told.replace(frame=(told["frame"].float() * torch.rand(len(told["frame"]), 3, generator=rng)[:, None, None])
+                            .to(torch.uint8))  # fmt: skip
+
+
+def test_a_batch_equals_its_singles_though_the_inner_world_observes_by_chance():
+    assert "a_batch_equals_its_singles" in check_world(Remembering(Glancing(), memory_mb=1))
+    world = Remembering(Glancing(), memory_mb=1)
+    start, turn, rng = world.start(2, make_rng(0)), torch.tensor([[0, 1, 0], [1, 0, 0]]), make_rng(1)
+    both = hold(world, world.imagine(start, turn, make_rng(1)), 1, 1, make_rng(2))
+    singles = State.stack([world.imagine(start.at(n), turn[n : n + 1], rng) for n in range(2)])
+    assert torch.equal(hold(world, singles, 1, 1, make_rng(2))["rgb"], both["rgb"])
+
+
+def test_a_learned_world_of_frames_alone_with_a_memory_keeps_the_contract():
+    estimator = Estimator(EstimatorConfig((16, 24))).eval().requires_grad_(False)
+    world = Remembering(made(Controls.buttons(3)), 1.0, estimator, CAMERA)
+    assert "a_batch_equals_its_singles" in check_world(world)
+
+
+def test_a_state_of_another_memory_around_a_world_is_adopted_or_refused():
+    world, twin, other = (Remembering(Fickle(), memory_mb=size) for size in (2, 2, 1))
+    state = hold(world, world.start(1, make_rng(0)), 1, 5)
+    assert torch.equal(hold(twin, state, 2, 3)["rgb"], hold(world, state, 2, 3)["rgb"])
+    for verb in (lambda: other.render(state, ("keyframes",)), lambda: hold(other, state, 1, 1)):
+        with pytest.raises(ContractError, match="layout"):
+            verb()
+
+
+def test_the_estimators_gradients_are_the_callers_choice():
+    world = Remembering(Fickle(channels=()), 1.0, Estimator(EstimatorConfig(SIZE)).eval())
+    state = hold(world, world.start(1, make_rng(0)), 1, 1)
+    assert state["depth"].requires_grad and not state["depth"].is_inference()

@@ -93,3 +93,5 @@ def test_what_is_no_old_world_is_refused(tmp_path):
     (tmp_path / "old" / "weights.safetensors").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="cannot be converted"):
         convert_world(tmp_path / "old", tmp_path / "new")
+    with pytest.raises(CheckpointError, match="in place; name a new folder"):
+        convert_world(tmp_path / "old", tmp_path / "old" / ".." / "old")

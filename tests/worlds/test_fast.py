@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,8 @@ from terrella.worlds.generator import Conditioning, Generator, generate
 from terrella.worlds.history import FrameHistory, Starts
 from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.moving import PLANES
+
+from .made import place
 
 PARITY = 2e-6  # of colours in [-1, 1], so far below one level of 255
 
@@ -190,3 +194,39 @@ def test_several_flow_steps_go_through_it_too(worlds):
     with torch.inference_mode():
         one, other = (generate(world.generator, noisy, conditioning, 3) for world in worlds)
     assert (one - other).abs().max() < 3 * PARITY
+
+
+def test_threads_that_draw_with_other_numbers_of_threads_do_not_disturb_one_another(monkeypatch):
+    pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
+    import onnxruntime
+
+    world = place(Controls.buttons(3))
+    given = example(world)
+    quick = through_onnx(world.generator, given)
+    counts = threading.local()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: counts.now)
+    real = onnxruntime.InferenceSession
+
+    def draw(threads: int) -> torch.Tensor:
+        counts.now = threads
+        with torch.no_grad():
+            return quick(*given)
+
+    class Interrupted:
+        """A session that another thread's call comes between."""
+
+        def __init__(self, *args, **kwargs):
+            self.inner = real(*args, **kwargs)
+            self.run = self.inner.run
+
+        def get_inputs(self):
+            if not interrupted:
+                interrupted.append(True)
+                other = threading.Thread(target=draw, args=(1,))
+                other.start()
+                other.join()
+            return self.inner.get_inputs()
+
+    interrupted: list[bool] = []
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Interrupted)
+    assert torch.isfinite(draw(2)).all() and interrupted

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 
 import terrella
-from terrella.core import check_world, make_rng
+from terrella.core import State, check_world, make_rng
 from terrella.core.errors import ContractError
+from terrella.data.channels import facts_of
+from terrella.learn.recording import controls_of
 from terrella.worlds import learned
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
@@ -158,3 +164,32 @@ def test_a_whole_step_stays_on_the_worlds_device(more):
         state = world.imagine(state, world.spec.sample_action(2, rng).to("meta"), rng)
     shown = world.render(state, tuple(world.spec.channels))
     assert {tensor.device.type for tensor in (*shown.values(), *state.values())} == {"meta"}
+
+
+def test_a_state_of_another_memory_is_adopted_or_refused():
+    world = place(KINDS["buttons"])
+    state, still = walk(world, look=False), torch.zeros(2, 3, dtype=torch.int8)
+    twin, other = place(KINDS["buttons"]), place(KINDS["buttons"]).with_memory_of(0.3)
+    seen = world.render(state, ("rgb", "keyframes"))
+    assert all(torch.equal(value, seen[name]) for name, value in twin.render(state, tuple(seen)).items())
+    after = twin.imagine(state, still, make_rng(3))
+    assert after.arenas == twin.scene.own.arenas
+    assert torch.equal(after["rgb"], world.imagine(state, still, make_rng(3))["rgb"])
+    pose = {"pose": world.render(state, ("pose",))["pose"]}
+    for verb, given in ((other.imagine, (state, still, make_rng(0))), (other.observe, (pose, state, make_rng(0))),
+                        (other.render, (state, ("rgb",))), (State.stack, ([state, other.start(1, make_rng(0))],)),
+                        (State.stack, ([walk(world, look=False), walk(other, look=False)],))):  # fmt: skip
+        with pytest.raises(ContractError, match=r"layout|shapes"):
+            list(verb(*given).values())
+    with pytest.raises(ContractError, match="no memory"):
+        world.render(State({"pose": torch.zeros(1, 7)}), ("rgb",))
+
+
+def test_several_choices_are_each_one_hot():
+    controls = Controls(CHOICE, (0.0, 2.0), (2.0, 6.0))
+    world = place(controls)
+    assert world.spec.action == spaces.MultiDiscrete([3, 5], start=[0, 2]) and Controls.of(world.spec) == controls
+    assert controls.encode(torch.tensor([[1, 6]])).tolist() == [[0, 1, 0, 0, 0, 0, 0, 1]]
+    assert check_world(world)
+    cache = SimpleNamespace(world=facts_of(world.spec), action=np.zeros((4, 2), np.float32))
+    assert controls_of(cache) == controls

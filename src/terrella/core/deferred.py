@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .errors import ContractError
+
 if TYPE_CHECKING:
+    from .arena import Arena
     from .state import State
 
 
@@ -73,6 +76,9 @@ class Pick:
                 index[mine] = start + place
                 start += len(rows)
                 kept.append(source if len(rows) == source.batch else source.narrowed(rows))
+        if not kept:  # nothing is picked: one entry says what shapes nothing has
+            some = next((source for source in self.sources if source.batch), self.sources[0])
+            kept.append(some if some.batch < 2 else some.narrowed(index.new_zeros(1)))
         return Pick(tuple(kept), index)
 
     def at(self, rows: torch.Tensor) -> Pick:
@@ -83,6 +89,11 @@ class Pick:
         """The tensors; nothing that they need waits any more."""
         if not len(self.index):
             return {name: self.sources[0][name][:0] for name in names}
+        kinds = {name: {tuple(source[name].shape[1:]) for source in self.sources} for name in names}
+        for name in (name for name in names if len(kinds[name]) > 1):
+            raise ContractError(
+                f"'{name}' has the shapes {sorted(kinds[name])} in these states; join those of one world."
+            )
         return {name: torch.cat([source[name] for source in self.sources])[self.index] for name in names}
 
 
@@ -117,11 +128,12 @@ class Deferred:
         assert self._values is not None
         return self._values
 
-    def at(self, rows: torch.Tensor) -> Deferred:
-        """The entries `rows` alone, without the work for the others."""
-        plan = self._plan
-        if plan is None:
-            plan = Pick((_whole(self.values()),), torch.arange(self.batch, device=rows.device))
+    def at(self, rows: torch.Tensor, arenas: Mapping[str, Arena]) -> Deferred:
+        """The entries `rows` alone, without the work for the others; arenas: those that the tensors point into."""
+        with self._lock:
+            plan = self._plan
+        if plan is None:  # another thread has computed it meanwhile
+            plan = Pick((_whole(self.values(), arenas),), torch.arange(self.batch, device=rows.device))
         return Deferred(self.names, plan.at(rows))
 
     def _waits_for(self) -> list[Deferred]:
@@ -143,7 +155,7 @@ class Deferred:
             self._values, self._plan, self.length = found, None, 0
 
 
-def _whole(values: Mapping[str, torch.Tensor]) -> State:
+def _whole(values: Mapping[str, torch.Tensor], arenas: Mapping[str, Arena]) -> State:
     from .state import State
 
-    return State(values)
+    return State(values, arenas)

@@ -92,6 +92,7 @@ class WorldEnv(VectorEnv):
             raise TerrellaError("the environment has not begun: call reset() first.")
         return self._state
 
+    @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """New episodes in all environments, or in those of options["reset_mask"]; `seed` restarts all chance."""
         super().reset(seed=seed)
@@ -113,6 +114,7 @@ class WorldEnv(VectorEnv):
             self._state = self._restarted(self.state, mask)
         return self._observations(self._look()), {}
 
+    @torch.no_grad()
     def step(self, actions):
         """Observations, rewards float64, terminated, truncated, infos; each leads with num_envs."""
         state, actions = self.state, torch.as_tensor(np.asarray(actions))
@@ -142,6 +144,7 @@ class WorldEnv(VectorEnv):
             observations = self._restart_ended()
         return observations, rewards, terminated, truncated, infos
 
+    @torch.no_grad()
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One uint8 [H, W, 3] picture an environment; None for a world without `rgb`."""
         if self.render_mode is None:

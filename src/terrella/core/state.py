@@ -187,7 +187,11 @@ class State(Mapping):
         deferred = self.deferred
         if deferred is None:
             return self.at(rows)
-        return State({name: tensor[rows] for name, tensor in self._tensors.items()}, self._arenas, deferred.at(rows))
+        return State(
+            {name: tensor[rows] for name, tensor in self._tensors.items()},
+            self._arenas,
+            deferred.at(rows, self._arenas),
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes one safetensors file, with the rows that the state points at."""
@@ -235,6 +239,12 @@ class State(Mapping):
         """`combine` of the states' tensors that are there; of what waits in one of them, `pick` of the rows' numbers."""
         if any(set(state) != set(self) for state in states):
             raise ValueError("only states of the same world can be stacked, put or mixed")
+        for name in self._tensors:
+            kinds = {tuple(state[name].shape[1:]) for state in states if name in state._tensors}
+            if len(kinds) > 1:
+                raise ContractError(
+                    f"'{name}' has the shapes {sorted(kinds)} in these states; join those of one world."
+                )
         late = {name for state in states if state.deferred is not None for name in state if name not in state._tensors}
         tensors = {name: combine(*(state[name] for state in states)) for name in self if name not in late}
         if not late:

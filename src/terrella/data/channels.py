@@ -142,7 +142,7 @@ def facts_of(spec: Spec) -> dict[str, object]:
         "action_frame": spec.action_frame,
         "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
         "units": dict(spec.units),
-        "discrete": isinstance(spec.action, spaces.Discrete),
+        "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
         **limits,
     }
 

@@ -53,6 +53,7 @@ def record(
     return recorder
 
 
+@torch.no_grad()
 def _episode(world, policy, recorder, frames, rng, progress, max_steps) -> None:
     channels = [name for name in world.spec.channels if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]

@@ -186,13 +186,14 @@ def controls_of(cache: ClipCache) -> Controls | None:
     if cache.action is None:
         return None
     low, high = cache.world.get("action_low"), cache.world.get("action_high")
-    whole = bool(cache.world.get("discrete"))
+    space = str(cache.world.get("action_space"))
+    whole = bool(cache.world.get("discrete")) or space.startswith("MultiDiscrete")
     if low is None or high is None:
         action = np.asarray(cache.action)
         low, high = action.min(0).tolist(), action.max(0).tolist()
         buttons = not whole and bool(np.isin(action, (0, 1)).all())
     else:
-        buttons = str(cache.world.get("action_space")).startswith("MultiBinary")
+        buttons = space.startswith("MultiBinary")
     if buttons:
         return Controls.buttons(cache.action.shape[1])
     limits = tuple(map(float, low)), tuple(map(float, high))

@@ -99,6 +99,22 @@ class Memory:
         """The tensors of `state` that are memory's."""
         return {name: state[name] for name in self.empty(0)}
 
+    def adopted(self, state: State) -> State:
+        """`state` with what it remembers in this memory's arena: itself where it lies there. ContractError where it is of
+        another layout."""
+        arena = state.arenas.get(ROWS)
+        if arena is self._arena or (arena is None and ROWS in state):
+            return state
+        if arena is None:
+            raise ContractError("the state has no memory, so it is not of this world; begin with start or observe.")
+        slots = state[ROWS].shape[1]
+        if slots != self.capacity or not arena.same_layout(self._arena):
+            raise ContractError(
+                f"the state's memory ({slots} keyframes) has another layout than the world's ({self.capacity} of "
+                f"{self.size[0]} x {self.size[1]} pixels); give it to a world with the memory that it was made with."
+            )
+        return state.into(self.arenas)
+
     def count(self, held: Held) -> torch.Tensor:
         """Keyframes held by each episode: [B]."""
         return (held["memory_kind"] > EMPTY).sum(1)

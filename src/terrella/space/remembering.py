@@ -67,7 +67,7 @@ class Remembering:
             raise ContractError(f"{spec.name} has no camera in its spec, nor the estimator: give the intrinsics.")
         height, width, _ = shape_of(spec.channels["rgb"])
         self.world, self.estimator = world, estimator
-        self.memory = Memory(camera, (height, width), memory_mb)
+        self.memory = Memory(camera, (height, width), memory_mb, device=str(getattr(world, "device", "cpu")))
         if not self.memory.capacity:
             least = math.ceil(100 * self.memory.keyframe_bytes / 2**20) / 100
             raise ContractError(f"a budget of {memory_mb} MiB has no room for a keyframe; give {least:.2f} or more.")
@@ -86,13 +86,15 @@ class Remembering:
             raise ObservationError(
                 f"{self.spec.name} observes {', '.join(self.world.spec.observes)}; got {list(observation)}."
             )
+        prior, again = None if prior is None else self.memory.adopted(prior), rng.clone_state()
         inner = self.world.observe(observation, None if prior is None else _inner(prior), rng)
         if "rgb" in observation or prior is None:
             return self._witnessed(inner, prior)
-        return self._drawn(inner, prior, rng)
+        return self._drawn(inner, prior, again)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        after = self._drawn(self.world.imagine(_inner(state), action, rng), state, rng)
+        state, again = self.memory.adopted(state), rng.clone_state()
+        after = self._drawn(self.world.imagine(_inner(state), action, rng), state, again)
         if "done" not in state or not state["done"].any():
             return after
         still = state["done"]  # what is over stays as it is, and pays no more
@@ -101,6 +103,7 @@ class Remembering:
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
+        state = self.memory.adopted(state)
         show = {
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
@@ -118,11 +121,15 @@ class Remembering:
         seen, rgb, depth, pose = self._seen(inner, prior)
         held = State(self.memory.empty(len(rgb)), self.memory.arenas) if prior is None else prior
         held = held.replace(**self.memory.observed(held, rgb, depth, pose))
-        known = torch.full(depth.shape, 255, dtype=torch.uint8)
+        known = torch.full(depth.shape, 255, dtype=torch.uint8, device=rgb.device)
         return self._joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
 
     def _drawn(self, inner: State, before: State, rng: torch.Generator) -> State:
-        """The state in which the inner world's invention and what memory knows of the view are one picture."""
+        """The state in which the inner world's invention and what memory knows of the view are one picture.
+
+        rng: as it was before the invention, so that a batch equals its singles where the inner world's verbs draw alike: all
+        once an entry, say (core/chance.py), or the blend's observation nothing.
+        """
         seen, rgb, depth, pose = self._seen(inner, before)
         glimpse = self.memory.look(before, pose)
         rgb, known = blend(glimpse, rgb)
@@ -144,21 +151,19 @@ class Remembering:
             depth = F.interpolate(seen["depth"].float()[:, None], self.memory.size, mode="nearest-exact")[:, 0]
             depth = depth.clamp_min(0.05)
         elif self.estimator is not None:
-            with torch.inference_mode():
-                depth = self.estimator.depth(rgb).clone()
+            depth = self.estimator.depth(rgb)
         else:
-            beams = rays(self.memory.camera, *self.memory.size)
+            beams = rays(self.memory.camera, *self.memory.size, rgb.device)
             depth = (SHELL_M / beams.norm(dim=-1)).expand(len(rgb), -1, -1)
         return seen, rgb, depth, seen["pose"].float() if "pose" in seen else self._felt(rgb, before)
 
     def _felt(self, rgb: torch.Tensor, before: State | None) -> torch.Tensor:
         """Where odometry says that the picture was taken, `before` being the last; the origin for a first one."""
         assert self.estimator is not None
-        zero = torch.zeros(len(rgb))
+        zero = torch.zeros(len(rgb), device=rgb.device)
         if before is None:
             return planar_pose(zero, zero, zero, zero)
-        with torch.inference_mode():
-            forward, left, turn = self.estimator.motion(before["rgb"], rgb, before["depth"]).clone().unbind(-1)
+        forward, left, turn = self.estimator.motion(before["rgb"], rgb, before["depth"]).unbind(-1)
         pose, heading = before["pose"], yaw(before["pose"])
         x = pose[:, 0] + forward * heading.cos() - left * heading.sin()
         y = pose[:, 1] + forward * heading.sin() + left * heading.cos()

@@ -54,7 +54,7 @@ def arrive(
     corner = starts.pose[:1].clone()
     corner[0, 0] = starts.pose[:, 0].max() + AWAY_M
     corner[0, 2] = starts.pose[:, 2].median()
-    corner[0, 3:] = torch.tensor([1.0, 0, 0, 0])
+    corner[0, 3:] = corner.new_tensor([1.0, 0, 0, 0])
     for view, picture in enumerate(rgb):
         place = recognise(picture, memory, small, camera, sources)
         known = place is not None and place.likeness > ALIKE and place.edges > ALIKE_EDGES and place.known > KNOWN
@@ -65,4 +65,4 @@ def arrive(
             picks = retrieve(memory, poses[-1][None], camera, size, sources)
             seen = look(memory, picks, poses[-1][None], camera, size, 1)
             depth[view] = torch.where(seen.known[0] > 0, seen.depth[0], depth[view])
-    return Arrival(torch.stack(poses), depth, torch.tensor(found))
+    return Arrival(torch.stack(poses), depth, torch.tensor(found, device=rgb.device))

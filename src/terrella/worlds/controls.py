@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core.errors import ContractError
@@ -16,7 +17,7 @@ AXES = "axes"
 
 @dataclass(frozen=True)
 class Controls:
-    """kind: "buttons", each 0 or 1; "choice", a whole number from low to high; "axes", numbers between low and high.
+    """kind: "buttons", each 0 or 1; "choice", a whole number from low to high, or several; "axes", numbers between low and high.
     low and high: limits, one for each number of an action. What axes mean: mode, units and frame, as in Spec."""
 
     kind: str
@@ -45,23 +46,32 @@ class Controls:
     @property
     def numbers(self) -> int:
         """How many numbers networks take of an action."""
-        return int(self.high[0] - self.low[0]) + 1 if self.kind == CHOICE else len(self.low)
+        return sum(self._counts) if self.kind == CHOICE else len(self.low)
+
+    @property
+    def _counts(self) -> list[int]:
+        """Of how many each choice is one."""
+        return [int(high - low) + 1 for low, high in zip(self.low, self.high)]
 
     def space(self) -> spaces.Space:
         """The space of one action."""
         if self.kind == BUTTONS:
             return spaces.MultiBinary(len(self.low))
         if self.kind == CHOICE:
-            return spaces.Discrete(self.numbers, start=int(self.low[0]))
+            starts = [int(low) for low in self.low]
+            if len(starts) == 1:
+                return spaces.Discrete(self.numbers, start=starts[0])
+            return spaces.MultiDiscrete(self._counts, start=starts)
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
     def encode(self, action: torch.Tensor) -> torch.Tensor:
-        """[B, ...], as recorded or as `space` has it, to float32 [B, numbers]: buttons as they are, a choice one-hot (all zero
+        """[B, ...], as recorded or as `space` has it, to float32 [B, numbers]: buttons as they are, each choice one-hot (all zero
         would be no choice at all), axes so that their limits are -1 and 1."""
         given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
-            picked = (given[:, 0].round().long() - int(self.low[0])).clamp(0, self.numbers - 1)
-            return torch.nn.functional.one_hot(picked, self.numbers).float()
+            whole = given.round().long()
+            picked = [(whole[:, n] - int(low)).clamp(0, self._counts[n] - 1) for n, low in enumerate(self.low)]
+            return torch.cat([F.one_hot(one, count) for one, count in zip(picked, self._counts)], 1).float()
         if self.kind == AXES:
             low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
             return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)

@@ -23,14 +23,16 @@ def convert_world(old: str | Path, new: str | Path) -> None:
     """Writes the world in the folder `old`, of format version 2, to the folder `new`. Nothing is lost: weights are copied, and
     the remembered pictures stay byte for byte.
 
-    CheckpointError where `old` is no such world, or `new` exists and is another folder with files in it.
+    CheckpointError where `old` is no such world, or `new` is a folder with files in it, `old` itself among them.
     """
     old, new = Path(old), Path(new)
     about = read_about(old)
     if (about.get("kind"), about.get("version")) != (OLD_KIND, OLD_VERSION):
         found = f"kind {about.get('kind')!r}, version {about.get('version')}"
         raise CheckpointError(f"{old} is {found}; only kind '{OLD_KIND}' of version {OLD_VERSION} needs converting.")
-    if new != old and new.exists() and any(new.iterdir()):
+    if new.resolve() == old.resolve():
+        raise CheckpointError(f"{old} cannot be converted in place; name a new folder.")
+    if new.exists() and any(new.iterdir()):
         raise CheckpointError(f"{new} is not empty; name a new folder.")
     try:
         weights, remembered = load_file(old / WEIGHTS_FILE), (old / MEMORY_FILE).read_bytes()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import statistics
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -104,19 +105,22 @@ def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
         )
     import onnxruntime
 
-    graph, sessions = _exported(generator, inputs), {}
+    graph, sessions, lock = _exported(generator, inputs), {}, threading.Lock()
 
     def forward(*given) -> torch.Tensor:
         threads = torch.get_num_threads()
-        if threads not in sessions:
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = threads
-            options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # others need the cores too
-            sessions.clear()
-            sessions[threads] = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        with lock:
+            session = sessions.get(threads)
+            if session is None:
+                options = onnxruntime.SessionOptions()
+                options.intra_op_num_threads = threads
+                options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # others need the cores too
+                session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+                sessions.clear()
+                sessions[threads] = session
         tensors = [tensor.numpy() for tensor in _flat(given)]
-        wanted = [node.name for node in sessions[threads].get_inputs()]
-        return torch.from_numpy(sessions[threads].run(None, {name: tensors[int(name[1:])] for name in wanted})[0])
+        wanted = [node.name for node in session.get_inputs()]
+        return torch.from_numpy(session.run(None, {name: tensors[int(name[1:])] for name in wanted})[0])
 
     return forward
 

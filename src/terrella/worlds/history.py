@@ -90,6 +90,10 @@ class FrameHistory:
         check_prior(prior.batch, len(frame))
         return Evidence(len(frame), self.device, None, {"frames": torch.cat([frame, prior["frames"][:, 1:]], 1)})
 
+    def adopted(self, state: State) -> State:
+        """`state`, which points at nothing."""
+        return state
+
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
         return State({"frames": evidence.seen["frames"]})

@@ -197,6 +197,7 @@ class LearnedWorld:
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """Evidence into state, as the scene takes it (places.py, history.py); of a pose alone the frame is dreamt."""
+        prior = None if prior is None else self.scene.adopted(prior)
         evidence = self.scene.evidence(observation, prior, self.estimator)
         seeds = chance.seeds(evidence.batch, rng, self.device)
         state = self._observed(evidence, observation, prior)
@@ -209,7 +210,7 @@ class LearnedWorld:
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         """One step: move, then draw what is seen from there, now or when somebody looks. What is over stands still."""
         numbers = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
-        seeds = chance.seeds(state.batch, rng, self.device)
+        state, seeds = self.scene.adopted(state), chance.seeds(state.batch, rng, self.device)
         still = state["done"]
         asked = self.asked(state, numbers)
         asked = asked.replace(**self.outcome.placed(state, self.body.ends(asked, numbers)))
@@ -222,6 +223,7 @@ class LearnedWorld:
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
+        state = self.scene.adopted(state)
         show = {**self.scene.show(state), **self.objects.show(state), **self.outcome.show(state)}
         return {name: show[name]() if name in show else state[name] for name in channels}
 

@@ -193,6 +193,10 @@ class KeyframeScene:
         moving = ("things", "instances", *(f"earlier_{part}" for part in SEEN)) if self.config.moving else ()
         return "rgb", "depth", "known", *moving, *self.own.empty(1)
 
+    def adopted(self, state: State) -> State:
+        """`state` with its keyframes in this scene's arena; ContractError where its memory is of another layout."""
+        return self.own.adopted(state)
+
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
         batch, there, (height, width) = evidence.batch, self.device, self.config.size
