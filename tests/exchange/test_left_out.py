@@ -198,3 +198,13 @@ def test_an_export_counts_what_it_wrote_and_says_what_it_left_out(tmp_path):
     count, notes = browse(tmp_path / "log").export(tmp_path / "good", [1, 2], lambda *done: None)
     assert count == len(Dataset(tmp_path / "good").episodes) == 1
     assert any("was left out: it has 1 row" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    "value, words", [(80.0, ["beyond 65.535 m"]), (1.2344, ["rounded to 1 mm"]), (2.5, []), (np.inf, [])]
+)
+def test_what_depth_loses_in_lerobot_is_said(tmp_path, value, words):
+    depth = Sensor("observation.depth", "depth", (4, 6))
+    take = Take({depth.name: Readings(np.arange(3) / 10, np.full((3, 4, 6), value, np.float32))})
+    notes = write_source(Source("deep", {depth.name: depth}, lambda: [take], 10.0), tmp_path / "set")
+    assert len(notes) == len(words) and all(word in note for word, note in zip(words, notes))

@@ -197,7 +197,7 @@ def test_bad_videos_are_named(tmp_path):
         list(videos.read(tmp_path).takes())
     (tmp_path / "folder").mkdir()
     (tmp_path / "c.mp4").rename(tmp_path / "folder" / "c.mp4")
-    with pytest.raises(DatasetError, match="beside folders"):
+    with pytest.raises(DatasetError, match="next to folders"):
         videos.read(tmp_path)
 
 
@@ -336,7 +336,8 @@ def test_bad_images_are_named(tmp_path):
 def test_depth_beyond_sixteen_bits_is_nothing(tmp_path):
     depth = np.array([[[0.0, 0.0004, 1.2344, 65.535, 65.6, np.inf, np.nan, -1.0]]], np.float32)
     source = source_of([{"observation.depth": ([0.0], depth)}], {"observation.depth": "depth"}, fps=1)
-    images.write(source, tmp_path / "d")
+    notes = images.write(source, tmp_path / "d")
+    assert len(notes) == 2 and "beyond 65.535 m" in notes[0] and "rounded to 1 mm" in notes[1]
     (take,) = images.read(tmp_path / "d", 1).takes()
     found = take.readings["observation.depth"].values[0][0]
     inf = np.inf

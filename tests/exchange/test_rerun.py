@@ -105,11 +105,17 @@ def test_one_take_is_one_file_and_nothing_is_overwritten(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["one.rrd"]
 
 
-def test_a_viewer_that_cannot_be_reached_is_a_sentence():
+def test_a_viewer_that_cannot_be_reached_is_a_sentence(monkeypatch):
+    import rerun as rr
+
     from terrella.exchange.formats import rerun
 
-    with pytest.raises(DatasetError, match="nowhere cannot be reached"):
-        rerun.show(source_of(1), "nowhere")
+    def nowhere(self):
+        raise RuntimeError("no viewer")
+
+    monkeypatch.setattr(rr.RecordingStream, "spawn", nowhere)
+    with pytest.raises(DatasetError, match="cannot be reached"):
+        rerun.show(source_of(1))
 
 
 def test_a_broken_reading_leaves_nothing_behind(tmp_path):

@@ -16,22 +16,18 @@ _MOST_STEPS = 1000
 
 
 def from_env(
-    env: str | Callable[[], gymnasium.Env],
-    episodes: int = 10,
-    seed: int = 0,
-    fps: float | None = None,
-    max_steps: int = _MOST_STEPS,
+    env: str | Callable[[], gymnasium.Env], episodes: int = 10, seed: int = 0, fps: float | None = None
 ) -> Source:
     """Rollouts of an environment, its id or a function that makes one; the same at each call of `takes`.
 
     fps: rows a second; by default from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
-    max_steps: an episode is cut (truncated) after so many.
 
-    Observations are one more than actions: the one after the last step is kept. Spaces are flattened as in minari.read.
+    An episode is cut (truncated) after 1000 steps. Observations are one more than actions: the one after the last step is
+    kept. Spaces are flattened as in minari.read.
     DatasetError for unknown ids, and spaces that are not arrays.
     """
-    if episodes < 1 or max_steps < 1:
-        raise DatasetError(f"{episodes} episodes of {max_steps} steps are no recording; ask for 1 or more of each.")
+    if episodes < 1:
+        raise DatasetError(f"{episodes} episodes are no recording; ask for 1 or more.")
     rows.check_fps(fps, "the rollout")
     made, name = _make(env)
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
@@ -48,7 +44,7 @@ def from_env(
         try:
             for number in range(episodes):
                 draw = np.random.SeedSequence([seed, number]).generate_state(2)
-                yield _take(_rollout(made, draw, max_steps), leaves, sensors, rate, name, int(draw[0]))
+                yield _take(_rollout(made, draw), leaves, sensors, rate, name, int(draw[0]))
         finally:
             made.close()
 
@@ -76,7 +72,7 @@ def _rate(env: gymnasium.Env) -> float | None:
     return float(stated) if isinstance(stated, int | float) and stated > 0 else None
 
 
-def _rollout(env: gymnasium.Env, draw: np.ndarray, max_steps: int) -> dict[str, list]:
+def _rollout(env: gymnasium.Env, draw: np.ndarray) -> dict[str, list]:
     seen, _ = env.reset(seed=int(draw[0]))
     env.action_space.seed(int(draw[1]))
     found: dict[str, list] = {rows.OBSERVATION: [seen], rows.ACTION: []}
@@ -86,7 +82,7 @@ def _rollout(env: gymnasium.Env, draw: np.ndarray, max_steps: int) -> dict[str, 
         action = env.action_space.sample()
         seen, reward, terminated, truncated, _ = env.step(action)
         done, steps = bool(terminated), len(found[rows.ACTION]) + 1
-        cut = bool(truncated) or (steps == max_steps and not done)
+        cut = bool(truncated) or (steps == _MOST_STEPS and not done)
         for name, value in zip(found, (seen, action, float(reward), done, cut)):  # type: ignore[arg-type]
             found[name].append(value)
     return found

@@ -13,7 +13,7 @@ CAMERA = f"{rows.IMAGES}{rows.CAMERA}"
 
 
 def takes_of(path: Path, suffixes: frozenset[str], what: str, deep: bool) -> dict[str, dict[str, list[Path]]]:
-    """Take -> camera -> its files, by the rule of `read_videos` (or, `deep`, of `read_images`)."""
+    """Take -> camera -> its files, by the rule of `videos.read` (or, `deep`, of `images.read`)."""
     if not path.is_dir():
         raise DatasetError(f"{path} is not a folder; name a folder of {what}.")
     here, folders = _listed(path, suffixes)
@@ -40,7 +40,7 @@ def takes_of(path: Path, suffixes: frozenset[str], what: str, deep: bool) -> dic
             if files:
                 found[name] = cameras
     if here and any(files or below for files, below in inside.values()) and len(found) > (1 if deep else len(here)):
-        raise DatasetError(f"{path} has {what} beside folders of {what}; keep the one or the other in it.")
+        raise DatasetError(f"{path} has {what} next to folders of {what}; keep the one or the other in it.")
     if not found:
         raise DatasetError(f"{path} has no {what} ({', '.join(sorted(suffixes))}); name a folder that has.")
     return found

@@ -156,6 +156,8 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
                 row = 0
                 for part in rows.batches(readings.values, source.sensors[name], f"take {number}", size=8):
                     for value in part:
+                        if source.sensors[name].kind == "depth":
+                            notes |= dict.fromkeys(rows.depth_lost(name, value))
                         stored = value if source.sensors[name].kind == "image" else _millimetres(value)
                         Image.fromarray(stored).save(folder / f"{row:06d}.png", compress_level=3)
                         row += 1

@@ -12,11 +12,13 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.dataset import Dataset
+from ...data.features import unit_of
 from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
 from ...data.source import Readings, Sensor, Source, Take, follows
 from ...data.storage import durable
+from . import rows
 
 
 def read(root: str | Path, fps: float | None = None) -> Source:
@@ -165,6 +167,7 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
     layout, notes = recorder.layout, []
     recorder.task = take.task
     columns, exact = {}, set()
+    deep = {name: unit_of(sensor) for name, sensor in layout.sensors.items() if sensor.kind == "depth"}
     for name, sensor in layout.sensors.items():
         readings = take.readings.get(name, _NONE)
         place = _places(readings.time_s, at)
@@ -186,6 +189,8 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
             elif not follows(name):
                 first = int((place >= 0).argmax())
                 row[name] = values[int(place[first])] if place[first] >= 0 else None
+        for name in deep:
+            notes += rows.depth_lost(name, row[name], deep[name]) if row.get(name) is not None else []
         recorder.add_row(row, float(time_s))
     for name in layout.streams:
         if name not in exact:

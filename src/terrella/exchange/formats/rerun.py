@@ -50,19 +50,16 @@ def write(source: Source, path: str | Path) -> list[str]:
     return _left_out(source)
 
 
-def show(source: Source, address: str | None = None) -> list[str]:
-    """Sends all takes to Rerun's viewer: the one at `address` ("rerun+http://127.0.0.1:9876/proxy"), or one that is
-    opened on this machine; gives back what Rerun has no place for. DatasetError where there is none."""
+def show(source: Source) -> list[str]:
+    """Sends all takes to Rerun's viewer, which is opened on this machine; returns what Rerun has no place for.
+    DatasetError where there is none."""
     for number, take in enumerate(source.takes()):
         stream = _stream(source, number)
         try:
-            with _reached(address):
-                if address is None:
-                    stream.spawn()  # joins the viewer that is already open, if any
-                else:
-                    stream.connect_grpc(address)
+            with _reached():
+                stream.spawn()  # joins the viewer that is already open, if any
             _log(stream, source, take)
-            with _reached(address):
+            with _reached():
                 stream.flush(timeout_sec=_PATIENCE_S)
         finally:
             stream.disconnect()
@@ -70,13 +67,12 @@ def show(source: Source, address: str | None = None) -> list[str]:
 
 
 @contextlib.contextmanager
-def _reached(address: str | None) -> Iterator[None]:
+def _reached() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, OSError) as error:
-        where = f"Rerun's viewer at {address}" if address else "a viewer of Rerun"
         raise DatasetError(
-            f"{where} cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`, or write .rrd files."
+            f"a viewer of Rerun cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`, or write .rrd files."
         ) from error
 
 

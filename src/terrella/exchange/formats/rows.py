@@ -113,6 +113,15 @@ def check_size(height: int, width: int, what: str) -> None:
         )
 
 
+def depth_lost(name: str, depth_m: np.ndarray, unit_m: float = 0.001) -> list[str]:
+    """What depth in metres loses as 16-bit counts of `unit_m`, in sentences; inf and NaN lose nothing."""
+    steps = np.asarray(depth_m, np.float64) / unit_m
+    steps = steps[np.isfinite(steps) & (steps >= 0)]
+    far, finer = steps > 65_535.5, np.abs(steps - np.rint(steps)) > 0.01
+    lost = [f"depth of '{name}' beyond {65_535 * unit_m:g} m was kept as out of range"] if far.any() else []
+    return lost + [f"depth of '{name}' was rounded to {1000 * unit_m:g} mm"] * bool((finer & ~far).any())
+
+
 # -- names
 
 

@@ -178,7 +178,7 @@ def write(
         height, width = source.sensors[name].shape[:2]
         if not lossless and (height % 2 or width % 2):
             raise DatasetError(
-                f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write it lossless."
+                f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write it as images."
             )
     with durable.in_whole(path) as staged:
         staged.mkdir()
