@@ -159,7 +159,7 @@ def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path):
     state = world.start(1, rng)
     still, left = (world.imagine(state, torch.tensor([[held]], dtype=torch.int8), make_rng(1)) for held in (0, 1))
     assert not torch.equal(still["actions"], left["actions"])
-    with pytest.raises(DatasetError, match="no poses"):
+    with pytest.raises(DatasetError, match="without depth and poses"):
         train_video(tmp_path / "set", tmp_path / "other", replace(CONFIG, keep_out=(0, 0, 1, 1)), quiet)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from ..core.errors import DatasetError
 from ..data import Clips
 from ..space.keyframes import Keyframes
 from ..worlds.config import VideoConfig
@@ -55,6 +56,10 @@ def frames_feed(
     if memory is not None:
         of_place = moving_batch if config.moving else place_batch
         return Drawn(lambda now: of_place(recording, memory, config, size, now, dream))
-    clips = history_clips(recording.cache, config, size, seed, recording.seen)
+    ranges = recording.cache.episodes  # of what is kept out, whole episodes are left out: clips know no rows
+    whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
+    if not whole:
+        raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
+    clips = history_clips(recording.cache, config, size, seed, whole)
     controls = recording.controls or Controls.buttons(config.actions)
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))

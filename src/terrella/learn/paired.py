@@ -39,7 +39,7 @@ class Paired:
 
     @property
     def memory(self) -> Keyframes | None:
-        return self.world.memory if self.world.config.geometry else None
+        return self.world.memory.to("cpu") if self.world.config.geometry else None
 
     def feed(self, batch: int, seed: int, dream: Dream | None = None) -> Feed:
         """Batches as in `train video`; with `dream`, some of the frames shown are the generator's own."""

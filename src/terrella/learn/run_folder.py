@@ -73,9 +73,14 @@ def _facts(path: Path) -> dict:
 
 
 def write_log(folder: Path, line: Mapping[str, object]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / LOG, "a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(folder / LOG, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+    except OSError as error:
+        raise TrainingError(
+            f"{folder / LOG} cannot be written ({error}); free some space and run the same command again."
+        ) from error
 
 
 def trim_log(folder: Path, stage: str, step: int) -> None:
@@ -91,7 +96,7 @@ def trim_log(folder: Path, stage: str, step: int) -> None:
 
 def _before(line: str, stage: str, step: int) -> bool:
     try:
-        told = json.loads(line)
-        return told.get("stage") != stage or told["step"] <= step
+        noted = json.loads(line)
+        return noted.get("stage") != stage or noted["step"] <= step
     except (ValueError, KeyError, AttributeError):
         return False  # a line that was cut by a kill

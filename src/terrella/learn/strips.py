@@ -41,4 +41,4 @@ def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch
         else:
             state = world.imagine(state, recording.played(world.spec, [row - 1]), rng)
         frames.append(world.render(state, ("rgb",))["rgb"])
-    return torch.cat(frames)[::8].permute(0, 3, 1, 2)
+    return torch.cat(frames)[::8].permute(0, 3, 1, 2).cpu()

@@ -142,7 +142,7 @@ class _Learned:
         if config.keep_out is not None:
             if not self.video.geometry:
                 raise DatasetError(
-                    f"{recording.name} has no poses, so no part of its map can be kept out; drop --keep-out."
+                    f"without depth and poses no part of the map of {recording.name} can be kept out; drop --keep-out."
                 )
             usable = Recording.of(recording.cache, recording.seen, config.keep_out).usable
             recording = replace(recording, usable=usable)
