@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import pytest
 import uvicorn
 
-from terrella.serve.door import open_port
-from terrella.serve.server import Offer, ServeConfig, make_server
+from terrella.serve.door import make_server, open_port
+from terrella.serve.server import Sessions, build_app
 
 from .panorama import Panorama
 
@@ -61,8 +61,8 @@ def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, po
         sinks.append(ListSink())
         return sinks[-1]
 
-    offer = Offer(worlds, 0, sink_factory if record else None, policy=policy, config=config or ServeConfig())
-    server = make_server(offer, listener, host, token, on_ready)
+    sessions = Sessions(worlds, 0, sink_factory if record else None, policy=policy, config=config)
+    server = make_server(build_app(sessions, host, token), listener, host, token, on_ready, websockets=True)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     assert ready.wait(20), "the server did not start"

@@ -24,7 +24,7 @@ def test_the_fake_keeps_the_contract():
 
 
 def test_show_is_read_and_junk_is_refused():
-    assert parse_message('{"type": "show", "map": true, "invented": false}') == Show(True, False)
+    assert parse_message('{"type": "show", "map": true, "invented": false}') == ("show", Show(True, False))
     for junk in ('{"type": "show"}', '{"type": "show", "map": 1, "invented": true}'):
         with pytest.raises(ProtocolError, match="true or false"):
             parse_message(junk)

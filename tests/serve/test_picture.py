@@ -16,7 +16,7 @@ from PIL import Image
 from terrella.core import Spec
 from terrella.core.errors import ObservationError, ProtocolError, ServeError
 from terrella.serve.picture import MAX_DROPPED_PIXELS, picture_of, read_picture, uncertainty_levels
-from terrella.serve.protocol import MAX_PICTURE, Picture, parse_message
+from terrella.serve.protocol import MAX_PICTURE, parse_message
 from terrella.serve.timeline import Timeline
 
 from .panorama import Panorama
@@ -134,7 +134,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
 
 
 def test_bytes_from_a_page_are_pictures_and_bounded():
-    assert parse_message(b"abc") == Picture(b"abc")
+    assert parse_message(b"abc") == ("picture", b"abc")
     with pytest.raises(ProtocolError, match="bytes"):
         parse_message(bytes(MAX_PICTURE + 1))
     with pytest.raises(ProtocolError, match="bytes"):

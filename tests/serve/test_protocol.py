@@ -11,18 +11,7 @@ from hypothesis import strategies as st
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
 from terrella.serve.history import Image
-from terrella.serve.protocol import (
-    Ack,
-    Controls,
-    Drive,
-    Frame,
-    Record,
-    Restart,
-    Rewind,
-    Seek,
-    Show,
-    Verb,
-)
+from terrella.serve.protocol import Controls, Frame, Show
 
 from .wire import decode_frame
 
@@ -95,22 +84,26 @@ def test_no_field_crashes_the_reader(value):
 
 def test_every_message_is_understood():
     said = {
-        '{"type": "controls", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': Controls(
-            7, ("KeyW", "ArrowLeft"), (), 12.5
+        '{"type": "controls", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': (
+            "controls",
+            Controls(7, ("KeyW", "ArrowLeft"), (), 12.5),
         ),
-        '{"type": "controls", "id": 8, "held": [], "axes": [0.5, -1]}': Controls(8, (), (0.5, -1.0)),
-        '{"type": "drive", "on": false}': Drive(False),
-        '{"type": "show", "map": true, "invented": false, "cameras": ["rgb.wrist"]}': Show(True, False, ("rgb.wrist",)),
-        '{"type": "ack", "seq": 3}': Ack(3),
-        '{"type": "pause"}': Verb.PAUSE,
-        '{"type": "resume"}': Verb.RESUME,
-        '{"type": "restart", "seed": 5}': Restart(5),
-        '{"type": "restart"}': Restart(None),
-        '{"type": "rewind", "steps": 9}': Rewind(9),
-        '{"type": "seek", "step": 9}': Seek(9),
-        '{"type": "branch"}': Verb.BRANCH,
-        '{"type": "sync"}': Verb.SYNC,
-        '{"type": "record", "on": true}': Record(True),
+        '{"type": "controls", "id": 8, "held": [], "axes": [0.5, -1]}': ("controls", Controls(8, (), (0.5, -1.0))),
+        '{"type": "drive", "on": false}': ("drive", False),
+        '{"type": "show", "map": true, "invented": false, "cameras": ["rgb.wrist"]}': (
+            "show",
+            Show(True, False, ("rgb.wrist",)),
+        ),
+        '{"type": "ack", "seq": 3}': ("ack", 3),
+        '{"type": "pause"}': ("pause", None),
+        '{"type": "resume"}': ("resume", None),
+        '{"type": "restart", "seed": 5}': ("restart", 5),
+        '{"type": "restart"}': ("restart", None),
+        '{"type": "rewind", "steps": 9}': ("rewind", 9),
+        '{"type": "seek", "step": 9}': ("seek", 9),
+        '{"type": "branch"}': ("branch", None),
+        '{"type": "sync"}': ("sync", None),
+        '{"type": "record", "on": true}': ("record", True),
     }
     for text, message in said.items():
         assert protocol.parse_message(text) == message

@@ -190,8 +190,8 @@ def test_the_rules_of_refusal():
 def test_an_address_that_others_reach_gets_a_token(token, serve_world, monkeypatch):
     seen = []
     monkeypatch.setattr("uvicorn.Server.run", lambda server, sockets: seen.append(server.config.app))
-    monkeypatch.setattr("terrella.serve.server.is_loopback", lambda host: False)
-    monkeypatch.setattr("terrella.serve.server.page_address", lambda host, port, token: seen.append(token))
+    monkeypatch.setattr("terrella.serve.door.is_loopback", lambda host: False)
+    monkeypatch.setattr("terrella.serve.door.page_address", lambda host, port, token: seen.append(token))
     serve([Panorama()], port=0, token=token)
     assert isinstance(seen[0], str) and len(seen[0]) > 16
 

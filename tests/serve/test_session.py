@@ -6,7 +6,7 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from terrella.serve.protocol import REPLAY, Ack, Controls, Restart, Rewind, Seek, Verb
+from terrella.serve.protocol import REPLAY, Controls
 from terrella.serve.session import MAX_UNACKED, Session
 from terrella.serve.timeline import Timeline
 
@@ -25,7 +25,7 @@ class FakeSocket:
         self.frames.append(decode_frame(data))
         self.most_unacked = max(self.most_unacked, self.session.unacked)
         if self.prompt:
-            self.session.hear(Ack(self.frames[-1].seq))
+            self.session.hear("ack", self.frames[-1].seq)
 
     async def send_text(self, data: str) -> None:
         self.events.append(json.loads(data))
@@ -69,10 +69,10 @@ def test_a_silent_browser_gets_two_frames_and_no_more():
         await until(lambda: len(socket.frames) == MAX_UNACKED)
         await asyncio.sleep(0.1)
         assert len(socket.frames) == MAX_UNACKED
-        session.hear(Ack(socket.frames[0].seq))
+        session.hear("ack", socket.frames[0].seq)
         await until(lambda: len(socket.frames) == MAX_UNACKED + 1)
         await asyncio.sleep(0.05)
-        assert socket.most_unacked == MAX_UNACKED and session.timeline.newest_step == MAX_UNACKED
+        assert socket.most_unacked == MAX_UNACKED and session.timeline.history.newest.step == MAX_UNACKED
 
     play(scenario)
 
@@ -84,8 +84,8 @@ def test_never_more_than_two_on_their_way():
         for _ in range(60):
             await asyncio.sleep(0.003)
             if socket.frames:
-                session.hear(Ack(socket.last.seq))
-                session.hear(Ack(10**6))  # of a frame that was never sent: means nothing
+                session.hear("ack", socket.last.seq)
+                session.hear("ack", 10**6)  # of a frame that was never sent: means nothing
         assert socket.most_unacked <= MAX_UNACKED and len(socket.frames) > 10
 
     play(scenario)
@@ -96,9 +96,9 @@ def test_the_latest_keys_win_and_are_named_in_the_frame():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: socket.frames)
-        session.hear(Controls(1, ("ArrowLeft",), t=5.0))
-        session.hear(Controls(3, ("KeyW",), t=7.0))
-        session.hear(Controls(2, ("ArrowLeft",), t=6.0))  # late, and older
+        session.hear("controls", Controls(1, ("ArrowLeft",), t=5.0))
+        session.hear("controls", Controls(3, ("KeyW",), t=7.0))
+        session.hear("controls", Controls(2, ("ArrowLeft",), t=6.0))  # late, and older
         await until(lambda: socket.last.action_id == 3)
         obeyed = next(frame for frame in socket.frames if frame.action_id == 3)
         assert obeyed.client_ms == 7.0
@@ -113,12 +113,12 @@ def test_pausing_stops_time():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: len(socket.frames) > 3)
-        session.hear(Verb.PAUSE)
+        session.hear("pause")
         await until(lambda: socket.events and socket.events[-1]["paused"])
         count = len(socket.frames)
         await asyncio.sleep(0.05)
         assert len(socket.frames) == count
-        session.hear(Verb.RESUME)
+        session.hear("resume")
         await until(lambda: len(socket.frames) > count + 3)
 
     play(scenario)
@@ -129,20 +129,20 @@ def test_rewind_then_branch_goes_on_from_there():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: socket.frames and socket.last.step >= 20)
-        session.hear(Verb.PAUSE)
+        session.hear("pause")
         await until(lambda: socket.events[-1]["paused"])
         shown = {frame.step: frame.images for frame in socket.frames}
         end = socket.last.step
-        session.hear(Rewind(10))
+        session.hear("rewind", 10)
         await until(lambda: socket.last.flags & REPLAY)
         assert socket.last.step == end - 10 and socket.last.images == shown[end - 10] and socket.last.newest == end
-        session.hear(Seek(5))
+        session.hear("seek", 5)
         await until(lambda: socket.last.step == 5)
-        session.hear(Verb.BRANCH)
+        session.hear("branch")
         await until(lambda: not socket.last.flags & REPLAY and socket.last.step >= 12)
         again = {frame.step: frame.images for frame in socket.frames[-6:]}
         assert all(images == shown[step] for step, images in again.items() if step in shown)
-        session.hear(Restart(9))
+        session.hear("restart", 9)
         await until(lambda: socket.events[-1]["seed"] == 9)
 
     play(scenario)
@@ -153,7 +153,7 @@ def test_a_running_game_says_why_it_cannot_rewind():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: len(socket.frames) > 3)
-        session.hear(Rewind(2))
+        session.hear("rewind", 2)
         await until(lambda: any(event["type"] == "error" for event in socket.events))
         assert "running game" in next(event["text"] for event in socket.events if event["type"] == "error")
         count = len(socket.frames)
@@ -166,19 +166,21 @@ def test_a_dropped_socket_pauses_the_story_and_another_goes_on():
     async def scenario(session):
         first = FakeSocket(session)
         session.attach(first)
-        session.hear(Controls(50, ("KeyW",)))
+        session.hear("controls", Controls(50, ("KeyW",)))
         await until(lambda: first.frames and first.last.step >= 5)
         session.detach(first)
         await asyncio.sleep(0.05)
-        step = session.timeline.newest_step
+        step = session.timeline.history.newest.step
         await asyncio.sleep(0.05)
-        assert session.timeline.newest_step == step
+        assert session.timeline.history.newest.step == step
         second = FakeSocket(session)
         assert session.attach(second) is None
         await until(lambda: second.frames and second.last.step > step)
         assert second.frames[0].step == step and second.frames[0].seq > first.last.seq
         score = second.last.episode_return
-        session.hear(Controls(1, ("ArrowLeft",)))  # a reloaded page counts anew, and no key of the old page is held
+        session.hear(
+            "controls", Controls(1, ("ArrowLeft",))
+        )  # a reloaded page counts anew, and no key of the old page is held
         await until(lambda: second.last.action_id == 1)
         assert second.last.episode_return == score
 
@@ -209,7 +211,7 @@ def test_a_world_that_breaks_is_reported_and_can_be_restarted(capsys):
         session.attach(socket)
         await until(lambda: socket.events and "paint is wet" in socket.events[-1]["text"])
         world.breaks_at = None
-        session.hear(Restart(1))
+        session.hear("restart", 1)
         await until(lambda: socket.last.step > 8)
         assert socket.events[-1]["text"] == ""
 

@@ -13,7 +13,7 @@ from terrella.core.errors import DatasetError, ServeError
 from terrella.serve.actions import action_of
 from terrella.serve.history import History, Moment
 from terrella.serve.protocol import DONE, FRESH
-from terrella.serve.timeline import Timeline, TimelineConfig
+from terrella.serve.timeline import Timeline
 
 from .conftest import ListSink
 from .panorama import BUTTONS, PIXELS_PER_STEP, Panorama, SlowDream
@@ -57,7 +57,7 @@ def test_rewinding_and_branching_tells_the_same_story_again():
     timeline.stand_at(4)
     assert timeline.rewound and timeline.shown.images == first[3]
     timeline.branch()
-    assert not timeline.rewound and timeline.newest_step == 4
+    assert not timeline.rewound and timeline.history.newest.step == 4
     again = [timeline.step(held).images for held in plan[4:]]
     assert again == first[4:]
     assert again != first[3:-1], "the frames differ from step to step, or this proves nothing"
@@ -106,7 +106,7 @@ def test_a_running_game_does_not_rewind():
     timeline.step(LEFT)
     with pytest.raises(ServeError, match="running game"):
         timeline.stand_at(0)
-    assert timeline.oldest_step == timeline.newest_step == 1 and timeline.step(LEFT).step == 2
+    assert timeline.history.oldest_step == timeline.history.newest.step == 1 and timeline.step(LEFT).step == 2
 
 
 def test_done_begins_the_next_episode():
@@ -118,14 +118,14 @@ def test_done_begins_the_next_episode():
 
 def test_memory_is_bounded():
     world = Panorama()
-    timeline = Timeline([world], seed=0, config=TimelineConfig(history_s=64 / 50))
+    timeline = Timeline([world], seed=0, history_s=64 / 50)
     for _ in range(200):
         timeline.step(LEFT)
-    assert len(timeline.pictures()) == 64 and timeline.newest_step - timeline.oldest_step == 63
-    full = timeline.state_bytes
+    assert len(timeline.pictures()) == 64 and timeline.history.newest.step - timeline.history.oldest_step == 63
+    full = timeline.history.state_bytes
     for _ in range(100):
         timeline.step(LEFT)
-    assert timeline.state_bytes == full > 0
+    assert timeline.history.state_bytes == full > 0
 
 
 def test_states_keep_to_their_budget_and_pictures_outlive_them():
@@ -242,7 +242,12 @@ def test_play_goes_on_where_the_recording_cannot():
     timeline.record(True)
     for _ in range(4):
         timeline.step(WALK)
-    assert not timeline.recording and "disk is full" in timeline.notice and sink.closed and timeline.newest_step == 4
+    assert (
+        not timeline.recording.on
+        and "disk is full" in timeline.notice
+        and sink.closed
+        and timeline.history.newest.step == 4
+    )
 
 
 def test_worlds_without_a_picture_are_refused():

@@ -7,8 +7,8 @@ import threading
 
 import httpx
 
-from terrella.serve.door import open_port
-from terrella.serve.viewer import make_viewer
+from terrella.serve.door import make_server, open_port
+from terrella.serve.viewer import build_viewer
 
 
 @contextlib.contextmanager
@@ -21,7 +21,8 @@ def viewed(viewable, *, host="127.0.0.1", token=None, export_to=None):
         addresses.append(url)
         ready.set()
 
-    server = make_viewer(viewable, listener, host, token, export_to, on_ready)
+    app = build_viewer(viewable, host, token, export_to)
+    server = make_server(app, listener, host, token, on_ready, websockets=False)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     assert ready.wait(20), "the server did not start"

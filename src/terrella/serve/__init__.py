@@ -3,6 +3,5 @@
 from .picture import read_picture
 from .recording import SinkFactory
 from .server import ServeConfig, serve
-from .timeline import TimelineConfig
 
-__all__ = ["ServeConfig", "SinkFactory", "TimelineConfig", "read_picture", "serve"]
+__all__ = ["ServeConfig", "SinkFactory", "read_picture", "serve"]

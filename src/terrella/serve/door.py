@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import secrets
+import signal
 import socket
 import sys
+import threading
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from importlib import resources
 from typing import Any
@@ -23,7 +26,7 @@ from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..core.errors import ServeError
-from .guard import Guard
+from .guard import Guard, is_loopback
 
 REQUEST_S = 10.0  # from the first to the last byte of a request
 MOST_WAITING = 64  # connections that have not finished a request; beyond it the oldest of them goes
@@ -82,6 +85,7 @@ def application(
     async def quiet_lifespan(app: Starlette) -> AsyncIterator[None]:
         quiet_accepting(asyncio.get_running_loop())
         async with lifespan(app):
+            app.state.on_ready()
             yield
 
     guard = Middleware(Guard, host=host, token=token, files=contents)
@@ -90,14 +94,55 @@ def application(
     )
 
 
-def make_uvicorn(app: Starlette, websockets: bool) -> uvicorn.Server:
-    """The server of a page; `websockets`: the page has one."""
+def make_server(
+    app: Starlette,
+    listener: socket.socket,
+    host: str,
+    token: str | None,
+    on_ready: Callable[[str], None] | None,
+    websockets: bool,
+) -> uvicorn.Server:
+    """The server of a page, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it; `websockets`: the
+    page has one. `on_ready` gets the address to open."""
+    url = page_address(host, listener.getsockname()[1], token)
+    app.state.on_ready = lambda: on_ready and on_ready(url)
     settings = uvicorn.Config(
         app, http=Door, ws="websockets-sansio" if websockets else "none", ws_max_size=2**16, ws_max_queue=64,
         ws_per_message_deflate=False, log_level="error", access_log=False, timeout_graceful_shutdown=2,
         server_header=False, proxy_headers=False,
     )  # fmt: skip
     return uvicorn.Server(settings)
+
+
+def serve_page(
+    build: Callable[[str | None], Starlette],
+    host: str,
+    port: int,
+    token: str | None,
+    on_ready: Callable[[str], None] | None,
+    websockets: bool,
+) -> None:
+    """Serves the application that `build(token)` gives until interrupted. On any address but this machine's own a token is
+    mandatory: where none is given one is made, and the address carries it. ServeError where the port is taken."""
+    if not token and not is_loopback(host):
+        token = secrets.token_urlsafe(16)
+    with contextlib.closing(open_port(host, port)) as listener:
+        server = make_server(build(token), listener, host, token, on_ready, websockets)
+        with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
+            server.run(sockets=[listener])
+
+
+@contextlib.contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM end the process as Ctrl-C does, so that worlds with processes of their own can take them along."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn puts it back, then raises it again
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:

@@ -7,7 +7,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from typing import Any
 
 from ..core.errors import ProtocolError
 from .actions import MAX_AXES
@@ -84,53 +84,6 @@ class Controls:
 
 
 @dataclass(frozen=True)
-class Ack:
-    seq: int
-
-
-class Verb(Enum):
-    """Messages without a body."""
-
-    PAUSE = "pause"
-    RESUME = "resume"  # goes on; out of the past, back to the newest moment
-    BRANCH = "branch"  # goes on from the moment shown; what came after it is forgotten
-    SYNC = "sync"  # the dream observes the game beside it
-
-
-@dataclass(frozen=True)
-class Restart:
-    """A new episode; with a seed, that of the seed."""
-
-    seed: int | None = None
-
-
-@dataclass(frozen=True)
-class Rewind:
-    """`steps` back from the moment shown (negative: forward), and stand there."""
-
-    steps: int
-
-
-@dataclass(frozen=True)
-class Seek:
-    """Stand at `step`, or the nearest that is remembered."""
-
-    step: int
-
-
-@dataclass(frozen=True)
-class Record:
-    on: bool
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Whether the policy acts while nobody touches the controls."""
-
-    on: bool
-
-
-@dataclass(frozen=True)
 class Show:
     """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures; cameras are picture
     channels, none for the main one."""
@@ -140,22 +93,13 @@ class Show:
     cameras: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Picture:
-    """The bytes of an image file: a new episode begins with it."""
-
-    data: bytes
-
-
-Message = Controls | Ack | Verb | Restart | Rewind | Seek | Record | Drive | Show | Picture
-
-
-def parse_message(data: str | bytes) -> Message:
-    """A message from a page: text is JSON, bytes are a picture; ProtocolError says what is wrong with it."""
+def parse_message(data: str | bytes) -> tuple[str, Any]:
+    """A message from a page, its kind and its value: text is JSON of a kind in `_READERS`, bytes are a picture's file, with
+    which a new episode begins. ProtocolError says what is wrong with it."""
     if isinstance(data, bytes):
         if not 0 < len(data) <= MAX_PICTURE:
             raise ProtocolError(f"a picture of {len(data)} bytes came; at most {MAX_PICTURE} are taken.")
-        return Picture(data)
+        return "picture", data
     if len(data) > MAX_MESSAGE:
         raise ProtocolError(f"a message of {len(data)} bytes is too long; the limit is {MAX_MESSAGE}.")
     try:
@@ -168,7 +112,7 @@ def parse_message(data: str | bytes) -> Message:
     read = _READERS.get(kind) if isinstance(kind, str) else None
     if read is None:
         raise ProtocolError(f"no message is called {str(kind)[:40]!r}.")
-    return read(body)
+    return str(kind), read(body)
 
 
 def _controls(body: dict) -> Controls:
@@ -180,15 +124,18 @@ def _controls(body: dict) -> Controls:
     return Controls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
 
 
-_READERS: dict[str, Callable[[dict], Message]] = {
-    **{verb.value: lambda body, verb=verb: verb for verb in Verb},
+_READERS: dict[str, Callable[[dict], Any]] = {
+    "pause": lambda body: None,
+    "resume": lambda body: None,  # goes on; out of the past, back to the newest moment
+    "branch": lambda body: None,  # goes on from the moment shown; what came after it is forgotten
+    "sync": lambda body: None,  # the dream observes the game beside it
     "controls": _controls,
-    "ack": lambda body: Ack(_integer(body, "seq", 0, U32)),
-    "restart": lambda body: Restart(None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1)),
-    "rewind": lambda body: Rewind(_integer(body, "steps", -U32, U32)),
-    "seek": lambda body: Seek(_integer(body, "step", 0, U32)),
-    "record": lambda body: Record(_switch(body, "on")),
-    "drive": lambda body: Drive(_switch(body, "on")),
+    "ack": lambda body: _integer(body, "seq", 0, U32),  # of a frame that has arrived
+    "restart": lambda body: None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1),
+    "rewind": lambda body: _integer(body, "steps", -U32, U32),  # back from the moment shown, and stand there
+    "seek": lambda body: _integer(body, "step", 0, U32),  # stand there, or at the nearest that is remembered
+    "record": lambda body: _switch(body, "on"),
+    "drive": lambda body: _switch(body, "on"),  # whether the policy acts while nobody touches the controls
     "show": lambda body: Show(
         _switch(body, "map"), _switch(body, "invented"), _names(body, "cameras", MAX_CAMERAS, "picture channels")
     ),

@@ -5,17 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import secrets
-import signal
-import socket
-import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -30,12 +25,12 @@ from . import protocol
 from .actions import axes_of
 from .chart import knows_share, mapped
 from .clip import make_clip
-from .door import application, make_uvicorn, open_port, page_address
-from .guard import RateLimit, is_loopback
+from .door import application, serve_page
+from .guard import RateLimit
 from .picture import uncertainty_levels
 from .recording import SinkFactory
 from .session import Session
-from .timeline import Timeline, TimelineConfig, check_playable, vitals
+from .timeline import Timeline, check_playable, no_rewind, vitals
 
 _SCRIPTS = ("app", "axes", "card", "controls", "keycaps", "link", "map", "picture", "screens", "uncertainty")
 _FILES = {
@@ -49,7 +44,9 @@ _FILES = {
 @dataclass(frozen=True)
 class ServeConfig:
     """seats: sessions at once (a world that cannot fork has one); grace_s: how long a session outlives its socket;
-    idle_s: how long a silent, paused one keeps its seat; per_s and burst: messages a page may send."""
+    idle_s: how long a silent, paused one keeps its seat; per_s and burst: messages a page may send; faults: those without a
+    meaning, before its socket is closed; history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory
+    for the states among them."""
 
     seats: int = 4
     grace_s: float = 120.0
@@ -57,31 +54,28 @@ class ServeConfig:
     per_s: float = 240.0
     burst: float = 480.0
     faults: int = 20
-    timeline: TimelineConfig = TimelineConfig()
-
-
-@dataclass(frozen=True)
-class Offer:
-    """What a page plays: see `serve`."""
-
-    worlds: Sequence[World]
-    seed: int = 0
-    sink_factory: SinkFactory | None = None
-    picture: torch.Tensor | None = None
-    policy: Policy | None = None
-    config: ServeConfig = ServeConfig()
-
-    def timeline(self) -> Timeline:
-        """A new one, for one person."""
-        return Timeline(self.worlds, self.seed, self.sink_factory, self.config.timeline, self.picture, self.policy)
+    history_s: float = 30.0
+    state_mb: int = 256
 
 
 class Sessions:
-    """The sessions of one server, their one worker thread and their seats."""
+    """The sessions of one server, their one worker thread and their seats; the arguments are those of `serve`."""
 
-    def __init__(self, offer: Offer):
-        self.offer, self.worlds, self.config = offer, offer.worlds, offer.config
-        self._seats = offer.config.seats if all(world.spec.forkable for world in offer.worlds) else 1
+    def __init__(
+        self,
+        worlds: Sequence[World],
+        seed: int = 0,
+        sink_factory: SinkFactory | None = None,
+        picture: torch.Tensor | None = None,
+        policy: Policy | None = None,
+        config: ServeConfig | None = None,
+    ):
+        check_playable(worlds)
+        self.worlds, self.config = tuple(worlds), config or ServeConfig()
+        self._sink_factory, self._policy = sink_factory, policy
+        kept = self.config.history_s, self.config.state_mb
+        self._make_timeline = lambda: Timeline(self.worlds, seed, sink_factory, picture, policy, *kept)
+        self._seats = self.config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
         self._open: dict[str, tuple[Session, asyncio.Task]] = {}
         self._ended: set[asyncio.Task] = set()
@@ -98,7 +92,7 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self.offer.timeline, self._worker)
+        session = Session(self._make_timeline, self._worker)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -125,16 +119,15 @@ class Sessions:
     def hello(self, session: Session, resumed: bool) -> str:
         """All that the page needs to know about the worlds."""
         labels = ("game", "dream") if len(self.worlds) == 2 else ("",)
-        fixed = next((world.spec.name for world in self.worlds if not world.spec.forkable), "")
         return protocol.encode_event(
             "hello",
             version=protocol.VERSION,
             session=session.id,
             resumed=resumed,
             worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
-            no_rewind=f"{fixed} is a running game: it cannot go back in time." if fixed else "",
-            no_record="" if self.offer.sink_factory else "start the server with --record FOLDER.",
-            driver=type(self.offer.policy).__name__ if self.offer.policy else "",
+            no_rewind=no_rewind(self.worlds),
+            no_record="" if self._sink_factory else "start the server with --record FOLDER.",
+            driver=type(self._policy).__name__ if self._policy else "",
         )
 
 
@@ -164,18 +157,13 @@ def _describe(world: World, label: str) -> dict:
     }
 
 
-def build_app(
-    offer: Offer, host: str = "127.0.0.1", token: str | None = None, on_ready: Callable[[], None] | None = None
-) -> Starlette:
-    """The ASGI application; ServeError where the worlds cannot be played."""
-    check_playable(offer.worlds)
+def build_app(sessions: Sessions, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
+    """The ASGI application."""
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.sessions = sessions = Sessions(offer)
+        app.state.sessions = sessions
         sweeper = asyncio.create_task(_sweep(sessions))
-        if on_ready:
-            on_ready()
         try:
             yield
         finally:
@@ -186,18 +174,18 @@ def build_app(
         return PlainTextResponse("ok")
 
     async def clip(request: Request) -> Response:
-        session = request.app.state.sessions.get(request.path_params["session"])
+        session = sessions.get(request.path_params["session"])
         pictures = await session.pictures() if session else []
         if not pictures:
             return PlainTextResponse("this session has ended; reload the page.", 404)
-        spec = offer.worlds[0].spec
+        spec = sessions.worlds[0].spec
         content = await asyncio.get_running_loop().run_in_executor(None, make_clip, pictures, spec.dt_s)
         name = "".join(letter if letter.isalnum() else "-" for letter in spec.name)[:60]
         disposition = {"Content-Disposition": f'attachment; filename="{name}.mp4"'}
         return Response(content, media_type="video/mp4", headers=disposition)
 
     async def play(websocket: WebSocket) -> None:
-        await _play(websocket, websocket.app.state.sessions)
+        await _play(websocket, sessions)
 
     routes = [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
     return application(_FILES, routes, lifespan, host, token)
@@ -244,7 +232,7 @@ async def _listen(websocket: WebSocket, session: Session, config: ServeConfig) -
             )
             return await websocket.close(1008, "too many messages")
         try:
-            session.hear(protocol.parse_message(data), websocket)
+            session.hear(*protocol.parse_message(data), websocket)
         except ProtocolError as error:
             faults += 1
             await websocket.send_text(protocol.encode_event("error", text=str(error)))
@@ -271,39 +259,7 @@ def serve(
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
     """
-    offer = Offer(tuple(worlds), seed, sink_factory, picture, policy, config or ServeConfig())
-    check_playable(offer.worlds)
+    sessions = Sessions(worlds, seed, sink_factory, picture, policy, config)
     # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
     torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
-    if not token and not is_loopback(host):
-        token = secrets.token_urlsafe(16)
-    listener = open_port(host, port)
-    with contextlib.closing(listener):
-        server = make_server(offer, listener, host, token, on_ready)
-        with contextlib.suppress(KeyboardInterrupt), _ended_like_ctrl_c():
-            server.run(sockets=[listener])
-
-
-@contextlib.contextmanager
-def _ended_like_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM end the process as Ctrl-C does, so that worlds with processes of their own can take them along."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn puts it back, then raises it again
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def make_server(
-    offer: Offer,
-    listener: socket.socket,
-    host: str = "127.0.0.1",
-    token: str | None = None,
-    on_ready: Callable[[str], None] | None = None,
-) -> uvicorn.Server:
-    """The server behind `serve`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
-    url = page_address(host, listener.getsockname()[1], token)
-    return make_uvicorn(build_app(offer, host, token, (lambda: on_ready(url)) if on_ready else None), websockets=True)
+    serve_page(lambda token: build_app(sessions, host, token), host, port, token, on_ready, websockets=True)

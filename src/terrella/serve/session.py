@@ -11,26 +11,13 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from ..core.errors import TerrellaError
 from . import protocol
 from .chart import Chart
 from .history import Moment
-from .protocol import (
-    Ack,
-    Controls,
-    Drive,
-    Frame,
-    Message,
-    Picture,
-    Record,
-    Restart,
-    Rewind,
-    Seek,
-    Show,
-    Verb,
-)
+from .protocol import Controls, Frame, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
@@ -63,12 +50,13 @@ class Session:
         self._make_timeline, self._worker = make_timeline, worker
         self._socket: Socket | None = None
         self._controls = Controls(0)
-        self._commands: deque[Message] = deque()
+        self._commands: deque[tuple[str, Any]] = deque()
         self._wake = asyncio.Event()
         self._sent = self._acked = 0
         self._paused = self._closed = False
         self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
-        self._error = self._status_sent = ""
+        self._error = ""
+        self._status_sent: dict[str, object] = {}
         self._show = Show(map=False, invented=False)
         self._charted: Chart | None = None  # what the page has on its map
         self._chart_due = 0.0
@@ -87,7 +75,7 @@ class Session:
     def attach(self, socket: Socket) -> Socket | None:
         """Plays on through `socket`; gives the socket that was attached until now."""
         before, self._socket = self._socket, socket
-        self.detached_at, self._acked, self._status_sent = None, self._sent, "hello"
+        self.detached_at, self._acked, self._status_sent = None, self._sent, {}
         self._controls = Controls(0)  # a new page counts its messages anew
         self._show = Show(map=False, invented=False)
         self.heard_at = time.monotonic()
@@ -98,31 +86,29 @@ class Session:
     def detach(self, socket: Socket) -> None:
         """The socket is gone; the timeline waits, and its recording is closed."""
         if self._socket is socket:
-            self._commands.append(Record(False))
+            self._commands.append(("record", False))
             self._wake.set()
             self._socket = None
             self._controls = replace(self._controls, held=(), axes=())
             self.detached_at = time.monotonic()
 
-    def hear(self, message: Message, socket: Socket | None = None) -> None:
+    def hear(self, kind: str, value: Any = None, socket: Socket | None = None) -> None:
         """A message of the player; one that a replaced socket still had in its buffer counts no more."""
         if socket is not None and socket is not self._socket:
             return
         self.heard_at = time.monotonic()
-        if isinstance(message, Controls):
-            if message.id >= self._controls.id:
-                self._controls = message
-        elif isinstance(message, Ack):
-            if self._acked < message.seq <= self._sent:
-                self._acked = message.seq
+        if kind == "controls":
+            if value.id >= self._controls.id:
+                self._controls = value
+        elif kind == "ack":
+            if self._acked < value <= self._sent:
+                self._acked = value
                 self._wake.set()
             return
-        elif isinstance(message, Seek) and self._commands and isinstance(self._commands[-1], Seek):
-            self._commands[-1] = message  # a scrubbed timeline: only the latest place matters
-        elif isinstance(message, Picture) and self._commands and isinstance(self._commands[-1], Picture):
-            self._commands[-1] = message
+        elif kind in ("seek", "picture") and self._commands and self._commands[-1][0] == kind:
+            self._commands[-1] = kind, value  # a scrubbed timeline: only the latest place matters
         elif len(self._commands) < 64:
-            self._commands.append(message)
+            self._commands.append((kind, value))
         self._wake.set()
 
     async def pictures(self) -> list[tuple[bytes, ...]]:
@@ -143,28 +129,33 @@ class Session:
         finally:
             if self.timeline:
                 await asyncio.shield(self._work(self.timeline.close))
-            if self._socket is not None:
-                await self._event(
-                    protocol.encode_event("error", text="this session has ended; reload the page to begin anew.")
-                )
+            await self._event("error", text="this session has ended; reload the page to begin anew.")
 
     async def _begin(self) -> None:
         try:
             self.timeline = await self._work(self._make_timeline)
             self._unseen = self.timeline.shown
-        except TerrellaError as error:
-            self._error = str(error)
-        except Exception as error:  # a world is a stranger's code: the server outlives it
+        except Exception as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """A world is a stranger's code: the server outlives what it raises."""
+        reason = str(error)
+        if not isinstance(error, TerrellaError):
             traceback.print_exc(file=sys.stderr)
-            self._error = f"the world cannot start ({type(error).__name__}: {error})."
+            reason = f"{type(error).__name__}: {error}."
+        started = self.timeline is not None
+        self._error = (
+            f"the world stopped: {reason} Restart to go on." if started else f"the world cannot start: {reason}"
+        )
 
     async def _turn(self) -> None:
         self._wake.clear()
         while self._commands and self.timeline:
-            await self._obey(self._commands.popleft(), self.timeline)
+            await self._obey(*self._commands.popleft(), self.timeline)
         timeline = self.timeline
-        if self._status_sent != self._status():
-            await self._send_status()
+        if self._socket is not None:
+            await self._send_status(timeline)
         if self._socket is None or timeline is None or self.unacked >= MAX_UNACKED:
             await self._wake.wait()
         elif self._unseen is not None:
@@ -185,11 +176,8 @@ class Session:
         self._due = max(self._due + dt_s, now - dt_s)  # a late step is caught up, a long wait is not
         try:
             controls, moment, made_ms = await self._work(self._step, timeline)
-        except Exception as error:  # a world is a stranger's code: the server outlives it
-            if not isinstance(error, TerrellaError):
-                traceback.print_exc(file=sys.stderr)
-            self._error = f"the world stopped: {error} Restart to go on."
-            return
+        except Exception as error:
+            return self._fail(error)
         await self._send(moment, timeline, made_ms, controls)
 
     def _step(self, timeline: Timeline) -> tuple[Controls, Moment, float]:
@@ -198,60 +186,54 @@ class Session:
         moment = timeline.step(controls.held, controls.axes)
         return controls, moment, (time.perf_counter() - begun) * 1e3
 
-    async def _obey(self, message: Message, timeline: Timeline) -> None:
+    async def _obey(self, kind: str, value: Any, timeline: Timeline) -> None:
         try:
-            match message:
-                case Verb.PAUSE:
+            match kind:
+                case "pause":
                     self._paused = True
-                case Verb.RESUME:
-                    self._unseen = await self._work(timeline.to_newest) if timeline.rewound else self._unseen
-                    self._paused, self._error = False, ""
-                case Restart(seed):
-                    new = secrets.randbelow(2**31) if seed is None else seed
-                    self._unseen = await self._work(timeline.restart, new, seed is not None)
-                    self._paused, self._error = False, ""
-                case Rewind(steps):
-                    self._unseen = await self._work(timeline.stand_at, timeline.shown.step - steps)
-                case Seek(step):
-                    self._unseen = await self._work(timeline.stand_at, step)
-                case Verb.BRANCH:
+                case "resume" if timeline.rewound:
+                    self._unseen = await self._work(timeline.to_newest)
+                case "restart":
+                    new = secrets.randbelow(2**31) if value is None else value
+                    self._unseen = await self._work(timeline.restart, new, value is not None)
+                case "rewind":
+                    self._unseen = await self._work(timeline.stand_at, timeline.shown.step - value)
+                case "seek":
+                    self._unseen = await self._work(timeline.stand_at, value)
+                case "branch":
                     self._unseen = await self._work(timeline.branch)
-                    self._paused, self._error = False, ""
-                case Picture(data):
-                    self._unseen = await self._work(timeline.enter, data)
-                    self._paused, self._error = False, ""
-                case Verb.SYNC:
+                case "picture":
+                    self._unseen = await self._work(timeline.enter, value)
+                case "sync":
                     self._unseen = await self._work(timeline.sync)
-                case Record(on):
-                    await self._work(timeline.record, on)
-                case Drive(on):
-                    timeline.driving = on
-                case Show():
-                    self._show, self._charted, self._chart_due = message, None, 0.0
-                    timeline.look(message.cameras)
+                case "record":
+                    await self._work(timeline.record, value)
+                case "drive":
+                    timeline.driving = value
+                case "show":
+                    self._show, self._charted, self._chart_due = value, None, 0.0
+                    timeline.look(value.cameras)
                     self._unseen = self._unseen or timeline.shown
+            if kind in ("resume", "restart", "branch", "picture"):
+                self._paused, self._error = False, ""
         except TerrellaError as error:
-            await self._event(protocol.encode_event("error", text=str(error)))
-        except Exception as error:  # a world is a stranger's code: the server outlives it
-            traceback.print_exc(file=sys.stderr)
-            self._error = f"the world stopped ({type(error).__name__}: {error}). Restart to go on."
+            await self._event("error", text=str(error))
+        except Exception as error:
+            self._fail(error)
 
     def _work(self, function: Callable, *arguments):
         return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
 
-    def _status(self) -> str:
-        timeline = self.timeline
-        if timeline is None:
-            return protocol.encode_event("status", text=self._error) if self._error else "hello"
-        return protocol.encode_event(
-            "status", paused=self._paused, rewound=timeline.rewound, recording=timeline.recording, driving=timeline.driving,
-            seed=timeline.seed, notice=timeline.notice, text=self._error,
-        )  # fmt: skip
-
-    async def _send_status(self) -> None:
-        status = self._status()
-        if self._socket is not None and status != "hello":
-            await self._event(status)
+    async def _send_status(self, timeline: Timeline | None) -> None:
+        """What the page shows of the session, where that has changed since it was sent."""
+        status: dict[str, object] = {"text": self._error}
+        if timeline is not None:
+            status |= {
+                "paused": self._paused, "rewound": timeline.rewound, "recording": timeline.recording.on,
+                "driving": timeline.driving, "seed": timeline.seed, "notice": timeline.notice,
+            }  # fmt: skip
+        if status != self._status_sent and (timeline is not None or self._error):
+            await self._event("status", **status)
             self._status_sent = status
 
     async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: Controls) -> None:
@@ -262,33 +244,21 @@ class Session:
             images = await self._extra(timeline.images, moment, self._show.invented) or images
         self._sent += 1
         frame = Frame(
-            self._sent, moment.step, timeline.oldest_step, timeline.newest_step, images, flags,
+            self._sent, moment.step, timeline.history.oldest_step, timeline.history.newest.step, images, flags,
             controls.id, made_ms, moment.episode_return, controls.t, time.time(), moment.uncertainty,
             moment.vitals,
         )  # fmt: skip
-        socket = self._socket
-        if socket is None:
-            return
-        try:
-            await socket.send_bytes(protocol.encode_frame(frame))
-        except Exception:  # however a connection breaks, the timeline waits for the next
-            self.detach(socket)
+        await self._deliver(protocol.encode_frame(frame))
         if self._show.map and (time.perf_counter() >= self._chart_due or timeline.rewound):
             await self._chart(timeline)
 
     async def _chart(self, timeline: Timeline) -> None:
         self._chart_due = time.perf_counter() + CHART_S
-        text = await self._extra(self._charted_text, timeline)
-        if text is not None:
-            await self._event(text)
-
-    def _charted_text(self, timeline: Timeline) -> str | None:
-        found = timeline.chart()
-        if found is None:
-            return None
-        number, chart = found
-        before, self._charted = self._charted, chart
-        return protocol.encode_event("chart", world=number, step=timeline.shown.step, **chart.body(before))
+        found = await self._extra(timeline.chart)
+        if found is not None:
+            number, chart = found
+            before, self._charted = self._charted, chart
+            await self._event("chart", world=number, step=timeline.shown.step, **chart.body(before))
 
     async def _extra(self, function: Callable, *arguments):
         """What is shown beyond the step itself; None, and no more of it, where the world fails."""
@@ -299,11 +269,14 @@ class Session:
             self._show = Show(map=False, invented=False)
             return None
 
-    async def _event(self, text: str) -> None:
+    async def _event(self, kind: str, **body) -> None:
+        await self._deliver(protocol.encode_event(kind, **body))
+
+    async def _deliver(self, data: str | bytes) -> None:
         socket = self._socket
         if socket is None:
             return
         try:
-            await socket.send_text(text)
-        except Exception:  # as above
+            await (socket.send_text(data) if isinstance(data, str) else socket.send_bytes(data))
+        except Exception:  # however a connection breaks, the timeline waits for the next
             self.detach(socket)

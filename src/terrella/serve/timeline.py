@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import simplejpeg
@@ -36,12 +35,10 @@ def _alike(one: Spec, other: Spec, name: str) -> bool:
     return name in one.channels and name in other.channels and one.channels[name].shape == other.channels[name].shape
 
 
-@dataclass(frozen=True)
-class TimelineConfig:
-    """history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory for the states among them."""
-
-    history_s: float = 30.0
-    state_mb: int = 256
+def no_rewind(worlds: Sequence[World]) -> str:
+    """Why there is no way back in these worlds; empty where there is."""
+    fixed = next((world.spec.name for world in worlds if not world.spec.forkable), "")
+    return f"{fixed} is a running game: it cannot go back in time." if fixed else ""
 
 
 def check_playable(worlds: Sequence[World]) -> None:
@@ -67,7 +64,9 @@ def check_playable(worlds: Sequence[World]) -> None:
 class Timeline:
     """Not thread-safe, and slow: the session calls it from one worker thread, a verb at a time.
 
-    `policy` drives while nobody touches the controls; without one, or with `driving` off, the person at the page does.
+    The first world is the one that is played; a dream beside it follows. `policy` drives while nobody touches the controls;
+    without one, or with `driving` off, the person at the page does. history_s: seconds of pictures kept (for rewinding and
+    clips); state_mb: memory for the states among them.
     """
 
     def __init__(
@@ -75,62 +74,32 @@ class Timeline:
         worlds: Sequence[World],
         seed: int,
         sink_factory: SinkFactory | None = None,
-        config: TimelineConfig | None = None,
         picture: torch.Tensor | None = None,
         policy: Policy | None = None,
+        history_s: float = 30.0,
+        state_mb: int = 256,
     ):
         check_playable(worlds)
-        config = config or TimelineConfig()
-        self.worlds, self._picture = tuple(worlds), picture
+        self.worlds, self.spec = tuple(worlds), worlds[0].spec
+        self.no_rewind = no_rewind(worlds)
         self.notice = ""  # something that a person should know, in one sentence
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
         self.driving = policy is not None
-        self._policy, self._person, self._memory = policy, Person(self.spec), None
-        self._recording = Recording(sink_factory)
-        frames = int(min(max(config.history_s / self.spec.dt_s, 64), 4096))
-        self._history = History(frames, config.state_mb * 2**20)
+        self.recording = Recording(sink_factory)
+        frames = int(min(max(history_s / self.spec.dt_s, 64), 4096))
+        self.history = History(frames, state_mb * 2**20)
+        self.shown: Moment  # that the timeline stands at: the newest, unless it was rewound
+        self._picture, self._policy, self._person = picture, policy, Person(self.spec)
         self.restart(seed)
 
     @property
-    def spec(self) -> Spec:
-        """Of the world that is played; a dream beside it follows."""
-        return self.worlds[0].spec
-
-    @property
-    def no_rewind(self) -> str:
-        """Why there is no way back; empty where there is."""
-        fixed = [world.spec.name for world in self.worlds if not world.spec.forkable]
-        return f"{fixed[0]} is a running game: it cannot go back in time." if fixed else ""
-
-    @property
-    def recording(self) -> bool:
-        return self._recording.on
-
-    @property
-    def shown(self) -> Moment:
-        """The moment that the timeline stands at: the newest, unless it was rewound."""
-        return self._shown
-
-    @property
-    def newest_step(self) -> int:
-        return self._history.newest.step
-
-    @property
-    def oldest_step(self) -> int:
-        return self._history.oldest_step
-
-    @property
     def rewound(self) -> bool:
-        return self._shown.step < self.newest_step
-
-    @property
-    def state_bytes(self) -> int:
-        return self._history.state_bytes
+        return self.shown.step < self.history.newest.step
 
     def pictures(self) -> list[tuple[bytes, ...]]:
         """The JPEGs of the recent past, oldest first, up to the moment shown, while the same cameras were looked through."""
-        past = self._history.pictures()
-        past = past[: len(past) - (self.newest_step - self._shown.step)]
+        past = self.history.pictures()
+        past = past[: len(past) - (self.history.newest.step - self.shown.step)]
         views = [image[:2] for image in past[-1]]
         first = next((at for at in range(len(past), 0, -1) if [image[:2] for image in past[at - 1]] != views), 0)
         return [tuple(image.jpeg for image in images) for images in past[first:]]
@@ -141,7 +110,7 @@ class Timeline:
         number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
         if number is None:
             return None
-        return number, chart(self.worlds[number], (self._shown.states or self._states)[number])
+        return number, chart(self.worlds[number], (self.shown.states or self._states)[number])
 
     @torch.inference_mode()
     def images(self, moment: Moment, invented: bool = False) -> tuple[Image, ...]:
@@ -166,15 +135,11 @@ class Timeline:
     def restart(self, seed: int, same_picture: bool = True) -> Moment:
         """Begins anew from `seed`, and from the picture that this episode began with, if any; the past is forgotten, once the
         new episode has begun."""
-        picture, self._picture = self._picture, self._picture if same_picture else None
+        picture = self._picture if same_picture else None
         rngs = tuple(make_rng(seed) for _ in (*self.worlds, "policy"))
-        try:
-            states = self._starts(rngs)
-        except TerrellaError:
-            self._picture = picture
-            raise
-        self.seed, self._rngs = seed, rngs
-        self._history.clear()
+        states = self._starts(rngs, picture)
+        self.seed, self._rngs, self._picture = seed, rngs, picture
+        self.history.clear()
         return self._begin(0, states)
 
     @torch.inference_mode()
@@ -182,58 +147,54 @@ class Timeline:
         """One step of every world under what is held, or under the policy; after `done`, the first moment of a new episode."""
         self._person.hold(held, axes)
         if self.rewound:
-            self._return_to(self._history.newest)
-        if self._shown.flags & DONE:
-            return self._begin(self._shown.step + 1, self._starts(self._rngs))
+            self._return_to(self.history.newest)
+        if self.shown.flags & DONE:
+            return self._begin(self.shown.step + 1, self._starts(self._rngs, self._picture))
         action = self._action()
         pairs = zip(self.worlds, self._states, self._rngs, strict=False)
         self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
-        return self._show(self._shown.step + 1, 0, action)
+        return self._show(self.shown.step + 1, 0, action)
 
     def stand_at(self, step: int) -> Moment:
         """Shows a remembered moment without going on from it."""
         if self.no_rewind:
             raise ServeError(self.no_rewind)
-        self._shown = self._history.at(step)
-        return self._shown
+        self.shown = self.history.at(step)
+        return self.shown
 
     @torch.inference_mode()
     def branch(self) -> Moment:
         """Goes on from the moment shown: what came after it is forgotten, and the same actions lead to the same frames."""
         if self.rewound:
-            self._recording.end_episode()
-            self._history.forget_after(self._shown.step)
-            self._return_to(self._shown)
-        return self._shown
+            self.recording.end_episode()
+            self.history.forget_after(self.shown.step)
+            self._return_to(self.shown)
+        return self.shown
 
     def to_newest(self) -> Moment:
-        self._shown = self._history.newest
-        return self._shown
+        self.shown = self.history.newest
+        return self.shown
 
     @torch.inference_mode()
     def enter(self, data: bytes) -> Moment:
         """A new episode that begins with a picture, the bytes of an image file; the past stays."""
         height, width = self.spec.channels["rgb"].shape[:2]
-        before = self._picture
-        self._picture = picture_of(data, (height, width), MAX_DROPPED_PIXELS, "this picture")
-        try:
-            states = self._starts(self._rngs)
-        except TerrellaError:
-            self._picture = before
-            raise
+        picture = picture_of(data, (height, width), MAX_DROPPED_PIXELS, "this picture")
+        states = self._starts(self._rngs, picture)
+        self._picture = picture
         if self.rewound:
-            self._return_to(self._history.newest)
-        return self._begin(self._shown.step + 1, states)
+            self._return_to(self.history.newest)
+        return self._begin(self.shown.step + 1, states)
 
     @torch.inference_mode()
     def sync(self) -> Moment:
         """The dream observes the game as it is now."""
         if len(self.worlds) != 2:
             raise ServeError("there is no game beside this world to observe; play with --compare.")
-        if self.rewound or self._shown.flags & DONE:
+        if self.rewound or self.shown.flags & DONE:
             raise ServeError("go on from this moment first, then let the dream observe the game.")
         self._states = (self._states[0], self._dream_of(self._states[0], self._rngs[1]))
-        return self._show(self._shown.step + 1, 0, None)
+        return self._show(self.shown.step + 1, 0, None)
 
     def look(self, cameras: Sequence[str]) -> None:
         """Shows the pictures of these channels from now on; of a world that has none of them, its main one."""
@@ -242,14 +203,14 @@ class Timeline:
     def record(self, on: bool) -> None:
         """Begins or ends writing the played world (the game, where two are shown) to a dataset."""
         if on:
-            self._recording.begin()
+            self.recording.begin()
         else:
             self.close()
 
     def close(self) -> None:
         """Ends the recording."""
-        self._recording.close()
-        self.notice = self._recording.fault or self.notice
+        self.recording.close()
+        self.notice = self.recording.fault or self.notice
 
     # -- inside -------------------------------------------------------------------------------------------------
 
@@ -266,15 +227,15 @@ class Timeline:
         action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
         return action
 
-    def _starts(self, rngs: tuple[torch.Generator, ...]) -> tuple[State, ...]:
-        if self._picture is not None:
-            return (self._entered(self._picture, rngs[0]),)
+    def _starts(self, rngs: tuple[torch.Generator, ...], picture: torch.Tensor | None) -> tuple[State, ...]:
+        if picture is not None:
+            return (self._entered(picture, rngs[0]),)
         self.notice = ""
         game = self.worlds[0].start(1, rngs[0])
         return (game,) if len(self.worlds) == 1 else (game, self._dream_of(game, rngs[1]))
 
     def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
-        self._recording.end_episode()
+        self.recording.end_episode()
         self._states, self._return = states, 0.0
         self._begin_policy()
         return self._show(step, FRESH, None)
@@ -327,8 +288,8 @@ class Timeline:
         reward = float(seen["reward"][0]) if "reward" in seen and acted else 0.0
         done = bool(seen["done"][0]) if "done" in seen and acted else False
         self._return += reward
-        self._recording.add(seen, action, reward, done)
-        self.notice = self._recording.fault or self.notice
+        self.recording.add(seen, action, reward, done)
+        self.notice = self.recording.fault or self.notice
         moment = Moment(
             step,
             images,
@@ -339,8 +300,8 @@ class Timeline:
             float(last["uncertainty"][0]) if "uncertainty" in last else -1.0,
             tuple(float(seen[name][0]) for name in vitals(self.spec)),
         )
-        self._history.push(moment)
-        self._shown = moment
+        self.history.push(moment)
+        self.shown = moment
         return moment
 
     def _observed(self, number: int) -> Mapping[str, torch.Tensor]:
@@ -348,12 +309,12 @@ class Timeline:
         spec = self.worlds[number].spec
         wanted = [*self._shown_of(number).values(), "uncertainty"]
         if number == 0:
-            wanted += ["reward", "done", *vitals(spec), *(spec.channels if self.recording else ())]
+            wanted += ["reward", "done", *vitals(spec), *(spec.channels if self.recording.on else ())]
         names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))
         return self.worlds[number].render(self._states[number], names)
 
     def _return_to(self, moment: Moment) -> None:
-        self._shown = moment
+        self.shown = moment
         if moment.states is not None and moment.rngs is not None:
             self._states, self._return = moment.states, moment.episode_return
             for rng, state in zip(self._rngs, moment.rngs, strict=True):

@@ -6,8 +6,6 @@ import asyncio
 import contextlib
 import json
 import math
-import secrets
-import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
@@ -23,8 +20,7 @@ from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .door import application, make_uvicorn, open_port, page_address
-from .guard import is_loopback
+from .door import application, serve_page
 
 _SCRIPTS = ("app", "library", "tiles", "depth", "points", "map", "tracks", "colours")
 _FILES = {
@@ -142,17 +138,16 @@ class _Desk:
     def __init__(self, viewable: Viewable, exporting: Exporting):
         self._viewable, self._exporting = viewable, exporting
         self._spans: dict[tuple[int, str], tuple[float, float]] = {}
-        about = viewable.about()
-        self._kinds = {sensor["name"]: sensor["kind"] for sensor in about["sensors"]}
+        self._kinds = {sensor["name"]: sensor["kind"] for sensor in viewable.about()["sensors"]}
         self._names = list(self._kinds)
 
     def about(self, request: Request) -> Response:
         path = self._exporting.path
         about = {**self._viewable.about(), "export_to": str(path) if path else ""}
-        return _json({**about, "episodes": self._viewable.listing(), "bad": self._viewable.marks()})
+        return JSONResponse({**about, "episodes": self._viewable.listing(), "bad": self._viewable.marks()})
 
     def episode(self, request: Request) -> Response:
-        return _json(self._viewable.episode(request.path_params["number"]))
+        return JSONResponse(self._viewable.episode(request.path_params["number"]))
 
     def times(self, request: Request) -> Response:
         return _bytes(readings.times(self._viewable.times(request.path_params["number"], self._sensor(request))))
@@ -179,12 +174,13 @@ class _Desk:
 
     def mark(self, number: int, bad: bool) -> Response:
         self._viewable.mark(number, bad)
-        return _json({"bad": self._viewable.marks()})
+        return JSONResponse({"bad": self._viewable.marks()})
 
-    def export(self) -> Response:
-        bad = set(self._viewable.marks())
-        self._exporting.start([number for number in range(len(self._viewable.listing())) if number not in bad])
-        return _json(self._exporting.status)
+    def export(self, request: Request) -> Response:
+        if request.method == "POST":
+            bad = set(self._viewable.marks())
+            self._exporting.start([number for number in range(len(self._viewable.listing())) if number not in bad])
+        return JSONResponse(self._exporting.status)
 
     def _sensor(self, request: Request) -> str:
         place = request.path_params["sensor"]
@@ -207,10 +203,6 @@ class _Desk:
         return self._spans[number, sensor]
 
 
-def _json(value: object) -> Response:
-    return JSONResponse(value)
-
-
 def _bytes(content: bytes) -> Response:
     return Response(content, media_type="application/octet-stream")
 
@@ -230,7 +222,6 @@ def build_viewer(
     host: str = "127.0.0.1",
     token: str | None = None,
     export_to: str | Path | None = None,
-    on_ready: Callable[[], None] | None = None,
 ) -> Starlette:
     """The ASGI application of `view`."""
     exporting = Exporting(viewable, Path(export_to) if export_to is not None else None)
@@ -239,38 +230,21 @@ def build_viewer(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        if on_ready:
-            on_ready()
         try:
             yield
         finally:
             await asyncio.get_running_loop().run_in_executor(None, exporting.stop)
             worker.shutdown(cancel_futures=True)
 
-    async def answered(request: Request, method: Callable[..., Response], *arguments: object) -> Response:
-        try:
-            return await asyncio.get_running_loop().run_in_executor(worker, method, *arguments)
-        except TerrellaError as error:
-            return PlainTextResponse(str(error), 422)
-
-    def asks(method: Callable[[Request], Response]) -> Callable:
+    def asks(method: Callable[..., Response], read: Callable | None = None) -> Callable:
         async def route(request: Request) -> Response:
-            return await answered(request, method, request)
+            try:
+                given = (request,) if read is None else await read(request)
+                return await asyncio.get_running_loop().run_in_executor(worker, method, *given)
+            except TerrellaError as error:
+                return PlainTextResponse(str(error), 422)
 
         return route
-
-    async def mark(request: Request) -> Response:
-        try:
-            body = await _message(request)
-            number, bad = body["episode"], body["bad"]
-            if type(number) is not int or type(bad) is not bool:
-                raise ValueError
-        except (ValueError, KeyError, TypeError, RecursionError):
-            return PlainTextResponse("a mark is {episode: a whole number, bad: true or false}; reload the page.", 422)
-        return await answered(request, desk.mark, number, bad)
-
-    async def export(request: Request) -> Response:
-        return _json(exporting.status) if request.method == "GET" else await answered(request, desk.export)
 
     routes = [
         Route("/about", asks(desk.about)),
@@ -278,39 +252,27 @@ def build_viewer(
         Route("/times/{number:int}/{sensor:int}", asks(desk.times)),
         Route("/series/{number:int}/{sensor:int}", asks(desk.series)),
         Route("/reading/{number:int}/{sensor:int}/{index:int}", asks(desk.reading)),
-        Route("/mark", mark, methods=["POST"]),
-        Route("/export", export, methods=["GET", "POST"]),
+        Route("/mark", asks(desk.mark, _mark_of), methods=["POST"]),
+        Route("/export", asks(desk.export), methods=["GET", "POST"]),
     ]
-    app = application(_FILES, routes, lifespan, host, token)
-    app.state.exporting = exporting
-    return app
+    return application(_FILES, routes, lifespan, host, token)
 
 
-async def _message(request: Request) -> dict:
-    """The posted JSON object; ValueError where it is none, or too long."""
+async def _mark_of(request: Request) -> tuple[int, bool]:
+    """The posted episode, and whether it is bad; ServeError where that is not what was posted."""
     content = b""
     async for part in request.stream():
         content += part
         if len(content) > _LONGEST_MESSAGE:
-            raise ValueError
-    found = json.loads(content)
-    if not isinstance(found, dict):
-        raise ValueError
-    return found
-
-
-def make_viewer(
-    viewable: Viewable,
-    listener: socket.socket,
-    host: str = "127.0.0.1",
-    token: str | None = None,
-    export_to: str | Path | None = None,
-    on_ready: Callable[[str], None] | None = None,
-) -> uvicorn.Server:
-    """The server behind `view`, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it."""
-    url = page_address(host, listener.getsockname()[1], token)
-    app = build_viewer(viewable, host, token, export_to, (lambda: on_ready(url)) if on_ready else None)
-    return make_uvicorn(app, websockets=False)
+            break
+    try:
+        body = json.loads(content) if len(content) <= _LONGEST_MESSAGE else {}
+        number, bad = body["episode"], body["bad"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        number, bad = None, None
+    if type(number) is not int or type(bad) is not bool:
+        raise ServeError("a mark is {episode: a whole number, bad: true or false}; reload the page.")
+    return number, bad
 
 
 def view(
@@ -327,9 +289,5 @@ def view(
     yet. On any address but this machine's own a token is mandatory: where none is given one is made, and the address
     carries it. ServeError where the port is taken.
     """
-    if not token and not is_loopback(host):
-        token = secrets.token_urlsafe(16)
-    with contextlib.closing(open_port(host, port)) as listener:
-        server = make_viewer(viewable, listener, host, token, export_to, on_ready)
-        with contextlib.suppress(KeyboardInterrupt):
-            server.run(sockets=[listener])
+    build = lambda token: build_viewer(viewable, host, token, export_to)  # noqa: E731
+    serve_page(build, host, port, token, on_ready, websockets=False)
