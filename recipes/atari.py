@@ -18,7 +18,6 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella.core.policy import Scripted
 from terrella.data import record
 
 
@@ -41,6 +40,23 @@ COURTS = {
 }
 
 
+@dataclass(frozen=True)
+class BallPlayers:
+    """The Policy of a player for each episode; names: those of the game's actions."""
+
+    court: Court
+    names: tuple[str, ...]
+
+    def begin(self, batch: int, rng: torch.Generator) -> list[BallPlayer]:
+        return [BallPlayer(self.court, self.names) for _ in range(batch)]
+
+    def act(
+        self, observation: Mapping, memory: list[BallPlayer], rng: torch.Generator
+    ) -> tuple[torch.Tensor, list[BallPlayer]]:
+        pairs = zip(memory, observation["rgb"], strict=True)
+        return torch.cat([player.act(picture, rng) for player, picture in pairs]), memory
+
+
 class BallPlayer:
     """Plays one episode: see the top of this file."""
 
@@ -49,15 +65,13 @@ class BallPlayer:
         self.left, self.follows, self.aim = 0, True, 0.0
         self.held, self.hold = 0, 0
 
-    def __call__(self, observation: Mapping, step: int, rng: torch.Generator) -> torch.Tensor:
-        if step == 0 or self.left <= 0:
+    def act(self, picture: torch.Tensor, rng: torch.Generator) -> torch.Tensor:
+        if self.left <= 0:
             self.left = _whole(rng, 20, 80)
             self.follows = _unit(rng) < 0.85
             self.aim = 4 * _unit(rng) - 2
         self.left -= 1
-        ball, paddle = (
-            _place(observation["rgb"][0], box, self.court.axis) for box in (self.court.ball, self.court.paddle)
-        )
+        ball, paddle = (_place(picture, box, self.court.axis) for box in (self.court.ball, self.court.paddle))
         if ball is None and _unit(rng) < 0.2:
             return torch.tensor([self.names.index("FIRE")])
         if self.follows and ball is not None and paddle is not None and _unit(rng) < 0.9:
@@ -90,7 +104,7 @@ def record_game(name: str, out: Path, frames: int = 100_000, held_out: int = 12_
     court = COURTS[name]
     for folder, seed, rows in (("test", 1, held_out), ("rec", 0, frames)):
         world = terrella.load(court.game, size=(64, 64), forkable=False)  # twice as fast
-        player = Scripted(lambda court=court, names=world.spec.action_names: BallPlayer(court, names))
+        player = BallPlayers(court, world.spec.action_names)
         rng = terrella.make_rng(seed)
         done = record(world, player, out / folder, rows, rng, max_episode_steps=3000, pictures="png")
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)

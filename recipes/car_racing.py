@@ -17,32 +17,44 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella.core.policy import Scripted
 from terrella.data import record
+
+
+class Drivers:
+    """The Policy of a driver for each episode."""
+
+    def begin(self, batch: int, rng: torch.Generator) -> list[Driver]:
+        return [Driver() for _ in range(batch)]
+
+    def act(
+        self, observation: Mapping, memory: list[Driver], rng: torch.Generator
+    ) -> tuple[torch.Tensor, list[Driver]]:
+        pairs = zip(memory, observation["rgb"], strict=True)
+        return torch.cat([driver.act(picture, rng) for driver, picture in pairs]), memory
 
 
 class Driver:
     """Plays one episode: see the top of this file."""
 
     def __init__(self):
-        self.left, self.lapse = 0, False
+        self.step, self.left, self.lapse = 0, 0, False
         self.throttle, self.eagerness, self.wild = 0.0, 1.0, torch.zeros(3)
         self.side, self.lost = 1.0, 0
 
-    def __call__(self, observation: Mapping, step: int, rng: torch.Generator) -> torch.Tensor:
+    def act(self, picture: torch.Tensor, rng: torch.Generator) -> torch.Tensor:
         def chance() -> float:
             return float(torch.rand(1, generator=rng))
 
-        if step == 0 or self.left <= 0:
+        if self.left <= 0:
             self.left = 20 + int(60 * chance())
-            self.lapse = step > 60 and chance() < 1 / 6
+            self.lapse = self.step > 60 and chance() < 1 / 6
             self.throttle, self.eagerness = 0.05 + 0.25 * chance(), 1.5 + 1.5 * chance()
             self.wild = torch.tensor([2 * chance() - 1, chance() * (chance() < 0.7), 0.8 * chance() * (chance() < 0.3)])
             self.left = min(self.left, 25) if self.lapse else self.left
-        self.left -= 1
+        self.left, self.step = self.left - 1, self.step + 1
         if self.lapse:
             return self.wild[None]
-        off = _road(observation["rgb"][0])
+        off = _road(picture)
         if off is None:  # off the road: turn round towards where it was
             self.lost += 1
             return torch.tensor([[self.side, 0.12, 0.0 if self.lost % 40 < 30 else 0.3]])
@@ -66,7 +78,7 @@ def record_driving(out: Path, frames: int = 20_000, held_out: int = 5_000) -> No
     world = terrella.load("gym:CarRacing-v3", size=(64, 64))
     for folder, seed, rows in (("test", 1, held_out), ("rec", 0, frames)):
         rng = terrella.make_rng(seed)
-        done = record(world, Scripted(Driver), out / folder, rows, rng, max_episode_steps=900, pictures="png")
+        done = record(world, Drivers(), out / folder, rows, rng, max_episode_steps=900, pictures="png")
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)
 
 

@@ -21,20 +21,8 @@ _HOME = {"check_world": "check", "WorldEnv": "env", "as_env": "env", "Policy": "
 _HOME |= {"rollout": "rollouts", "Camera": "spec", "Spec": "spec", "State": "state"}
 _HOME |= {"Observation": "world", "World": "world", "make_rng": "world"}
 
-__all__ = [
-    "Camera",
-    "Observation",
-    "Policy",
-    "Rollout",
-    "Spec",
-    "State",
-    "World",
-    "WorldEnv",
-    "as_env",
-    "check_world",
-    "make_rng",
-    "rollout",
-]
+__all__ = ["Camera", "Observation", "Policy", "Rollout", "Spec", "State", "World", "WorldEnv"]
+__all__ += ["as_env", "check_world", "make_rng", "rollout"]
 
 
 def __getattr__(name: str):

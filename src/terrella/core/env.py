@@ -15,15 +15,8 @@ from .state import State
 from .world import World, make_rng
 
 
-def as_env(
-    world: World,
-    num_envs: int = 1,
-    max_steps: int | None = None,
-    observation: str | Sequence[str] | None = None,
-    seed: int = 0,
-    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
-) -> WorldEnv:
-    """`num_envs` episodes of `world` side by side.
+class WorldEnv(VectorEnv):
+    """`as_env(world)`: `num_envs` episodes of `world` side by side. Arrays lead with num_envs; the world is not closed with it.
 
     max_steps:      an episode is truncated after that many steps.
     observation:    a channel's name, whose arrays are the observations; or several names, for a dictionary of arrays.
@@ -36,20 +29,15 @@ def as_env(
     Reward is the channel `reward` (0 where the world has none), terminated the channel `done`.
     Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` episodes.
     """
-    return WorldEnv(world, num_envs, max_steps, observation, seed, autoreset_mode)
-
-
-class WorldEnv(VectorEnv):
-    """What `as_env` gives. Arrays lead with num_envs; the world is not closed with it."""
 
     def __init__(
         self,
         world: World,
-        num_envs: int,
-        max_steps: int | None,
-        observation: str | Sequence[str] | None,
-        seed: int,
-        autoreset_mode: AutoresetMode,
+        num_envs: int = 1,
+        max_steps: int | None = None,
+        observation: str | Sequence[str] | None = None,
+        seed: int = 0,
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     ):
         spec = world.spec
         most = spec.max_batch if spec.forkable else 1
@@ -64,9 +52,8 @@ class WorldEnv(VectorEnv):
         self._single = isinstance(observation, str)
         self._names = (observation,) if isinstance(observation, str) else tuple(observation)
         spec.check_channels(self._names)
-        self._asked = tuple(
-            dict.fromkeys((*self._names, *(name for name in ("reward", "done") if name in spec.channels)))
-        )
+        more = [name for name in ("reward", "done") if name in spec.channels]
+        self._asked = tuple(dict.fromkeys((*self._names, *more)))
         self.world, self.num_envs, self.max_steps = world, num_envs, max_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         shown = {name: spec.channels[name] for name in self._names}
@@ -99,19 +86,12 @@ class WorldEnv(VectorEnv):
         if seed is not None:
             self._rng = make_rng(seed)
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.shape != (self.num_envs,)
-            or mask.dtype != np.bool_
-            or not mask.any()
-        ):
+        sound = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
+        if not sound or not mask.any():
             raise TerrellaError(
                 f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, one or more of them True."
             )
-        if mask.all():
-            self._begin(mask)
-        else:
-            self._state = self._restarted(self.state, mask)
+        self._restart(None if mask.all() else self.state, mask)
         return self._observations(self._look()), {}
 
     @torch.no_grad()
@@ -124,16 +104,14 @@ class WorldEnv(VectorEnv):
                 f"environments {np.flatnonzero(fresh).tolist()} have ended: reset them with a reset_mask first."
             )
         self.world.spec.check_action(actions, self.num_envs)
-        if fresh.all():
-            self._begin(fresh)
-        else:
-            moved = self.world.imagine(state, actions, self._rng)
-            self._state = self._restarted(moved, fresh) if fresh.any() else moved
+        if not fresh.all():
+            self._state = state = self.world.imagine(state, actions, self._rng)
+        if fresh.any():
+            self._restart(state, fresh)
         self._steps = np.where(fresh, 0, self._steps + 1)
         seen = self._look()
-        rewards = (
-            np.where(fresh, 0.0, seen["reward"].astype(np.float64)) if "reward" in seen else np.zeros(self.num_envs)
-        )
+        nothing = np.zeros(self.num_envs)
+        rewards = np.where(fresh, 0.0, seen["reward"].astype(np.float64)) if "reward" in seen else nothing
         terminated = seen["done"] & ~fresh if "done" in seen else np.zeros(self.num_envs, np.bool_)
         truncated = np.zeros(self.num_envs, np.bool_) if self.max_steps is None else self._steps >= self.max_steps
         self._ended = terminated | truncated
@@ -141,7 +119,8 @@ class WorldEnv(VectorEnv):
         if self._ended.any() and self.autoreset_mode == AutoresetMode.SAME_STEP:
             for place in np.flatnonzero(self._ended).tolist():
                 self._add_info(infos, {"final_obs": self._entry(observations, place), "final_info": {}}, place)
-            observations = self._restart_ended()
+            self._restart(self.state, self._ended.copy())
+            observations = self._observations(self._look())
         return observations, rewards, terminated, truncated, infos
 
     @torch.no_grad()
@@ -151,23 +130,11 @@ class WorldEnv(VectorEnv):
             return None
         return tuple(np.array(frame) for frame in self.world.render(self.state, ("rgb",))["rgb"].cpu().numpy())
 
-    def _begin(self, mask: np.ndarray) -> None:
-        self._state = self.world.start(self.num_envs, self._rng)
+    def _restart(self, state: State | None, mask: np.ndarray) -> None:
+        """Puts new starts into `state` where `mask`; where that is everywhere, no state is needed."""
+        fresh = self.world.start(int(mask.sum()), self._rng)
+        self._state = fresh if mask.all() else state.put(torch.from_numpy(np.flatnonzero(mask)), fresh)
         self._steps[mask], self._ended[mask] = 0, False
-
-    def _restarted(self, state: State, mask: np.ndarray) -> State:
-        """`state` with new starts where `mask`."""
-        renew = torch.from_numpy(np.flatnonzero(mask))
-        self._steps[mask], self._ended[mask] = 0, False
-        return state.put(renew, self.world.start(len(renew), self._rng))
-
-    def _restart_ended(self):
-        ended = self._ended.copy()
-        if ended.all():
-            self._begin(ended)
-        else:
-            self._state = self._restarted(self.state, ended)
-        return self._observations(self._look())
 
     def _look(self) -> dict[str, np.ndarray]:
         seen = self.world.render(self.state, self._asked)
@@ -180,3 +147,6 @@ class WorldEnv(VectorEnv):
         if self._single:
             return np.array(observations[place])
         return {name: np.array(array[place]) for name, array in observations.items()}
+
+
+as_env = WorldEnv

@@ -65,25 +65,6 @@ class Reactive:
         return self.function(observation, rng), None
 
 
-class Scripted:
-    """A policy of players that each play one episode: `make()` gives one, `player(observation, step, rng)` its action [1, ...].
-
-    Its memory is the players, which may change as they play.
-    """
-
-    def __init__(self, make: Callable[[], Callable[[Observation, int, torch.Generator], torch.Tensor]]):
-        self.make = make
-
-    def begin(self, batch: int, rng: torch.Generator) -> list:
-        return [(self.make(), 0) for _ in range(batch)]
-
-    def act(self, observation: Observation, memory: list, rng: torch.Generator) -> tuple[torch.Tensor, list]:
-        taken = []
-        for entry, (player, step) in enumerate(memory):
-            taken.append(player({name: seen[entry : entry + 1] for name, seen in observation.items()}, step, rng))
-        return torch.cat(taken), [(player, step + 1) for player, step in memory]
-
-
 class Replay:
     """Plays given actions [T, B, *action.shape]; ContractError after the last. Its memory is the step."""
 

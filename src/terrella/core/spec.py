@@ -42,6 +42,13 @@ def dtype_of(space: spaces.Space) -> np.dtype:
     return np.dtype(space.dtype)
 
 
+def torch_dtype_of(space: spaces.Space) -> torch.dtype:
+    """The same as torch spells it."""
+    import torch
+
+    return torch.from_numpy(np.zeros(0, space.dtype)).dtype
+
+
 def kind_of(channel: str) -> str:
     """The kind of a channel, "rgb" of "rgb.wrist": what its values mean."""
     return channel.partition(".")[0]
@@ -147,7 +154,7 @@ class Spec:
         if tuple(tensor.shape) != shape:
             raise ActionError(f"{self.name} takes an action of shape {shape} (batch first); got {tuple(tensor.shape)}.")
         if tensor.device.type == "meta":  # which has no values to check
-            return tensor.to(_torch_dtype(dtype_of(self.action)))
+            return tensor.to(torch_dtype_of(self.action))
         if tensor.is_complex() or not torch.isfinite(tensor).all():
             raise ActionError(f"{self.name} was given an action that is not a finite number.")
         plain = tensor.float() if tensor.dtype == torch.bfloat16 else tensor  # which numpy does not have
@@ -156,7 +163,7 @@ class Spec:
         whole = array.dtype.kind == "f" or (array == given).all()
         if not (whole and (array >= low).all() and (array <= high).all()):
             raise ActionError(f"{self.name} takes actions in {self.action}; got {given.tolist()}.")
-        return tensor.to(_torch_dtype(array.dtype), copy=True)
+        return tensor.to(torch_dtype_of(self.action), copy=True)
 
     def sample_action(self, batch: int, rng: torch.Generator) -> torch.Tensor:
         """Uniform random actions [batch, *action.shape], from `rng` alone; axes without a limit stay within 1000."""
@@ -203,9 +210,3 @@ def _mode_of(space: spaces.Space) -> str:
     if isinstance(space, spaces.MultiBinary):
         return BUTTONS
     return CHOICE if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) else AXES[0]
-
-
-def _torch_dtype(dtype: np.dtype) -> torch.dtype:
-    import torch
-
-    return torch.from_numpy(np.zeros(0, dtype)).dtype

@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import ObservationError, TerrellaError
-from ..core.spec import DONE, Camera, Spec, dtype_of, shape_of
+from ..core.spec import DONE, Camera, Spec, shape_of, torch_dtype_of
 from ..core.state import State
 
 
@@ -97,7 +97,7 @@ class Replay:
         rows, space = self._arrays[name], self.spec.channels[name]
         index = frame.cpu()
         picked = rows[index] if isinstance(rows, torch.Tensor) else torch.from_numpy(np.array(rows[index.numpy()]))
-        return picked.reshape(len(index), *shape_of(space)).to(_torch_dtype(dtype_of(space)))
+        return picked.reshape(len(index), *shape_of(space)).to(torch_dtype_of(space))
 
 
 def _space_of(array: np.ndarray | torch.Tensor) -> spaces.Box:
@@ -109,7 +109,3 @@ def _space_of(array: np.ndarray | torch.Tensor) -> spaces.Box:
     if dtype.kind in "iu":
         return spaces.Box(np.iinfo(dtype).min, np.iinfo(dtype).max, shape, dtype.type)
     return spaces.Box(-np.inf, np.inf, shape, np.float32)
-
-
-def _torch_dtype(dtype: np.dtype) -> torch.dtype:
-    return torch.from_numpy(np.zeros(0, dtype)).dtype
