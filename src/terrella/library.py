@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from .core.errors import CheckpointError, TerrellaError
+from .core.errors import TerrellaError
 from .core.world import World
 from .similar import did_you_mean
 from .space.estimator import Estimator
@@ -18,16 +16,12 @@ BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """One world at hand: `load(name)` opens it. source: "bundled", "game" or "checkpoint"; card: facts for people."""
 
     name: str
     source: str
     card: Mapping[str, object]
-
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self)
 
 
 def load(
@@ -65,9 +59,15 @@ def load(
     if options.get("fast") and is_truth(name):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
     if text == "doom" or text.startswith("doom:"):
-        return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
+        _require("vizdoom", "The real game needs ViZDoom", "sim")
+        from .sim.doom import Doom, DoomConfig
+
+        return Doom(DoomConfig(scenario=text.partition(":")[2] or GAME.partition(":")[2], **options))
     if text.startswith("gym:ALE/"):
-        return _open_atari(text.partition(":")[2], options)
+        _require("ale_py", "Atari games need ale-py", "atari")
+        from .sim.atari import AtariWorld
+
+        return AtariWorld(text.partition(":")[2], **options)
     if text.startswith("gym:"):
         from .sim.gymnasium import GymnasiumWorld
 
@@ -115,38 +115,27 @@ def _bundled() -> list[str]:
     return [file.parent.name for file in BUNDLED.glob("*/world.json")]
 
 
-def _read(folder: Path) -> dict:
-    path = folder / "world.json"
-    if not path.is_file():
-        raise CheckpointError(
-            f"{folder} is not a checkpoint: it holds no world.json; `terrella train` writes such folders when it ends."
-        )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} cannot be read ({error}); take the checkpoint from its source again.") from error
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{path} is not the description of a world; take the checkpoint from its source again.")
-    return content
-
-
 def _read_card(folder: Path) -> Mapping[str, object]:
-    card = _read(folder).get("card")
+    from .worlds.folder import read_about
+
+    card = read_about(folder).get("card")
     return card if isinstance(card, dict) else {}
 
 
 def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
-    kind = _read(folder).get("kind")
-    if kind in ("learned", "video"):  # "video" is of an earlier release, and load_world says how it is converted
-        from .worlds.folder import load_world
+    from .worlds.folder import load_world
 
-        world = load_world(folder, **{name: value for name, value in options.items() if name != "fast"})
-        if options.get("fast"):
-            from .worlds.fast import quickened
-
-            return quickened(world)[0]
+    world = load_world(folder, **{name: value for name, value in options.items() if name != "fast"})
+    if not options.get("fast"):
         return world
-    raise CheckpointError(f"{folder} holds a world of kind {kind!r}, which this release cannot open; update Terrella.")
+    from .worlds.fast import quickened
+
+    return quickened(world)[0]
+
+
+def _require(module: str, need: str, extra: str) -> None:
+    if not find_spec(module):
+        raise TerrellaError(f"{need}, which is not installed: pip install 'terrella[{extra}]'.")
 
 
 def open_estimator(source: str | Path) -> Estimator:
@@ -159,21 +148,3 @@ def open_estimator(source: str | Path) -> Estimator:
     if not isinstance(estimator, Estimator):
         raise TerrellaError(f"{source} has no estimator; give a file that `terrella train estimator` wrote.")
     return estimator
-
-
-def _open_atari(game: str, options: Mapping[str, Any]) -> World:
-    if not find_spec("ale_py"):
-        raise TerrellaError("Atari games need ale-py, which is not installed: pip install 'terrella[atari]'.")
-    from .sim.atari import AtariWorld
-
-    return AtariWorld(game, **options)
-
-
-def _open_doom(scenario: str, options: Mapping[str, Any]) -> World:
-    if not find_spec("vizdoom"):
-        raise TerrellaError(
-            "The real game needs ViZDoom, which is not installed: pip install 'terrella[sim]' (or -e '.[sim]')."
-        )
-    from .sim.doom import Doom, DoomConfig
-
-    return Doom(DoomConfig(scenario=scenario, **options))

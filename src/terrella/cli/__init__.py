@@ -8,6 +8,9 @@ import traceback
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
+from ..core.errors import TerrellaError
+from ..similar import did_you_mean
+
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
 
 # Each command: the function of this package that runs it, and what it does. Its module is imported when it runs.
@@ -64,9 +67,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has gone
         sys.stdout = None
         return 0
-    except UsageError as error:
-        print(f"terrella: {error}", file=sys.stderr)
-        return 2
     except Exception as error:
         sentence = _sentence(error)
         if sentence is None:
@@ -87,23 +87,17 @@ def _run(given: list[str]) -> int:
 
     import tyro
 
-    markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-    return (
-        tyro.cli(
-            _function(name), prog=f"terrella {name}", args=[RENAMED.get(word, word) for word in rest], config=markers
-        )
-        or 0
+    module, _, function = COMMANDS[name][0].partition(":")
+    command: Callable[..., int | None] = getattr(import_module(f"{__name__}.{module}"), function)
+    markers, words = (
+        (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        [RENAMED.get(word, word) for word in rest],
     )
-
-
-class UsageError(Exception):
-    """A command or an option that does not exist."""
+    return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
 
 
 def _command(given: list[str]) -> tuple[str, list[str]]:
-    """The command's name, "" or a group's where none is named yet, and what follows it; UsageError for unknown names."""
-    from ..similar import did_you_mean
-
+    """The command's name, "" or a group's where none is named yet, and what follows it; TerrellaError for unknown names."""
     group = ""
     for at, word in enumerate(given[:2]):
         name = f"{group} {word}".strip()
@@ -115,12 +109,12 @@ def _command(given: list[str]) -> tuple[str, list[str]]:
         known = _members(group)
         if name not in known:
             likest = did_you_mean(word, known)
-            raise UsageError(f"there is no command '{name}'{likest or '.'} The commands are {', '.join(known)}.")
+            raise TerrellaError(f"there is no command '{name}'{likest or '.'} The commands are {', '.join(known)}.")
         group = name
     rest = given[len(group.split()) :]
     if rest and rest[0] not in ("-h", "--help"):
         likest = did_you_mean(rest[0], ("--help", "--version"))
-        raise UsageError(f"there is no option '{rest[0]}'{likest or '.'} `terrella --help` lists the commands.")
+        raise TerrellaError(f"there is no option '{rest[0]}'{likest or '.'} `terrella --help` lists the commands.")
     return group, rest
 
 
@@ -143,15 +137,8 @@ def _help(group: str, asked: bool) -> int:
     return 0 if asked else 2
 
 
-def _function(name: str) -> Callable[..., int | None]:
-    module, function = COMMANDS[name][0].split(":")
-    return getattr(import_module(f"{__name__}.{module}"), function)
-
-
 def _sentence(error: Exception) -> str | None:
     """What to tell a person of an error that is theirs or their machine's; None for a fault of ours: that needs its trace."""
-    from ..core.errors import TerrellaError
-
     if isinstance(error, TerrellaError):
         return str(error)
     if isinstance(error, OSError) and error.errno in _THEIRS:

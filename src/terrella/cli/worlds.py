@@ -20,7 +20,7 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
 
     entries = library.worlds(folders)
     if json:
-        print(json_text.dumps([entry.as_dict() for entry in entries], indent=1))
+        print(json_text.dumps([entry._asdict() for entry in entries], indent=1))
         return
     for entry in entries:
         print(f"{entry.name}  [{entry.source}]")
