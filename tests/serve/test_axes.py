@@ -10,7 +10,7 @@ from terrella.core import Spec, check_world
 from terrella.core.policy import Random, Reactive
 from terrella.data import Layout, Recorder
 from terrella.exchange.browse import browse
-from terrella.serve.actions import MAX_AXES, Person, action_of, axes_of
+from terrella.serve.actions import MAX_AXES, action_of, axes_of
 from terrella.serve.protocol import Show
 from terrella.serve.timeline import Timeline
 
@@ -65,15 +65,6 @@ def test_a_held_key_overrides_its_axis_alone():
 def test_whole_axes_get_whole_numbers():
     spec = spec_of(spaces.Box(-3, 3, (1,), np.int64))
     assert action_of(spec, (), [1.6]).tolist() == [[2]] and axes_of(spec)[0]["whole"]
-
-
-def test_a_person_is_a_policy():
-    world = Robot()
-    person = Person(world.spec)
-    assert person.begin(1, None) is None and not person.active
-    person.hold((), (1.0, 0.0, 0.0))
-    action, memory = person.act({}, None, None)
-    assert action.tolist() == [[1.0, 0.0, 0.0]] and memory is None and person.active
 
 
 def test_a_policy_drives_until_somebody_touches_the_controls():

@@ -30,28 +30,27 @@ def test_show_is_read_and_junk_is_refused():
             parse_message(junk)
 
 
-def test_a_chart_tells_keyframes_only_when_they_changed():
+def test_a_chart_tells_where_the_camera_and_the_keyframes_are():
     timeline = Timeline([Mapped()], seed=0)
-    number, first = timeline.chart()
-    body = first.body(None)
-    assert number == 0 and len(body["keyframes"]) == 4 and body["known"] == 0.5 and len(body["camera"]) == 3
+    first = timeline.chart()
+    assert first["world"] == 0 and len(first["keyframes"]) == 4 and first["known"] == 0.5 and len(first["camera"]) == 3
     timeline.step(["KeyW"])
-    _, second = timeline.chart()
-    assert "keyframes" not in second.body(first) and second.camera[0] == pytest.approx(0.1)
+    second = timeline.chart()
+    assert second["keyframes"] == first["keyframes"] and second["camera"][0] == pytest.approx(0.1)
     for _ in range(20):
         timeline.step(["ArrowLeft"])
-    _, third = timeline.chart()
-    assert third.body(second)["keyframes"][4:] == [0.5, 0.0, 0.7, 2.0]
-    assert third.camera[2] != second.camera[2]
+    third = timeline.chart()
+    assert third["keyframes"][4:] == [0.5, 0.0, 0.7, 2.0]
+    assert third["camera"][2] != second["camera"][2]
 
 
 def test_the_past_has_its_own_map():
     timeline = Timeline([Mapped()], seed=0)
     for _ in range(45):
         timeline.step([])
-    assert len(timeline.chart()[1].keyframes) == 3
+    assert len(timeline.chart()["keyframes"]) == 3 * 4
     timeline.stand_at(3)
-    assert len(timeline.chart()[1].keyframes) == 1
+    assert len(timeline.chart()["keyframes"]) == 4
 
 
 def test_a_world_without_these_channels_has_no_map():
@@ -61,7 +60,7 @@ def test_a_world_without_these_channels_has_no_map():
 
 
 def test_of_two_worlds_the_dream_is_drawn():
-    assert Timeline([Panorama(), Mapped()], seed=0).chart()[0] == 1
+    assert Timeline([Panorama(), Mapped()], seed=0).chart()["world"] == 1
 
 
 def test_what_is_known_keeps_its_colours_and_the_rest_turns_amber():

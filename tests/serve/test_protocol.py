@@ -136,7 +136,7 @@ def test_a_card_becomes_plain_json():
             return "odd"
 
     card = {"a": 1, "b": float("nan"), "c": {"d": (1, 2.5, Odd())}, 3: None}
-    assert json.loads(json.dumps(protocol.plain(card))) == {"a": 1, "b": "nan", "c": {"d": [1, 2.5, "odd"]}, "3": None}
+    assert json.loads(json.dumps(protocol.plain(card))) == {"a": 1, "b": "NaN", "c": {"d": [1, 2.5, "odd"]}, "3": None}
 
 
 def test_vitals_ride_at_the_end_of_a_frame():

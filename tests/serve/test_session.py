@@ -6,10 +6,11 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from terrella.serve.protocol import REPLAY, Controls
+from terrella.serve.protocol import REPLAY, Controls, Show
 from terrella.serve.session import MAX_UNACKED, Session
 from terrella.serve.timeline import Timeline
 
+from .mapped import Mapped
 from .panorama import Panorama
 from .wire import decode_frame
 
@@ -160,6 +161,19 @@ def test_a_running_game_says_why_it_cannot_rewind():
         await until(lambda: len(socket.frames) > count + 3)
 
     play(scenario, Panorama(forkable=False, dt_s=1 / 400))
+
+
+def test_a_chart_tells_keyframes_only_when_they_changed():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        session.hear("show", Show(map=True, invented=False))
+        charts = lambda: [event for event in socket.events if event["type"] == "chart"]  # noqa: E731
+        await until(lambda: len(charts()) > 3)
+        told = [event["keyframes"] for event in charts() if "keyframes" in event]
+        assert len(told) < len(charts()) and all(a != b for a, b in zip(told, told[1:]))
+
+    play(scenario, Mapped())
 
 
 def test_a_dropped_socket_pauses_the_story_and_another_goes_on():

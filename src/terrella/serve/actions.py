@@ -9,7 +9,6 @@ import torch
 from gymnasium import spaces
 
 from ..core.spec import Spec, dtype_of, neutral_action
-from ..core.world import Observation
 
 MAX_AXES = 64  # that a page shows; an action's others rest
 _UNLIMITED = 1e6  # limits beyond this are none
@@ -64,25 +63,3 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
     elif rows:
         flat = np.max(rows, axis=0) if isinstance(space, spaces.MultiBinary) else rows[-1]
     return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
-
-
-class Person:
-    """The Policy of whoever sits at the page: it acts by what is held there, and needs no observation."""
-
-    def __init__(self, spec: Spec):
-        self._spec, self._held, self._axes = spec, (), ()
-
-    def hold(self, held: Sequence[str], axes: Sequence[float]) -> None:
-        """From now on these keys and values of the axes."""
-        self._held, self._axes = tuple(held), tuple(axes)
-
-    @property
-    def active(self) -> bool:
-        """Whether anything is held that the world knows."""
-        return not torch.equal(action_of(self._spec, self._held, self._axes), action_of(self._spec))
-
-    def begin(self, batch: int, rng: torch.Generator) -> None:
-        return None
-
-    def act(self, observation: Observation, memory: None, rng: torch.Generator) -> tuple[torch.Tensor, None]:
-        return action_of(self._spec, self._held, self._axes), memory

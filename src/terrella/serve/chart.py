@@ -7,7 +7,6 @@ It knows no kind of world: a world with the channels `pose` and `keyframes` [N, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 
@@ -27,33 +26,20 @@ def knows_share(spec: Spec) -> bool:
     return "known" in spec.channels
 
 
-@dataclass(frozen=True)
-class Chart:
-    """One moment's map: where the camera is [x, y, heading], what share of the picture memory knew (None where the world does
-    not say), and its keyframes [n, 4] without the empty slots."""
-
-    camera: list[float]
-    known: float | None
-    keyframes: torch.Tensor
-
-    def body(self, before: Chart | None) -> dict:
-        """As the page gets it: numbers to the centimetre and half a degree, and keyframes only if they are not those of
-        `before`."""
-        body: dict = {"camera": [round(number, 3) for number in self.camera], "known": self.known}
-        if before is None or not torch.equal(before.keyframes, self.keyframes):
-            body["keyframes"] = [round(number, 2) for number in self.keyframes.flatten().tolist()]
-        return body
-
-
-def chart(world: World, state: State) -> Chart:
-    """The map of the first entry of `state`."""
+def chart(world: World, state: State) -> dict:
+    """The map of the first entry of `state`, as the page gets it: camera [x, y, heading], to the millimetre; known, the share
+    of the picture that memory knew (None where the world does not say); keyframes, x, y, heading and kind of each, to the
+    centimetre, in one flat list without the empty slots."""
     wanted = ["pose", "keyframes", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     x, y, _, w, qx, qy, z = seen["pose"].tolist()
     heading = math.atan2(2 * (w * z + qx * qy), 1 - 2 * (qy * qy + z * z))
     held = seen["keyframes"][seen["keyframes"][:, 3] > 0]
-    known = round(float(seen["known"].mean()), 3) if "known" in seen else None
-    return Chart([x, y, heading], known, held)
+    return {
+        "camera": [round(number, 3) for number in (x, y, heading)],
+        "known": round(float(seen["known"].mean()), 3) if "known" in seen else None,
+        "keyframes": held.flatten().double().round(decimals=2).tolist(),
+    }
 
 
 def tinted(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -180,14 +179,7 @@ def encode_event(kind: str, **body) -> str:
     return json.dumps({"type": kind, **body}, allow_nan=False)
 
 
-def plain(value, depth: int = 3):
+def plain(card: Mapping[str, object]) -> dict:
     """A world's card as JSON: numbers, strings, lists and objects stay, the rest becomes text."""
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    if depth and hasattr(value, "items"):
-        return {str(key): plain(inner, depth - 1) for key, inner in value.items()}
-    if depth and isinstance(value, Sequence):
-        return [plain(inner, depth - 1) for inner in value]
-    return str(value)
+    text = json.dumps(dict(card), default=lambda value: dict(value) if isinstance(value, Mapping) else str(value))
+    return json.loads(text, parse_constant=str)

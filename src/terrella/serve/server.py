@@ -153,7 +153,7 @@ def _describe(world: World, label: str) -> dict:
         "uncertainty": uncertainty_levels(spec),
         "mapped": mapped(spec),
         "knows_share": knows_share(spec),
-        "card": protocol.plain(dict(spec.card)),
+        "card": protocol.plain(spec.card),
     }
 
 

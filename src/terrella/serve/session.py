@@ -15,7 +15,6 @@ from typing import Any, Protocol
 
 from ..core.errors import TerrellaError
 from . import protocol
-from .chart import Chart
 from .history import Moment
 from .protocol import Controls, Frame, Show
 from .timeline import Timeline
@@ -58,7 +57,7 @@ class Session:
         self._error = ""
         self._status_sent: dict[str, object] = {}
         self._show = Show(map=False, invented=False)
-        self._charted: Chart | None = None  # what the page has on its map
+        self._charted: list[float] | None = None  # the keyframes that the page has on its map
         self._chart_due = 0.0
         self._due = 0.0
 
@@ -256,9 +255,10 @@ class Session:
         self._chart_due = time.perf_counter() + CHART_S
         found = await self._extra(timeline.chart)
         if found is not None:
-            number, chart = found
-            before, self._charted = self._charted, chart
-            await self._event("chart", world=number, step=timeline.shown.step, **chart.body(before))
+            if found["keyframes"] == self._charted:
+                del found["keyframes"]
+            self._charted = found.get("keyframes", self._charted)
+            await self._event("chart", **found)
 
     async def _extra(self, function: Callable, *arguments):
         """What is shown beyond the step itself; None, and no more of it, where the world fails."""

@@ -14,8 +14,8 @@ from ..core.policy import Policy, act
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
-from .actions import Person
-from .chart import Chart, chart, mapped, tinted
+from .actions import action_of
+from .chart import chart, mapped, tinted
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, uncertainty_levels
 from .protocol import DONE, FRESH
@@ -89,7 +89,7 @@ class Timeline:
         frames = int(min(max(history_s / self.spec.dt_s, 64), 4096))
         self.history = History(frames, state_mb * 2**20)
         self.shown: Moment  # that the timeline stands at: the newest, unless it was rewound
-        self._picture, self._policy, self._person = picture, policy, Person(self.spec)
+        self._picture, self._policy, self._rest = picture, policy, action_of(self.spec)
         self.restart(seed)
 
     @property
@@ -105,12 +105,13 @@ class Timeline:
         return [tuple(image.jpeg for image in images) for images in past[first:]]
 
     @torch.inference_mode()
-    def chart(self) -> tuple[int, Chart] | None:
-        """The map of the moment shown, of the last world that has one, and which that is; None where none has."""
+    def chart(self) -> dict | None:
+        """The map of the moment shown, of the last world that has one, as the page gets it; None where none has."""
         number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
         if number is None:
             return None
-        return number, chart(self.worlds[number], (self.shown.states or self._states)[number])
+        found = chart(self.worlds[number], (self.shown.states or self._states)[number])
+        return {"world": number, "step": self.shown.step, **found}
 
     @torch.inference_mode()
     def images(self, moment: Moment, invented: bool = False) -> tuple[Image, ...]:
@@ -145,12 +146,11 @@ class Timeline:
     @torch.inference_mode()
     def step(self, held: Sequence[str] = (), axes: Sequence[float] = ()) -> Moment:
         """One step of every world under what is held, or under the policy; after `done`, the first moment of a new episode."""
-        self._person.hold(held, axes)
         if self.rewound:
             self._return_to(self.history.newest)
         if self.shown.flags & DONE:
             return self._begin(self.shown.step + 1, self._starts(self._rngs, self._picture))
-        action = self._action()
+        action = self._action(held, axes)
         pairs = zip(self.worlds, self._states, self._rngs, strict=False)
         self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
         return self._show(self.shown.step + 1, 0, action)
@@ -219,10 +219,11 @@ class Timeline:
         known = dict(enumerate(self.worlds[number].spec.kinds("rgb")))
         return {at: name for at, name in known.items() if name in self.cameras} or {0: known[0]}
 
-    def _action(self) -> torch.Tensor:
+    def _action(self, held: Sequence[str], axes: Sequence[float]) -> torch.Tensor:
         """[1, ...], the person's, or the policy's while it drives and nobody touches the controls."""
-        if self._policy is None or not self.driving or self._person.active:
-            return act(self._person, {}, None, 1, self.spec, self._rngs[-1])[0]
+        action = action_of(self.spec, held, axes)
+        if self._policy is None or not self.driving or not torch.equal(action, self._rest):
+            return action
         seen = self.worlds[0].render(self._states[0], tuple(self.spec.channels))
         action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
         return action
