@@ -37,6 +37,9 @@ class _View:
         blocks = (across < _BODY_M) | (apart == 0)
         return torch.where(blocks, along, torch.inf).amin(1)
 
+    def stands_at(self, other: _View) -> bool:
+        return math.dist((other.x, other.y), (self.x, self.y)) < 0.02
+
     def ahead_m(self) -> float:
         """The same straight ahead."""
         across = (self.free_m * torch.sin(self.bearing)).abs()
@@ -114,7 +117,7 @@ class _Walk:
 
     def step(self, *buttons: str) -> _Moves:
         view = yield buttons
-        cell = (math.floor(view.x / _CELL_M), math.floor(view.y / _CELL_M))
+        cell = _cell(view.x, view.y)
         self.visits[cell] = self.visits.get(cell, 0) + 1
         return view
 
@@ -135,7 +138,7 @@ class _Walk:
         goal, stuck = self.choose(view, score), 0
         for step in range(1, _whole(self.rng, 12, 40)):
             if step % 8 == 0:  # look again, and keep to the way taken unless another is clearly better
-                apart = (view.yaw + view.bearing - goal + math.pi) % (2 * math.pi) - math.pi
+                apart = _wrapped(view.yaw + view.bearing - goal)
                 goal = self.choose(view, self.promise(view) + 0.3 * torch.exp(-((apart / 0.3) ** 2)))
             off, ahead = _wrapped(goal - view.yaw), view.ahead_m()
             buttons = ["MOVE_FORWARD"] if abs(off) < 0.3 or ahead > 1.2 else list(along)
@@ -145,8 +148,7 @@ class _Walk:
                 break
             before = view
             view = yield from self.step(*buttons)
-            stood = math.dist((before.x, before.y), (view.x, view.y)) < 0.02
-            stuck = stuck + 1 if stood and buttons[:1] == ["MOVE_FORWARD"] else 0
+            stuck = stuck + 1 if buttons[:1] == ["MOVE_FORWARD"] and view.stands_at(before) else 0
             if stuck > 5:
                 return (yield from self.dodge(view))
         return view
@@ -191,8 +193,7 @@ class _Walk:
                 buttons.append("TURN_LEFT" if off > 0 else "TURN_RIGHT")
             before = view
             view = yield from self.step(*buttons)
-            stood = math.dist((before.x, before.y), (view.x, view.y)) < 0.02
-            stuck = stuck + 1 if stood and buttons[:1] == ["MOVE_FORWARD"] else 0
+            stuck = stuck + 1 if buttons[:1] == ["MOVE_FORWARD"] and view.stands_at(before) else 0
             found = view.thing(off) if _chance(self.rng, 0.98) else None  # some are never reached
         return view
 
@@ -215,11 +216,7 @@ class _Walk:
         if _chance(self.rng, 0.25):
             for _ in range(_whole(self.rng, 3, 10)):
                 view = yield from self.step("MOVE_BACKWARD")
-        side = (
-            ("MOVE_LEFT" if left else "MOVE_RIGHT")
-            if _chance(self.rng, 0.2)
-            else ("TURN_LEFT" if left else "TURN_RIGHT")
-        )
+        side = ("MOVE_" if _chance(self.rng, 0.2) else "TURN_") + ("LEFT" if left else "RIGHT")
         for _ in range(_whole(self.rng, 8, 30)):
             view = yield from self.step(side)
             if side.startswith("TURN") and view.ahead_m() > 2.0:
@@ -289,13 +286,7 @@ class _Walk:
         for index, (distance, bearing) in enumerate(zip(free.tolist(), view.bearing.tolist())):
             direction = view.yaw + bearing
             reach = [0.5 + i for i in range(1, 12) if 0.5 + i < distance - 0.4]
-            cells = [
-                (
-                    math.floor((view.x + r * math.cos(direction)) / _CELL_M),
-                    math.floor((view.y + r * math.sin(direction)) / _CELL_M),
-                )
-                for r in reach
-            ]
+            cells = [_cell(view.x + r * math.cos(direction), view.y + r * math.sin(direction)) for r in reach]
             if cells:
                 news[index] = sum(1 / (1 + self.visits.get(cell, 0) / 3) for cell in cells) / len(cells)
         return news * (free / 5.0).clamp(max=1.0)
@@ -323,7 +314,12 @@ def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
     )
 
 
-def _wrapped(angle: float) -> float:
+def _cell(x: float, y: float) -> tuple[int, int]:
+    return math.floor(x / _CELL_M), math.floor(y / _CELL_M)
+
+
+def _wrapped(angle):
+    """Radians in -pi to pi, of a number or a tensor."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 

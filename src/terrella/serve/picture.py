@@ -12,15 +12,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from ..core.errors import ServeError
 from ..core.spec import Spec
 
-FORMATS = (
-    "JPEG",
-    "PNG",
-    "WEBP",
-    "GIF",
-    "BMP",
-    "TIFF",
-    "PPM",
-)  # those that are tried: a small part of what Pillow can read
+FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP", "TIFF", "PPM")  # that are tried: a small part of what Pillow can read
 MAX_FILE = 2**26  # bytes of a file
 MAX_PIXELS = 2**26
 MAX_DROPPED_PIXELS = 2**22  # of one from the page, which scales it down itself

@@ -14,9 +14,7 @@ from .history import Image
 
 VERSION = 3
 MAX_MESSAGE = 4096  # bytes of one message from a page
-MAX_PICTURE = (
-    2**16 - 256
-)  # bytes of a picture from a page: what it sends as bytes is one, what it sends as text is JSON
+MAX_PICTURE = 2**16 - 256  # bytes of a picture from a page, which are all that it sends as bytes
 MAX_HELD = 16  # keys held at once
 MAX_CAMERAS = 16  # shown at once
 U32 = 2**32 - 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -50,38 +51,31 @@ class Recording:
         """The observation [1, ...] of this moment, and the action [1, ...] that led to it (None at an episode's start)."""
         if self._sink is None:
             return
-        if self._seen is not None and action is not None:
-            self._put(self._seen, action[0].cpu().numpy(), reward, done)
+        before = self._seen
         self._seen = {name: tensor[0].cpu().numpy() for name, tensor in seen.items() if name not in ("reward", "done")}
+        if before is not None and action is not None:
+            taken = action[0].cpu().numpy()
+            self._try(lambda sink: sink.add(before, taken, reward, done))
 
     def end_episode(self) -> None:
-        if self._sink is not None and self._seen is not None:
-            self._put(self._seen, None, 0.0, None)
-            self._seen = None
-            self._put()
+        last, self._seen = self._seen, None
+        if last is not None:
+            self._try(lambda sink: sink.add(last, None, 0.0, None))
+            self._try(lambda sink: sink.end_episode())
 
     def close(self) -> None:
         self.end_episode()
-        self._drop()
+        self._try(lambda sink: sink.close())
+        self._sink = None
 
-    def _put(self, *row) -> None:
-        """A row; without one, the end of an episode."""
-        try:
-            if self._sink is not None and row:
-                self._sink.add(*row)
-            elif self._sink is not None:
-                self._sink.end_episode()
-        except (TerrellaError, OSError) as error:
-            self._stopped(error)
-            self._drop()
-
-    def _drop(self) -> None:
-        sink, self._sink, self._seen = self._sink, None, None
+    def _try(self, do: Callable[[Sink], object]) -> None:
+        """Does it, if anything is recorded; the recording stops where that cannot be done."""
+        sink = self._sink
         try:
             if sink is not None:
-                sink.close()
+                do(sink)
         except (TerrellaError, OSError) as error:
-            self._stopped(error)
-
-    def _stopped(self, error: Exception) -> None:
-        self.fault = self.fault or f"the recording stopped: {error}"
+            self.fault = f"the recording stopped: {error}"
+            self._sink = self._seen = None
+            with contextlib.suppress(TerrellaError, OSError):
+                sink.close()

@@ -97,13 +97,10 @@ class _Screen(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, size: tuple[int, int] | None, frames: int, noops: int, sticky: float):
         super().__init__(env)
         self.sticky, self.loaded = sticky, False
+        self.ale = _ale(env)
         self.size = size or tuple(self.ale.getScreenDims())
         self.frames, self.noops = frames, noops
         self.observation_space = spaces.Box(0, 255, (*self.size, 3), np.uint8)
-
-    @property
-    def ale(self) -> ale_py.ALEInterface:
-        return self.unwrapped.ale  # pyright: ignore[reportAttributeAccessIssue]
 
     def reset(self, *, seed=None, options=None):
         if self.sticky or not self.loaded:

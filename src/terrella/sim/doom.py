@@ -22,7 +22,7 @@ import vizdoom
 from gymnasium import spaces
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, REWARD, Camera, Spec
+from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Camera, Spec
 from ..core.state import State
 from .doom_map import Sectors, map_names, skies
 
@@ -49,6 +49,9 @@ MAP_SPACING_M = 1024.0  # from one map of a game to the next: see `map_origin`
 HEALTH = spaces.Box(0, 1000, (), np.float32)
 OBJECTS = 16  # sprites that are told apart at most, the nearest
 PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
+SWITCHES = {"depth_buffer_enabled": True, "sectors_info_enabled": True, "audio_buffer_enabled": False}
+SWITCHES |= {"automap_buffer_enabled": False, "window_visible": False, "render_hud": False, "render_weapon": False}
+SWITCHES |= {"render_crosshair": False, "render_messages": False, "render_screen_flashes": False}
 _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map units + offset), fitted on my_way_home
 
 
@@ -91,7 +94,7 @@ class Doom:
         channels: dict[str, spaces.Space] = {
             "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
             "depth": spaces.Box(0, MAX_DEPTH_M, config.depth_size, np.float32),
-            "pose": spaces.Box(-np.inf, np.inf, (7,), np.float32),
+            "pose": POSE,
         }
         if alive:
             channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
@@ -104,11 +107,11 @@ class Doom:
             channels={**channels, "reward": REWARD, "done": DONE},
             observes=(),
             dt_s=1 / TICS_PER_S,
-            units={"depth": "m", "pose": "m, quaternion wxyz of T_world_cam"},
+            units={"depth": "m", "pose": POSE_UNIT},
             action_names=self.buttons,
             keys={
-                code: [float(name == button) for name in self.buttons]
-                for code, button in KEYS.items()
+                key: [float(one == button) for one in self.buttons]
+                for key, button in KEYS.items()
                 if button in self.buttons
             },
             cameras={"rgb": Camera(CAMERA, config.size)},
@@ -231,9 +234,8 @@ class Doom:
         """Where a sprite covers any of a pixel: bool [h, w]."""
         values = np.zeros(256, bool)
         values[[label.value for label in self._present.labels]] = True
-        return _any_of(
-            _any_of(values[self._present.labels_buffer], self.config.depth_size[0], 0), self.config.depth_size[1], 1
-        )
+        rows, columns = self.config.depth_size
+        return _any_of(_any_of(values[self._present.labels_buffer], rows, 0), columns, 1)
 
     def _told_apart(self, x: float, y: float) -> dict[str, np.ndarray]:
         """`objects` and `instances` as seen from (x, y), in map units."""
@@ -244,10 +246,8 @@ class Doom:
             feet = np.array([label.object_position_x, label.object_position_y, label.object_position_z]) / UNITS_PER_M
             objects[row] = (label.object_id + 1, *(feet + (*self._origin, 0.0)))
             row_of[label.value] = row + 1
-        return {
-            "objects": objects,
-            "instances": row_of[_sampled(np.asarray(self._present.labels_buffer), self.config.depth_size)],
-        }
+        instances = row_of[_sampled(np.asarray(self._present.labels_buffer), self.config.depth_size)]
+        return {"objects": objects, "instances": instances}
 
 
 def map_origin(game: str, name: str) -> tuple[float, float]:
@@ -275,23 +275,12 @@ def _open_game(
     alive = bool(maps) or variable.HEALTH in game.get_available_game_variables()
     buttons = (*BUTTONS, *more)
     game.set_doom_config_path(os.path.join(tempfile.gettempdir(), f"terrella-vizdoom-{os.getpid()}.ini"))
-    game.set_window_visible(False)
     game.set_mode(vizdoom.Mode.PLAYER)
     game.set_screen_resolution(vizdoom.ScreenResolution.RES_512X384)
     game.set_screen_format(vizdoom.ScreenFormat.RGB24)
-    game.set_depth_buffer_enabled(True)
-    game.set_sectors_info_enabled(True)
     game.set_labels_buffer_enabled(alive)
-    game.set_audio_buffer_enabled(False)
-    game.set_automap_buffer_enabled(False)
-    for switch in (
-        game.set_render_hud,
-        game.set_render_weapon,
-        game.set_render_crosshair,
-        game.set_render_messages,
-        game.set_render_screen_flashes,
-    ):
-        switch(False)
+    for what, on in SWITCHES.items():
+        getattr(game, f"set_{what}")(on)
     game.set_available_buttons([getattr(button, name) for name in buttons])
     game.set_available_game_variables(
         [variable.POSITION_X, variable.POSITION_Y, variable.CAMERA_POSITION_Z, variable.ANGLE, variable.HEALTH]
@@ -315,12 +304,8 @@ def _check_scenario(config: DoomConfig, scenario: str, maps: tuple[str, ...]) ->
     if config.skill is not None and not 1 <= config.skill <= 5:
         raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); {config.skill} is not one.")
     games = sorted(path.stem for path in Path(vizdoom.__file__).parent.glob("freedoom*.wad"))
-    if (
-        not scenario
-        or Path(scenario).name != scenario
-        or not (Path(vizdoom.scenarios_path) / f"{scenario}.cfg").exists()
-    ):
-        known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
+    known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
+    if scenario not in known:
         raise TerrellaError(f"ViZDoom has no scenario '{scenario}'; it has {', '.join(known)}.")
     if maps or scenario in games:
         have = map_names(Path(vizdoom.__file__).parent / f"{scenario}.wad") if scenario in games else []
