@@ -16,7 +16,8 @@ import pytest
 from terrella.care import repair
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
-from terrella.data.format import RGB, STATE
+from terrella.data.channels import RGB, STATE
+from terrella.data.resample import resample
 from terrella.data.source import Sensor
 
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"
@@ -209,11 +210,11 @@ def test_streams_keep_their_true_times_and_come_to_the_rows_by_a_stated_policy(t
         drive(recorder, 40)
     assert check(tmp_path, 0, 40) == 40
     dataset = Dataset(tmp_path)
-    clouds, valid = dataset.aligned(0, LIDAR)  # previous: row i sees the reading of row i - 1, for it came 10 ms late
+    clouds, valid = _aligned(dataset, 0, LIDAR)  # previous: row i sees the reading of row i - 1, for it came 10 ms late
     assert valid.tolist() == [False, *[True] * 39] and [cloud[0, 0] for cloud in clouds[1:]] == list(range(39))
-    clouds, valid = dataset.aligned(0, LIDAR, "nearest")
+    clouds, valid = _aligned(dataset, 0, LIDAR, "nearest")
     assert valid.all() and [cloud[0, 0] for cloud in clouds] == list(range(40))
-    _, valid = dataset.aligned(0, SIDE, max_gap_s=0.1)
+    _, valid = _aligned(dataset, 0, SIDE, max_gap_s=0.1)
     assert valid.sum() == 20  # of four rows, those that are 30 ms and 80 ms after a picture
     assert STATE in dataset.sensors and dataset.episodes[0].start_ns
 
@@ -227,3 +228,8 @@ def test_a_stream_that_goes_back_in_time_is_refused(tmp_path):
             recorder.log("sonar", np.zeros(3))
         with pytest.raises(DatasetError, match=r"points of shape \[n, 3\]"):
             recorder.log(LIDAR, np.zeros((2, 4)))
+
+
+def _aligned(dataset, number, name, policy="previous", max_gap_s=None):
+    sensor = (dataset.streams | dataset.sensors)[name]
+    return resample(dataset.readings(number, name), sensor, dataset.time_s(number), policy, max_gap_s)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from terrella.core.errors import DatasetError
 from terrella.data import ClipCache, Dataset, Layout, Recorder
-from terrella.data.format import RGB
+from terrella.data.channels import RGB
 from terrella.data.source import Sensor
 from terrella.data.training.cache import finish, new_arrays
 from terrella.data.training.clips import Clips

@@ -16,6 +16,7 @@ from PIL import Image
 from terrella.core.errors import DatasetError
 from terrella.data import ClipCache, Dataset, Layout, Recorder, Sensor
 from terrella.data.format import PICTURE
+from terrella.data.resample import resample
 from terrella.exchange.convert import open_source, write_source
 
 ROWS, HEIGHT, WIDTH = 12, 6, 8
@@ -143,7 +144,7 @@ def test_texts_are_read_as_texts_and_block_nothing(plain, tmp_path):
     assert dataset.episode(0)["observation.note"].reshape(-1).tolist() == words
     note = dataset.readings(0, "observation.note")
     assert [str(value[0]) for value in note.values] == words and len(note.time_s) == ROWS
-    aligned, valid = dataset.aligned(0, "observation.note")
+    aligned, valid = _aligned(dataset, 0, "observation.note")
     assert valid.all() and [str(value[0]) for value in aligned] == words
     ClipCache.open(dataset, (8, 8))
     write_source(open_source(plain), tmp_path / "again")
@@ -161,7 +162,12 @@ def test_sensors_that_share_the_times_of_the_rows_are_read_after_a_conversion(tm
     dataset = Dataset(tmp_path / "recording")
     for name in (imu, "observation.state"):
         assert len(dataset.readings(0, name).time_s) == ROWS
-        values, valid = dataset.aligned(0, name, "linear")
+        values, valid = _aligned(dataset, 0, name, "linear")
         assert valid.all() and np.array_equal(values, dataset.episode(0, [name])[name])
     with pytest.raises(DatasetError, match="no sensor 'observation.none'"):
         dataset.readings(0, "observation.none")
+
+
+def _aligned(dataset, number, name, policy="previous", max_gap_s=None):
+    sensor = (dataset.streams | dataset.sensors)[name]
+    return resample(dataset.readings(number, name), sensor, dataset.time_s(number), policy, max_gap_s)

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.episodes import Episode
-from ..data.staged import SAMPLE_EVERY
+from ..data.staged import SAMPLE_EVERY, look
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel
 from .survey import LEFTOVER, RESTORE, Fault, Survey
@@ -103,9 +103,10 @@ def _decoded(
         yield Fault(film.file, episode.start + int(zeroed[0]), what, RESTORE)
         return
     shown.static.add(episode.number)
+    pictures = mp4.Frames(path, film.first, count, survey.fps)
     for row in _sampled(survey, count):
         try:
-            picture = mp4.frames_at(path, [film.first + row], survey.fps)[0]
+            picture = pictures[row]
         except DatasetError:
             what = f"the video's frame {film.first + row} cannot be decoded"
             yield Fault(film.file, episode.start + min(row, episode.length - 1), what, RESTORE)
@@ -118,9 +119,9 @@ def _decoded(
         if np.abs(picture.astype(np.int16) - first).max() >= 8:
             moving.add(episode.number)
         if not survey.ours or row % SAMPLE_EVERY == 0:
-            seen.append(stats.summarise_pictures(picture[None, ::4, ::4]))
-    look = stats.merge([{camera: each} for each in seen])[camera]
-    shown.looks[episode.number, camera] = np.concatenate([look["mean"].ravel(), look["std"].ravel()])
+            seen.append(look(picture))
+    merged = stats.merge([{camera: each} for each in seen])[camera]
+    shown.looks[episode.number, camera] = np.concatenate([merged["mean"].ravel(), merged["std"].ravel()])
     halves = [np.mean([each["mean"].ravel() for each in seen[at::2] or seen], 0) for at in (0, 1)]
     shown.noise[episode.number, camera] = 0.0 if survey.ours else float(np.abs(halves[0] - halves[1]).max())
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..core.errors import DatasetError
+from ..data.channels import ACTION, POSE_NAMES
 from ..data.dataset import Dataset
-from ..data.format import ACTION, ACTION_VALID, POSE_NAMES, names_of
+from ..data.format import ACTION_VALID, names_of
 from .alignment import FARTHEST, Run, Verdict, judge
 from .film_checks import Shown
 from .row_checks import Rows, Seen

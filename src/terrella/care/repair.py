@@ -16,7 +16,7 @@ from ..data import stats
 from ..data.features import decoded, sensors_of
 from ..data.format import ACTION_VALID, AUTOMATIC, INFO, TIME, Layout, schema, tidy
 from ..data.source import follows, is_action
-from ..data.staged import LOG, SAMPLE_EVERY, Staged
+from ..data.staged import LOG, Staged, look, sampled
 from ..data.storage import durable, mp4
 from ..data.storage.films import cut, whole_frames
 from ..data.storage.tables import read_json
@@ -228,7 +228,10 @@ class _Mender:
                 anew.append(camera)
             if not whole_frames(videos[camera], 0, piece.count, self.found.fps).all():
                 raise DatasetError(f"{film.file} has frames that cannot be decoded")
-            pictures[camera] = self._look(videos[camera], piece.count, camera)
+            shown = mp4.Frames(videos[camera], 0, piece.count, self.found.fps)
+            if shown[0].shape != tuple(self.features[camera]["shape"]):
+                raise DatasetError(f"the pictures of {film.file} have another size than the others of {camera}")
+            pictures[camera] = sampled(shown)
         listed = self.found.episodes.get(piece.number)
         streams, films, shift = self.stream_mender.cut(piece)
         start_ns = None if listed is None or listed.start_ns is None else listed.start_ns + round(shift * 1e9)
@@ -239,25 +242,14 @@ class _Mender:
         rows, counts = self._rows(piece, shift), self._counts(piece)
         return Draft(piece.count, rows, videos, pictures, tasks[0], streams, films, start_ns, tasks, counts), anew
 
-    def _look(self, video: Path, count: int, camera: str) -> stats.Summary:
-        """Statistics of an episode's pictures, from as many as our recorder looks at."""
-        parts = []
-        for row in range(0, count, SAMPLE_EVERY):
-            picture = mp4.frames_at(video, [row], self.found.fps)
-            if picture.shape[1:] != tuple(self.features[camera]["shape"]):
-                raise DatasetError(f"the pictures of {video.name} have another size than the others of {camera}")
-            parts.append({camera: stats.summarise_pictures(picture[:, ::4, ::4])})
-        return stats.merge(parts)[camera]
-
     def _image_statistics(self, piece: Piece) -> dict[str, stats.Summary]:
         """Of pictures that the rows hold themselves, from some of them."""
-        names = [name for name, feature in self.features.items() if feature["dtype"] == "image"]
-        parts = []
-        for columns in RowReader({name: self.features[name] for name in names}).columns(piece) if names else ():
-            for name in names:
-                some = decoded({"bytes": columns[name][0]}, tuple(self.features[name]["shape"]), name)
-                parts.append({name: stats.summarise_pictures(some[None, ::4, ::4])})
-        return stats.merge(parts)
+        shapes = {name: tuple(f["shape"]) for name, f in self.features.items() if f["dtype"] == "image"}
+        reader = RowReader({name: self.features[name] for name in shapes})
+        return stats.merge(
+            {name: look(decoded({"bytes": columns[name][0]}, shape, name)) for name, shape in shapes.items()}
+            for columns in (reader.columns(piece) if shapes else ())
+        )
 
     def _counts(self, piece: Piece) -> dict[str, int]:
         """Sensor -> rows up to the last that has it, where that is not the piece's last."""

@@ -11,7 +11,8 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.format import ACTION, ACTION_VALID, DONE, STATE, TASKS, schema, to_numpy
+from ..data.channels import ACTION, DONE, STATE
+from ..data.format import ACTION_VALID, TASKS, schema, to_numpy
 from ..data.storage.tables import open_parquet
 from .pieces import whole_pictures
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey

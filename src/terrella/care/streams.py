@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.errors import DatasetError
 from ..data.episodes import Episode
-from ..data.format import STREAM_PATH, TIME, where
+from ..data.format import TIME, stream_path
 from ..data.source import Sensor
 from ..data.storage import mp4
 from ..data.storage.films import cut, reel, whole_frames
@@ -71,8 +71,9 @@ def _stream(survey: Survey, sensor: Sensor, episode: Episode, has_film: bool) ->
     try:
         if packets.zeroed.any():
             raise DatasetError("zeros")
-        if len(time_s):
-            mp4.frames_at(survey.path(film), sorted({0, len(time_s) - 1}), rate)
+        shown = mp4.Frames(survey.path(film), 0, len(time_s), rate)
+        for at in {0, len(time_s) - 1} if len(time_s) else ():
+            shown[at]
     except DatasetError:
         yield Fault(film, episode.start, "frames of the film cannot be decoded", "let --repair keep those before them")
 
@@ -156,8 +157,7 @@ def possible(sensor: Sensor) -> bool:
 
 def _places(name: str, number: int) -> tuple[str, str]:
     """The table and the film of a stream in an episode."""
-    table, film = (STREAM_PATH.format(name=name, suffix=suffix, **where(number)) for suffix in ("parquet", "mp4"))
-    return table, film
+    return stream_path(name, number, "parquet"), stream_path(name, number, "mp4")
 
 
 def _readings(path: Path, sensor: Sensor) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.format import ACTION, STATS, contained, names_of
+from ..data.channels import ACTION
+from ..data.format import STATS, contained, names_of
 from ..data.storage.tables import read_json
 from .row_checks import Rows, Seen
 from .survey import Fault, Survey

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -15,9 +14,8 @@ from ..core.spec import Camera, kind_of
 from .channels import ACTION, DONE, REWARD, RGB, cameras_of, channel_of
 from .episodes import Episode, EpisodeTable, read_episodes
 from .features import as_depth, checked_features, is_deep, metres, sensors_of, shown, unit_of
-from .format import ACTION_VALID, DEPTH_BEYOND, INFO, STREAM_PATH, TIME, names_of, to_numpy, where
+from .format import ACTION_VALID, DEPTH_BEYOND, INFO, TIME, names_of, stream_path, to_numpy
 from .meta import read_about, read_info, read_sensors, read_tasks
-from .resample import resample
 from .source import Lazy, Readings, Sensor, Source, Take, follows, is_action
 from .storage import mp4
 from .storage.remote import Files, LocalFiles, open_files
@@ -121,11 +119,7 @@ class Dataset:
         for name in wanted:
             if self.feature(name) is None and name != "action_valid":
                 raise DatasetError(f"{self.root} has no '{name}'; it has {', '.join([*known, *extra])}.")
-        pictures = [name for name in wanted if self.feature(name) in self.cameras]
-        found = self._columns(episode, [name for name in wanted if name not in pictures])
-        for name in pictures:
-            found[name] = np.stack(list(self.frames(number, name)))
-        return {name: found[name] for name in wanted}
+        return self._columns(episode, wanted)
 
     def frames(
         self, number: int, camera: str | None = None, first: int = 0, count: int | None = None
@@ -140,11 +134,8 @@ class Dataset:
             raise DatasetError(
                 f"episode {number} of {self.root} has {episode.length} rows, not {first} to {first + count}."
             )
-        if camera in episode.videos:
-            path, begin = self._film(episode, camera)
-            return iter(mp4.frames(path, begin + first, count, self.fps)) if count else iter(())
-        sensor, pictures = self.sensors[camera], self._table(episode, [camera])[camera]
-        return (shown(pictures[i].as_py(), sensor) for i in range(first, first + count))
+        pictures = self._pictures(episode, camera)
+        return (pictures[i] for i in range(first, first + count))
 
     def rgb_at(self, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
         """Full-resolution pictures uint8 [n, H, W, 3] of any rows of the dataset, in the order asked."""
@@ -156,12 +147,8 @@ class Dataset:
         for number in np.unique(numbers):
             episode, inside = self.episodes[int(number)], np.flatnonzero(numbers == number)
             rows, back = np.unique(wanted[inside] - episode.start, return_inverse=True)
-            if camera in episode.videos:
-                path, first = self._film(episode, camera)
-                result[inside] = mp4.frames_at(path, (rows + first).tolist(), self.fps)[back]
-            else:
-                table, sensor = self._table(episode, [camera])[camera], self.sensors[camera]
-                result[inside] = np.stack([shown(table[int(row)].as_py(), sensor) for row in rows])[back]
+            pictures = self._pictures(episode, camera)
+            result[inside] = np.stack([pictures[int(row)] for row in rows])[back]
         return result
 
     def time_s(self, number: int) -> np.ndarray:
@@ -182,22 +169,9 @@ class Dataset:
                 return stream
         return self._of_rows(self._episode(number), name, self.time_s(number))  # it has the rows' times
 
-    def aligned(
-        self,
-        number: int,
-        name: str,
-        policy: Literal["previous", "nearest", "linear"] = "previous",
-        max_gap_s: float | None = None,
-    ) -> tuple[Sequence | np.ndarray, np.ndarray]:
-        """A sensor's readings brought to the rows of an episode: (values of T rows, valid bool [T]), as `resample` says."""
-        readings = self.readings(number, name)
-        sensor = self.streams[name] if name in self.streams else self.sensors[name]
-        return resample(readings, sensor, self.time_s(number), policy, max_gap_s)
-
     def source(self) -> Source:
         """This recording as every format is read: sensors at the rows' times, streams at their own."""
         sensors = {**self.sensors, **self.streams}
-
         rate = None if self.streams or TIME in self.features else self.fps
         ours = ("version", "sensors", "streams", "channels", "terminal", "pose", "depth_unit_m", "depth_beyond")
         facts = {key: value for key, value in self.about.items() if key not in ours}
@@ -220,17 +194,15 @@ class Dataset:
         sensor, there = self.sensors[name], self._there(episode, name)
         if not there.any():
             return Readings(np.zeros(0), [])
-        if sensor.kind == "image":
-            values = self._pictures(episode, name)
-        elif sensor.kind == "depth":
-            stored = self._pictures(episode, name)
-            values = Lazy(episode.length, lambda i: metres(stored[i].reshape(sensor.shape), sensor))
-        else:
-            values = self._stored(episode, [name])[name]
-        if not there.all():
-            rows = np.flatnonzero(there)
-            values = values[rows] if isinstance(values, np.ndarray) else _chosen(values, rows)
-        return Readings(at[there], values)
+        if sensor.kind == "vector":
+            return Readings(at[there], self._stored(episode, [name])[name][there])
+        rows, stored = np.flatnonzero(there), self._pictures(episode, name)
+
+        def look(i: int) -> np.ndarray:
+            value = stored[int(rows[i])]
+            return metres(value.reshape(sensor.shape), sensor) if sensor.kind == "depth" else value
+
+        return Readings(at[there], Lazy(len(rows), look))
 
     def _there(self, episode: Episode, name: str) -> np.ndarray:
         """bool [T]: the rows in which a sensor was read; the rest is padding."""
@@ -254,15 +226,16 @@ class Dataset:
         """An image or depth sensor's rows as they are stored, each decoded when it is looked at."""
         sensor = self.sensors[name]
         if name in episode.videos:
-            path, first = self._film(episode, name)
-            return mp4.Frames(path, first, episode.length, self.fps, deep=sensor.kind == "depth")
+            film = episode.videos[name]
+            path, deep = self.files.local(film.file), sensor.kind == "depth"
+            return mp4.Frames(path, film.first, episode.length, self.fps, deep)
         stored = RowsOf(self.files.local(episode.data), name, episode.start, episode.stop, self.features)
         if self.features[name]["dtype"] != "image":
             return stored
         return Lazy(episode.length, lambda i: shown(stored[i], sensor))
 
     def _stream(self, number: int, sensor: Sensor) -> Readings:
-        name = STREAM_PATH.format(name=sensor.name, suffix="parquet", **where(number))
+        name = stream_path(sensor.name, number, "parquet")
         if not self.files.exists(name):
             return Readings(np.zeros(0), np.zeros((0, *sensor.shape), sensor.dtype))
         path = self.files.local(name)
@@ -273,7 +246,7 @@ class Dataset:
         if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
             raise DatasetError(f"{self.root / name}: its times do not ascend; see `terrella data doctor {self.root}`.")
         if sensor.kind == "image":
-            film = self.files.local(STREAM_PATH.format(name=sensor.name, suffix="mp4", **where(number)))
+            film = self.files.local(stream_path(sensor.name, number, "mp4"))
             return Readings(time_s, mp4.Frames(film, 0, len(time_s), sensor.rate_hz or self.fps))
         stored = ValuesOf(path, "value", len(time_s))
         shape = (-1, sensor.shape[1]) if sensor.kind == "points" else sensor.shape
@@ -331,10 +304,6 @@ class Dataset:
                 except DatasetError:
                     pass  # whoever reads it gets an error
 
-    def _film(self, episode: Episode, camera: str) -> tuple[Path, int]:
-        film = episode.videos[camera]
-        return self.files.local(film.file), film.first
-
     def _table(self, episode: Episode, columns: list[str]):
         return read_rows(self.files.local(episode.data), columns, episode.start, episode.stop, self.features)
 
@@ -352,7 +321,7 @@ class Dataset:
 
     def _columns(self, episode: Episode, names: list[str]) -> dict[str, np.ndarray]:
         stored = {name: self.feature(name) for name in names}
-        columns = {key: key for key in stored.values() if key is not None}
+        columns = dict.fromkeys(key for key in stored.values() if key is not None)
         pictured = [key for key in columns if self.features[key]["dtype"] in ("image", "video")]
         there = self._stored(episode, [key for key in columns if key not in pictured])
         there |= {key: np.stack(list(self._pictures(episode, key))) for key in pictured}
@@ -372,7 +341,3 @@ def _as_promised(name: str, array: np.ndarray, sensor: Sensor | None) -> np.ndar
     if name in ("reward", "done", "action_valid"):
         return array.reshape(-1).astype(np.float32 if name == "reward" else bool)
     return array.astype(np.float32) if name in ("pose", "action") else array
-
-
-def _chosen(values: Sequence, rows: np.ndarray) -> Lazy:
-    return Lazy(len(rows), lambda i: values[int(rows[i])])

@@ -23,7 +23,6 @@ FILES_PER_CHUNK = 1000
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-STREAM_PATH = "streams/{name}/chunk-{chunk_index:03d}/file-{file_index:03d}.{suffix}"
 INFO, STATS, TASKS, WORLD = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/terrella.json"
 
 ACTION_VALID = "action_valid"
@@ -130,17 +129,10 @@ class Layout:
         if self.pictures == "png":
             return {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
         height, width = even(sensor)
-        info = {
-            "video.height": height,
-            "video.width": width,
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": self.fps,
-            "video.channels": 3,
-            "has_audio": False,
-        }
-        return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
+        info = {"height": height, "width": width, "codec": "h264", "pix_fmt": "yuv420p", "is_depth_map": False}
+        info = {f"video.{key}": value for key, value in {**info, "fps": self.fps, "channels": 3}.items()}
+        names = ["height", "width", "channels"]
+        return {"dtype": "video", "shape": shape, "names": names, "info": {**info, "has_audio": False}}
 
 
 def even(sensor: Sensor) -> tuple[int, int]:
@@ -163,16 +155,9 @@ def names_of(feature: Mapping) -> tuple[str, ...]:
 
 def sensor_json(sensor: Sensor) -> dict:
     """A Sensor as meta/terrella.json keeps it."""
-    return {
-        "kind": sensor.kind,
-        "shape": list(sensor.shape),
-        "dtype": sensor.dtype,
-        "names": list(sensor.names),
-        "units": dict(sensor.units),
-        "frame": sensor.frame,
-        "rate_hz": sensor.rate_hz,
-        "facts": dict(sensor.facts),
-    }
+    plain = {"shape": list(sensor.shape), "names": list(sensor.names)}
+    plain |= {"units": dict(sensor.units), "facts": dict(sensor.facts)}
+    return {key: plain.get(key, value) for key, value in vars(sensor).items() if key != "name"}
 
 
 def sensor_from_json(name: str, stated: Mapping) -> Sensor:
@@ -201,6 +186,11 @@ def tidy(fps: float) -> float:
 def where(episode: int) -> dict[str, int]:
     """Chunk and file number of an episode's own files."""
     return {"chunk_index": episode // FILES_PER_CHUNK, "file_index": episode % FILES_PER_CHUNK}
+
+
+def stream_path(name: str, episode: int, suffix: str) -> str:
+    """Where a stream's table ("parquet") or film ("mp4") of an episode lies."""
+    return f"streams/{name}/chunk-{{chunk_index:03d}}/file-{{file_index:03d}}.{suffix}".format(**where(episode))
 
 
 _FIELD = re.compile(r"\{(\w+)(?::0?[0-9])?d?\}")

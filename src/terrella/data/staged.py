@@ -146,15 +146,21 @@ class Staged:
 
     def _sampled(self, videos: Mapping[str, Path], length: int) -> dict[str, stats.Summary]:
         """Statistics of the cameras, from every SAMPLE_EVERY-th row."""
-        parts: list[dict[str, stats.Summary]] = []
-        for name, video in videos.items():
-            for row in range(0, length, SAMPLE_EVERY):
-                parts.append({name: stats.summarise_pictures(mp4.frames_at(video, [row], self.fps)[:, ::4, ::4])})
+        found = {name: sampled(mp4.Frames(video, 0, length, self.fps)) for name, video in videos.items()}
         images = [name for name, sensor in self.rows.items() if sensor.kind == "image" and name not in videos]
-        if images:
-            for row in islice(self._rows(encode=False), 0, length, SAMPLE_EVERY):
-                parts += [{name: stats.summarise_pictures(row[name][None, ::4, ::4])} for name in images]
-        return stats.merge(parts)
+        rows = islice(self._rows(encode=False), 0, length, SAMPLE_EVERY) if images else ()
+        return found | stats.merge({name: look(row[name]) for name in images} for row in rows)
+
+
+def look(picture: np.ndarray) -> stats.Summary:
+    """Statistics of a picture [H, W, …], from a part of its pixels."""
+    return stats.summarise_pictures(picture[None, ::4, ::4])
+
+
+def sampled(pictures: Sequence[np.ndarray]) -> stats.Summary:
+    """Statistics of an episode's pictures, from every SAMPLE_EVERY-th."""
+    parts = [{"": look(pictures[row])} for row in range(0, len(pictures), SAMPLE_EVERY)]
+    return stats.merge(parts)[""]
 
 
 def _form(sensor: Sensor) -> tuple:
@@ -163,14 +169,13 @@ def _form(sensor: Sensor) -> tuple:
 
 def _good(film: Path, target: Path, most: int, fps: float) -> int:
     """How many of the first frames of a growing film are whole and can be decoded."""
-    count = min(most, mp4.count_whole(film))
-    if not count:
+    if not most:
         return 0
     try:
-        count = mp4.finish(film, target, count)
+        count = mp4.finish(film, target, most)
         good = whole_frames(target, 0, count, fps)
         return int(count if good.all() else good.argmin())
-    except DatasetError:
+    except (DatasetError, FileNotFoundError):
         return 0
     finally:
         target.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,7 +28,6 @@ from .format import (
     INFO,
     POSE_CONVENTION,
     STATS,
-    STREAM_PATH,
     TASKS,
     VERSION,
     VIDEO_PATH,
@@ -36,6 +36,7 @@ from .format import (
     even,
     schema,
     sensor_json,
+    stream_path,
     to_arrow,
     where,
 )
@@ -45,9 +46,7 @@ from .storage import durable
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
 _CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error, not another number
-EPISODES_PER_TABLE = (
-    128  # so many one-row tables of meta/episodes are made one, so that opening a long dataset stays quick
-)
+EPISODES_PER_TABLE = 128  # so many one-row tables of meta/episodes are made one: a long dataset opens quickly
 
 
 @dataclass(frozen=True)
@@ -119,16 +118,17 @@ class Writer:
         number = self.episodes
         tasks = list(dict.fromkeys([*self._tasks, *(draft.tasks or [draft.task])]))
         rows, of_episode = self._stage_rows(draft, tasks)
-        staged = {self._data(number): rows}
+        staged = {DATA_PATH.format(**where(number)): rows}
         of_episode |= {name: {**seen, "count": np.array([draft.length])} for name, seen in draft.pictures.items()}
         for name, file in draft.videos.items():
             staged[VIDEO_PATH.format(video_key=name, **where(number))] = file
         for name, readings in draft.streams.items():
-            staged[_stream(name, number, "parquet")] = self._stage_stream(self.layout.streams[name], readings)
+            staged[stream_path(name, number, "parquet")] = self._stage_stream(self.layout.streams[name], readings)
             if name in draft.films:
-                staged[_stream(name, number, "mp4")] = draft.films[name]
-        table = self._episode_table(number, draft, of_episode)
-        staged[EPISODES_PATH.format(**where(number))] = self._write(table, "episode.parquet")
+                staged[stream_path(name, number, "mp4")] = draft.films[name]
+        staged[EPISODES_PATH.format(**where(number))] = table = self.staging / "episode.parquet"
+        pq.write_table(self._episode_table(number, draft, of_episode), table, **_CHECKED)
+        durable.sync_file(table)
         for path, file in staged.items():
             durable.move_into_place(file, self.root / path)
         merged = stats.merge([self._stats, of_episode])
@@ -144,22 +144,25 @@ class Writer:
         Looks at the newest episodes, or at all from number `first` on.
         """
         newest = max(0, self.episodes // EPISODES_PER_TABLE - 1) * EPISODES_PER_TABLE
-        try:
-            self._merge_finished(newest if first is None else first)
-        except (OSError, pa.ArrowException, ValueError, KeyError):
-            pass  # reading many small tables is slower, and as right
+        with suppress(
+            OSError, pa.ArrowException, ValueError, KeyError
+        ):  # reading many small tables is slower, and as right
+            for begin in range(
+                newest if first is None else first, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE
+            ):
+                files = [self.root / EPISODES_PATH.format(**where(begin + i)) for i in range(EPISODES_PER_TABLE)]
+                if files[-1].exists():  # it is the last to be removed
+                    _merge_tables([file for file in files if file.exists()], where(begin))
 
     def remove_unfinished(self) -> None:
         """Files of an episode that were moved into place but never committed."""
         number = self.episodes
-        for path in [self._data(number), EPISODES_PATH.format(**where(number))]:
-            (self.root / path).unlink(missing_ok=True)
-        for name, feature in self.features.items():
-            if feature["dtype"] == "video":
-                (self.root / VIDEO_PATH.format(video_key=name, **where(number))).unlink(missing_ok=True)
-        for name in self.layout.streams:
-            for suffix in ("parquet", "mp4"):
-                (self.root / _stream(name, number, suffix)).unlink(missing_ok=True)
+        videos = [name for name, feature in self.features.items() if feature["dtype"] == "video"]
+        files = [path.format(**where(number)) for path in (DATA_PATH, EPISODES_PATH)]
+        files += [VIDEO_PATH.format(video_key=name, **where(number)) for name in videos]
+        files += [stream_path(name, number, suffix) for name in self.layout.streams for suffix in ("parquet", "mp4")]
+        for file in files:
+            (self.root / file).unlink(missing_ok=True)
 
     # -- opening ------------------------------------------------------------------------------------------------
 
@@ -228,9 +231,6 @@ class Writer:
 
     # -- files of an episode ------------------------------------------------------------------------------------
 
-    def _data(self, number: int) -> str:
-        return DATA_PATH.format(**where(number))
-
     def _stage_rows(self, draft: Draft, tasks: list[str]) -> tuple[Path, dict[str, stats.Summary]]:
         file, done, parts = self.staging / "data.parquet", 0, []
         index = {task: number for number, task in enumerate(tasks)}
@@ -239,9 +239,8 @@ class Writer:
         with pq.ParquetWriter(file, self.schema, **options) as table:
             for group in draft.rows:
                 columns = dict(group)
-                count = len(
-                    next(iter(columns.values()), range(min(ROWS_PER_GROUP, draft.length - done)))
-                )  # videos alone
+                left = range(min(ROWS_PER_GROUP, draft.length - done))
+                count = len(next(iter(columns.values()), left))  # of videos alone there are no columns
                 frame = np.arange(done, done + count, dtype=np.int64)
                 done += count
                 if done == draft.length and ACTION_VALID in columns:
@@ -276,12 +275,6 @@ class Writer:
         durable.sync_file(file)
         return file
 
-    def _write(self, table: pa.Table, name: str) -> Path:
-        file = self.staging / name
-        pq.write_table(table, file, **_CHECKED)
-        durable.sync_file(file)
-        return file
-
     def _episode_table(self, number: int, draft: Draft, of_episode: dict[str, stats.Summary]) -> pa.Table:
         at, length, tasks = where(number), draft.length, list(dict.fromkeys(draft.tasks or [draft.task]))
         row: dict[str, object] = {"episode_index": number, "tasks": tasks, "length": length}
@@ -296,32 +289,6 @@ class Writer:
         row |= {"counts": json.dumps(dict(draft.counts))}
         table = pa.table({name: [value] for name, value in row.items()})
         return table.append_column("start_ns", pa.array([draft.start_ns], pa.int64()))
-
-    # -- tables of episodes -------------------------------------------------------------------------------------
-
-    def _merge_tables(self, first: int) -> None:
-        """Makes one table of the one-row tables of EPISODES_PER_TABLE episodes; the first file's name is kept."""
-        files = [self.root / EPISODES_PATH.format(**where(first + i)) for i in range(EPISODES_PER_TABLE)]
-        table = pa.concat_tables([pq.ParquetFile(file).read() for file in files], promote_options="default")
-        for key, value in where(first).items():
-            at = table.schema.get_field_index(f"meta/episodes/{key}")
-            column = pa.array(np.full(len(table), value, np.int64))
-            table = table.set_column(at, f"meta/episodes/{key}", column)
-        durable.write_whole(files[0], lambda path: pq.write_table(table, path, **_CHECKED))
-        for file in files[1:]:
-            file.unlink()
-
-    def _merge_finished(self, start: int) -> None:
-        """Merges each full block of one-row tables; of a merge that was killed, the one-row tables are removed."""
-        for first in range(start, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE):
-            last = self.root / EPISODES_PATH.format(**where(first + EPISODES_PER_TABLE - 1))
-            if not last.exists():
-                continue
-            if pq.read_metadata(self.root / EPISODES_PATH.format(**where(first))).num_rows == 1:
-                self._merge_tables(first)
-            else:
-                for number in range(first + 1, first + EPISODES_PER_TABLE):
-                    (self.root / EPISODES_PATH.format(**where(number))).unlink(missing_ok=True)
 
     def _info(self, episodes: int, rows: int, tasks: int) -> dict:
         return {
@@ -339,6 +306,18 @@ class Writer:
             "video_path": VIDEO_PATH if any(f["dtype"] == "video" for f in self.features.values()) else None,
             "features": self.features,
         }
+
+
+def _merge_tables(files: Sequence[Path], at: Mapping[str, int]) -> None:
+    """Makes one table of several of episodes, which lies where the first did; of a killed merge it has some rows already."""
+    table = pa.concat_tables([pq.ParquetFile(file).read() for file in files], promote_options="default")
+    table = table.take(np.unique(table["episode_index"].to_numpy(), return_index=True)[1])
+    for key, value in at.items():
+        place = table.schema.get_field_index(f"meta/episodes/{key}")
+        table = table.set_column(place, f"meta/episodes/{key}", pa.array(np.full(len(table), value, np.int64)))
+    durable.write_whole(files[0], lambda path: pq.write_table(table, path, **_CHECKED))
+    for file in files[1:]:
+        file.unlink()
 
 
 def stream_schema(sensor: Sensor) -> pa.Schema:
@@ -403,10 +382,6 @@ def _columns(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return found
 
 
-def _stream(name: str, number: int, suffix: str) -> str:
-    return STREAM_PATH.format(name=name, suffix=suffix, **where(number))
-
-
 def _alike(was: Mapping | None, now: Mapping | None) -> bool:
     """Whether a sensor is what it was, units and frame that were not stated then apart."""
     if was is None or now is None:
@@ -420,29 +395,8 @@ def _json(sensors: Mapping[str, Sensor]) -> dict:
 
 def tasks_table(tasks: list[str]) -> pa.Table:
     """tasks.parquet as pandas reads it: indexed by the task's sentence."""
-    columns = [
-        {
-            "name": "task_index",
-            "field_name": "task_index",
-            "pandas_type": "int64",
-            "numpy_type": "int64",
-            "metadata": None,
-        },
-        {
-            "name": None,
-            "field_name": "__index_level_0__",
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": None,
-        },
-    ]
-    pandas = {
-        "index_columns": ["__index_level_0__"],
-        "column_indexes": [],
-        "columns": columns,
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table(
-        {"task_index": pa.array(range(len(tasks)), pa.int64()), "__index_level_0__": pa.array(tasks, pa.string())}
-    )
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    index, keys = "__index_level_0__", ("name", "field_name", "pandas_type", "numpy_type", "metadata")
+    columns = [("task_index", "task_index", "int64", "int64", None), (None, index, "unicode", "object", None)]
+    stated = {"index_columns": [index], "column_indexes": [], "columns": [dict(zip(keys, one)) for one in columns]}
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), index: pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({"pandas": json.dumps({**stated, "pandas_version": "2.0.0"})})

@@ -184,23 +184,8 @@ def bound(stream) -> None:
     stream.codec_context.options = {"max_pixels": str(_LARGEST)}
 
 
-def frames_at(path: Path, indices: Sequence[int], fps: float) -> np.ndarray:
-    """uint8 [n, H, W, 3] of ascending, distinct frame numbers; seeks where that saves decoding."""
-    found: list[np.ndarray] = []
-    start = 0
-    while start < len(indices):
-        stop = start + 1
-        while stop < len(indices) and indices[stop] - indices[stop - 1] <= KEYFRAME_EVERY:
-            stop += 1
-        wanted = set(indices[start:stop])
-        run = frames(path, indices[start], indices[stop - 1] - indices[start] + 1, fps)
-        found += [frame for at, frame in enumerate(run, indices[start]) if at in wanted]
-        start = stop
-    return np.stack(found)
-
-
 class Frames(Sequence):
-    """Frames `first` .. `first + count - 1` of a file, decoded when looked at; going on in order does not seek."""
+    """Frames `first` .. `first + count - 1` of a file, decoded when looked at; seeks where that saves decoding."""
 
     def __init__(self, path: Path, first: int, count: int, fps: float, deep: bool = False):
         self._path, self._first, self._count, self._fps, self._deep = path, first, count, fps, deep
@@ -216,7 +201,7 @@ class Frames(Sequence):
             raise IndexError(index)
         index = int(index) % self._count
         ahead = index - self._next
-        if self._next < 0 or not 0 <= ahead <= 2 * KEYFRAME_EVERY:
+        if self._next < 0 or not 0 <= ahead <= KEYFRAME_EVERY:
             self._run = frames(self._path, self._first + index, self._count - index, self._fps, self._deep)
             ahead = 0
         self._next = -1  # until it is found
