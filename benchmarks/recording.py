@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from terrella.data import Dataset, Layout, Recorder
-from terrella.data.storage import mp4
+from terrella.data.storage.films import reel
 
 
 def camera(root: Path, seconds: float, facts: dict) -> None:
@@ -69,7 +69,7 @@ def pictures(height: int, width: int) -> list[np.ndarray]:
 def told(recorder: Recorder, given: int) -> dict:
     """What the folder holds against what was given, counted in the files themselves."""
     dataset = Dataset(recorder.root)
-    films = sum(mp4.count_whole(dataset.files.local(e.videos[dataset.rgb_key].file)) for e in dataset.episodes)
+    films = sum(reel(dataset.files.local(e.videos[dataset.rgb_key].file), dataset.fps).count for e in dataset.episodes)
     pressure = recorder.pressure
     return {
         "given": given,

@@ -14,7 +14,7 @@ from PIL import Image
 
 from ..core.errors import DatasetError
 from ..data.format import AUTOMATIC, PICTURE, TIME, Layout, contained, sensor_from_json
-from ..data.storage import boxes
+from ..data.storage import mp4
 from ..data.storage.tables import open_parquet, read_whole
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, AttributeError, DatasetError)
@@ -106,9 +106,7 @@ def film_size(root: Path, films: list[str], video_path: str, camera: str) -> tup
 
 
 def _size(path: Path) -> tuple[int, int]:
-    boxes.check(path)
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0]
+    with mp4.opened(path) as (_, stream):
         return stream.height, stream.width
 
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data.format import INFO, contained, tidy
-from ..data.storage import boxes
+from ..data.storage import mp4
 from ..data.storage.tables import read_whole
 
 _BROKEN = (OSError, pa.ArrowException, av.FFmpegError, ValueError, KeyError, TypeError, IndexError, DatasetError)
@@ -62,9 +62,7 @@ def _rate_of_films(root: Path, films: Sequence[str]) -> float | None:
     rates = []
     for name in _some(films):
         try:
-            boxes.check(contained(root, name))
-            with av.open(str(contained(root, name))) as container:
-                stream = container.streams.video[0]
+            with mp4.opened(contained(root, name)) as (container, stream):
                 packets = (packet.pts for packet, _ in zip(container.demux(stream), range(_PACKETS)))
                 ticks = np.sort([pts for pts in packets if pts is not None])
                 rates.append(_even(ticks * float(stream.time_base or 0)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -13,18 +12,19 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from ..data.episodes import Episode, EpisodeTable
+from ..data.episodes import MOST, OPTIONAL, Episode, EpisodeTable, read_part
 from ..data.features import checked_features
-from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, inside, sensor_from_json
+from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, sensor_from_json
+from ..data.meta import sentences
 from ..data.source import Sensor
-from ..data.storage.tables import open_parquet, read_json, read_whole
+from ..data.storage.remote import LocalFiles
+from ..data.storage.tables import open_parquet, read_json
 from .features import BROKEN, features_without_info
 from .rates import true_rate
 
 RESTORE = "restore the file from a copy, or let --repair make a dataset of what is whole"
 LEFTOVER = "it was being committed when the recorder was killed: record into the folder again, or delete the file"
 FROM_ROWS = "let --repair make it anew from the rows"
-_MOST = 20_000_000  # episodes; more is damage
 _LATEST_S = 1e12  # a video that begins later is damage
 
 Look = tuple[np.ndarray, np.ndarray]  # mean and deviation of each colour of an episode's pictures, float64 [3], in 0..1
@@ -108,8 +108,8 @@ def survey(root: str | Path) -> Survey:
     if not root.is_dir():
         raise DatasetError(f"there is no dataset at {root}; name the folder that holds meta/, data/ and videos/.")
     faults: list[Fault] = []
-    info = _json(root, INFO, faults, FROM_ROWS)
-    about = _json(root, WORLD, faults, RESTORE) if (root / WORLD).exists() else {}
+    info = read_object(root, INFO, faults, FROM_ROWS)
+    about = read_object(root, WORLD, faults, RESTORE) if (root / WORLD).exists() else {}
     _only_v3(root, info)
     data_path, video_path = _templates(info, faults)
     data, films = listed(root, _top(data_path), ".parquet"), listed(root, _top(video_path), ".mp4")
@@ -144,14 +144,8 @@ def cameras_of(features: Mapping[str, dict]) -> tuple[str, ...]:
 
 
 def listed(root: Path, folder: str, suffix: str) -> list[str]:
-    """Names of the files anywhere under a folder of the dataset, sorted; hidden ones and linked folders are passed over."""
-    found = []
-    for place, folders, files in os.walk(root / inside(folder) if folder else root):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in files:
-            if name.endswith(suffix) and not name.startswith("."):
-                found.append(Path(place, name).relative_to(root).as_posix())
-    return sorted(found)
+    """Names of the files anywhere under a folder of the dataset, sorted."""
+    return LocalFiles(root).list(folder, suffix)
 
 
 def _mapping(value: object) -> dict:
@@ -161,7 +155,8 @@ def _mapping(value: object) -> dict:
 # -- JSON ------------------------------------------------------------------------------------------------------------
 
 
-def _json(root: Path, name: str, faults: list[Fault], mend: str) -> dict:
+def read_object(root: Path, name: str, faults: list[Fault], mend: str) -> dict:
+    """A JSON object of the dataset; {} and a fault more where it cannot be read."""
     try:
         found = read_json(contained(root, name))
         if not isinstance(found, dict):
@@ -266,21 +261,13 @@ def _episode_tables(
     root: Path, cameras: tuple[str, ...], empty: bool, faults: list[Fault]
 ) -> tuple[list[tuple[str, pa.Table]], bool]:
     """(file, table) of those that can be read, and whether all can."""
-    columns = ["episode_index", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"]
-    for name in cameras:
-        columns += [f"videos/{name}/{key}" for key in ("chunk_index", "file_index", "from_timestamp")]
-    more = ["tasks", "start_ns", "counts", "length"]
-    more += [f"stats/{name}/{key}" for name in cameras for key in ("mean", "std")]
+    more = [*OPTIONAL, "length", *(f"stats/{name}/{key}" for name in cameras for key in ("mean", "std"))]
     files, found = listed(root, "meta/episodes", ".parquet"), []
     if not files and not empty:
         faults.append(Fault("meta/episodes", None, "there is no table of episodes", FROM_ROWS))
     for file in files:
         try:
-            table = read_whole(contained(root, file), [*columns, *more], _MOST)
-            missing = sorted(set(columns) - set(table.column_names))
-            if missing:
-                raise ValueError(f"it has no column {missing[0]}")
-            found.append((file, table))
+            found.append((file, read_part(contained(root, file), cameras, MOST, more)))
         except BROKEN as error:
             faults.append(Fault(file, None, _what(error, "table of episodes"), FROM_ROWS))
     return found, len(found) == len(files) and (bool(files) or empty)
@@ -295,8 +282,6 @@ def _episodes(
     video_path: str,
     faults: list[Fault],
 ) -> dict[int, Episode]:
-    if "tasks" not in table.column_names:
-        table = table.append_column("tasks", pa.nulls(len(table), pa.list_(pa.string())))
     found: dict[int, Episode] = {}
     listed = EpisodeTable(table, data_path, video_path, cameras, fps)
     numbers = table["episode_index"].to_pylist()
@@ -327,18 +312,13 @@ def _looks(table: pa.Table, cameras: tuple[str, ...]) -> dict[tuple[int, str], L
 def _tasks(root: Path, episodes: Mapping[int, Episode], count: object, faults: list[Fault]) -> dict[int, str]:
     """`count`: of the episodes that are safe; the tasks of what a killed commit left beyond them are not missed."""
     try:
-        table = read_whole(contained(root, TASKS))
-        texts = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)
-        if texts is None:
-            raise ValueError("it has no sentences")
-        found = {int(at): str(text) for at, text in zip(table["task_index"].to_pylist(), table[texts].to_pylist())}
+        found = sentences(contained(root, TASKS))
         safe = [episode for number, episode in episodes.items() if not isinstance(count, int) or number < count]
         lost = sorted({task for episode in safe for task in episode.tasks} - set(found.values()))
         if lost:
             faults.append(Fault(TASKS, None, f"it lacks the task '{lost[0][:100]}' of meta/episodes", RESTORE))
         return found
     except BROKEN as error:
-        faults.append(
-            Fault(TASKS, None, _what(error, "table of tasks"), "let --repair make it anew from meta/episodes")
-        )
+        mend = "let --repair make it anew from meta/episodes"
+        faults.append(Fault(TASKS, None, _what(error, "table of tasks"), mend))
     return {}

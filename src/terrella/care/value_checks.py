@@ -7,13 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..core.errors import DatasetError
 from ..data import stats
 from ..data.channels import ACTION
-from ..data.format import STATS, contained, names_of
-from ..data.storage.tables import read_json
+from ..data.format import STATS, names_of
 from .row_checks import Rows, Seen
-from .survey import Fault, Survey
+from .survey import Fault, Survey, read_object
 
 _STILL_ROWS, _STILL_PART = 16, 32  # rows of a whole episode, or of half of one, in which a state may not stand still
 _ACTIONS = 3  # changes of the action meanwhile
@@ -21,22 +19,12 @@ _ACTIONS = 3  # changes of the action meanwhile
 
 def statistics(survey: Survey, found: Rows) -> Iterator[Fault]:
     """meta/stats.json against the rows."""
-    again = "let --repair compute it from the rows"
-    try:
-        said = read_json(contained(survey.root, STATS))
-        if not isinstance(said, dict):
-            raise ValueError("it is no JSON object")
-    except FileNotFoundError:
-        if survey.info.get("total_episodes") == 0 and not survey.data:
-            return
-        yield Fault(STATS, None, "the file is missing, LeRobot cannot normalise without it", again)
+    again, faults = "let --repair compute it from the rows", []
+    if survey.info.get("total_episodes") == 0 and not survey.data:
         return
-    except (OSError, ValueError, DatasetError) as error:
-        yield Fault(STATS, None, f"the file cannot be read ({error})", again)
-        return
-    if found.broken:
-        return
-    for name, summary in found.summary.items():
+    said = read_object(survey.root, STATS, faults, again)
+    yield from faults
+    for name, summary in found.summary.items() if not (faults or found.broken) else ():
         if name not in said or not np.isfinite(summary["max"]).all():
             continue
         off = _differs(said[name], summary)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,8 @@ from .storage.tables import read_whole
 if TYPE_CHECKING:
     from .dataset import Dataset
 
-_MOST = 20_000_000  # episodes; more is damage
+MOST = 20_000_000  # episodes; more is damage
+OPTIONAL = ("tasks", "start_ns", "counts")  # columns of meta/episodes that a stranger's recording may lack
 
 
 @dataclass(frozen=True)
@@ -88,12 +90,10 @@ class EpisodeTable(Sequence[Episode]):
         for name in self._cameras:
             file = fill(self._video_path, video_key=name, **self._place(f"videos/{name}", index))
             videos[name] = Film(file, round(float(self._from[name][index]) * self._fps))
-        tasks = self._table["tasks"][index].as_py() or []
-        tasks = tuple(map(str, [tasks] if isinstance(tasks, str) else tasks))
-        start_ns, counts = (
-            self._table[name][index].as_py() if name in self._table.column_names else None
-            for name in ("start_ns", "counts")
+        tasks, start_ns, counts = (
+            self._table[name][index].as_py() if name in self._table.column_names else None for name in OPTIONAL
         )
+        tasks = tuple(map(str, [tasks] if isinstance(tasks, str) else tasks or []))
         data = fill(self._data_path, **self._place("data", index))
         start, stop = int(self.starts[index]), int(self.stops[index])
         return Episode(index, start, stop, data, videos, tasks, start_ns or None, counts_of(counts))
@@ -112,25 +112,13 @@ def read_episodes(dataset: Dataset, cameras: Sequence[str], count: int) -> Episo
     cameras: features that are kept as video.
     """
     root = dataset.root
-    if count > _MOST:
+    if count > MOST:
         raise DatasetError(
             f"{root} claims {count:,} episodes, more than can be meant; restore meta/info.json from a copy."
         )
-    columns = [
-        "episode_index",
-        "data/chunk_index",
-        "data/file_index",
-        "dataset_from_index",
-        "dataset_to_index",
-        "tasks",
-        "start_ns",
-        "counts",
-    ]
-    for name in cameras:
-        columns += [f"videos/{name}/{key}" for key in ("chunk_index", "file_index", "from_timestamp")]
-    parts = _read_parts(dataset, columns, count)
+    parts = _read_parts(dataset, cameras, count)
     try:
-        table = pa.concat_tables(parts, promote_options="default") if parts else _nothing(columns)
+        table = pa.concat_tables(parts, promote_options="default") if parts else _nothing(columns_of(cameras))
         number = _whole(table, "episode_index")
         _, first = np.unique(number, return_index=True)
         table = table.take(pa.array(first[: min(count, len(first))])).combine_chunks()
@@ -143,20 +131,31 @@ def read_episodes(dataset: Dataset, cameras: Sequence[str], count: int) -> Episo
         raise DatasetError(f"{root}/meta/episodes is damaged ({error}); restore it from a copy.") from error
 
 
-def _read_parts(dataset: Dataset, columns: list[str], count: int, attempts: int = 3) -> list[pa.Table]:
+def columns_of(cameras: Sequence[str]) -> list[str]:
+    """The columns of meta/episodes that say where an episode lies."""
+    films = [f"videos/{name}/{key}" for name in cameras for key in ("chunk_index", "file_index", "from_timestamp")]
+    return ["episode_index", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index", *films]
+
+
+def read_part(path: Path, cameras: Sequence[str], most_rows: int, more: Sequence[str] = OPTIONAL) -> pa.Table:
+    """One table of meta/episodes, with the columns `more` as far as it has them; DatasetError where it is none."""
+    columns = columns_of(cameras)
+    table = read_whole(path, [*columns, *more], most_rows)
+    for name in set(columns) - set(table.column_names):
+        raise DatasetError(f"{path} has no column {name}; restore it from a copy.")
+    return table
+
+
+def _read_parts(dataset: Dataset, cameras: Sequence[str], count: int, attempts: int = 3) -> list[pa.Table]:
     """The tables of meta/episodes; listed anew where a recorder has just made one of many."""
     parts = []
     for name in dataset.files.list("meta/episodes", ".parquet"):
         try:
-            part = read_whole(dataset.files.local(name), columns, count + 10_000)
+            parts.append(read_part(dataset.files.local(name), cameras, count + 10_000))
         except DatasetError:
             if attempts > 1 and not dataset.files.exists(name):
-                return _read_parts(dataset, columns, count, attempts - 1)
+                return _read_parts(dataset, cameras, count, attempts - 1)
             raise
-        missing = set(columns) - set(part.column_names) - {"start_ns", "counts"}
-        if missing:
-            raise DatasetError(f"{dataset.root / name} has no column {sorted(missing)[0]}; restore it from a copy.")
-        parts.append(part)
     return parts
 
 

@@ -60,14 +60,20 @@ def read_tasks(root: Path, files: LocalFiles | Files) -> tuple[str, ...]:
     """The texts of meta/tasks.parquet by their number, "" for a number that has none; () where there is no such table."""
     if not files.exists(TASKS):
         return ()
-    table = read_whole(files.local(TASKS))
-    name = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)
-    if name is None or "task_index" not in table.column_names:
-        raise DatasetError(f"{root / TASKS} is no table of tasks; see `terrella data doctor {root}`.")
-    numbers, texts = table["task_index"].to_pylist(), table[name].to_pylist()
+    try:
+        found = sentences(files.local(TASKS))
+    except ValueError as error:
+        raise DatasetError(f"{root / TASKS} is damaged ({error}); see `terrella data doctor {root}`.") from error
+    return tuple(found.get(number, "") for number in range(max(found, default=-1) + 1))
+
+
+def sentences(path: Path) -> dict[int, str]:
+    """task_index -> its text, of a table of tasks; DatasetError or ValueError where it is none."""
+    table = read_whole(path)
+    texts = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)
+    if texts is None or "task_index" not in table.column_names:
+        raise ValueError("it is no table of tasks")
+    numbers = table["task_index"].to_pylist()
     if not all(isinstance(number, int) and 0 <= number < len(numbers) + 1_000_000 for number in numbers):
-        raise DatasetError(f"{root / TASKS} numbers its tasks by what is no number; see `terrella data doctor {root}`.")
-    found = [""] * (max(numbers, default=-1) + 1)
-    for number, text in zip(numbers, texts):
-        found[number] = str(text)
-    return tuple(found)
+        raise ValueError("it numbers its tasks by what is no number")
+    return {number: str(text) for number, text in zip(numbers, table[texts].to_pylist())}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ def _checked(path: str, size: int, _changed_ns: int) -> None:
                 _fragment(file, at, min(at + length, size), size)
 
 
-def _walk(file: BinaryIO | io.FileIO, size: int) -> Iterator[tuple[int, int, bytes]]:
+def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
     """(place, bytes, kind) of the boxes of a file; the last may be cut, or claim what no box can have."""
     at = 0
     while at + 8 <= size:
@@ -64,43 +63,28 @@ def _fragment(file: BinaryIO, start: int, end: int, size: int) -> None:
         at += length
 
 
-class Whole(io.RawIOBase):
-    """A growing file up to its last whole fragment; other files as they are. A half-written header would spoil the rest."""
+def whole(path: Path) -> tuple[int, int]:
+    """(bytes, fragments) of a growing file up to the end of its last fragment (moof and mdat) that is whole.
 
-    def __init__(self, path: Path):
-        self._file = open(path, "rb", buffering=0)
-        self._end = _whole_bytes(self._file)
-        self._file.seek(0)
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def readinto(self, buffer) -> int:
-        room = max(0, self._end - self._file.tell())
-        return self._file.readinto(memoryview(buffer)[:room]) or 0
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(self._end + offset) if whence == 2 else self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+    All bytes of a file that has no fragments, or is damaged: whoever reads it will tell.
+    """
+    with open(path, "rb") as file:
+        end = file.seek(0, 2)
+        kept, fragments, begun = end, 0, False
+        for at, length, kind in _walk(file, end):
+            if not begun and (length < 8 or (at + length > end and kind != b"moof")):
+                return end, 0
+            if length < 8 or at + length > end or (begun and kind not in (b"moof", b"mdat")):
+                break  # cut; after a power cut what follows may be zeros
+            if kind == b"moof":
+                kept, begun = kept if begun else at, True
+            else:
+                kept, fragments = at + length, fragments + begun
+    return kept, fragments
 
 
-def _whole_bytes(file: io.FileIO) -> int:
-    """Bytes up to the end of the last fragment (moof and mdat) that is whole; all of them where there are no fragments."""
-    end, whole, fragments = file.seek(0, 2), 0, False
-    for at, length, kind in _walk(file, end):
-        if not fragments and (length < 8 or (at + length > end and kind != b"moof")):
-            return end  # not in fragments, or damaged: whoever reads it will tell
-        if length < 8 or at + length > end or (fragments and kind not in (b"moof", b"mdat")):
-            break  # cut; after a power cut what follows may be zeros
-        fragments |= kind == b"moof"
-        whole = whole if kind == b"moof" else at + length
-    return whole
+def trim(path: Path) -> None:
+    """Cuts a growing file after its last whole fragment; a half-written one would spoil the rest."""
+    size = whole(path)[0]
+    if size < os.stat(path).st_size:
+        os.truncate(path, size)

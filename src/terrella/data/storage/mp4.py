@@ -5,8 +5,8 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
+from ..source import Lazy
 from . import boxes, durable
 
 BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
@@ -103,10 +104,10 @@ class Mp4Writer:
 
 
 @contextmanager
-def opened(path: Path, growing: bool = False) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video's container and its first stream; `growing`: up to the last frame that is whole. One of BROKEN where it is none."""
+def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """A video's container and its first stream; one of BROKEN where it is none."""
     boxes.check(path)
-    with boxes.Whole(path) if growing else nullcontext(str(path)) as file, av.open(file, "r") as container:
+    with av.open(str(path), "r") as container:
         yield container, container.streams.video[0]
 
 
@@ -116,16 +117,14 @@ def ticks(stream: VideoStream, fps: float) -> Fraction:
 
 
 def finish(growing: Path, target: Path, frames: int | None = None) -> int:
-    """Copies a grown file, whole or cut, to `target` with its index in front; returns how many frames it holds.
+    """Copies a grown file, which is cut after its last whole frame, to `target` with its index in front.
 
-    At most `frames` are taken. Nothing is encoded anew. DatasetError where not one frame is whole.
+    At most `frames` are taken; returns how many it holds. Nothing is encoded anew. DatasetError where not one is whole.
     """
-    count = 0
+    count, options = 0, FINISHED
     try:
-        with (
-            opened(growing, growing=True) as (source, stream),
-            av.open(str(target), "w", format="mp4", options=FINISHED) as copy,
-        ):
+        boxes.trim(growing)
+        with opened(growing) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
             out = copy.add_stream_from_template(stream)
             for packet in source.demux(stream):
                 if packet.size == 0 or packet.is_corrupt or count == frames:
@@ -184,46 +183,25 @@ def bound(stream) -> None:
     stream.codec_context.options = {"max_pixels": str(_LARGEST)}
 
 
-class Frames(Sequence):
+class Frames(Lazy):
     """Frames `first` .. `first + count - 1` of a file, decoded when looked at; seeks where that saves decoding."""
 
     def __init__(self, path: Path, first: int, count: int, fps: float, deep: bool = False):
-        self._path, self._first, self._count, self._fps, self._deep = path, first, count, fps, deep
+        super().__init__(count, self._frame)
+        self._film = path, first, fps, deep
         self._next, self._run = -1, iter(())
 
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._count))]
-        if not -self._count <= index < self._count:
-            raise IndexError(index)
-        index = int(index) % self._count
+    def _frame(self, index: int) -> np.ndarray:
         ahead = index - self._next
         if self._next < 0 or not 0 <= ahead <= KEYFRAME_EVERY:
-            self._run = frames(self._path, self._first + index, self._count - index, self._fps, self._deep)
-            ahead = 0
+            path, first, fps, deep = self._film
+            self._run, ahead = frames(path, first + index, len(self) - index, fps, deep), 0
         self._next = -1  # until it is found
         for _ in range(ahead):
             next(self._run)
         frame = next(self._run)
         self._next = index + 1
         return frame
-
-
-def count_whole(growing: Path) -> int:
-    """How many frames of a file, growing or not, whole or cut, are whole; 0 where there is none. Nothing is decoded."""
-    count = 0
-    try:
-        with opened(growing, growing=True) as (container, _):
-            for packet in container.demux(video=0):
-                if packet.size == 0 or packet.is_corrupt:
-                    break
-                count += 1
-    except BROKEN:
-        pass
-    return count
 
 
 def broken(path: Path, why: str) -> DatasetError:

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,13 +22,9 @@ from . import durable
 BUDGET_BYTES = 8 << 30
 _LOCKS = 64
 _PACKAGES = {  # scheme -> what to install
-    "s3": "'terrella[remote]'",
-    "s3a": "'terrella[remote]'",
-    "hf": "'terrella[remote]'",
-    "gs": "gcsfs",
-    "gcs": "gcsfs",
-    "abfs": "adlfs",
-    "az": "adlfs",
+    **dict.fromkeys(("s3", "s3a", "hf"), "'terrella[remote]'"),
+    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
+    **dict.fromkeys(("abfs", "az"), "adlfs"),
 }
 _Result = TypeVar("_Result")
 
@@ -63,10 +60,16 @@ class LocalFiles:
         return str(path.stat().st_size) if path.is_file() else ""
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""
-        top = self.local(folder) if folder else self.root
-        found = (path.relative_to(self.root) for path in top.rglob("*") if path.is_file())
-        return sorted(path.as_posix() for path in found if path.name.endswith(suffix) and not _hidden(path.parts))
+        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`.
+
+        Hidden ones and linked folders are passed over.
+        """
+        found = []
+        for place, folders, names in os.walk(self.root / inside(folder) if folder else self.root):
+            folders[:] = (name for name in folders if not name.startswith("."))
+            names = (name for name in names if name.endswith(suffix) and not name.startswith("."))
+            found += [Path(place, name).relative_to(self.root).as_posix() for name in names]
+        return sorted(found)
 
     @contextmanager
     def holding(self, *names: str) -> Iterator[None]:
@@ -97,7 +100,7 @@ class Files:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "terrella" / "remote"
         self._cache = Path(cache_dir) if cache_dir is not None else home
         self._listed: dict[str, dict[str, tuple[int, str]]] = {}  # folder -> name -> (bytes, tag)
-        self._system, self._base = _file_system(self.root)
+        self._system, self._base, self._callback = _file_system(self.root)
         try:
             (self._cache / ".coming").mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -127,7 +130,7 @@ class Files:
         names = []
         for path, about in found.items():
             parts = path.strip("/").split("/")[depth:]
-            if about["type"] == "file" and parts and not _hidden(parts):
+            if about["type"] == "file" and parts and not any(part.startswith(".") for part in parts):
                 names.append(inside("/".join(parts)))
                 self._listed.setdefault("/".join(parts[:-1]), {})[parts[-1]] = _told(self.root, about)
         return sorted(name for name in names if name.endswith(suffix))
@@ -196,7 +199,8 @@ class Files:
         def get(alive: Callable[[], None]) -> Path:
             handle, made = tempfile.mkstemp(prefix="part-", dir=room)
             os.close(handle)
-            self._system.get_file(f"{self._base}/{name}", made, callback=_beat(alive))
+            beat = self._callback(hooks={"alive": alive})  # is called as bytes come
+            self._system.get_file(f"{self._base}/{name}", made, callback=beat)
             got = os.stat(made).st_size
             if got != size:
                 raise OSError(f"{got} of {size} bytes came")
@@ -250,10 +254,6 @@ class Files:
         handle, folder = claim
         try:
             yield folder
-        except BaseException:
-            with _locked(self._cache / ".lock"):
-                self._write_used((self._read_used() or size) - size)
-            raise
         finally:
             shutil.rmtree(folder, ignore_errors=True)
             os.close(handle)
@@ -261,50 +261,35 @@ class Files:
     def _claimed(self, size: int) -> tuple[int, Path] | None:
         """A locked folder named after the bytes that are set aside; None where files in use leave too little room."""
         with _locked(self._cache / ".lock"):
-            used = self._read_used()
-            if used is None or used + size > self.budget_bytes:
-                used = self._evicted(size)
-                if used + size > self.budget_bytes:
-                    return None
-            self._write_used(used + size)
+            if self._evicted(size) + size > self.budget_bytes:
+                return None
             folder = Path(tempfile.mkdtemp(prefix=f"{size}-", dir=self._cache / ".coming"))
             handle = os.open(folder, os.O_RDONLY)
             fcntl.flock(handle, fcntl.LOCK_EX)
             return handle, folder
 
     def _evicted(self, size: int) -> int:
-        """Bytes in use after what was used longest ago has made room for `size`, and some more so that this is rare."""
-        total, files = 0, []
+        """Bytes in use after what was used longest ago has made room for `size`."""
         # What comes is counted first: if it arrives meanwhile it counts twice until the next look, never not at all.
-        for entry in os.scandir(self._cache / ".coming"):
-            if _let_go(Path(entry.path), shutil.rmtree):  # of a process that was killed
-                continue
-            total += int(entry.name.split("-")[0])
+        # What nobody has locked is of a process that was killed.
+        coming = [
+            entry for entry in os.scandir(self._cache / ".coming") if not _let_go(Path(entry.path), shutil.rmtree)
+        ]
+        files = []
         for entry in os.scandir(self._cache):
             if not entry.name.startswith("."):
-                about = entry.stat()
-                total += about.st_size
-                files.append((about.st_mtime_ns, about.st_size, entry.path))
-        enough = max(0, self.budget_bytes - self.budget_bytes // 16 - size)
+                files.append((entry.stat().st_mtime_ns, entry.stat().st_size, entry.path))
+        total = sum(int(entry.name.split("-")[0]) for entry in coming) + sum(bytes_ for _, bytes_, _ in files)
         for _, bytes_, path in sorted(files):
-            if total <= enough:
+            if total + size <= self.budget_bytes:
                 break
             if _let_go(Path(path), os.unlink):
                 total -= bytes_
         return total
 
-    def _read_used(self) -> int | None:
-        try:
-            return int((self._cache / ".used").read_text())
-        except (OSError, ValueError):
-            return None
 
-    def _write_used(self, used: int) -> None:
-        (self._cache / ".used").write_text(str(used))
-
-
-def _file_system(root: str) -> tuple[Any, str]:
-    """fsspec's file system for an address, and the path in it."""
+def _file_system(root: str) -> tuple[Any, str, Any]:
+    """fsspec's file system for an address, the path in it, and fsspec's class of callbacks."""
     scheme = root.split("://", 1)[0]
     try:
         import fsspec
@@ -313,7 +298,7 @@ def _file_system(root: str) -> tuple[Any, str]:
     try:
         system, base = fsspec.core.url_to_fs(root)
         system.invalidate_cache()
-        return system, base
+        return system, base, fsspec.callbacks.Callback
     except ImportError as error:
         need = f"pip install {_PACKAGES[scheme]}" if scheme in _PACKAGES else "install it"
         raise DatasetError(f"reading {scheme}:// needs a package that is missing ({error}): {need}.") from error
@@ -337,39 +322,24 @@ def _told(root: str, about: dict) -> tuple[int, str]:
 
 def _in_time(action: Callable[[Callable[[], None]], _Result], silence_s: float) -> _Result:
     """`action(alive)` in a thread of its own; TimeoutError once it has not called `alive` for `silence_s`."""
-    heard, done = [time.monotonic()], threading.Event()
-    result: list[_Result] = []
-    failed: list[BaseException] = []
+    heard, answer = [time.monotonic()], Future[_Result]()
 
-    def alive() -> None:
+    def alive(*_, **__) -> None:
         heard[0] = time.monotonic()
 
     def work() -> None:
         try:
-            result.append(action(alive))
+            answer.set_result(action(alive))
         except BaseException as error:  # handed to the caller's thread
-            failed.append(error)
-        finally:
-            done.set()
+            answer.set_exception(error)
 
     threading.Thread(target=work, name="remote", daemon=True).start()
-    while not done.wait(max(0.0, heard[0] + silence_s - time.monotonic())):
-        if time.monotonic() >= heard[0] + silence_s:
-            raise TimeoutError(f"it was silent for {silence_s:g} s")
-    if failed:
-        raise failed[0]
-    return result[0]
-
-
-def _beat(alive: Callable[[], None]):
-    """A callback of fsspec that says that bytes come."""
-    from fsspec.callbacks import Callback
-
-    class Beat(Callback):
-        def call(self, *args, **kwargs):
-            alive()
-
-    return Beat()
+    while (left := heard[0] + silence_s - time.monotonic()) > 0:
+        if wait([answer], left).done:
+            break
+    if not answer.done():
+        raise TimeoutError(f"it was silent for {silence_s:g} s")
+    return answer.result()
 
 
 def _touched(path: Path, size: int) -> bool:
@@ -406,7 +376,3 @@ def _locked(path: Path) -> Iterator[None]:
     with open(path, "a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _hidden(parts) -> bool:
-    return any(part.startswith(".") for part in parts)

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from ...core.errors import DatasetError
 from ..format import to_numpy
+from ..source import Lazy
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, RuntimeError)
 _BATCH = 64 << 20  # bytes that one batch of numbers may take
@@ -143,11 +144,12 @@ def read_json(path: Path) -> object:
         raise ValueError("it is nested too deeply") from error
 
 
-class ValuesOf(Sequence):
+class ValuesOf(Lazy):
     """The lists of numbers of one column, each a numpy array, read row group by row group when they are looked at."""
 
     def __init__(self, path: Path, column: str, count: int):
-        self._path, self._column, self._count, self._first = path, column, count, 0
+        super().__init__(count, self._row)
+        self._path, self._column, self._first = path, column, 0
         try:
             with open_parquet(path) as file:
                 rows = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
@@ -156,13 +158,8 @@ class ValuesOf(Sequence):
         self._starts = np.cumsum([0, *rows])
         self._open, self._group = -1, None
 
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index):
-        if not -self._count <= index < self._count:
-            raise IndexError(index)
-        row = self._first + int(index) % self._count
+    def _row(self, index: int) -> Any:
+        row = self._first + index
         group = int(np.searchsorted(self._starts, row, side="right")) - 1
         try:
             if group != self._open:

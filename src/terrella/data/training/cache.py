@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...core.spec import Camera
-from ..channels import ESTIMATES, cameras_of, channel_of, feature_of, renamed
+from ..channels import ESTIMATES, channel_of, feature_of, renamed
 from ..dataset import Dataset
 from ..format import INFO
 from ..storage import durable
@@ -107,11 +106,6 @@ class ClipCache:
         names = {key: key.removeprefix(prefix) for key in self.arrays if key.startswith(prefix)}
         hidden = {key for key, name in names.items() if name in ESTIMATES or name.startswith("images.")}
         return {name: self.arrays[key] for key, name in names.items() if key not in hidden}
-
-    @property
-    def camera_models(self) -> dict[str, Camera]:
-        """channel -> Camera of the recorded world; {} where nobody said."""
-        return cameras_of(self.world, self.rgb.shape[1:3] if self.rgb is not None else (1, 1))
 
     @property
     def vitals(self) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +17,10 @@ from ...core.errors import DatasetError
 from ...core.instruction import embed_all
 from ..dataset import Dataset
 from ..storage.remote import Files
-from .cache import INSTRUCTION, ClipCache, array_for, further_cameras
-from .order import Plan, Starts, chosen
+from .cache import INSTRUCTION, ClipCache, Kinds, array_for, further_cameras
+from .order import Plan, Starts, chosen, copy_rows
 from .windows import Windows
 
-Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]
 Fill = Callable[[int, int, Mapping[str, np.ndarray]], None]
 _PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64), ())}  # any recording has these
 
@@ -84,7 +83,7 @@ class Clips:
         if isinstance(source, str | Path):
             source = Dataset(_files(source, cache_dir, budget_bytes))
         if isinstance(source, Dataset) and isinstance(source.files, Files):
-            self._shelf: Shelf = Windows.of(source, plan, channels, size, episodes, budget_bytes // 4)
+            self._shelf: _Whole | Windows = Windows(source, plan, channels, size, episodes, budget_bytes // 4)
         else:
             if isinstance(source, Dataset):
                 source = ClipCache.open(source, size, progress, further_cameras(source, channels), budget_bytes)
@@ -189,10 +188,8 @@ class Clips:
 
     def _make(self, fill: Fill, epoch: int, number: int) -> dict[str, np.ndarray]:
         clips = min(self._plan.batch, self._shelf.clips(epoch) - number * self._plan.batch)
-        arrays = {
-            name: self._memory.empty((clips, self._plan.length, *shape), dtype)
-            for name, (dtype, shape) in self._kinds.items()
-        }
+        kinds, length = self._kinds.items(), self._plan.length
+        arrays = {name: self._memory.empty((clips, length, *shape), dtype) for name, (dtype, shape) in kinds}
         fill(epoch, number, arrays)
         return {name: self._meant(name, arrays[key]) for name, key in self._keys.items()}
 
@@ -208,41 +205,20 @@ def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) 
     return Files(source, cache_dir, budget_bytes // 2) if isinstance(source, str) and "://" in source else source
 
 
-class Shelf(Protocol):
-    """Where clips come from: one clip cache, or windows of a recording far away."""
-
-    kinds: Kinds  # (dtype, shape of a row) by array
-    keys: Mapping[str, str]  # channel -> array
-    tasks: tuple[str, ...]
-
-    def facts(self) -> dict:
-        """JSON values that, with the epoch, decide the order."""
-        ...
-
-    def clips(self, epoch: int) -> int:
-        """How many clips of an epoch are this rank's."""
-        ...
-
-    def batches(self, epoch: int) -> int:
-        """How many batches of an epoch each rank gets; without `drop_last`, this rank."""
-        ...
-
-    def reading(self, epochs: range, first: int) -> AbstractContextManager[Fill]:
-        """While it is entered, `fill(epoch, batch, arrays)` works from batch `first` of the first of `epochs` on."""
-        ...
-
-
 class _Whole:
-    """All clips of one clip cache, which any number of processes map at once."""
+    """All clips of one clip cache, which any number of processes map at once.
+
+    `facts` are the JSON values that, with the epoch, decide the order; `clips` and `batches` tell how many of an epoch are
+    this rank's; while `reading` is entered, `fill(epoch, batch, arrays)` works from batch `first` of the first epoch on.
+    """
 
     def __init__(self, cache: ClipCache, plan: Plan, episodes: Sequence[int] | None):
         self._plan = plan
         self._arrays = {name: np.asarray(array) for name, array in cache.arrays.items()}
         self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
-        self.keys: Mapping[str, str] = cache.keys
-        self.tasks = cache.tasks
+        self.keys, self.tasks = cache.keys, cache.tasks
         self._episodes = chosen(episodes, len(cache.episodes))
-        first, stop = cache.episodes.pairs[slice(None) if self._episodes is None else self._episodes].T
+        first, stop = cache.episodes.pairs[slice(None) if episodes is None else self._episodes].T
         self._counts = np.maximum(stop - first - plan.span + 1, 0)
         self._starts = Starts.of(first, self._counts)
 
@@ -253,9 +229,7 @@ class _Whole:
         return -(-(self._starts.count - self._plan.rank) // self._plan.world_size)
 
     def batches(self, epoch: int) -> int:
-        if self._plan.drop_last:
-            return self._starts.count // self._plan.world_size // self._plan.batch
-        return -(-self.clips(epoch) // self._plan.batch)
+        return self._plan.batches(self.clips(epoch), self._starts.count // self._plan.world_size)
 
     def reading(self, epochs: range, first: int) -> AbstractContextManager[Fill]:
         return nullcontext(self._fill)
@@ -264,14 +238,7 @@ class _Whole:
         clips = len(next(iter(arrays.values())))
         places = (number * self._plan.batch + np.arange(clips)) * self._plan.world_size + self._plan.rank
         stretch, first = self._starts.at(self._plan.order(places, self._starts.count, epoch))
-        rows = self._plan.rows(first)
-        for name, out in arrays.items():
-            if name == "row":
-                out[:] = rows
-            elif name == "episode":
-                out[:] = (stretch if self._episodes is None else self._episodes[stretch])[:, None]
-            else:
-                np.take(self._arrays[name], rows, axis=0, out=out, mode="clip")  # "raise" would copy twice
+        copy_rows(self._arrays, self._plan.rows(first), 0, self._episodes[stretch], arrays)
 
 
 class _Memory:
@@ -287,9 +254,7 @@ class _Memory:
             memory = spare.pop()
         except IndexError:
             memory = bytearray(size)
-        array = np.ndarray(
-            shape, dtype, memory
-        )  # every view of it holds on to it, for it owns no memory that numpy knows
+        array = np.ndarray(shape, dtype, memory)  # every view holds on to it, for it owns no memory that numpy knows
         weakref.finalize(array, spare.append, memory).atexit = False
         return array
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import isqrt
 
@@ -104,6 +104,10 @@ class Plan:
         """int64 [n, length]: the rows of clips that begin at `first` [n]."""
         return first[:, None] + np.arange(self.length) * self.stride
 
+    def batches(self, mine: int, least: int) -> int:
+        """Batches of an epoch of which `mine` clips are this rank's and `least` that of the rank with the fewest."""
+        return least // self.batch if self.drop_last else -(-mine // self.batch)
+
     def facts(self, counts: np.ndarray) -> dict:
         """JSON values that, with the epoch, decide the order of clips, of which counts[i] begin in episode i."""
         stated = {name: value for name, value in asdict(self).items() if name != "rank"}
@@ -111,10 +115,27 @@ class Plan:
         return stated | {"clips": int(counts.sum()), "episodes": digest[:16]}
 
 
-def chosen(episodes: Sequence[int] | None, count: int) -> np.ndarray | None:
+def copy_rows(
+    source: Mapping[str, np.ndarray],
+    rows: np.ndarray,
+    shift: np.ndarray | int,
+    episode: np.ndarray,
+    target: Mapping[str, np.ndarray],
+) -> None:
+    """Copies the rows [n, length] of n clips; `episode` of each, and `shift`, by which its rows lie later in the dataset."""
+    for name, out in target.items():
+        if name == "row":
+            out[:] = rows + np.reshape(shift, (-1, 1))
+        elif name == "episode":
+            out[:] = episode[:, None]
+        else:
+            np.take(source[name], rows, axis=0, out=out, mode="clip")  # "raise" would copy twice
+
+
+def chosen(episodes: Sequence[int] | None, count: int) -> np.ndarray:
     """int64: the numbers of the episodes to read, ascending; None: all `count`."""
     if episodes is None:
-        return None
+        return np.arange(count)
     try:
         found = np.array([operator.index(number) for number in episodes], np.int64)
     except TypeError as error:

@@ -15,14 +15,15 @@ import numpy as np
 from ...core.errors import DatasetError
 from ..dataset import Dataset
 from .cache import Kinds, array_for, bytes_a_row, fill_episode, further_cameras, keys_of, kinds_of
-from .order import Plan, Starts, chosen
+from .order import Plan, Starts, chosen, copy_rows
 
 _FILES, _CLIPS = 1, 2  # which of an epoch's shuffles
 
 
 class Windows:
-    """Clips of a recording in windows of at most `window_rows` rows of memory, two of which exist at a time.
+    """Clips of a recording in windows of as many rows of `channels` as `window_bytes` hold, two of which exist at a time.
 
+    `kinds` lacks the channels that the recording does.
     An epoch takes the recording's files in shuffled order, cuts what they hold into windows, deals these to the ranks in
     turn, and shuffles the clips of each. A file is fetched once an epoch (twice where a window ends inside it). An
     episode that is longer than a window is cut into several; which clips there are does not change.
@@ -32,41 +33,27 @@ class Windows:
         self,
         dataset: Dataset,
         plan: Plan,
-        kinds: Kinds,
+        channels: Sequence[str],
         size: tuple[int, int],
         episodes: Sequence[int] | None,
-        window_rows: int,
+        window_bytes: int,
     ):
-        if window_rows < plan.span:
+        there, self.keys = kinds_of(dataset, size, further_cameras(dataset, channels)), keys_of(dataset)
+        wanted = [array_for(name, there, self.keys) for name in channels]
+        self.kinds: Kinds = {key: there[key] for key in wanted if key is not None} or there
+        self.window_rows = window_bytes // bytes_a_row(self.kinds)
+        if self.window_rows < plan.span:
             raise DatasetError(
-                f"a window of {max(0, window_rows)} rows holds no clip of {plan.span}; allow more bytes, smaller pictures "
-                "or shorter clips."
+                f"a window of {max(0, self.window_rows)} rows holds no clip of {plan.span}; allow more bytes, smaller "
+                "pictures or shorter clips."
             )
-        self.dataset, self.kinds, self.size, self.plan = dataset, kinds, size, plan
-        self.keys: Mapping[str, str] = keys_of(dataset)
-        self.window_rows, self.tasks = window_rows, dataset.tasks
-        picked = chosen(episodes, len(dataset.episodes))
-        self._numbers = np.arange(len(dataset.episodes)) if picked is None else picked
+        self.dataset, self.size, self.plan, self.tasks = dataset, size, plan, dataset.tasks
+        self._numbers = chosen(episodes, len(dataset.episodes))
         lengths = (dataset.episodes.stops - dataset.episodes.starts)[self._numbers]
         self._counts = np.maximum(lengths - plan.span + 1, 0)
         files = [self.files_of(int(number)) for number in self._numbers]
         self._shard = np.cumsum([before != after for before, after in zip([(), *files], files)], dtype=np.int64) - 1
         self.epoch = functools.lru_cache(4)(self._epoch)
-
-    @staticmethod
-    def of(
-        dataset: Dataset,
-        plan: Plan,
-        channels: Sequence[str],
-        size: tuple[int, int],
-        episodes: Sequence[int] | None,
-        window_bytes: int,
-    ) -> Windows:
-        """Windows of as many rows of `channels` as `window_bytes` hold; channels that the recording lacks are not in `kinds`."""
-        there, keys = kinds_of(dataset, size, further_cameras(dataset, channels)), keys_of(dataset)
-        wanted = [array_for(name, there, keys) for name in channels]
-        kinds = {key: there[key] for key in wanted if key is not None} or there
-        return Windows(dataset, plan, kinds, size, episodes, window_bytes // bytes_a_row(kinds))
 
     def files_of(self, number: int) -> tuple[str, ...]:
         """The files that hold the wanted channels of an episode."""
@@ -82,9 +69,7 @@ class Windows:
         return int(self.epoch(epoch).of_ranks[self.plan.rank])
 
     def batches(self, epoch: int) -> int:
-        if self.plan.drop_last:
-            return int(self.epoch(epoch).of_ranks.min()) // self.plan.batch
-        return -(-self.clips(epoch) // self.plan.batch)
+        return self.plan.batches(self.clips(epoch), int(self.epoch(epoch).of_ranks.min()))
 
     @contextmanager
     def reading(self, epochs: range, first: int) -> Iterator:
@@ -196,14 +181,7 @@ class _Belt:
         number = self._windows.epoch(epoch).numbers[w]
         clips = self._plan.order(places, window.starts.count, epoch, _CLIPS, number)
         piece, start = window.starts.at(clips)
-        rows = self._plan.rows(start)
-        for name, out in arrays.items():
-            if name == "row":
-                out[:] = rows + window.shift[piece][:, None]
-            elif name == "episode":
-                out[:] = window.episode[piece][:, None]
-            else:
-                np.take(window.arrays[name], rows, axis=0, out=out, mode="clip")
+        copy_rows(window.arrays, self._plan.rows(start), window.shift[piece], window.episode[piece], arrays)
 
     def _run(self, epochs: range, first: int) -> None:
         try:
