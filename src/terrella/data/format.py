@@ -190,7 +190,7 @@ def where(episode: int) -> dict[str, int]:
 
 def stream_path(name: str, episode: int, suffix: str) -> str:
     """Where a stream's table ("parquet") or film ("mp4") of an episode lies."""
-    return f"streams/{name}/chunk-{{chunk_index:03d}}/file-{{file_index:03d}}.{suffix}".format(**where(episode))
+    return "streams/{}/chunk-{chunk_index:03d}/file-{file_index:03d}.{}".format(name, suffix, **where(episode))
 
 
 _FIELD = re.compile(r"\{(\w+)(?::0?[0-9])?d?\}")
