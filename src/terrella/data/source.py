@@ -115,7 +115,7 @@ class Lazy(Sequence):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index):
+    def __getitem__(self, index) -> Any:
         if isinstance(index, slice):
             return [self._make(i) for i in range(*index.indices(self._count))]
         if not -self._count <= index < self._count:
