@@ -82,6 +82,27 @@ def test_on_unknown_ground_the_walls_of_the_dream_count():
     assert state.deferred is None and len(walls.shared) == 0 and walls.own.shape[1] >= known.own.shape[1]
 
 
+def test_of_a_batch_those_off_known_ground_alone_are_drawn(monkeypatch):
+    world, drawn, action = place(KINDS["buttons"]), [], torch.zeros(3, 3, dtype=torch.int8)
+    rng = make_rng(1)
+    state = world.start(3, rng)
+    far = state["pose"] + torch.tensor([[0.0], [50.0], [0.0]]) * torch.eye(7)[0]
+    state = world.observe({"pose": far}, state, rng)
+    real = learned.generate
+    monkeypatch.setattr(learned, "generate", lambda *given: (drawn.append(len(given[1])), real(*given))[1])
+    after, chance_then = [state], rng.get_state()
+    for _ in range(4):
+        after.append(world.imagine(after[-1], action, rng))
+    assert drawn == [1] * 4, "the observed frame and those after it, of the second episode"
+    again = state
+    rng.set_state(chance_then)
+    for waited in after[1:]:
+        again = world.imagine(again, action, rng)
+        world.render(again, ("rgb",))
+        for name in world.spec.channels:
+            assert torch.equal(world.render(again, (name,))[name], world.render(waited, (name,))[name]), name
+
+
 def test_of_equally_trusted_keyframes_the_recorded_one_comes_first():
     world = place(KINDS["buttons"])
     scene, pose = world.scene, world.memory.pose[:1]

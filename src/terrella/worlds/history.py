@@ -94,6 +94,10 @@ class FrameHistory:
         """`state`, which points at nothing."""
         return state
 
+    def settled(self, state: State) -> State:
+        """`state`, in which nothing waits for a body."""
+        return state
+
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
         return State({"frames": evidence.seen["frames"]})

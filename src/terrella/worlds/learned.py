@@ -210,7 +210,7 @@ class LearnedWorld:
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         """One step: move, then draw what is seen from there, now or when somebody looks. What is over stands still."""
         numbers = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
-        state, seeds = self.scene.adopted(state), chance.seeds(state.batch, rng, self.device)
+        state, seeds = self.scene.settled(self.scene.adopted(state)), chance.seeds(state.batch, rng, self.device)
         still = state["done"]
         asked = self.asked(state, numbers)
         asked = asked.replace(**self.outcome.placed(state, self.body.ends(asked, numbers)))

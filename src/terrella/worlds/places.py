@@ -18,7 +18,7 @@ from ..core.state import State
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import floor_plan
 from ..space.keyframes import Glimpse, Keyframes
-from ..space.memory import RECORDED, Memory, keyframe_table
+from ..space.memory import RECORDED, ROWS, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
@@ -230,15 +230,26 @@ class KeyframeScene:
 
     def walls(self, state: State) -> Walls:
         """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
-        own, away = state["observed_walls"], ~self._known_ground(state["pose"])
-        if away.is_meta or away.any():  # tensors of `meta` have no values to ask for
-            own = torch.where(away[:, None, None], self.own.walls(state), own)
+        own, away = state["observed_walls"], self._away(state)
+        if len(away):
+            own = own.index_copy(0, away, self.own.walls(state if len(away) == len(own) else state.narrowed(away)))
         return Walls(self._plan, own)
 
-    def _known_ground(self, pose: torch.Tensor) -> torch.Tensor:
-        """Whether `pose` [B, 7] is in a cell of the map that recorded keyframes are near: bool [B]."""
-        cells, codes = self._cells, _cell_codes(pose[:, :2])
-        return cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] == codes
+    def settled(self, state: State) -> State:
+        """`state`, of which the episodes off known ground are drawn, since `walls` reads what they dreamt; the others may wait."""
+        away = self._away(state)
+        if state.deferred is None or not len(away):
+            return state
+        drawn = state if len(away) == state.batch else state.narrowed(away)
+        drawn[ROWS]
+        return state if drawn is state else state.put(away, drawn)
+
+    def _away(self, state: State) -> torch.Tensor:
+        """The entries of the batch [n] that are in no cell of the map that recorded keyframes are near."""
+        cells, codes = self._cells, _cell_codes(state["pose"][:, :2])
+        if codes.is_meta:  # it has no values to ask for
+            return torch.zeros(state.batch, dtype=torch.int64, device=codes.device)
+        return (cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] != codes).nonzero()[:, 0]
 
     def familiar(self, state: State) -> torch.Tensor:
         """How far the next recorded keyframe is, a radian counting two metres, and how much of its own memory is in use; as

@@ -6,7 +6,6 @@ import numba
 import numpy as np
 
 from ..camera import FAR_M, NEAR_M, SAME
-from .planes import between
 from .surfaces import cast_one
 
 LOT = 16  # of an episode's slots, in whose order keyframes that are trusted alike show
@@ -147,32 +146,45 @@ def recall(first, last, picks, shared, own, seen, turns, positions, camera, colo
     own_rgb, own_depth, own_turns, own_poses = own
     known, most = len(rgb), picks.shape[1]
     _, slots, rows, columns = trust.shape
-    fx, fy, cx, cy = camera
+    fx, fy, cx, cy = np.float32(camera[0]), np.float32(camera[1]), np.float32(camera[2]), np.float32(camera[3])
     sure, across, down = np.zeros(most, np.float32), np.zeros(most, np.float32), np.zeros(most, np.float32)
-    turn_of, at = np.zeros((most, 3, 3), np.float32), np.zeros((most, 3), np.float32)
+    beam, step, at = (
+        np.zeros((most, 3), np.float32),
+        np.zeros((most, 3, 3), np.float32),
+        np.zeros((most, 3), np.float32),
+    )
     which, mine = np.zeros(most, np.int64), np.zeros(most, np.bool_)
     for view in range(first, last):
         keys = 0
         for key in picks[view]:
             if key >= 0:
                 mine[keys], which[keys] = key >= known, key - known if key >= known else key
-                row = which[keys]
-                turn_of[keys] = own_turns[row] if mine[keys] else key_turns[row]
-                at[keys] = own_poses[row, :3] if mine[keys] else poses[row, :3]
+                if mine[keys]:
+                    relative(
+                        own_turns[which[keys]],
+                        own_poses[which[keys]],
+                        turns[view],
+                        positions[view],
+                        step[keys],
+                        at[keys],
+                    )
+                else:
+                    relative(
+                        key_turns[which[keys]], poses[which[keys]], turns[view], positions[view], step[keys], at[keys]
+                    )
                 keys += 1
-        turn, position = turns[view], positions[view]
         for v in range(rows):
+            up = -((v + np.float32(0.5)) / np.float32(rows) - cy) / fy
+            for k in range(keys):
+                for c in range(3):
+                    beam[k, c] = step[k, c, 0] + up * step[k, c, 2]
             for u in range(columns):
-                side, up, far = -((u + 0.5) / columns - cx) / fx, -((v + 0.5) / rows - cy) / fy, seen[view, v, u]
-                x = position[0] + far * (turn[0, 0] + side * turn[0, 1] + up * turn[0, 2])
-                y = position[1] + far * (turn[1, 0] + side * turn[1, 1] + up * turn[1, 2])
-                z = position[2] + far * (turn[2, 0] + side * turn[2, 1] + up * turn[2, 2])
+                side, far = -((u + np.float32(0.5)) / np.float32(columns) - cx) / fx, seen[view, v, u]
                 for k in range(keys):
-                    px, py, pz = x - at[k, 0], y - at[k, 1], z - at[k, 2]
-                    ahead = turn_of[k, 0, 0] * px + turn_of[k, 1, 0] * py + turn_of[k, 2, 0] * pz
-                    near = max(ahead, 1e-4)
-                    a = cx - fx * (turn_of[k, 0, 1] * px + turn_of[k, 1, 1] * py + turn_of[k, 2, 1] * pz) / near
-                    b = cy - fy * (turn_of[k, 0, 2] * px + turn_of[k, 1, 2] * py + turn_of[k, 2, 2] * pz) / near
+                    ahead = far * (beam[k, 0] + side * step[k, 0, 1]) + at[k, 0]
+                    near = max(ahead, np.float32(1e-4))
+                    a = cx - fx * (far * (beam[k, 1] + side * step[k, 1, 1]) + at[k, 1]) / near
+                    b = cy - fy * (far * (beam[k, 2] + side * step[k, 2, 1]) + at[k, 2]) / near
                     sure[k], across[k], down[k] = 0.0, a, b
                     if ahead > NEAR_M and 0 <= a <= 1 and 0 <= b <= 1:
                         held = at_pixel(own_depth, which[k], a, b) if mine[k] else at_pixel(depth, which[k], a, b)
@@ -186,12 +198,21 @@ def recall(first, last, picks, shared, own, seen, turns, positions, camera, colo
                             best = k
                     trust[view, slot, v, u] = sure[best]
                     sure[best] = -1.0
-                    for c in range(3):
-                        if mine[best]:
-                            value = between_twice(own_rgb[which[best], c], across[best], down[best])
-                        else:
-                            value = between_at(rgb[which[best], c], across[best], down[best])
-                        colours[view, slot, c, v, u] = value / 255
+                    shown = colours[view, slot, :, v, u]
+                    if mine[best]:
+                        between_twice(own_rgb[which[best]], across[best], down[best], shown)
+                    else:
+                        between_at(rgb[which[best]], across[best], down[best], shown)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def relative(turn, pose, new_turn, new_position, step, at):
+    """From the camera frame of a view into that of a keyframe: fills the rotation step [3, 3] and the offset at [3]."""
+    for c in range(3):
+        at[c] = 0
+        for d in range(3):
+            at[c] += turn[d, c] * (new_position[d] - pose[d])
+            step[c, d] = turn[0, c] * new_turn[0, d] + turn[1, c] * new_turn[1, d] + turn[2, c] * new_turn[2, d]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -202,21 +223,31 @@ def at_pixel(depth, key, a, b):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def between_at(plane, a, b):
-    """The plane [h, w] at image coordinates a, b, that lie in [0, 1] or are moved there, bilinear."""
-    height, width = plane.shape
-    a, b = min(max(a * width - 0.5, 0.0), width - 1.0), min(max(b * height - 0.5, 0.0), height - 1.0)
+def between_at(planes, a, b, shown):
+    """Bytes [3, h, w] at image coordinates a, b, that lie in [0, 1] or are moved there, bilinear: fills shown [3] in [0, 1]."""
+    _, height, width = planes.shape
+    half, one = np.float32(0.5), np.float32(1)
+    a = min(max(a * np.float32(width) - half, np.float32(0)), np.float32(width - 1))
+    b = min(max(b * np.float32(height) - half, np.float32(0)), np.float32(height - 1))
     i, j = min(int(a), width - 2), min(int(b), height - 2)
-    return between(plane, i, j, a - i, b - j)
+    a, b = a - np.float32(i), b - np.float32(j)
+    for c in range(3):
+        above = planes[c, j, i] * (one - a) + planes[c, j, i + 1] * a
+        below = planes[c, j + 1, i] * (one - a) + planes[c, j + 1, i + 1] * a
+        shown[c] = (above * (one - b) + below * b) / np.float32(255)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def between_twice(plane, a, b):
-    """`between_at` of the plane with every pixel four times (keyframes.doubled)."""
-    height, width = 2 * plane.shape[0], 2 * plane.shape[1]
-    a, b = min(max(a * width - 0.5, 0.0), width - 1.0), min(max(b * height - 0.5, 0.0), height - 1.0)
+def between_twice(planes, a, b, shown):
+    """`between_at` of the planes with every pixel four times (keyframes.doubled)."""
+    height, width = 2 * planes.shape[1], 2 * planes.shape[2]
+    half, one = np.float32(0.5), np.float32(1)
+    a = min(max(a * np.float32(width) - half, np.float32(0)), np.float32(width - 1))
+    b = min(max(b * np.float32(height) - half, np.float32(0)), np.float32(height - 1))
     i, j = min(int(a), width - 2), min(int(b), height - 2)
-    a, b = a - i, b - j
-    above = plane[j >> 1, i >> 1] * (1 - a) + plane[j >> 1, (i + 1) >> 1] * a
-    below = plane[(j + 1) >> 1, i >> 1] * (1 - a) + plane[(j + 1) >> 1, (i + 1) >> 1] * a
-    return above * (1 - b) + below * b
+    a, b = a - np.float32(i), b - np.float32(j)
+    left, right, top, bottom = i >> 1, (i + 1) >> 1, j >> 1, (j + 1) >> 1
+    for c in range(3):
+        above = planes[c, top, left] * (one - a) + planes[c, top, right] * a
+        below = planes[c, bottom, left] * (one - a) + planes[c, bottom, right] * a
+        shown[c] = (above * (one - b) + below * b) / np.float32(255)
