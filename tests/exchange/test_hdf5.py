@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from terrella.data.source import Readings, Sensor, Source, Take
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'terrella[hdf5]'")
 
 from terrella.exchange.formats import counter_strike, hdf5, robomimic, rows  # noqa: E402
+from terrella.exchange.formats.arrays import Array  # noqa: E402
 
 
 def stacked(readings: Readings) -> np.ndarray:
@@ -160,14 +162,18 @@ def test_write_read_write_is_the_identity(tmp_path_factory, state, action, pictu
 
 def test_pictures_are_read_when_looked_at(tmp_path, monkeypatch):
     source = hdf5.read(robomimic_file(tmp_path / "a.hdf5"))
-    reads = []
-    original = hdf5.taken
-    monkeypatch.setattr(hdf5, "taken", lambda d, s, *at: (reads.append((s.kind, *at)), original(d, s, *at))[1])
+    reads, original = [], hdf5.array
+
+    def counted(*given) -> Array:
+        array = original(*given)
+        return replace(array, read=lambda *at: (reads.append((len(array.shape), *at)), array.read(*at))[1])
+
+    monkeypatch.setattr(hdf5, "array", counted)
     take = next(iter(source.takes()))
-    assert all(kind == "vector" for kind, *_ in reads)
+    assert reads and all(dimensions < 4 for dimensions, *_ in reads)
     reads.clear()
     assert take.readings["observation.images.agentview"].values[1][0, 0, 0] == 11
-    assert reads == [("image", 1, 2)]
+    assert reads == [(4, 1, 2)]
 
 
 def test_a_folder_is_the_takes_of_its_files(tmp_path):

@@ -323,7 +323,10 @@ def test_broken_datasets_are_named(store, kind):
         ({"observation_space": None}, "no observation_space"),
         ({"observation_space": "{"}, "observation_space .* damaged"),
         ({"observation_space": json.dumps({"type": "Graph"})}, "Graph"),
-        ({"observation_space": json.dumps({"type": "Box", "shape": [1 << 40], "dtype": "float32"})}, "not .*numbers"),
+        (
+            {"observation_space": json.dumps({"type": "Box", "shape": [1 << 40], "dtype": "float32"})},
+            "array of numbers",
+        ),
         ({"observation_space": json.dumps({"type": "Box", "shape": [-1], "dtype": "int8"})}, "-1"),
         ({"total_episodes": 3}, "episode_2|/2 has no"),
     ]:

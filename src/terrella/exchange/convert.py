@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 from ..core.errors import DatasetError
 from ..data.format import INFO
 from ..data.source import Sensor, Source, Take
-from .formats.suffixes import IMAGES, VIDEOS
+from .formats.folders import IMAGES, VIDEOS
 
 Format = Literal["lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"]
 _DEEPEST = 4  # folders below the one named that are looked into

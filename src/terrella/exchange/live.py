@@ -24,7 +24,6 @@ class Live:
     target:  a new file ending in .mcap, never more than half a second behind; or a port number as text, at which a
              WebSocket server on 127.0.0.1 is found by Foxglove ("0" chooses a free port, see `port`).
     sensors: name -> Sensor, all that will be logged.
-    image:   how pictures are sent: "jpeg", "png" or "raw".
 
     `log` never raises and never waits: errors are named in `notes`, readings that were lost are counted in `dropped`.
     DatasetError, from the constructor alone, where the target cannot be used.
@@ -36,8 +35,6 @@ class Live:
         sensors: Mapping[str, Sensor],
         name: str,
         *,
-        image: str = "jpeg",
-        task: str = "",
         start_ns: int | None = None,
     ):
         self.start_ns = time.time_ns() if start_ns is None else start_ns
@@ -47,9 +44,7 @@ class Live:
         self._waiting: deque[tuple[str, int, np.ndarray]] = deque()
         self._bytes, self._closing, self._broken = 0, False, False
         self._wake = threading.Condition()
-        if image not in ("jpeg", "png", "raw"):
-            raise DatasetError(f"Live pictures are sent as jpeg, png or raw, not as '{image}'.")
-        self._out = _open(str(target), self._sensors, name, image, task, self.start_ns)
+        self._out = _open(str(target), self._sensors, name, self.start_ns)
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
 
@@ -153,22 +148,21 @@ class Live:
                 self._lose("")
 
 
-def _open(target: str, sensors: Mapping[str, Sensor], name: str, image: str, task: str, start_ns: int):
+def _open(target: str, sensors: Mapping[str, Sensor], name: str, start_ns: int):
     """Something with add(name, time_ns, value), flush(), close() and abandon()."""
     if target.isascii() and target.isdigit():
         from .live_server import LiveServer
 
-        return LiveServer(int(target), sensors, name, image)
+        return LiveServer(int(target), sensors, name)
     if not target.endswith(".mcap"):
         raise DatasetError(f"'{target}' is neither a port nor a file ending in .mcap; name one of these.")
     from .formats.mcap_write import Recording
 
     source = Source(name, sensors, lambda: iter(()))
-    about = Take({}, task, start_ns)
     if Path(target).exists():
         raise DatasetError(f"'{target}' exists already; choose another name for the live log.")
     try:
         Path(target).parent.mkdir(parents=True, exist_ok=True)
-        return Recording(Path(target), sensors, source, about, start_ns, image=image)
+        return Recording(Path(target), sensors, source, Take({}, start_ns=start_ns), start_ns, jpeg=True)
     except OSError as error:
         raise DatasetError(f"'{target}' cannot be written ({error.strerror}); choose another place.") from error

@@ -41,9 +41,9 @@ class LiveServer:
     `port` is where watchers connect. DatasetError where it cannot be had.
     """
 
-    def __init__(self, port: int, sensors: Mapping[str, Sensor], name: str, image: str = "jpeg"):
+    def __init__(self, port: int, sensors: Mapping[str, Sensor], name: str):
         self._sensors, self._context = sensors, (context := foxglove.Context())  # channels end with their context
-        self._encoders = {key: encoder.Encoder(sensor, image) for key, sensor in sensors.items()}
+        self._encoders = {key: encoder.Encoder(sensor, jpeg=True) for key, sensor in sensors.items()}
         topic, calibration = topics(sensors), encoder.calibration_schema()
 
         def channel(topic: str, schema: foxglove.Schema) -> foxglove.Channel:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Lazy, Readings, Sensor, Source, Take
-from . import hdf5, rows
+from ...data.source import Sensor, Source, Take
+from . import arrays, hdf5, rows
 
 # what is at each place of frame_i_y (ACTION) and of frame_i_xaux (AUX: the last three actions and what they met)
 FPS = 16.0
@@ -30,7 +30,8 @@ AUX = tuple(
     for back in (1, 2, 3)
     for name in (*KEYS, *CLICKS, "mouse_x_of_1000", "mouse_y_of_200", "health_of_100", "ammo_of_30", "is_ct")
 )
-_PARTS = {
+_PARTS = {  # frame_i_PART -> its sensor, and the names of its numbers
+    "x": (f"{rows.IMAGES}{rows.CAMERA}", ()),
     "xaux": ("observation.xaux", AUX),
     "y": (rows.ACTION, ACTION),
     "helperarr": ("observation.events", ("kill", "death")),
@@ -44,68 +45,52 @@ def read(path: Path, files: list[Path], fps: float | None) -> Source:
     23 horizontal and one of 15 vertical mouse steps (ACTION names them). "observation.events" says whether the player
     scored a kill, and whether it died, since the last row.
     """
-    rate = fps or FPS
+    sensors: dict[arrays.Place, Sensor] = {}
     with hdf5.opened(files[0]) as file:
-        picture = hdf5.numbers(file, "frame_0_x")
-        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-            raise DatasetError(f"{files[0]}/frame_0_x is {picture.dtype} {list(picture.shape)}, not a picture.")
-        rows.check_size(picture.shape[0], picture.shape[1], f"{files[0]}/frame_0_x")
-        found = [Sensor(f"{rows.IMAGES}{rows.CAMERA}", "image", picture.shape, "uint8", rate_hz=rate)]
         for part, (name, names) in _PARTS.items():
             if f"frame_0_{part}" in file:
-                values = hdf5.numbers(file, f"frame_0_{part}")
-                if values.ndim != 1:
-                    raise DatasetError(f"{files[0]}/frame_0_{part} is {list(values.shape)}, not one row of numbers.")
-                named = names if len(names) == len(values) else ()
-                found.append(Sensor(name, "vector", values.shape, values.dtype.name, named, rate_hz=rate))
-    sensors = {sensor.name: sensor for sensor in found}
+                found = hdf5.numbers(file, f"frame_0_{part}")
+                kind = "image" if part == "x" else "vector"
+                good = found.ndim == 1 if kind == "vector" else found.shape[2:] == (3,) and found.dtype == np.uint8
+                if not good:
+                    raise DatasetError(f"{files[0]}/frame_0_{part} is {found.dtype} {list(found.shape)}, not a {kind}.")
+                if kind == "image":
+                    rows.check_size(found.shape[0], found.shape[1], f"{files[0]}/frame_0_x")
+                names = names if len(names) == len(found) else ()
+                sensors[part,] = Sensor(name, kind, found.shape, found.dtype.name, names, rate_hz=fps or FPS)
     base = path if path.is_dir() else path.parent
-    return Source(
-        name=path.name if path.is_dir() else path.stem,
-        sensors=sensors,
-        takes=lambda: (_take(file, sensors, rate, file.relative_to(base).as_posix()) for file in files),
-        fps=rate,
-        robot="counter-strike",
-        facts={"layout": "counter-strike"},
-    )
+
+    def takes(rate: float) -> Iterator[Take]:
+        for file in files:
+            there = _episode(file, sensors)
+            found = arrays.readings(there, sensors, np.arange(there["x",].shape[0]) / rate, str(file))
+            yield Take(found, facts={"file": file.relative_to(base).as_posix()})
+
+    name = path.name if path.is_dir() else path.stem
+    facts = {"layout": "counter-strike"}
+    return arrays.source(name, name, sensors, takes, fps=fps or FPS, robot="counter-strike", facts=facts)
 
 
-def _take(path: Path, sensors: Mapping[str, Sensor], fps: float, name: str) -> Take:
-    parts = {part: sensors[sensor] for part, (sensor, _) in _PARTS.items() if sensor in sensors}
+def _episode(path: Path, sensors: dict[arrays.Place, Sensor]) -> dict[arrays.Place, arrays.Array]:
     with hdf5.opened(path) as file:
         names = set(hdf5.members(file))
-        frames = sum(bool(re.fullmatch(r"frame_\d+_x", key)) for key in names)
-        missing = [
-            key
-            for i in range(frames)
-            for key in (f"frame_{i}_x", *(f"frame_{i}_{p}" for p in parts))
-            if key not in names
-        ]
-        if missing or not frames:
-            raise DatasetError(
-                f"{path} lacks {(missing or ['frame_0_x'])[0]}; it is truncated, or no Counter-Strike recording."
-            )
-        time_s = np.arange(frames) / fps
-        readings = {}
-        for part, sensor in parts.items():
-            values = np.empty((frames, *sensor.shape), sensor.dtype)
-            for i in range(frames):
-                values[i] = _value(file, f"frame_{i}_{part}", sensor)
-            readings[sensor.name] = Readings(time_s, values)
-    camera = sensors[f"{rows.IMAGES}{rows.CAMERA}"]
+    frames = sum(bool(re.fullmatch(r"frame_\d+_x", key)) for key in names)
+    needed = [f"frame_{i}_{part}" for i in range(max(frames, 1)) for (part,) in sensors]
+    if missing := [key for key in needed if key not in names]:
+        raise DatasetError(f"{path} lacks {missing[0]}; it is truncated, or no Counter-Strike recording.")
 
-    def picture(i: int) -> np.ndarray:
-        with hdf5.opened(path) as file:
-            return np.ascontiguousarray(_value(file, f"frame_{i}_x", camera)[..., ::-1])  # stored blue, green, red
+    def one(part: str, sensor: Sensor) -> arrays.Array:
+        def read(start: int, stop: int) -> np.ndarray:
+            found = np.empty((stop - start, *sensor.shape), sensor.dtype)
+            with hdf5.opened(path) as file:
+                for i in range(start, stop):
+                    frame = hdf5.numbers(file, f"frame_{i}_{part}")
+                    if frame.shape != sensor.shape:
+                        shape, want = list(frame.shape), list(sensor.shape)
+                        raise DatasetError(f"{path}{frame.name} is {shape} where the first frame has {want}.")
+                    found[i - start] = frame[()]
+            return found[..., ::-1] if part == "x" else found  # stored blue, green, red
 
-    readings[camera.name] = Readings(time_s, Lazy(frames, picture))
-    return Take(readings, facts={"file": name})
+        return arrays.Array((frames, *sensor.shape), np.dtype(sensor.dtype), read)
 
-
-def _value(file: hdf5.File, name: str, sensor: Sensor) -> np.ndarray:
-    dataset = hdf5.numbers(file, name)
-    if dataset.shape != sensor.shape:
-        raise DatasetError(
-            f"{file.filename}/{name} is {list(dataset.shape)} where the first frame has {list(sensor.shape)}."
-        )
-    return np.asarray(dataset[()], sensor.dtype)
+    return {place: one(str(place[0]), sensor) for place, sensor in sensors.items()}

@@ -13,7 +13,6 @@ from PIL import Image
 
 from ...core.errors import DatasetError
 from ...data.source import Sensor
-from .films import h264_encoder
 from .messages import POSE_NAMES, VECTOR
 
 try:
@@ -23,31 +22,19 @@ try:
 except ImportError as error:
     raise DatasetError("MCAP needs packages that are not installed: pip install 'terrella[mcap]'.") from error
 
-CODINGS = ("png", "jpeg", "raw", "h264")
 _JPEG_QUALITY = 90
 
 
 class Encoder:
-    """Makes messages of one sensor's readings, in their order in time (video depends on what came before).
+    """Makes messages of one sensor's readings; pictures become PNG (exact), or `jpeg`."""
 
-    image: "png" (exact), "jpeg", "raw" (exact) or "h264"; a picture of odd size is not made H.264 but PNG.
-    """
-
-    def __init__(self, sensor: Sensor, image: str = "png"):
-        if image not in CODINGS:
-            raise DatasetError(f"Images are written as {', '.join(CODINGS)}, not as '{image}'.")
-        self._sensor, self.note = sensor, ""
+    def __init__(self, sensor: Sensor, jpeg: bool = False):
+        self._sensor = sensor
         kind: str = sensor.kind
         if kind == "image":
-            kind = image
-            if image == "h264" and (sensor.shape[0] % 2 or sensor.shape[1] % 2):
-                kind = "png"
-                self.note = f"'{sensor.name}' is written as PNG: H.264 needs even sizes, and it is {sensor.shape[:2]}."
-            elif image in ("jpeg", "h264"):
-                self.note = f"'{sensor.name}' is written as {image.upper()}, which is not exact; 'png' is."
+            kind = "jpeg" if jpeg else "png"
         elif kind == "vector" and sensor.names == POSE_NAMES:
             kind = "transform" if sensor.facts.get("child_frame") else "pose"
-        self._film = h264_encoder(sensor.shape[1], sensor.shape[0]) if kind == "h264" else None
         self.schema, self._make = _vector_schema() if kind == "vector" else _SCHEMAS[kind](), getattr(self, f"_{kind}")
 
     def __call__(self, value: np.ndarray, time_ns: int) -> bytes:
@@ -66,24 +53,17 @@ class Encoder:
         pixels = np.ascontiguousarray(value)
         return self._picture(time, simplejpeg.encode_jpeg(pixels, quality=_JPEG_QUALITY, colorspace="RGB"), "jpeg")
 
-    def _h264(self, value: np.ndarray, time: fox.Timestamp) -> bytes:
-        data = self._film(value) if self._film else b""
-        return fox.CompressedVideo(timestamp=time, frame_id=self._sensor.frame, data=data, format="h264").encode()
-
-    def _raw(self, value: np.ndarray, time: fox.Timestamp, encoding: str = "rgb8", pixel_bytes: int = 3) -> bytes:
-        height, width = value.shape[:2]
+    def _depth(self, value: np.ndarray, time: fox.Timestamp) -> bytes:
+        height, width = value.shape
         return fox.RawImage(
             timestamp=time,
             frame_id=self._sensor.frame,
             width=width,
             height=height,
-            encoding=encoding,
-            step=width * pixel_bytes,
-            data=value.tobytes(),
+            encoding="32FC1",
+            step=width * 4,
+            data=value.astype("<f4").tobytes(),
         ).encode()
-
-    def _depth(self, value: np.ndarray, time: fox.Timestamp) -> bytes:
-        return self._raw(value.astype("<f4"), time, "32FC1", 4)
 
     def _points(self, value: np.ndarray, time: fox.Timestamp) -> bytes:
         columns, names = value.shape[1], self._sensor.names
@@ -125,8 +105,6 @@ class Encoder:
 _SCHEMAS: dict[str, Callable[[], Schema]] = {
     "png": fox.CompressedImage.get_schema,
     "jpeg": fox.CompressedImage.get_schema,
-    "h264": fox.CompressedVideo.get_schema,
-    "raw": fox.RawImage.get_schema,
     "depth": fox.RawImage.get_schema,
     "points": fox.PointCloud.get_schema,
     "pose": fox.PoseInFrame.get_schema,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from functools import partial
 
 import gymnasium
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Readings, Sensor, Source, Take
-from . import rows, spaces
+from ...data.source import Sensor, Source, Take
+from . import arrays, rows, spaces
+from .arrays import Array, Place
 
+_FOLLOW = [("rewards",), ("terminations",), ("truncations",)]
 _MOST_STEPS = 1000
 
 
@@ -31,15 +33,19 @@ def from_env(
     rows.check_fps(fps, "the rollout")
     made, name = _make(env)
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
-    rate, notes = rows.rate_of(fps, _rate(made), name)
+    stated = {"fps": _rate(made)}
     made.close()
-    both = ((rows.OBSERVATION, observation), (rows.ACTION, action))
-    leaves = {role: spaces.leaves(role, space, name) for role, space in both}
-    sensors = {leaf.sensor.name: leaf.sensor for parts in leaves.values() for leaf in parts if leaf.sensor}
-    for role, kind in ((rows.REWARD, "float64"), (rows.DONE, "bool"), (rows.TRUNCATED, "bool")):
-        sensors[role] = replace(rows.sensor_for("", role, (), kind), name=role)
+    leaves = {
+        (root, *place): leaf
+        for root, space in (("observations", observation), ("actions", action))
+        for place, leaf in spaces.leaves(space, root, name).items()
+    }
+    known = {place: leaf for place, leaf in leaves.items() if leaf} | dict.fromkeys(
+        _FOLLOW, Array((0,), np.dtype(float))
+    )
+    sensors, _ = arrays.columns(known, partial(arrays.named, arrays.GYMNASIUM), name)
 
-    def takes() -> Iterator[Take]:
+    def takes(rate: float) -> Iterator[Take]:
         made, _ = _make(env)
         try:
             for number in range(episodes):
@@ -49,7 +55,7 @@ def from_env(
             made.close()
 
     facts = {"observation_space": observation, "action_space": action, "env": name, "seed": seed}
-    return Source(name, sensors, takes, rate, notes=notes, facts=facts)
+    return arrays.source(name, name, sensors, takes, fps=fps, about=stated, facts=facts)
 
 
 def _make(env: str | Callable[[], gymnasium.Env]) -> tuple[gymnasium.Env, str]:
@@ -75,48 +81,42 @@ def _rate(env: gymnasium.Env) -> float | None:
 def _rollout(env: gymnasium.Env, draw: np.ndarray) -> dict[str, list]:
     seen, _ = env.reset(seed=int(draw[0]))
     env.action_space.seed(int(draw[1]))
-    found: dict[str, list] = {rows.OBSERVATION: [seen], rows.ACTION: []}
-    found |= {name: [] for name in (rows.REWARD, rows.DONE, rows.TRUNCATED)}
+    found: dict[str, list] = {name: [] for name in arrays.GYMNASIUM}
+    found["observations"].append(seen)
     done = cut = False
     while not (done or cut):
         action = env.action_space.sample()
         seen, reward, terminated, truncated, _ = env.step(action)
-        done, steps = bool(terminated), len(found[rows.ACTION]) + 1
+        done, steps = bool(terminated), len(found["actions"]) + 1
         cut = bool(truncated) or (steps == _MOST_STEPS and not done)
-        for name, value in zip(found, (seen, action, float(reward), done, cut)):  # type: ignore[arg-type]
+        for name, value in zip(arrays.GYMNASIUM, (seen, action, float(reward), done, cut)):
             found[name].append(value)
     return found
 
 
 def _take(
     found: Mapping[str, list],
-    leaves: Mapping[str, tuple[spaces.Leaf, ...]],
-    sensors: Mapping[str, Sensor],
+    leaves: Mapping[Place, Array | None],
+    sensors: Mapping[Place, Sensor],
     fps: float,
     name: str,
     seed: int,
 ) -> Take:
-    time_s = np.arange(len(found[rows.OBSERVATION])) / fps
-    readings, task, texts = {}, "", {}
-    for role, parts in leaves.items():
-        for leaf in parts:
-            values = found[role]
-            for key in leaf.path:
-                values = [value[key] for value in values]
-            if leaf.sensor is None:
-                if leaf.is_instruction and len(set(values)) == 1 and not task:
-                    task = str(values[0])
-                else:
-                    texts["/".join(map(str, (f"{role}s", *leaf.path)))] = [str(text) for text in values]
-                continue
-            shape = rows.stored_shape(leaf.sensor)
-            try:
-                stacked = np.stack([np.asarray(value, leaf.sensor.dtype).reshape(shape) for value in values])
-            except (TypeError, ValueError) as error:
-                raise DatasetError(
-                    f"{name} gave {leaf.sensor.name} of another shape than its space says: {error}."
-                ) from error
-            readings[leaf.sensor.name] = Readings(time_s[: len(values)], rows.from_stored(stacked, leaf.sensor))
-    for role in (rows.REWARD, rows.DONE, rows.TRUNCATED):
-        readings[role] = Readings(time_s[:-1], np.asarray(found[role], sensors[role].dtype)[:, None])
-    return Take(readings, task, facts={"seed": seed, **({"texts": texts} if texts else {})})
+    there: dict[Place, Array] = {}
+    texts: dict[Place, list[str]] = {}
+    for place in {**leaves, **sensors}:
+        values = found[str(place[0])]
+        for key in place[1:]:
+            values = [value[key] for value in values]
+        if place not in sensors:
+            texts[place] = [str(text) for text in values]
+            continue
+        sensor = sensors[place]
+        try:
+            stored = np.stack([np.asarray(it, sensor.dtype).reshape(rows.stored_shape(sensor)) for it in values])
+        except (TypeError, ValueError) as error:
+            raise DatasetError(f"{name} gave {sensor.name} of another shape than its space says: {error}.") from error
+        there[place] = Array(stored.shape, stored.dtype, lambda start, stop, stored=stored: stored[start:stop])
+    task, kept = spaces.said(texts)
+    readings = arrays.readings(there, sensors, np.arange(len(found["observations"])) / fps, name)
+    return Take(readings, task, facts={"seed": seed, **({"texts": kept} if kept else {})})

@@ -1,39 +1,73 @@
-"""H.264 and H.265 as messages, one frame each: encoded one after another, decoded by number."""
+"""Pictures of a film by number; and H.264 and H.265 as messages, one frame each."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from fractions import Fraction
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import av
 import numpy as np
 
 from ...core.errors import DatasetError
-from .messages import MAX_PIXELS
+from .rows import MAX_PIXELS
 
 _HELD_BACK = 16  # messages after which a picture must have come out
-_REMEMBERED = 4  # pictures
+_NEAR = 2  # pictures ahead that are decoded without a look at where keyframes are
 _CODECS = {"h264": "h264", "h265": "hevc"}
 _KEY_UNITS = {"h264": (lambda byte: byte & 31, {5}), "h265": (lambda byte: byte >> 1 & 63, set(range(16, 22)))}
 
 
-def h264_encoder(width: int, height: int) -> Callable[[np.ndarray], bytes]:
-    """One message per frame: Annex B, no B-frames, the parameter sets with every keyframe."""
-    options = {"preset": "veryfast", "tune": "zerolatency", "crf": "18", "g": "30", "bf": "0", "threads": "1"}
-    codec: Any = av.CodecContext.create("libx264", "w")
-    codec.width, codec.height, codec.pix_fmt, codec.options = width, height, "yuv420p", options
-    codec.time_base = Fraction(1, 30)  # nobody reads it: each message has its own time
-    count = 0
+class Film:
+    """Pictures by number, uint8 [H, W, 3]: going on in order decodes each once, elsewhere begins at the last keyframe.
 
-    def encode(value: np.ndarray) -> bytes:
-        nonlocal count
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(value), format="rgb24")
-        frame.pts, count = count, count + 1
-        return b"".join(bytes(packet) for packet in codec.encode(frame))
+    begin(i) gives (number, frame) from keyframe i on; key(i) is the last keyframe not after frame i; show(frame) is its
+    picture; `what` is filmed, for errors. One thread decodes at a time.
+    """
 
-    return encode
+    def __init__(
+        self,
+        begin: Callable[[int], Iterator[tuple[int, av.VideoFrame]]],
+        key: Callable[[int], int],
+        show: Callable[[av.VideoFrame], np.ndarray],
+        what: str = "the video",
+    ):
+        self._what = what
+        self._begin, self._key, self._show = begin, key, show
+        self._run: Iterator[tuple[int, av.VideoFrame]] | None = None
+        self._next, self._last = 0, (-1, np.zeros(0))
+        self._lock = threading.Lock()
+
+    def __call__(self, index: int) -> np.ndarray:
+        """Frame `index`; DatasetError where it does not decode."""
+        with self._lock:
+            if self._last[0] != index:
+                try:
+                    self._last = index, self._show(self._frame(index))
+                except BaseException:
+                    self._run = None
+                    raise
+            return self._last[1].copy()
+
+    def rest(self) -> None:
+        """Lets go of the file, when no more is looked at."""
+        self._run = None
+
+    def _frame(self, index: int) -> av.VideoFrame:
+        if self._run is None or not 0 <= index - self._next <= _NEAR:
+            key = self._key(index)
+            if self._run is None or not key <= self._next <= index:
+                self._run, self._next = self._begin(key), key
+        for again in (False, True):
+            if again:  # the container's index led elsewhere
+                self._run = self._begin(0)
+            for number, frame in self._run:
+                self._next = number + 1
+                if number == index:
+                    return frame
+                if number > index + _HELD_BACK:
+                    break
+        raise DatasetError(f"frame {index} of {self._what} decodes to no picture; restore it from a copy.")
 
 
 def decodable(read: Callable[[int], bytes], after_gap: np.ndarray, format: str) -> np.ndarray:
@@ -68,62 +102,34 @@ def is_key(data: bytes, format: str) -> bool:
     return False
 
 
-class VideoDecoder:
-    """Frames of a film by number, uint8 [H, W, 3].
+def film(read: Callable[[int], bytes], count: int, format: str) -> Film:
+    """The film of `count` messages, the first of which is a keyframe; read(i) gives the data of message i."""
 
-    read(i) gives the data of message i of `count`, the first of which is a keyframe. Decoding starts at the last keyframe
-    before what is asked for, and goes on from where it stands when frames are asked for in order. One thread decodes at
-    a time.
-    """
-
-    def __init__(self, read: Callable[[int], bytes], count: int, format: str):
-        self._read, self._count, self._format = read, count, format
-        self._codec: Any = None
-        self._fed, self._given = 0, -1  # the next message to decode, the last picture that came out
-        self._frames: dict[int, np.ndarray] = {}
-        self._lock = threading.Lock()
-
-    def __call__(self, index: int) -> np.ndarray:
-        with self._lock:
-            if index not in self._frames:
-                self._go_to(index)
-                try:
-                    self._decode(index)
-                except BaseException:
-                    self._codec = None  # start anew, at a keyframe
-                    raise
-            return self._frames[index]
-
-    def _go_to(self, index: int) -> None:
-        ahead = self._codec is not None and index > self._given
-        if ahead and index <= self._fed + 2:
-            return
-        key = next((i for i in range(index, -1, -1) if is_key(self._read(i), self._format)), None)
-        if key is None:
-            raise DatasetError("no keyframe comes before it")
-        if not (ahead and key <= self._fed):
-            self._codec = av.CodecContext.create(_CODECS[self._format], "r")
-            self._codec.thread_count = 1
-            self._codec.options = {"max_pixels": str(MAX_PIXELS)}
-            self._fed, self._given, self._frames = key, key - 1, {}
-
-    def _decode(self, index: int) -> None:
-        while index not in self._frames:
-            if self._fed > min(index + _HELD_BACK, self._count):
+    def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
+        codec: Any = av.CodecContext.create(_CODECS[format], "r")
+        codec.thread_count = 1
+        codec.options = {"max_pixels": str(MAX_PIXELS)}
+        seen = key
+        for i in range(key, count + 1):
+            if i > seen + _HELD_BACK:
                 raise DatasetError("it decodes to no picture")
             packet = None  # the end: what the decoder still holds comes out
-            if self._fed < self._count:
-                packet = av.Packet(self._read(self._fed))
-                packet.pts = self._fed
+            if i < count:
+                packet = av.Packet(read(i))
+                packet.pts = i
             try:
-                pictures = self._codec.decode(packet)
-                self._fed += 1
-                for picture in pictures:
-                    if picture.pts is not None:
-                        self._given = picture.pts
-                        self._frames[picture.pts] = picture.to_ndarray(format="rgb24")
+                frames = codec.decode(packet)
             except (av.FFmpegError, ValueError, MemoryError) as error:
                 raise DatasetError(f"its video cannot be decoded ({error})") from error
-            for old in list(self._frames)[:-_REMEMBERED]:
-                if old != index:
-                    del self._frames[old]
+            for frame in frames:
+                if frame.pts is not None:
+                    seen = i
+                    yield frame.pts, frame
+
+    def last_key(index: int) -> int:
+        for i in range(index, -1, -1):
+            if is_key(read(i), format):
+                return i
+        raise DatasetError("no keyframe comes before it")
+
+    return Film(begin, last_key, lambda frame: frame.to_ndarray(format="rgb24"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Lazy, Sensor, Source, Take
+from ...data.source import Readings, Sensor, Source, Take
 from . import rows
+from .arrays import Array, Place
 
 try:
     from h5py import Dataset, File, Group, HardLink, string_dtype
@@ -24,7 +25,7 @@ SUFFIXES = (".hdf5", ".h5", ".hdf")
 OURS = "terrella"  # the attribute under which our description of the sensors is kept
 TEXT = string_dtype("utf-8")
 _UNTOLD_BYTES, _BEST_RATIO = 1 << 26, 1100  # deflate packs at most 1032 to 1: who claims more than that is lying
-DEEPEST = 16  # groups in groups
+_DEEPEST = 16  # groups in groups
 _STUMBLES = (OSError, RuntimeError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
 
 
@@ -109,8 +110,12 @@ def members(parent: Group) -> list[str]:
     return [str(name) for name in parent]
 
 
-def child(parent: Group, name: str) -> Group | Dataset:
-    """parent[name], of the same file: links elsewhere are refused, as are datasets whose bytes lie elsewhere."""
+def child(parent: Group, name: str | int) -> Group | Dataset:
+    """parent[name], of the same file: links elsewhere are refused, as are datasets whose bytes lie elsewhere.
+
+    An index of a Tuple is "_index_i", as Minari has it.
+    """
+    name = f"_index_{name}" if isinstance(name, int) else name
     where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
     try:
         link = parent.get(name, getlink=True)
@@ -126,7 +131,7 @@ def child(parent: Group, name: str) -> Group | Dataset:
     return found
 
 
-def numbers(parent: Group, name: str, count: int | None = None) -> Dataset:
+def numbers(parent: Group, name: str | int, count: int | None = None) -> Dataset:
     """The dataset of numbers `name` with `count` rows; DatasetError where it is another or claims more than it stores."""
     where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
     found = child(parent, name)
@@ -142,44 +147,105 @@ def numbers(parent: Group, name: str, count: int | None = None) -> Dataset:
     return found
 
 
-def taken(dataset: Dataset, sensor: Sensor, start: int = 0, stop: int | None = None) -> np.ndarray:
-    """Rows [start, stop) as the sensor's values."""
-    try:
-        return rows.from_stored(np.asarray(dataset[start:stop], sensor.dtype), sensor)
-    except _STUMBLES as error:
-        raise broken(dataset, error) from error
+def inside(parent: Group, *names: str | int) -> Group:
+    """parent[name][…], which must be a group."""
+    for name in names:
+        found = child(parent, name)
+        if not isinstance(found, Group):
+            where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
+            raise DatasetError(f"{where} is not a group; the file is inconsistent.")
+        parent = found
+    return parent
 
 
-def pictures(path: Path, names: Sequence[str], sensor: Sensor, start: int, count: int) -> Lazy:
-    """Rows start … start + count - 1 of the dataset at `names`, each read when looked at; the file is opened at the first look."""
-    kept: list[Dataset] = []
-
-    def make(i: int) -> np.ndarray:
-        if not kept:
-            item = _open(path)
-            for name in names[:-1]:
-                item = group(item, name)
-            kept.append(numbers(item, names[-1]))
-        if kept[0].shape[1:] != rows.stored_shape(sensor) or start + i >= len(kept[0]):
-            raise DatasetError(f"{path} changed while it was read; read it anew.")
-        return taken(kept[0], sensor, start + i, start + i + 1)[0]
-
-    return Lazy(count, make)
+def walked(parent: Group, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Dataset]]:
+    """Every dataset in a group and the groups in it, with its place."""
+    if len(place) > _DEEPEST:
+        raise DatasetError(f"{parent.file.filename} nests its groups too deep; it is damaged.")
+    for name in members(parent):
+        item = child(parent, name)
+        if isinstance(item, Group):
+            yield from walked(item, (*place, name))
+        else:
+            yield (*place, name), item
 
 
-def followed_by(first: Lazy, last: Lazy) -> Lazy:
-    """The values of both, one after the other."""
+def array(file: File, count: int, *pieces: tuple[Place, int, int]) -> Array:
+    """Rows of datasets one after the other, of each piece those from its second number to its third.
 
-    def make(i: int) -> np.ndarray:
-        return np.asarray(first[i] if i < len(first) else last[i - len(first)])
+    All must have `count` rows. Rows read after `file` was closed open it anew, once.
+    """
+    path = Path(file.filename)
+    held = [numbers(inside(file, *names[:-1]), names[-1], count) for names, _, _ in pieces]
 
-    return Lazy(len(first) + len(last), make)
+    def read(start: int, stop: int) -> np.ndarray:
+        if not all(held):
+            again = _open(path)
+            held[:] = [numbers(inside(again, *names[:-1]), names[-1], count) for names, _, _ in pieces]
+        parts, row = [], 0
+        for dataset, (_, first, last) in zip(held, pieces):
+            begin, end = max(start - row, 0) + first, min(stop - row + first, last)
+            try:
+                parts += [np.asarray(dataset[begin:end])] if begin < end else []
+            except _STUMBLES as error:
+                where = f"{path}{dataset.name}"
+                raise DatasetError(f"{where} cannot be read ({_first_line(error)}); restore it from a copy.") from error
+            row += last - first
+        return np.concatenate(parts) if parts else np.asarray(held[0][:0])
+
+    size = sum(last - first for _, first, last in pieces)
+    for dataset in held[1:]:
+        if dataset.shape[1:] != held[0].shape[1:]:
+            raise DatasetError(f"{path}{dataset.name} has another shape than {held[0].name}; drop the episode.")
+    return Array((size, *held[0].shape[1:]), held[0].dtype, read)
 
 
-def broken(dataset: Dataset, error: BaseException) -> DatasetError:
-    """What to raise where a dataset's values cannot be read."""
-    where = f"{dataset.file.filename}{dataset.name}"
-    return DatasetError(f"{where} cannot be read ({_first_line(error)}); restore the file from a copy.")
+def headers(items: Iterable[tuple[tuple[str, ...], Dataset]]) -> dict[Place, Array]:
+    """What is known of datasets without reading them."""
+    return {place: Array(item.shape, item.dtype) for place, item in items}
+
+
+def texts(dataset: Group | Dataset) -> list[str]:
+    """The values of a dataset [n] of texts."""
+    if (
+        not isinstance(dataset, Dataset)
+        or dataset.dtype.kind not in "OS"
+        or dataset.ndim != 1
+        or len(dataset) > 1 << 24
+    ):
+        raise DatasetError(f"{dataset.file.filename}{dataset.name} holds no texts; restore it from a copy.")
+    return [it.decode("utf-8", "replace") if isinstance(it, bytes) else str(it) for it in np.asarray(dataset)]
+
+
+def set_attributes(item: Group, given: object) -> None:
+    """Gives a group what of a mapping its attributes can hold."""
+    for key, value in given.items() if isinstance(given, Mapping) else ():
+        if isinstance(value, str | int | float | list):
+            item.attrs[key] = value
+
+
+def store(
+    parent: Group,
+    targets: Mapping[str, int],
+    shape: tuple[int, ...],
+    sensor: Sensor,
+    readings: Readings,
+    where: str,
+    dtype: str = "",
+) -> None:
+    """Writes a sensor's readings as datasets of `shape`; targets: name -> the number of its first reading."""
+    more = {}
+    if sensor.kind != "vector":
+        more = {"chunks": (1, *shape[1:]), "compression": "gzip", "compression_opts": 1}
+    made = {parent.create_dataset(name, shape, dtype or sensor.dtype, **more): at for name, at in targets.items()}
+    row = 0
+    for part in rows.batches(readings.values, sensor, where, min(len(readings.values), shape[0] + max(made.values()))):
+        stored = rows.to_stored(part, sensor).reshape(len(part), *shape[1:])
+        for dataset, first in made.items():
+            begin, end = max(row, first), min(row + len(part), first + shape[0])
+            if begin < end:
+                dataset[begin - first : end - first] = stored[begin - row : end - row]
+        row += len(part)
 
 
 def _first_line(error: BaseException) -> str:
@@ -200,23 +266,18 @@ def attributes(item: Group, without: Sequence[str] = ()) -> dict[str, object]:
     return found
 
 
-def json_attribute(item: Group, name: str) -> object:
-    """The attribute as JSON, None where it is missing or is not."""
-    text = attributes(item).get(name)
+def json_attribute(item: Group, name: str) -> dict:
+    """The attribute as a JSON object, {} where it is missing or is none."""
+    return json_object(attributes(item).get(name))
+
+
+def json_object(text: object) -> dict:
+    """The JSON object that a text holds, {} where it is none."""
     try:
-        return json.loads(text) if isinstance(text, str) else None
+        found = json.loads(text) if isinstance(text, str) else None
     except ValueError:
-        return None
-
-
-def group(parent: Group, name: str) -> Group:
-    """parent[name], which must be a group."""
-    found = child(parent, name)
-    if not isinstance(found, Group):
-        raise DatasetError(
-            f"{parent.file.filename}{parent.name.rstrip('/')}/{name} is not a group; the file is inconsistent."
-        )
-    return found
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
@@ -234,12 +295,3 @@ def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
             yield from part.takes()
 
     return replace(first, name=name, takes=takes, notes=notes, facts=facts)
-
-
-def check_shape(dataset: Dataset, sensor: Sensor, where: str) -> None:
-    """DatasetError unless the dataset's rows are what the sensor stores."""
-    if dataset.shape[1:] != rows.stored_shape(sensor):
-        shape, want = list(dataset.shape[1:]), list(rows.stored_shape(sensor))
-        raise DatasetError(
-            f"{where} is {shape} a row where the first episode has {want}; drop the episode, or mend it."
-        )

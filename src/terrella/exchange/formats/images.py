@@ -14,7 +14,7 @@ from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from ...data.storage import durable
 from . import folders, rows
-from .suffixes import IMAGES
+from .folders import IMAGES
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
 _TURNS = {  # EXIF orientation -> what undoes it

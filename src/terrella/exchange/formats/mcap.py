@@ -20,7 +20,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import messages, rows
-from .films import VideoDecoder, decodable
+from .films import decodable, film
 from .mcap_index import Index, Metadata, Schema
 
 SOURCE, SENSORS, TAKE = "terrella.source", "terrella.sensors", "terrella.take"
@@ -295,7 +295,7 @@ class _File:
             self._note(group.topic, f"its first {begin} frames come before any keyframe and are left out")
         if lost := count - begin - len(good):
             self._note(group.topic, f"{lost} frames that follow a damaged chunk cannot be decoded and are left out")
-        decoder = VideoDecoder(lambda i: data(int(good[i])), len(good), format)
+        decoder = film(lambda i: data(int(good[i])), len(good), format)
         sensor = self._declared_for(group)
         if sensor is None:
             sensor = Sensor("", "image", decoder(0).shape, "uint8", frame=str(first.get("frame_id") or ""))

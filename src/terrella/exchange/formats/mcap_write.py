@@ -26,16 +26,13 @@ CALIBRATION_TOPIC = "/calibration"  # beneath the topic of its camera
 _CHUNK = 2**20
 
 
-def write(
-    source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None, image: str = "png"
-) -> list[str]:
+def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
     """Writes a source as `path`: a file if it ends in .mcap (one take), else a folder of take-000000.mcap and so on.
 
-    image: "png" or "raw" (both exact), "jpeg", or "h264". `progress(messages, of_this_take)` is called as it goes.
-    Nothing stands at `path` until all of it does. Returns notes on what is not exact. DatasetError where the path is
-    taken, the disk is full, or a reading is not what its sensor declares.
+    Values are exact. `progress(messages, of_this_take)` is called as it goes. Nothing stands at `path` until all of it does.
+    DatasetError where the path is taken, the disk is full, or a reading is not what its sensor declares.
     """
-    path, notes = Path(path), dict[str, None]()
+    path = Path(path)
     with durable.in_whole(path) as staged:
         for number, take in rows.numbered(source, None):
             if path.suffix == ".mcap" and number:
@@ -43,12 +40,12 @@ def write(
             if path.suffix != ".mcap":
                 staged.mkdir(exist_ok=True)
             target = staged if path.suffix == ".mcap" else staged / f"take-{number:06d}.mcap"
-            notes |= dict.fromkeys(_write_take(source, take, target, image, progress))
+            _write_take(source, take, target, progress)
             durable.sync_file(target)
-    return list(notes)
+    return []
 
 
-def _write_take(source: Source, take: Take, path: Path, image: str, progress) -> list[str]:
+def _write_take(source: Source, take: Take, path: Path, progress) -> None:
     names = list(take.readings)
     for name in names:
         if name not in source.sensors:
@@ -64,14 +61,13 @@ def _write_take(source: Source, take: Take, path: Path, image: str, progress) ->
     which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
     order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
     sensors = {name: source.sensors[name] for name in names}
-    with Recording(path, sensors, source, take, zero_ns, image) as recording:
+    with Recording(path, sensors, source, take, zero_ns) as recording:
         for done, at in enumerate(order.tolist()):
             name, i = names[whose[at]], int(which[at])
             value = np.asarray(take.readings[name].values[i])
             recording.add(name, zero_ns + int(times[whose[at]][i]), value)
             if progress:
                 progress(done + 1, len(order))
-    return recording.notes
 
 
 def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
@@ -87,7 +83,7 @@ class Recording:
 
     What was added before a `flush` is found by `read` even if nothing is written after it. The file must be new.
     zero_ns: the log time of the take's second 0, nanoseconds. Of `take` its start_ns, task and facts are kept, and of
-    `source` all but its sensors.
+    `source` all but its sensors. jpeg: whether pictures are written as JPEG, else as PNG (exact).
     """
 
     def __init__(
@@ -97,11 +93,10 @@ class Recording:
         source: Source,
         take: Take,
         zero_ns: int,
-        image: str = "png",
+        jpeg: bool = False,
     ):
         self._sensors = sensors
-        self._encoders = {name: Encoder(sensor, image) for name, sensor in sensors.items()}
-        self.notes = [encoder.note for encoder in self._encoders.values() if encoder.note]
+        self._encoders = {name: Encoder(sensor, jpeg) for name, sensor in sensors.items()}
         self._file = open(path, "xb")
         self._writer = Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(library="terrella")

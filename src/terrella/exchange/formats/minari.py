@@ -10,20 +10,23 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Readings, Sensor, Source, Take
+from ...data.source import Sensor, Source, Take
 from ...data.storage import durable
-from . import rows, spaces
-from .minari_stored import Episode, joined, open_storage
+from . import arrays, rows, spaces
+from .arrays import Place
+from .minari_stored import Episode, Shapes, open_storage
 
 VERSION = "0.5.4"  # of the layout that `write` writes (the first with pictures that are not JPEG)
 _ID = re.compile(r"(?:[-\w][-\w/]*/)?[-\w]+-v\d+", re.ASCII)
 _ROLES = {"observations": rows.OBSERVATION, "actions": rows.ACTION}
 _FOLLOW = {"rewards": rows.REWARD, "terminations": rows.DONE, "truncations": rows.TRUNCATED}
+_NAMES = {**arrays.GYMNASIUM, "infos": rows.INFO}
 _KEPT_ELSEWHERE = ("observation_space", "action_space", "total_episodes", "total_steps", "dataset_size", "terrella")
 
 
@@ -41,44 +44,32 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     """
     rows.check_fps(fps, str(path))
     data, meta, count = _opened(Path(path))
-    given = {"observations": _space(meta, "observation_space", data), "actions": _space(meta, "action_space", data)}
-    described = rows.sensors_described(meta["terrella"], str(data)) if isinstance(meta.get("terrella"), dict) else {}
-    leaves: dict[tuple, spaces.Leaf] = {}
-    for root, role in _ROLES.items():
-        found = spaces.leaves(role, given[root], str(data))
-        for leaf in found:
-            leaves[(root, *leaf.path)] = _as_described(role, leaf, found, described)
-    episode = open_storage(data, meta.get("data_format", "hdf5"), count)
-    sensors = {place: leaf.sensor for place, leaf in leaves.items() if leaf.sensor is not None}
-    for root, name in _FOLLOW.items():
-        kind = "float64" if root == "rewards" else "bool"
-        sensor = replace(rows.sensor_for("", root, (), kind), name=name)
-        mine = described.get(name)
-        one = mine is not None and mine.kind == "vector" and mine.shape == (1,)
-        sensors[(root,)] = replace(mine, facts={**mine.facts, **sensor.facts}) if mine is not None and one else sensor
-    for place, (shape, dtype) in sorted(episode(0).infos().items()):
-        sensor = rows.sensor_for(rows.INFO, joined(place), shape, dtype)
-        taken = {other.name: other for other in sensors.values()}
-        sensors[("infos", *place)] = _described(replace(sensor, name=rows.unique(sensor.name, taken)), described)
-    texts = {place: leaf for place, leaf in leaves.items() if leaf.sensor is None}
-    ours = meta["terrella"] if described else {}
-    rate, notes = rows.rate_of(fps, ours.get("fps"), "Minari")
-    kept = ours.get("facts")
-    facts = {
-        **(kept if isinstance(kept, dict) else {}),
-        "observation_space": spaces.compact(given["observations"]),
-        "action_space": spaces.compact(given["actions"]),
-        "minari": {key: value for key, value in meta.items() if key not in _KEPT_ELSEWHERE},
+    given = {root: _space(meta, f"{root.removesuffix('s')}_space", data) for root in _ROLES}
+    spaces_facts = {f"{root.removesuffix('s')}_space": spaces.compact(space) for root, space in given.items()}
+    leaves = {
+        (root, *place): leaf
+        for root, space in given.items()
+        for place, leaf in spaces.leaves(space, root, str(data)).items()
     }
-    return Source(
-        name=str(ours.get("name") or meta.get("dataset_id") or Path(path).name),
-        sensors={sensor.name: sensor for sensor in sensors.values()},
-        takes=lambda: (_take(episode(i), i, sensors, texts, rate) for i in range(count)),
-        fps=rate,
-        robot=str(ours.get("robot") or ""),
-        notes=notes,
-        facts=facts,
-    )
+    known = {place: leaf for place, leaf in leaves.items() if leaf}
+    shapes = {place: leaf.shape[1:] for place, leaf in known.items()}
+    episode = open_storage(data, meta.get("data_format", "hdf5"), count)
+    for place, array in sorted(episode(0).arrays(shapes).items(), key=str):
+        if place[0] in _FOLLOW or place[0] == "infos":
+            known |= {place: array}
+    ours = meta["terrella"] if isinstance(meta.get("terrella"), dict) else {}
+    described = rows.sensors_described(ours, str(data)) if ours else {}
+    places = _places(Source("", described, tuple, facts=spaces_facts))[1] if described else {}
+    mine = {place: described[name] for place, name in places.items() if name}
+    sensors, notes = arrays.columns(known, partial(arrays.named, _NAMES), "Minari's", mine)
+
+    def takes(rate: float) -> Iterator[Take]:
+        texts = [place for place, leaf in leaves.items() if leaf is None]
+        return (_take(episode(i), f"{data}, episode {i}", sensors, shapes, texts, rate) for i in range(count))
+
+    facts = {**spaces_facts, "minari": {key: value for key, value in meta.items() if key not in _KEPT_ELSEWHERE}}
+    name = str(meta.get("dataset_id") or Path(path).name)
+    return arrays.source("Minari", name, sensors, takes, fps=fps, about=ours, notes=notes, facts=facts)
 
 
 def _opened(path: Path) -> tuple[Path, dict, int]:
@@ -110,65 +101,30 @@ def _space(meta: dict, key: str, data: Path) -> dict:
     return found
 
 
-def _as_described(role: str, leaf: spaces.Leaf, found: tuple, described: Mapping[str, Sensor]) -> spaces.Leaf:
-    """The leaf with the sensor that we wrote it from, if we did."""
-    if leaf.sensor is None:
-        return leaf
-    mine = [name for name in described if rows.role_of(name) == role]
-    names = [
-        leaf.sensor.name,
-        f"{role}.{leaf.path[0]}" if leaf.path else "",
-        *(mine if len(found) == 1 == len(mine) else ()),
-    ]
-    for name in names:
-        sensor = _described(replace(leaf.sensor, name=name), described)
-        if name in described and sensor is described[name]:
-            return replace(leaf, sensor=sensor)
-    return leaf
-
-
-def _described(sensor: Sensor, described: Mapping[str, Sensor]) -> Sensor:
-    mine = described.get(sensor.name)
-    same = mine is not None and rows.stored_shape(mine) == rows.stored_shape(sensor) and mine.dtype == sensor.dtype
-    return mine if mine is not None and same else sensor
-
-
-def _take(episode: Episode, number: int, sensors: Mapping[tuple, Sensor], texts: Mapping, fps: float) -> Take:
-    steps = episode.steps()
+def _take(episode: Episode, where: str, sensors: Mapping, shapes: Shapes, texts: list[Place], fps: float) -> Take:
+    there = episode.arrays(shapes)
+    steps = there["rewards",].shape[0] if ("rewards",) in there else 0
     if not steps:
-        raise DatasetError(f"episode {number} has no steps; remove it from the dataset.")
-    infos = episode.infos()
-    readings, time_s = {}, np.arange(steps + 1) / fps
-    for place, sensor in sensors.items():
-        if place[0] == "infos":
-            if place[1:] not in infos or infos[place[1:]][0] != rows.stored_shape(sensor):
-                continue
-            values = _info(episode, place, sensor, steps)
-        else:
-            values = episode.values(place, sensor, steps + (place[0] == "observations"))
-        readings[sensor.name] = Readings(time_s[: len(values)], values)
+        raise DatasetError(f"{where} has no steps (rewards); remove it from the dataset.")
+    lacking = [
+        place for place, sensor in sensors.items() if place[0] == "infos" and not _fits(there.get(place), sensor)
+    ]
+    mine = {place: sensor for place, sensor in sensors.items() if place not in lacking}
+    readings = arrays.readings(there, mine, np.arange(steps + 1) / fps, where)
+    rows.rows_of(Take(readings), where)
     facts = episode.facts()
-    task, kept = facts.pop("task", ""), {}
-    for place, leaf in texts.items():
-        found = episode.texts(place)
-        if len(set(found)) == 1 and leaf.is_instruction and not task:
-            task = found[0]
-        elif len(set(found)) > 1 or not leaf.is_instruction:
-            kept["/".join(map(str, place))] = found
-    start_ns = facts.pop("start_ns", None)
+    task, start_ns = facts.pop("task", ""), facts.pop("start_ns", None)
+    task, kept = spaces.said({place: episode.texts(place) for place in texts}, task if isinstance(task, str) else "")
     return Take(
         readings,
-        task=task if isinstance(task, str) else "",
+        task=task,
         start_ns=start_ns if isinstance(start_ns, int) else None,
         facts={"minari": facts, **({"texts": kept} if kept else {})},
     )
 
 
-def _info(episode: Episode, place: tuple, sensor: Sensor, steps: int):
-    try:
-        return episode.values(place, sensor, steps + 1)
-    except DatasetError:
-        return episode.values(place, sensor, steps)
+def _fits(array: arrays.Array | None, sensor: Sensor) -> bool:
+    return array is not None and array.is_numbers and array.shape[1:] == rows.stored_shape(sensor)
 
 
 def write(
@@ -195,10 +151,7 @@ def write(
             f"'{dataset_id}' is no Minari id for {path}: it must be the end of the path and look like name-v0 or group/name-v0."
         )
     notes: dict[str, None] = {}
-    places, given = {}, {}
-    for root, role in _ROLES.items():
-        given[root], found = _structure(source, role, notes)
-        places.update({(root, *leaf_place): name for leaf_place, name in found.items()})
+    given, places = _places(source)
     for name in source.sensors:
         if rows.role_of(name) == "" or source.sensors[name].kind == "points":
             notes[f"'{name}' has no place in Minari's layout and was left out."] = None
@@ -217,22 +170,42 @@ def write(
     return list(notes)
 
 
-def _structure(source: Source, role: str, notes: dict[str, None]) -> tuple[dict, dict[tuple, str | None]]:
-    """The space of a role, and what lies at each of its leaves: the name of a sensor, None for a text."""
+def _places(source: Source) -> tuple[dict[str, dict], dict[Place, str | None]]:
+    """The spaces of observations and actions; and what lies at each place: the name of a sensor, None for a text."""
+    given: dict[str, dict] = {}
+    places: dict[Place, str | None] = {}
+    for root, role in _ROLES.items():
+        given[root], found = _structure(source, root, role)
+        places |= {(root, *place): name for place, name in found.items()}
+    for name in source.sensors:
+        flat = any(other != name and f"{name}.".startswith(f"{other}.") for other in source.sensors)
+        if name in _FOLLOW.values():
+            places[next(root for root in _FOLLOW if _FOLLOW[root] == name),] = name
+        elif rows.role_of(name) == rows.INFO and source.sensors[name].kind != "points":
+            below = name.removeprefix("info.")  # info.deep.count -> deep/count, where "info.deep" is no array itself
+            places["infos", *([below] if flat else below.split("."))] = name
+    return given, places
+
+
+def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, str | None]]:
+    """The space of a role, and what lies at each of its leaves."""
     mine = {n: s for n, s in source.sensors.items() if rows.role_of(n) == role and s.kind != "points"}
     if not mine:
         raise DatasetError(
-            f"{source.name or 'the source'} has no {role}s, which Minari needs; write it in another format."
+            f"{source.name or 'the source'} has no {root}, which Minari needs; write it in another format."
         )
     own = source.facts.get(f"{role}_space")
-    if isinstance(own, dict):
-        try:
-            leaves = spaces.leaves(role, own, "the source")
-        except DatasetError:
-            leaves = ()
-        arrays = {leaf.sensor.name: leaf.sensor for leaf in leaves if leaf.sensor is not None}
-        if arrays.keys() == mine.keys() and all(_same(arrays[name], mine[name]) for name in mine):
-            return own, {leaf.path: leaf.sensor.name if leaf.sensor else None for leaf in leaves}
+    try:
+        leaves = spaces.leaves(own, role, "the source") if isinstance(own, dict) else {}
+        known = {(root, *place): leaf for place, leaf in leaves.items() if leaf}
+        found, _ = arrays.columns(known, partial(arrays.named, _NAMES), "")
+    except DatasetError:
+        leaves, found = {}, {}
+    names = {place[1:]: sensor.name for place, sensor in found.items()}
+    if isinstance(own, dict) and {it.name: _form(it) for it in found.values()} == {
+        n: _form(s) for n, s in mine.items()
+    }:
+        return own, {place: names.get(place) for place in leaves}
     if len(mine) == 1:
         (sensor,) = mine.values()
         return spaces.box(sensor), {(): sensor.name}
@@ -241,8 +214,8 @@ def _structure(source: Source, role: str, notes: dict[str, None]) -> tuple[dict,
     return {"type": "Dict", "subspaces": parts}, {(key,): name for name, key in keys.items()}
 
 
-def _same(one: Sensor, other: Sensor) -> bool:
-    return one.dtype == other.dtype and rows.stored_shape(one) == rows.stored_shape(other)
+def _form(sensor: Sensor) -> tuple:
+    return sensor.dtype, rows.stored_shape(sensor)
 
 
 def _metadata(source: Source, given: dict, dataset_id: str) -> dict:
@@ -266,15 +239,13 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
     from . import hdf5
 
     where = f"take {number}"
-    missing = [name for name in places.values() if name is not None and name not in take.readings]
+    missing = [name for place, name in places.items() if place[0] in _ROLES and name not in (None, *take.readings)]
     if missing:
         raise DatasetError(
             f"{where} lacks '{missing[0]}', which Minari needs in every episode; leave out the one or the other."
         )
-    named = {name for name in places.values() if name is not None} | {
-        n for n in take.readings if rows.role_of(n) in _FOLLOW.values()
-    }
-    found = rows.rows_of(replace(take, readings={name: take.readings[name] for name in named}), where)
+    named = [name for place, name in places.items() if name is not None and place[0] != "infos"]
+    found = rows.rows_of(replace(take, readings={n: take.readings[n] for n in named if n in take.readings}), where)
     steps = min(found.steps, found.observations - 1)
     if steps < 1:
         raise DatasetError(f"{where} has {found.observations} observations; Minari needs 2 or more: leave it out.")
@@ -286,51 +257,27 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
         notes["Minari keeps no times: the true times of the rows were left out."] = None
     for place, name in places.items():
         keys = "/".join(f"_index_{part}" if isinstance(part, int) else part for part in place)
-        rows_here = steps + (place[0] == "observations")
+        count = steps + (place[0] == "observations")
         if name is None:
             texts = take.facts.get("texts")
-            given = texts.get("/".join(map(str, place))) if isinstance(texts, Mapping) else None
-            texts = given if isinstance(given, list) and len(given) == rows_here else [take.task] * rows_here
+            given = texts.get(arrays.spelled(place)) if isinstance(texts, Mapping) else None
+            texts = given if isinstance(given, list) and len(given) == count else [take.task] * count
             group.create_dataset(keys, data=texts, dtype=hdf5.TEXT)
-        else:
-            _write_rows(group, keys, source.sensors[name], take.readings[name], rows_here, where)
-    for root, values in _follow(source, take, steps, where, notes):
-        group.create_dataset(root, data=values)
-    for name, readings in take.readings.items():
-        if rows.role_of(name) == rows.INFO and source.sensors[name].kind != "points":
+        elif place[0] not in _FOLLOW and name in take.readings:
+            sensor, readings = source.sensors[name], take.readings[name]
             if len(readings.values) < steps:
                 notes[f"'{name}' has not a reading for each step and was left out."] = None
                 continue
-            key = f"infos/{_info_key(name, take)}"
-            _write_rows(group, key, source.sensors[name], readings, min(len(readings.values), steps + 1), where)
+            count = min(len(readings.values), steps + 1) if place[0] == "infos" else count
+            hdf5.store(group, {keys: 0}, (count, *rows.stored_shape(sensor)), sensor, readings, where)
+    for root, values in _follow(source, take, steps, where, notes):
+        group.create_dataset(root, data=values)
     own = take.facts.get("minari")
     attrs = {"task": take.task} if take.task else {}
     attrs |= {} if take.start_ns is None else {"start_ns": take.start_ns}
-    for key, value in {
-        **(own if isinstance(own, Mapping) else {}),
-        **attrs,
-        "id": number,
-        "total_steps": steps,
-    }.items():
-        if isinstance(value, str | int | float | list):
-            group.attrs[key] = value
+    own = {**(own if isinstance(own, Mapping) else {}), **attrs, "id": number, "total_steps": steps}
+    hdf5.set_attributes(group, own)
     return steps
-
-
-def _info_key(name: str, take: Take) -> str:
-    """info.deep.count -> deep/count, or deep.count where "info.deep" is an array itself."""
-    flat = any(other != name and (f"{name}.").startswith(f"{other}.") for other in take.readings)
-    return name.removeprefix("info.") if flat else name.removeprefix("info.").replace(".", "/")
-
-
-def _write_rows(group, key: str, sensor: Sensor, readings: Readings, count: int, where: str) -> None:
-    shape = rows.stored_shape(sensor)
-    more = {} if sensor.kind == "vector" else {"chunks": (1, *shape), "compression": "gzip", "compression_opts": 1}
-    stored = group.create_dataset(key, (count, *shape), sensor.dtype, **more)
-    row = 0
-    for part in rows.batches(readings.values, sensor, where, count):
-        stored[row : row + len(part)] = rows.to_stored(part, sensor)
-        row += len(part)
 
 
 def _follow(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -14,26 +14,18 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from ...core.errors import DatasetError
-from ...data.source import Lazy, Sensor
 from . import rows
+from .arrays import Array, Place, spelled
 
-Place = tuple[str | int, ...]  # ("observations", "agent", 0): keys of Dicts and indices of Tuples
-INFOS_DEEPEST = 8
+_DEEPEST = 16
+Shapes = Mapping[Place, tuple[int, ...]]  # of one row of what the spaces name, which the storage may have packed
 
 
 class Episode(Protocol):
     """One episode as it is stored."""
 
-    def steps(self) -> int:
-        """How many rewards there are."""
-        ...
-
-    def infos(self) -> dict[tuple[str, ...], tuple[tuple[int, ...], np.dtype]]:
-        """Place below `infos` -> shape and dtype of each array of numbers there that has a row for each step."""
-        ...
-
-    def values(self, place: Place, sensor: Sensor, count: int) -> np.ndarray | Lazy:
-        """`count` values of the sensor; pictures are decoded when looked at."""
+    def arrays(self, shapes: Shapes) -> dict[Place, Array]:
+        """All that has rows; pictures that are JPEG are decoded when they are read."""
         ...
 
     def texts(self, place: Place) -> list[str]:
@@ -48,7 +40,7 @@ class Episode(Protocol):
 def open_storage(data: Path, kind: object, count: int) -> Callable[[int], Episode]:
     """Opener of episode i of `count`; DatasetError where the storage is missing or of an unknown kind."""
     if kind == "hdf5":
-        from .minari_hdf5 import Hdf5Episode
+        from .minari_hdf5 import Hdf5Episode  # only who has such a dataset needs its package
 
         if not (data / "main_data.hdf5").is_file():
             raise DatasetError(f"{data / 'main_data.hdf5'} is missing; restore it from a copy.")
@@ -58,17 +50,29 @@ def open_storage(data: Path, kind: object, count: int) -> Callable[[int], Episod
     raise DatasetError(f"{data} keeps its data as '{kind}'; only hdf5, arrow and parquet are known.")
 
 
-def decode_jpeg(data: bytes, sensor: Sensor, where: str) -> np.ndarray:
-    """One value of the sensor from a JPEG; DatasetError where it is damaged or of another size."""
-    shape = rows.stored_shape(sensor)
-    try:
-        with Image.open(io.BytesIO(data), formats=("JPEG",)) as picture:
-            if (picture.height, picture.width) != shape[:2] or len(picture.getbands()) != math.prod(shape[2:]):
-                size = [picture.height, picture.width, len(picture.getbands())]
-                raise DatasetError(f"{where} is a picture of {size} where the space says {list(shape)}.")
-            return rows.from_stored(np.asarray(picture, np.uint8)[None], sensor)[0]
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise DatasetError(f"{where} is a damaged JPEG ({error}); restore the file from a copy.") from error
+def jpegs(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes], where: str) -> Array:
+    """Rows that are JPEG files each; DatasetError where one is damaged or of another size."""
+
+    def decode(i: int) -> np.ndarray:
+        try:
+            with Image.open(io.BytesIO(packed(i)), formats=("JPEG",)) as picture:
+                size = (picture.height, picture.width, len(picture.getbands()))
+                if size != (*shape[:2], math.prod(shape[2:])):
+                    raise DatasetError(f"{where} has a picture of {list(size)} where the space says {list(shape)}.")
+                return np.asarray(picture, np.uint8).reshape(shape)
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            Image.DecompressionBombError,
+            Image.DecompressionBombWarning,
+        ) as error:
+            raise DatasetError(f"{where}, row {i}, is a damaged JPEG ({error}); restore it from a copy.") from error
+
+    def read(start: int, stop: int) -> np.ndarray:
+        return np.stack([decode(i) for i in range(start, stop)])
+
+    return Array((count, *shape), np.dtype(np.uint8), read)
 
 
 class TableEpisode:
@@ -81,83 +85,64 @@ class TableEpisode:
             raise DatasetError(f"{folder} has no .{kind} file; restore the episode from a copy.")
         try:
             tables = [_arrow(part) if kind == "arrow" else _parquet(part) for part in parts]
-            table = tables[0] if len(tables) == 1 else pa.concat_tables(tables)
+            table = pa.concat_tables(tables)
             table.validate(full=True)
-            self._columns = {name: table.column(name).combine_chunks() for name in table.column_names}
+            columns = {name: table.column(name).combine_chunks() for name in table.column_names}
+            self._leaves = {place: leaf for name, column in columns.items() for place, leaf in _leaves(column, (name,))}
         except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError) as error:
             raise DatasetError(
                 f"{folder} cannot be read ({str(error)[:200]}); restore the episode from a copy."
             ) from error
-        self._rows = table.num_rows
-        if not self._rows or "observations" not in self._columns or "rewards" not in self._columns:
-            raise DatasetError(f"{folder} has no observations and rewards; restore the episode from a copy.")
 
-    def steps(self) -> int:
-        return self._rows - 1
-
-    def infos(self) -> dict[tuple[str, ...], tuple[tuple[int, ...], np.dtype]]:
+    def arrays(self, shapes: Shapes) -> dict[Place, Array]:
+        known = {tuple(map(str, place)): place for place in shapes}
         found = {}
-        if "infos" in self._columns:
-            for place, field in _info_fields(self._columns["infos"].type, ()):
-                kind = field.type.value_type if pa.types.is_fixed_size_list(field.type) else field.type
-                if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
-                    size = (field.type.list_size,) if pa.types.is_fixed_size_list(field.type) else ()
-                    stated = (field.metadata or {}).get(b"shape")  # "2,3", or nothing where a row is one number
-                    shape = (
-                        size if stated is None else tuple(int(part) for part in stated.split(b",") if part.isdigit())
-                    )
-                    found[place] = (shape if math.prod(shape) == math.prod(size) else size, kind.to_pandas_dtype())
-        return {place: (shape, np.dtype(dtype)) for place, (shape, dtype) in found.items()}
+        for names, (array, stated) in self._leaves.items():
+            place: Place = known.get(names) or names
+            count = len(array) - (names[0] not in ("observations", "infos"))
+            found[place] = self._array(array.slice(0, max(count, 0)), shapes.get(place, stated), spelled(names))
+        return found
 
-    def values(self, place: Place, sensor: Sensor, count: int) -> np.ndarray | Lazy:
-        array, where = self._array(place), f"{self._folder}, {'/'.join(map(str, place))}"
-        if not count <= len(array) <= count + 1:
-            raise DatasetError(f"{where} has {len(array)} rows where {count} are needed; the episode is inconsistent.")
-        array = array.slice(0, count)
+    def _array(self, array: pa.Array, shape: tuple[int, ...] | None, what: str) -> Array:
+        count, where = len(array), f"{self._folder}, {what}"
         if array.null_count:
             raise DatasetError(f"{where} has empty rows; restore the episode from a copy.")
-        if pa.types.is_binary(array.type) or pa.types.is_large_binary(array.type):
-            pictures = Lazy(count, lambda i: decode_jpeg(array[i].as_py(), sensor, f"{where}, row {i}"))
-            return pictures if sensor.kind != "vector" else np.stack(list(pictures))
+        if shape and (pa.types.is_binary(array.type) or pa.types.is_large_binary(array.type)):
+            return jpegs(count, shape, lambda i: array[i].as_py(), where)
         flat = array.flatten() if pa.types.is_fixed_size_list(array.type) else array
-        shape = rows.stored_shape(sensor)
-        if not (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type) or pa.types.is_boolean(flat.type)):
-            raise DatasetError(
-                f"{where} is {str(array.type)[:80]}, not an array of numbers; the spaces are of another dataset."
-            )
-        if flat.null_count or len(flat) != count * math.prod(shape):
-            raise DatasetError(f"{where} has {len(flat)} numbers where {count} x {list(shape)} are needed.")
+        if not _is_numbers(flat.type):
+            return Array((count,), np.dtype(object))
+        if flat.null_count:
+            raise DatasetError(f"{where} has empty numbers; restore the episode from a copy.")
+        row = (array.type.list_size,) if flat is not array else ()
+        shape = shape if shape is not None and math.prod(shape) == math.prod(row) else row
         stored = flat.to_numpy(zero_copy_only=False).reshape(count, *shape)
-        if sensor.kind == "vector":
-            return rows.from_stored(stored.astype(sensor.dtype), sensor)
-        return Lazy(count, lambda i: rows.from_stored(stored[i : i + 1].astype(sensor.dtype), sensor)[0])
+        return Array(stored.shape, stored.dtype, lambda start, stop: stored[start:stop])
 
     def texts(self, place: Place) -> list[str]:
-        return [str(text) for text in self._array(place).to_pylist()]
+        names = tuple(map(str, place))
+        if names not in self._leaves:
+            raise DatasetError(f"{self._folder} has no {spelled(place)}; restore the episode from a copy.")
+        return [str(text) for text in self._leaves[names][0].to_pylist()]
 
     def facts(self) -> dict[str, object]:
         return rows.read_json(self._folder / "metadata.json", missing={})
 
-    def _array(self, place: Place) -> pa.Array:
-        array = self._columns.get(str(place[0]))
-        for part in place[1:]:
-            if array is None or not pa.types.is_struct(array.type) or array.type.get_field_index(str(part)) < 0:
-                array = None
-                break
-            array = array.field(str(part))
-        if array is None:
-            raise DatasetError(f"{self._folder} has no {'/'.join(map(str, place))}; restore the episode from a copy.")
-        return array
+
+def _leaves(array: pa.Array, place: tuple[str, ...], metadata: Mapping | None = None) -> Iterator[tuple]:
+    """(place, (array, shape of a row as its metadata states it)) of all that is no struct: "2,3", "" for one number."""
+    if pa.types.is_struct(array.type) and len(place) < _DEEPEST:
+        for i in range(array.type.num_fields):
+            part = array.type.field(i)
+            yield from _leaves(array.field(i), (*place, part.name), part.metadata)
+    else:
+        stated = (metadata or {}).get(b"shape")
+        shape = None if stated is None else tuple(int(part) for part in stated.split(b",") if part.isdigit())
+        yield place, (array, shape)
 
 
-def _info_fields(kind: pa.DataType, place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], pa.Field]]:
-    if pa.types.is_struct(kind) and len(place) < INFOS_DEEPEST:
-        for i in range(kind.num_fields):
-            here = (*place, kind.field(i).name)
-            if pa.types.is_struct(kind.field(i).type):
-                yield from _info_fields(kind.field(i).type, here)
-            else:
-                yield here, kind.field(i)
+def _is_numbers(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
 
 
 def _arrow(path: Path) -> pa.Table:
@@ -179,8 +164,3 @@ def _width(kind: pa.DataType) -> int:
     if pa.types.is_fixed_size_list(kind):
         return kind.list_size * _width(kind.value_type)
     return max(1, kind.bit_width // 8) if pa.types.is_primitive(kind) else 1
-
-
-def joined(place: Sequence[str | int]) -> str:
-    """A place as a part of a sensor's name."""
-    return ".".join(rows.clean(part) for name in place for part in str(name).split("."))

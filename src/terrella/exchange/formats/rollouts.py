@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Lazy, Readings, Sensor, Source, Take
+from ...data.source import Sensor, Source, Take
 from ...data.storage import durable
-from . import rows
+from . import arrays, rows
+from .arrays import Array, Place
 
 ABOUT = "terrella.json"  # names, units and frames of what we wrote, in the folder of the episodes
 TIME, TASK, START = "time_s", "task", "start_ns"
@@ -25,19 +28,7 @@ _SPELLINGS = {  # the first is what `write` writes
     rows.TRUNCATED: ("truncations", "truncated", "timeouts"),
     rows.INFO: ("infos", "info"),
 }
-_ROLE = {spelling: role for role, spellings in _SPELLINGS.items() for spelling in spellings}
-
-
-@dataclass(frozen=True)
-class _Array:
-    """An array of an episode's file, of which only the header was read."""
-
-    key: str
-    shape: tuple[int, ...]
-    dtype: np.dtype
-
-
-# -- folders of .npz
+_NAMES = {spelling: role for role, spellings in _SPELLINGS.items() for spelling in spellings}
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
@@ -57,23 +48,34 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         raise DatasetError(f"{path} has no .npz files; name a folder of episodes, one .npz each.")
     about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
-    sensors, notes = _sensors(_headers(files[0]), described, str(files[0]))
-    rate, more = rows.rate_of(fps, about.get("fps"), "the folder")
-    facts = about.get("facts")
-    return Source(
-        name=str(about.get("name") or path.stem),
-        sensors={sensor.name: sensor for sensor in sensors.values()},
-        takes=lambda: (_take(file, sensors, rate) for file in files),
-        fps=rate,
-        robot=str(about.get("robot") or ""),
-        notes=(*notes, *more),
-        facts=facts if isinstance(facts, dict) else {},
-    )
+    mine = {_place(key): described[name] for name, key in _keys(described).items()}
+    first = _arrays(files[0])
+    unknown = {place: array for place, array in first.items() if place not in ((TIME,), (TASK,), (START,))}
+    sensors, notes = arrays.columns(unknown, partial(arrays.named, _NAMES), "the key", mine)
+    if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
+        keys = ", ".join(map(arrays.spelled, first)) or "nothing"
+        raise DatasetError(
+            f"{files[0]} has no observations; it holds {keys}, where keys like observations or obs.NAME are known."
+        )
+
+    def takes(rate: float) -> Iterator[Take]:
+        return (_take(file, sensors, rate) for file in files)
+
+    return arrays.source("the folder", path.stem, sensors, takes, fps=fps, about=about, notes=notes)
 
 
-def _headers(path: Path) -> dict[str, _Array]:
-    """What arrays a file holds; none of their values is read."""
-    found = {}
+def _place(key: str) -> Place:
+    """ "obs.front" -> ("obs", "front"); a key that is none of a rollout is a place of its own."""
+    for mark in ("/", "."):
+        head, _, rest = key.partition(mark)
+        if head in _NAMES and rest:
+            return head, *rest.replace("/", ".").split(".")
+    return (key,)
+
+
+def _arrays(path: Path) -> dict[Place, Array]:
+    """What arrays a file holds; none of their values is read yet."""
+    found: dict[Place, Array] = {}
     try:
         with zipfile.ZipFile(path) as file:
             for info in file.infolist():
@@ -93,7 +95,7 @@ def _headers(path: Path) -> dict[str, _Array]:
                     raise DatasetError(
                         f"'{key}' in {path} is {dtype} {list(shape)}: it is pickled, too large or cut off; write it anew."
                     )
-                found[key] = _Array(key, tuple(shape), dtype)
+                found[_place(key)] = Array(tuple(shape), dtype, _reader(path, key))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} does not exist; name a folder of .npz files.") from error
     except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
@@ -103,113 +105,43 @@ def _headers(path: Path) -> dict[str, _Array]:
     return found
 
 
+def _reader(path: Path, key: str) -> Callable[[int, int], np.ndarray]:
+    """Reads rows of an array; all of it at the first look, for a .npz gives an array whole or not at all."""
+    kept: list[np.ndarray] = []
+
+    def read(start: int, stop: int) -> np.ndarray:
+        if not kept:
+            kept.append(_load(path, key))
+        return kept[0][start:stop]
+
+    return read
+
+
 def _load(path: Path, key: str) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as file:
             return file[key]
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile, MemoryError) as error:
-        raise DatasetError(f"'{key}' in {path} cannot be read ({error}); restore it from a copy.") from error
     except Exception as error:  # zlib.error, and what else a damaged stream raises in the decompressor
-        raise DatasetError(f"'{key}' in {path} is damaged ({error}); restore it from a copy.") from error
+        raise DatasetError(f"'{key}' in {path} cannot be read ({error}); restore it from a copy.") from error
 
 
-def _split(key: str) -> tuple[str, str]:
-    """Role and name of a key: "obs.front" -> ("observation", "front"); ("", key) where it has none."""
-    for mark in ("/", "."):
-        head, _, rest = key.partition(mark)
-        if head in _ROLE and (rest or head == key):
-            return _ROLE[head], rest
-    return "", key
-
-
-def _sensors(
-    headers: Mapping[str, _Array], described: Mapping[str, Sensor], where: str
-) -> tuple[dict[str, Sensor], list[str]]:
-    """Key -> its sensor, and sentences on what is left out."""
-    found: dict[str, Sensor] = {}
-    notes = []
-    for key, array in headers.items():
-        role, name = _split(key)
-        if not role or array.dtype.kind not in "biuf" or not array.shape:
-            if key not in (TIME, TASK, START):
-                notes.append(f"'{key}' is left out: it is not an array of a rollout.")
-            continue
-        kind = np.dtype(bool) if role in (rows.DONE, rows.TRUNCATED) else array.dtype
-        sensor = rows.sensor_for(
-            role, ".".join(map(rows.clean, name.replace("/", ".").split("."))) if name else "", array.shape[1:], kind
-        )
-        mine = _mine(role, name, described)
-        same = mine is not None and mine.dtype == kind.name and rows.stored_shape(mine) == array.shape[1:]
-        taken = {other.name: other for other in found.values()}
-        found[key] = mine if mine is not None and same else replace(sensor, name=rows.unique(sensor.name, taken))
-    if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in found.values()):
-        keys = ", ".join(headers) or "nothing"
-        raise DatasetError(
-            f"{where} has no observations; it holds {keys}, where keys like observations or obs.NAME are known."
-        )
-    return found, notes
-
-
-def _mine(role: str, name: str, described: Mapping[str, Sensor]) -> Sensor | None:
-    """The sensor that we wrote under a key, if we did: a role's only sensor is written under the role alone."""
-    of_role = [sensor for sensor in described.values() if rows.role_of(sensor.name) == role]
-    return described.get(f"{role}.{name}") if name else (of_role[0] if len(of_role) == 1 else None)
-
-
-def _take(path: Path, sensors: Mapping[str, Sensor], fps: float) -> Take:
-    headers = _headers(path)
-    counts = {}
-    for key, sensor in sensors.items():
-        if key not in headers:
-            raise DatasetError(f"{path} lacks '{key}', which the first episode has; mend it, or move it away.")
-        if not headers[key].shape or headers[key].shape[1:] != rows.stored_shape(sensor):
-            shape, want = list(headers[key].shape[1:]), list(rows.stored_shape(sensor))
+def _take(path: Path, sensors: Mapping[Place, Sensor], fps: float) -> Take:
+    there = _arrays(path)
+    marching = [place for place, it in sensors.items() if place in there and rows.role_of(it.name) != rows.INFO]
+    count = max((there[place].shape for place in marching), default=(0,))[0]
+    time_s = np.arange(count) / fps
+    if (TIME,) in there:
+        time_s = _load(path, TIME)
+        if time_s.shape != (count,) or time_s.dtype.kind != "f":
             raise DatasetError(
-                f"'{key}' in {path} is {shape} a row where the first episode has {want}; mend it, or move it away."
+                f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have one for each."
             )
-        counts[key] = headers[key].shape[0]
-    count = max(counts[key] for key, sensor in sensors.items() if rows.role_of(sensor.name) != rows.INFO)
-    if long := [key for key in counts if counts[key] > count]:
-        raise DatasetError(
-            f"'{long[0]}' in {path} has {counts[long[0]]} rows where there are {count} observations; mend it."
-        )
-    times = _times(path, headers, count, fps)
-    readings = {}
-    for key, sensor in sensors.items():
-        values = _pictures(path, key, sensor, counts[key]) if sensor.kind != "vector" else _vector(path, key, sensor)
-        readings[sensor.name] = Readings(times[: counts[key]], values)
-    task = str(_load(path, TASK)) if TASK in headers and headers[TASK].shape == () else ""
-    start_ns = int(_load(path, START)) if START in headers and headers[START].shape == () else None
-    take = Take(readings, task, start_ns, {"file": path.name})
+    single = {key: _load(path, key) for key in (TASK, START) if (key,) in there and there[key,].shape == ()}
+    start_ns = int(single[START]) if START in single else None
+    readings = arrays.readings(there, sensors, time_s.astype(np.float64), str(path))
+    take = Take(readings, str(single.get(TASK, "")), start_ns, {"file": path.name})
     rows.rows_of(take, str(path))
     return take
-
-
-def _times(path: Path, headers: Mapping[str, _Array], count: int, fps: float) -> np.ndarray:
-    if TIME not in headers:
-        return np.arange(count) / fps
-    times = _load(path, TIME)
-    if times.shape != (count,) or times.dtype.kind != "f":
-        raise DatasetError(
-            f"'{TIME}' in {path} has {list(times.shape)} times for {count} rows; it must have one for each."
-        )
-    return times.astype(np.float64)
-
-
-def _vector(path: Path, key: str, sensor: Sensor) -> np.ndarray:
-    return rows.from_stored(_load(path, key).astype(sensor.dtype), sensor)
-
-
-def _pictures(path: Path, key: str, sensor: Sensor, count: int) -> Lazy:
-    """The file is read at the first look: a .npz gives an array whole or not at all."""
-    kept: list[np.ndarray] = []
-
-    def make(i: int) -> np.ndarray:
-        if not kept:
-            kept.append(_load(path, key))
-        return rows.from_stored(kept[0][i : i + 1], sensor)[0]
-
-    return Lazy(count, make)
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
@@ -220,7 +152,10 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     after each take. DatasetError where they do not, or `path` exists.
     """
     notes: dict[str, None] = {}
-    keys = _keys(source, notes)
+    keys = _keys(source.sensors)
+    notes |= {
+        f"'{name}' has no place in rollouts and was left out.": None for name in source.sensors if name not in keys
+    }
     with durable.in_whole(path) as staged:
         staged.mkdir()
         for number, take in rows.numbered(source, progress):
@@ -231,17 +166,15 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     return list(notes)
 
 
-def _keys(source: Source, notes: dict[str, None]) -> dict[str, str]:
-    """Sensor -> its key."""
+def _keys(sensors: Mapping[str, Sensor]) -> dict[str, str]:
+    """Sensor -> its key, for all that have a place in rollouts."""
+    roles = {name: rows.role_of(name) for name, sensor in sensors.items() if sensor.kind != "points"}
+    several = Counter(roles.values())
     found: dict[str, str] = {}
-    roles = {name: rows.role_of(name) for name, sensor in source.sensors.items() if sensor.kind != "points"}
-    for name in source.sensors:
-        role = roles.get(name)
-        if not role:
-            notes[f"'{name}' has no place in rollouts and was left out."] = None
-            continue
-        key, rest = _SPELLINGS[role][0], name.removeprefix(role).removeprefix(".")
-        found[name] = f"{key}/{rest}" if rest and list(roles.values()).count(role) > 1 else key
+    for name, role in roles.items():
+        if role:
+            key, rest = _SPELLINGS[role][0], name.removeprefix(role).removeprefix(".")
+            found[name] = f"{key}/{rest}" if rest and several[role] > 1 else key
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def picture_layout(shape: Sequence[int], dtype: np.dtype | str, least: int = LEA
     return None
 
 
-def sensor_for(role: str, key: str, shape: Sequence[int], dtype, *, least: int = LEAST_PICTURE_SIDE, **more) -> Sensor:
+def sensor_for(role: str, key: str, shape: Sequence[int], dtype, least: int = LEAST_PICTURE_SIDE) -> Sensor:
     """The sensor of an array [n, *shape]: a picture where its bytes look like one (observations only), else a vector.
 
     role, key: "observation", "agent.pos" -> "observation.agent.pos", or "observation.images.agent.pos" for a picture;
@@ -55,32 +55,30 @@ def sensor_for(role: str, key: str, shape: Sequence[int], dtype, *, least: int =
     if min(shape, default=0) < 0:
         raise DatasetError(f"'{key or role}' has the shape {list(shape)}, which no array has.")
     layout = picture_layout(shape, dtype, least) if role == OBSERVATION else None
-    facts = dict(more.pop("facts", {}))
     if layout is None:
-        size = math.prod(shape)
-        if shape != (size,):
-            facts[_STORED] = list(shape)
-        name = f"{role}.{key}" if key else ("observation.state" if role == OBSERVATION else role)
-        return Sensor(name, "vector", (size,), dtype.name, facts=facts, **more)
+        name = f"{role}.{key}" if role and key else ("observation.state" if role == OBSERVATION else role or key)
+        return stored_as(Sensor(name, "vector", (math.prod(shape),), dtype.name), shape)
     height, width = shape[1:] if layout == "chw" else shape[:2]
     check_size(height, width, f"a picture of '{key or role}'")
-    if layout != "hwc":
-        facts[_STORED] = list(shape)
-    return Sensor(f"{IMAGES}{key or CAMERA}", "image", (height, width, 3), "uint8", facts=facts, **more)
+    return stored_as(Sensor(f"{IMAGES}{key or CAMERA}", "image", (height, width, 3), "uint8"), shape)
+
+
+def stored_as(sensor: Sensor, shape: tuple[int, ...]) -> Sensor:
+    """The sensor, its readings kept with another shape; where that cannot be, `stored_shape` does not give it back."""
+    facts = {key: value for key, value in sensor.facts.items() if key != _STORED}
+    return replace(sensor, facts=facts if shape == sensor.shape else {**facts, _STORED: list(shape)})
 
 
 def stored_shape(sensor: Sensor) -> tuple[int, ...]:
     """The shape of one reading as its format keeps it."""
-    given = sensor.facts.get(_STORED)
-    if isinstance(given, list | tuple) and all(isinstance(n, int) and n >= 0 for n in given):
-        if sensor.kind == "vector" and math.prod(given) == sensor.shape[0]:
-            return tuple(given)
-        if sensor.kind == "depth" and tuple(given) == (*sensor.shape, 1):
-            return tuple(given)
-        height, width = sensor.shape[:2] if sensor.kind == "image" else (0, 0)
-        if tuple(given) in {(height, width), (height, width, 1), (1, height, width), (3, height, width)}:
-            return tuple(given)
-    return sensor.shape
+    given, shape = sensor.facts.get(_STORED), sensor.shape
+    if not isinstance(given, list | tuple) or not all(isinstance(n, int) and n >= 0 for n in given):
+        return shape
+    possible = {(*shape, 1)} if sensor.kind == "depth" else set()
+    if sensor.kind == "image":
+        possible = {shape[:2], (*shape[:2], 1), (1, *shape[:2]), (3, *shape[:2])}
+    fits = tuple(given) in possible or (sensor.kind == "vector" and math.prod(given) == shape[0])
+    return tuple(given) if fits else shape
 
 
 def from_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -130,7 +128,7 @@ def clean(part: str) -> str:
     return re.sub(r"[^\w-]+", "_", part, flags=re.ASCII).strip("_") or "unnamed"
 
 
-def unique(name: str, taken: Mapping[str, object]) -> str:
+def unique(name: str, taken: Collection[str]) -> str:
     """`name`, or name_2, name_3 … where it is taken."""
     number, found = 1, name
     while found in taken:

@@ -1,69 +1,55 @@
-"""Gymnasium spaces as JSON (in Minari's spelling) and as the named sensors that they flatten into."""
+"""Gymnasium spaces as JSON (in Minari's spelling), and the arrays and texts that they flatten into."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from ...core.errors import DatasetError
 from ...data.source import Sensor
-from .rows import clean, sensor_for, stored_shape, unique
+from .arrays import Array, Place
+from .rows import stored_shape
 
-INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # texts that are a take's task
+_INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # texts that are a take's task
 _DEEPEST = 32
 
 
-@dataclass(frozen=True)
-class Leaf:
-    """One array (or text) of a space: where it lies (keys of Dicts, indices of Tuples) and its sensor (None for texts)."""
-
-    path: tuple[str | int, ...]
-    sensor: Sensor | None
-    space: Mapping = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return ".".join(clean(str(part)) for part in self.path)
-
-    @property
-    def is_instruction(self) -> bool:
-        return self.sensor is None and (not self.path or str(self.path[-1]).lower() in INSTRUCTIONS)
-
-
-def leaves(role: str, space: object, where: str) -> tuple[Leaf, ...]:
-    """The arrays of a space as JSON, with one sensor each: "observation.NAME", "action", "action.NAME", …"""
-    found: dict[str, Leaf] = {}
+def leaves(space: object, role: str, where: str) -> dict[Place, Array | None]:
+    """The arrays of a space as JSON, without rows, where they lie (keys of Dicts, indices of Tuples); None for texts."""
     try:
-        _walk(role, space, (), found, 0)
+        return dict(_walked(space, ()))
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"the {role} space of {where} cannot be read ({error}).") from error
-    return tuple(found.values())
 
 
-def _walk(role: str, space, path: tuple, found: dict[str, Leaf], depth: int) -> None:
+def _walked(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
     kind = space["type"]
-    if depth > _DEEPEST:
+    if len(place) > _DEEPEST:
         raise ValueError("it nests too deep")
-    if kind == "Dict":
-        for key, part in space["subspaces"].items():
-            _walk(role, part, (*path, str(key)), found, depth + 1)
-        return
-    if kind == "Tuple":
-        for i, part in enumerate(space["subspaces"]):
-            _walk(role, part, (*path, i), found, depth + 1)
-        return
-    key = ".".join(clean(str(part)) for part in path)
-    if kind == "Text":
-        found[unique(f"text {key}", found)] = Leaf(path, None, space)
-        return
-    shape, dtype = _shape_of(kind, space)
-    sensor = sensor_for(role, key, shape, dtype)
-    if sensor.name in found:
-        sensor = sensor_for(role, unique(sensor.name, found).removeprefix(f"{role}."), shape, dtype)
-    found[sensor.name] = Leaf(path, sensor, space)
+    if kind in ("Dict", "Tuple"):
+        parts = space["subspaces"]
+        for key, part in parts.items() if kind == "Dict" else enumerate(parts):
+            yield from _walked(part, (*place, str(key) if kind == "Dict" else key))
+    elif kind == "Text":
+        yield place, None
+    else:
+        shape, dtype = _shape_of(kind, space)
+        yield place, Array((0, *shape), np.dtype(dtype))
+
+
+def said(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[str, dict[str, list[str]]]:
+    """(a take's task, what else was said): texts named mission, task, … that do not change are the task."""
+    kept = {}
+    for place, found in texts.items():
+        instruction = len(place) < 2 or str(place[-1]).lower() in _INSTRUCTIONS
+        if instruction and len(set(found)) == 1 and task in ("", found[0]):
+            task = found[0]
+        else:
+            kept["/".join(map(str, place))] = list(found)
+    return task, kept
 
 
 def _shape_of(kind: str, space) -> tuple[tuple[int, ...], str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from ...data.storage import durable
 from . import folders, rows
-from .suffixes import VIDEOS
+from .films import Film
+from .folders import VIDEOS
 
 _CLOCK = Fraction(1, 1_000_000)  # ticks of the videos written
-_LOSSY = {"preset": "veryfast", "crf": "18", "g": "8", "bf": "0", "threads": "1"}
-_LOSSLESS = {"preset": "veryfast", "qp": "0", "g": "8", "bf": "0", "threads": "1"}
+_CODEC = {"preset": "veryfast", "crf": "18", "g": "8", "bf": "0", "threads": "1"}
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
@@ -42,7 +43,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         for camera, files in folder.items():
             name = f"{rows.IMAGES}{camera}"
             if name not in sensors:
-                video = _Video(files[0])
+                video = _video(files[0])
                 sensors[name] = Sensor(name, "image", video.shape, "uint8", rate_hz=video.rate_hz)
     return Source(
         name=path.name,
@@ -52,7 +53,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
 
 def _video_take(name: str, folder: Mapping[str, list[Path]], sensors: Mapping[str, Sensor]) -> Take:
-    videos = {f"{rows.IMAGES}{camera}": _Video(files[0]) for camera, files in folder.items()}
+    videos = {f"{rows.IMAGES}{camera}": _video(files[0]) for camera, files in folder.items()}
     for sensor, video in videos.items():
         if video.shape != sensors[sensor].shape:
             size, want = (f"{shape[1]} x {shape[0]}" for shape in (video.shape, sensors[sensor].shape))
@@ -64,86 +65,65 @@ def _video_take(name: str, folder: Mapping[str, list[Path]], sensors: Mapping[st
     return Take(readings, facts={"file": name})
 
 
+@dataclass(frozen=True)
 class _Video:
     """One video file: when its frames are shown, and the frames. It is open only while frames are looked at."""
 
-    def __init__(self, path: Path):
-        self.path = path
-        self._frames: Iterator[av.VideoFrame] | None = None  # being decoded
-        self._following = 0  # number of the frame that comes next
-        self._last: tuple[int, np.ndarray] | None = None
-        with _opened(path) as (container, stream):
-            rows.check_size(stream.height, stream.width, f"the video {path}")
-            tick = stream.time_base or Fraction(1, 1000)
-            self.rate_hz = float(stream.average_rate) if stream.average_rate else None
-            shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
-        self._ticks = sorted({pts for pts, _ in shown if pts is not None})
-        self._timed = len(self._ticks) == len(shown)  # whether each frame has a time of its own
-        self._keys = [i for i, pts in enumerate(self._ticks) if (pts, True) in set(shown)] if self._timed else []
-        first = next(self._decoded(None), None)
-        if first is None:
-            raise DatasetError(f"the video {path} has no frames; remove it, or restore it from a copy.")
-        self.shape = self._upright(first).shape
-        times = [float(pts * tick) for pts in self._ticks] if self._timed else self._times_by_decoding()
-        self.time_s = np.array(times, np.float64)
+    path: Path
+    shape: tuple[int, ...]
+    rate_hz: float | None
+    time_s: np.ndarray
+    film: Film
 
     def frame(self, i: int) -> np.ndarray:
-        """Frame i, uint8 [H, W, 3]."""
-        if self._last is not None and self._last[0] == i:
-            return self._last[1].copy()
-        key = self._keys[bisect.bisect_right(self._keys, i) - 1] if self._keys and self._keys[0] <= i else 0
-        if self._frames is None or i < self._following or key > self._following:
-            self._begin(self._ticks[key] if key else None)
-        found = self._advance(i)
-        if found is None:  # the container's index led elsewhere
-            self._begin(None)
-            found = self._advance(i)
-        if found is None:
-            self._frames = None
-            raise DatasetError(f"frame {i} of the video {self.path} is missing or damaged; restore it from a copy.")
-        picture = self._upright(found)
+        picture = self.film(i)
         if picture.shape != self.shape:
             raise DatasetError(f"the video {self.path} changes its size at frame {i}; cut it in two.")
-        self._last = (i, picture)
         if i == len(self.time_s) - 1:
-            self._frames = None  # closes the file
-        return picture.copy()
+            self.film.rest()
+        return picture
 
-    def _begin(self, seek_to: int | None) -> None:
-        self._frames, self._following = self._decoded(seek_to), 0
 
-    def _advance(self, i: int) -> av.VideoFrame | None:
-        """Decodes up to frame i; None where it does not come."""
-        for frame in self._frames or ():
-            number = self._number(frame) if self._timed else self._following
-            if number is not None:
-                self._following = number + 1
-                if number >= i:
-                    return frame if number == i else None
-        return None
+def _video(path: Path) -> _Video:
+    with _opened(path) as (container, stream):
+        rows.check_size(stream.height, stream.width, f"the video {path}")
+        tick = stream.time_base or Fraction(1, 1000)
+        rate_hz = float(stream.average_rate) if stream.average_rate else None
+        shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
+    ticks = sorted({pts for pts, _ in shown if pts is not None})
+    place: dict[int | None, int] = {pts: i for i, pts in enumerate(ticks)}
+    timed = len(ticks) == len(shown)  # whether each frame has a time of its own
+    keys = sorted({0, *(place[pts] for pts, is_key in shown if is_key)}) if timed else [0]
 
-    def _number(self, frame: av.VideoFrame) -> int | None:
-        at = bisect.bisect_left(self._ticks, frame.pts) if frame.pts is not None else len(self._ticks)
-        return at if at < len(self._ticks) and self._ticks[at] == frame.pts else None
+    def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
+        for i, frame in enumerate(_decoded(path, ticks[key] if key else None)):
+            number = place.get(frame.pts, -1) if timed else i
+            if number >= 0:
+                yield number, frame
 
-    def _decoded(self, seek_to: int | None) -> Iterator[av.VideoFrame]:
-        with _opened(self.path) as (container, stream):
-            if seek_to is not None:
-                container.seek(seek_to, stream=stream)
-            yield from container.decode(stream)
-
-    def _upright(self, frame: av.VideoFrame) -> np.ndarray:
-        rows.check_size(frame.height, frame.width, f"the video {self.path}")
+    def show(frame: av.VideoFrame) -> np.ndarray:
+        rows.check_size(frame.height, frame.width, f"the video {path}")
         turns = round(frame.rotation / 90) % 4
         picture = frame.to_ndarray(format="rgb24")
         return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
 
-    def _times_by_decoding(self) -> list[float]:
-        times = [frame.time for frame in self._decoded(None)]
-        known = [time for time in times if time is not None]
-        if len(known) == len(times) and all(a < b for a, b in zip(known, known[1:])):
-            return known
-        return [i / (self.rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
+    first = next(_decoded(path, None), None)
+    if first is None:
+        raise DatasetError(f"the video {path} has no frames; remove it, or restore it from a copy.")
+    times = [float(pts * tick) for pts in ticks]
+    if not timed:
+        times = [frame.time for frame in _decoded(path, None)]
+        if None in times or any(a >= b for a, b in zip(times, times[1:])):
+            times = [i / (rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
+    film = Film(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
+    return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), film)
+
+
+def _decoded(path: Path, seek_to: int | None) -> Iterator[av.VideoFrame]:
+    with _opened(path) as (container, stream):
+        if seek_to is not None:
+            container.seek(seek_to, stream=stream)
+        yield from container.decode(stream)
 
 
 @contextmanager
@@ -163,20 +143,17 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         ) from error
 
 
-def write(
-    source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None, lossless: bool = False
-) -> list[str]:
+def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
     """Writes a source's pictures as mp4 files in a folder as `read` reads it; returns what had no place in it.
 
     take_0.mp4, take_1.mp4, … where the only camera is "observation.images.rgb", else take_0/CAMERA.mp4. Times are kept to
-    the microsecond. H.264 in 4:2:0, which every player shows, loses a little and needs even sizes; `lossless` keeps every
-    value, of any size, as H.264 in RGB, which FFmpeg's players show. `progress(takes, 0)` is called after each take.
-    DatasetError for odd sizes (unless lossless), frames at the same time, no pictures at all, or where `path` exists.
+    the microsecond. H.264 in 4:2:0, which every player shows, loses a little and needs even sizes. `progress(takes, 0)` is
+    called after each take. DatasetError for odd sizes, frames at the same time, no pictures at all, or where `path` exists.
     """
     cameras, notes = folders.cameras(source, ("image",), "a video")
     for name in cameras:
         height, width = source.sensors[name].shape[:2]
-        if not lossless and (height % 2 or width % 2):
+        if height % 2 or width % 2:
             raise DatasetError(
                 f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write it as images."
             )
@@ -189,20 +166,18 @@ def write(
                     file = staged / f"take_{number}" / f"{camera}.mp4"
                     file = staged / f"take_{number}.mp4" if list(cameras) == [folders.CAMERA] else file
                     file.parent.mkdir(exist_ok=True)
-                    _encode(file, source.sensors[name], take.readings[name], begin, lossless, f"take {number}")
+                    _encode(file, source.sensors[name], take.readings[name], begin, f"take {number}")
     return notes
 
 
-def _encode(path: Path, sensor: Sensor, readings: Readings, begin: float, lossless: bool, where: str) -> None:
+def _encode(path: Path, sensor: Sensor, readings: Readings, begin: float, where: str) -> None:
     ticks = np.rint((readings.time_s - begin) / float(_CLOCK)).astype(np.int64)
     if (np.diff(ticks) <= 0).any():
         raise DatasetError(f"'{sensor.name}' in {where} has two pictures within a microsecond; drop one of them.")
     height, width, _ = sensor.shape
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream(
-            "libx264rgb" if lossless else "libx264", options=_LOSSLESS if lossless else _LOSSY
-        )
-        stream.width, stream.height, stream.pix_fmt = width, height, "rgb24" if lossless else "yuv420p"
+        stream = container.add_stream("libx264", options=_CODEC)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = _CLOCK
         row = 0
         for part in rows.batches(readings.values, sensor, where, size=8):
