@@ -11,6 +11,7 @@ import torch
 from ..core.policy import Random
 from ..core.spec import Spec
 from ..core.world import Observation
+from ..space.camera import yaw
 
 LEGS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
 _BODY_M = 0.55  # half the width that must be free to walk
@@ -307,11 +308,8 @@ def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
         thing, target = (
             -torch.nn.functional.adaptive_max_pool1d(-rows.amin(0)[None], bins)[0] for rows in (far, far[top:bottom])
         )
-    x, y, _, w, qx, qy, qz = observation["pose"][0].tolist()
-    yaw = math.atan2(2 * (w * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
-    return _View(
-        x, y, yaw, bearing, level / torch.cos(bearing), thing / torch.cos(bearing), target / torch.cos(bearing)
-    )
+    pose, far = observation["pose"][0], [level / torch.cos(bearing) for level in (level, thing, target)]
+    return _View(float(pose[0]), float(pose[1]), float(yaw(pose)), bearing, *far)
 
 
 def _cell(x: float, y: float) -> tuple[int, int]:

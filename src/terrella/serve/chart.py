@@ -6,13 +6,12 @@ It knows no kind of world: a world with the channels `pose` and `keyframes` [N, 
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World
+from ..space.camera import yaw
 
 AMBER = (1.25, 0.95, 0.5)  # of what is invented: its brightness in this colour
 STRENGTH = 0.85
@@ -32,11 +31,9 @@ def chart(world: World, state: State) -> dict:
     centimetre, in one flat list without the empty slots."""
     wanted = ["pose", "keyframes", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
-    x, y, _, w, qx, qy, z = seen["pose"].tolist()
-    heading = math.atan2(2 * (w * z + qx * qy), 1 - 2 * (qy * qy + z * z))
     held = seen["keyframes"][seen["keyframes"][:, 3] > 0]
     return {
-        "camera": [round(number, 3) for number in (x, y, heading)],
+        "camera": [round(number, 3) for number in (*seen["pose"][:2].tolist(), float(yaw(seen["pose"])))],
         "known": round(float(seen["known"].mean()), 3) if "known" in seen else None,
         "keyframes": held.flatten().double().round(decimals=2).tolist(),
     }

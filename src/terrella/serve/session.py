@@ -11,7 +11,9 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
+
+from starlette.websockets import WebSocket
 
 from ..core.errors import TerrellaError
 from . import protocol
@@ -21,16 +23,6 @@ from .timeline import Timeline
 
 MAX_UNACKED = 2
 CHART_S = 0.1  # between two maps
-
-
-class Socket(Protocol):
-    """What a session needs of a connection; a failed send raises."""
-
-    async def send_bytes(self, data: bytes) -> None: ...
-
-    async def send_text(self, data: str) -> None: ...
-
-    async def close(self, code: int = 1000, reason: str | None = None) -> None: ...
 
 
 class Session:
@@ -47,7 +39,7 @@ class Session:
         self.detached_at: float | None = time.monotonic()
         self.heard_at = time.monotonic()
         self._make_timeline, self._worker = make_timeline, worker
-        self._socket: Socket | None = None
+        self._socket: WebSocket | None = None
         self._controls = Controls(0)
         self._commands: deque[tuple[str, Any]] = deque()
         self._wake = asyncio.Event()
@@ -71,7 +63,7 @@ class Session:
     def connected(self) -> bool:
         return self._socket is not None
 
-    def attach(self, socket: Socket) -> Socket | None:
+    def attach(self, socket: WebSocket) -> WebSocket | None:
         """Plays on through `socket`; gives the socket that was attached until now."""
         before, self._socket = self._socket, socket
         self.detached_at, self._acked, self._status_sent = None, self._sent, {}
@@ -82,7 +74,7 @@ class Session:
         self._wake.set()
         return before
 
-    def detach(self, socket: Socket) -> None:
+    def detach(self, socket: WebSocket) -> None:
         """The socket is gone; the timeline waits, and its recording is closed."""
         if self._socket is socket:
             self._commands.append(("record", False))
@@ -91,7 +83,7 @@ class Session:
             self._controls = replace(self._controls, held=(), axes=())
             self.detached_at = time.monotonic()
 
-    def hear(self, kind: str, value: Any = None, socket: Socket | None = None) -> None:
+    def hear(self, kind: str, value: Any = None, socket: WebSocket | None = None) -> None:
         """A message of the player; one that a replaced socket still had in its buffer counts no more."""
         if socket is not None and socket is not self._socket:
             return

@@ -9,10 +9,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
-from PIL import Image
 
 from ..core.errors import TerrellaError
-from .gymnasium import Adapter, GymnasiumWorld, check_size
+from .gymnasium import Adapter, GymnasiumWorld, check_size, resized
 from .snapshot import NotCopyable
 
 FRAMES_PER_SECOND = 60
@@ -114,7 +113,7 @@ class _Screen(gymnasium.Wrapper):
             *_, over, _, info = self.env.step(0)
             if over:
                 self.ale.reset_game()
-        return self._picture(self.ale.getScreenRGB()), info
+        return resized(self.ale.getScreenRGB(), self.size), info
 
     def step(self, action):
         total, screens = 0.0, []
@@ -127,13 +126,7 @@ class _Screen(gymnasium.Wrapper):
                 screens.append(self.ale.getScreenRGB())
             if terminated or truncated:
                 break
-        return self._picture(np.maximum.reduce(screens)), total, terminated, truncated, info
-
-    def _picture(self, screen: np.ndarray) -> np.ndarray:
-        height, width = self.size
-        if screen.shape[:2] == (height, width):
-            return screen
-        return np.asarray(Image.fromarray(screen).resize((width, height), Image.Resampling.BOX))
+        return resized(np.maximum.reduce(screens), self.size), total, terminated, truncated, info
 
 
 class _Savestates:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 import vizdoom
 from gymnasium import spaces
+from PIL import Image
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Camera, Spec
@@ -204,7 +205,7 @@ class Doom:
         if name == "done":
             return torch.tensor(self._done)
         if name == "rgb":
-            return torch.from_numpy(_area_mean(self._present.screen_buffer, self._shrink))
+            return torch.from_numpy(np.array(Image.fromarray(self._present.screen_buffer).reduce(self._shrink)))
         x, y, z, yaw_deg, health = (float(value) for value in np.asarray(self._present.game_variables))
         if name == "health":
             dead = self._done and self._game.is_player_dead()  # of the dead there is no state, the last picture stays
@@ -339,17 +340,6 @@ def _wad(game: vizdoom.DoomGame) -> Path:
     """The file that holds the map: the scenario's, or the game's."""
     own = Path(game.get_doom_scenario_path())
     return own if own.is_file() else Path(game.get_doom_game_path())
-
-
-def _area_mean(image: np.ndarray, shrink: int) -> np.ndarray:
-    """uint8 [H, W, 3] -> uint8 [H / shrink, W / shrink, 3], each pixel the mean of its block."""
-    rows = image[::shrink].astype(np.uint16)
-    for offset in range(1, shrink):
-        rows += image[offset::shrink]
-    total = rows[:, ::shrink] + np.uint16(shrink * shrink // 2)
-    for offset in range(1, shrink):
-        total += rows[:, offset::shrink]
-    return (total // np.uint16(shrink * shrink)).astype(np.uint8)
 
 
 def _any_of(mask: np.ndarray, count: int, axis: int) -> np.ndarray:

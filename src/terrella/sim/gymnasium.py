@@ -177,7 +177,7 @@ class GymnasiumWorld:
         space = self._env.observation_space
         seen = np.array(observation, dtype=space.dtype).reshape(space.shape)
         row = {
-            **({"rgb": _resized(seen, self._size)} if self._pictured else {"observation": seen}),
+            **({"rgb": resized(seen, self._size)} if self._pictured else {"observation": seen}),
             "reward": np.float32(reward),
             "done": np.bool_(done),
             **{name: np.float32(info[name]) for name in self._info},
@@ -219,7 +219,7 @@ class GymnasiumWorld:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
                 drawn = self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped)
                 seen = np.asarray(drawn)
-                found.append(np.array(_resized(seen, self._size) if channel is None else seen, space.dtype))
+                found.append(np.array(resized(seen, self._size) if channel is None else seen, space.dtype))
                 if found[-1].shape != space.shape:
                     raise TerrellaError(
                         f"{self.spec.name} gave '{name}' of shape {found[-1].shape}; its space is {space}."
@@ -326,7 +326,7 @@ def _is_picture(space: gymnasium.Space) -> bool:
     return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3 and space.shape[2] == 3
 
 
-def _resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+def resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
     """uint8 [H, W, 3] -> uint8 [*size, 3], each pixel the mean of the area that it covers."""
     if size is None or picture.shape[:2] == tuple(size):
         return picture
