@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
 from terrella.serve.history import Image
-from terrella.serve.protocol import Controls, Frame, Show
+from terrella.serve.protocol import Controls, Show
 
-from .wire import decode_frame
+from .wire import Frame, decode_frame, encode
 
 u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)
 f32 = st.floats(width=32, allow_nan=False)
@@ -36,12 +36,12 @@ frames = st.builds(
 
 @given(frames)
 def test_a_frame_survives_the_wire(frame):
-    assert decode_frame(protocol.encode_frame(frame)) == frame
+    assert decode_frame(encode(frame)) == frame
 
 
 @given(frames, st.integers(0, 200))
 def test_a_cut_frame_is_refused(frame, cut):
-    data = protocol.encode_frame(frame)
+    data = encode(frame)
     short = data[: min(cut, len(data) - 1)]
     with pytest.raises(ProtocolError):
         decode_frame(short)
@@ -140,7 +140,7 @@ def test_a_card_becomes_plain_json():
 
 
 def test_vitals_ride_at_the_end_of_a_frame():
-    frame = protocol.Frame(1, 2, 0, 2, (Image(0, 0, b"jpeg"), Image(1, 0, b"other")), vitals=(42.0, 3.0))
-    assert decode_frame(protocol.encode_frame(frame)) == frame
+    frame = Frame(1, 2, 0, 2, (Image(0, 0, b"jpeg"), Image(1, 0, b"other")), vitals=(42.0, 3.0))
+    assert decode_frame(encode(frame)) == frame
     with pytest.raises(ProtocolError):
-        decode_frame(protocol.encode_frame(frame)[:-1])
+        decode_frame(encode(frame)[:-1])

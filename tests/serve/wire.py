@@ -3,11 +3,40 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
-from terrella.serve.history import Image
-from terrella.serve.protocol import Frame
+from terrella.serve.history import Image, Moment
+from terrella.serve.protocol import Controls
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a page reads of a frame: see protocol.encode_frame."""
+
+    seq: int
+    step: int
+    oldest: int
+    newest: int
+    images: tuple[Image, ...]
+    flags: int = 0
+    action_id: int = 0
+    generation_ms: float = 0.0
+    episode_return: float = 0.0
+    client_ms: float = 0.0
+    server_s: float = 0.0
+    uncertainty: float = -1.0
+    vitals: tuple[float, ...] = ()
+
+
+def encode(frame: Frame) -> bytes:
+    moment = Moment(
+        frame.step, frame.images, frame.flags, frame.episode_return, uncertainty=frame.uncertainty, vitals=frame.vitals
+    )
+    controls = Controls(frame.action_id, t=frame.client_ms)
+    past = frame.oldest, frame.newest
+    return protocol.encode_frame(moment, frame.seq, *past, controls, frame.generation_ms, frame.server_s)
 
 
 def decode_frame(data: bytes) -> Frame:

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..core.errors import ProtocolError
 from .actions import MAX_AXES
-from .history import Image
+from .history import Moment
 
 VERSION = 3
 MAX_MESSAGE = 4096  # bytes of one message from a page
@@ -28,43 +28,6 @@ REPLAY = 4  # a frame out of the history: the session stands in the past
 # generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32; little endian
 _HEADER = struct.Struct("<BBHIIIIIffddf")
 _IMAGE = struct.Struct("<BBHI")  # world, camera, 0, bytes
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One moment as the page gets it.
-
-    seq counts messages (the page acknowledges it); step is the world's; oldest..newest is what can be rewound to;
-    action_id and client_ms echo the latest controls message that this step obeyed; images: see history.Image; uncertainty
-    is the error to expect of the last world's, -1 where it does not say; vitals are the numbers of the first world's
-    player (health), in the order of hello.
-    """
-
-    seq: int
-    step: int
-    oldest: int
-    newest: int
-    images: tuple[Image, ...]
-    flags: int = 0
-    action_id: int = 0
-    generation_ms: float = 0.0
-    episode_return: float = 0.0
-    client_ms: float = 0.0
-    server_s: float = 0.0
-    uncertainty: float = -1.0
-    vitals: tuple[float, ...] = ()
-
-
-def encode_frame(frame: Frame) -> bytes:
-    parts = [
-        _HEADER.pack(
-            VERSION, frame.flags, len(frame.images), frame.seq & U32, frame.step, frame.oldest, frame.newest,
-            frame.action_id, frame.generation_ms, frame.episode_return, frame.client_ms, frame.server_s, frame.uncertainty,
-        )
-    ]  # fmt: skip
-    for image in frame.images:
-        parts += [_IMAGE.pack(image.world, image.camera, 0, len(image.jpeg)), image.jpeg]
-    return b"".join([*parts, struct.pack(f"<{len(frame.vitals)}f", *frame.vitals)])
 
 
 @dataclass(frozen=True)
@@ -88,6 +51,22 @@ class Show:
     map: bool
     invented: bool
     cameras: tuple[str, ...] = ()
+
+
+def encode_frame(
+    moment: Moment, seq: int, oldest: int, newest: int, controls: Controls, made_ms: float, server_s: float
+) -> bytes:
+    """One moment as the page gets it. seq counts messages (the page acknowledges it); oldest..newest is what can be rewound
+    to; `controls`, of which id and time are echoed, are the latest that this step obeyed; vitals are in the order of hello."""
+    parts = [
+        _HEADER.pack(
+            VERSION, moment.flags, len(moment.images), seq & U32, moment.step, oldest, newest, controls.id, made_ms,
+            moment.episode_return, controls.t, server_s, moment.uncertainty,
+        )
+    ]  # fmt: skip
+    for image in moment.images:
+        parts += [_IMAGE.pack(image.world, image.camera, 0, len(image.jpeg)), image.jpeg]
+    return b"".join([*parts, struct.pack(f"<{len(moment.vitals)}f", *moment.vitals)])
 
 
 def parse_message(data: str | bytes) -> tuple[str, Any]:

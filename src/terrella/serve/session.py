@@ -18,7 +18,7 @@ from starlette.websockets import WebSocket
 from ..core.errors import TerrellaError
 from . import protocol
 from .history import Moment
-from .protocol import Controls, Frame, Show
+from .protocol import Controls, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
@@ -229,17 +229,13 @@ class Session:
 
     async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: Controls) -> None:
         self._unseen = None
-        flags = moment.flags | protocol.REPLAY * timeline.rewound
         images = moment.images
         if self._show.invented or not made_ms:
             images = await self._extra(timeline.images, moment, self._show.invented) or images
         self._sent += 1
-        frame = Frame(
-            self._sent, moment.step, timeline.history.oldest_step, timeline.history.newest.step, images, flags,
-            controls.id, made_ms, moment.episode_return, controls.t, time.time(), moment.uncertainty,
-            moment.vitals,
-        )  # fmt: skip
-        await self._deliver(protocol.encode_frame(frame))
+        moment = replace(moment, images=images, flags=moment.flags | protocol.REPLAY * timeline.rewound)
+        past = timeline.history.oldest_step, timeline.history.newest.step
+        await self._deliver(protocol.encode_frame(moment, self._sent, *past, controls, made_ms, time.time()))
         if self._show.map and (time.perf_counter() >= self._chart_due or timeline.rewound):
             await self._chart(timeline)
 
