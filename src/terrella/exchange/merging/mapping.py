@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,8 @@ from typing import Literal
 
 from ...core.errors import DatasetError
 from ...data.resample import Policy
-from ...data.source import Kind, Source
+from ...data.source import Source
+from ..formats.rows import MAX_SIDE
 from .units import convert
 
 ACTION = "action"
@@ -49,7 +51,7 @@ class Dimension:
 class Camera:
     """One merged camera: kind "image" or "depth", size in pixels."""
 
-    kind: Kind
+    kind: Literal["image", "depth"]
     height: int
     width: int
 
@@ -141,7 +143,12 @@ def affine(number: Number, dimension: Dimension) -> tuple[float, float]:
 def check_inside(mapping: MergeMapping) -> None:
     """What must hold whatever the sources are."""
     taken = set(MADE) | set(mapping.cameras)
-    for name in mapping.cameras:
+    for what, value in (("fps", mapping.rows.fps), ("max_gap_s", mapping.rows.max_gap_s)):
+        _check_positive(value, f"[rows] {what}")
+    for name, camera in mapping.cameras.items():
+        if not (0 < camera.height <= MAX_SIDE and 0 < camera.width <= MAX_SIDE):
+            size = f"{camera.height} x {camera.width}"
+            raise DatasetError(f"[cameras] '{name}' is {size}; give 1 to {MAX_SIDE} pixels each way.")
         if not name.startswith("observation.") or name in MADE or not NAME.fullmatch(name):
             raise DatasetError(
                 f"[cameras] '{name}' must begin with 'observation.', have only letters, digits, '.', '_' and '-', and be "
@@ -156,6 +163,7 @@ def check_inside(mapping: MergeMapping) -> None:
         taken |= {to, mask_of(to)}
     for count, source in enumerate(mapping.sources, 1):
         where = f"source {count} ({source.embodiment})"
+        _check_positive(source.fps, f"{where} fps")
         places: dict[str, str] = {}
         for table in ("vectors", "cameras", "keep", "out"):
             for sensor in getattr(source, table):
@@ -177,6 +185,11 @@ def check_inside(mapping: MergeMapping) -> None:
         raise DatasetError("two sources have one path; merge a recording once.")
 
 
+def _check_positive(value: float | None, what: str) -> None:
+    if value is not None and not 0 < value < math.inf:
+        raise DatasetError(f"{what} = {value:g} must be positive and finite.")
+
+
 def _check_numbers(mapping: MergeMapping, source: SourceMapping, where: str) -> None:
     filled: dict[tuple[bool, str], str] = {}
     for sensor, vector in source.vectors.items():
@@ -185,6 +198,11 @@ def _check_numbers(mapping: MergeMapping, source: SourceMapping, where: str) -> 
             this = f"{where} vectors '{sensor}' number {place}" + (f" ({number.name})" if number.name else "")
             if bool(number.to) == bool(number.out):
                 raise DatasetError(f"{this} needs either `to` or `out`.")
+            for key, value in (("scale", number.scale or 0), ("offset", number.offset)):
+                if not math.isfinite(value):
+                    raise DatasetError(f"{this} {key} = {value} must be finite.")
+            if number.scale == 0:
+                raise DatasetError(f"{this} has scale 0, which keeps nothing of it; give `out` and why instead.")
             if number.out:
                 continue
             if number.to not in dimensions:

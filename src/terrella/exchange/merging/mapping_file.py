@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tomlkit
 from tomlkit.items import InlineTable, Table
 
 from ...core.errors import DatasetError
-from .mapping import Camera, Dimension, MergeMapping, Number, Rows, SourceMapping, Vector, check_inside
+from .mapping import MergeMapping, Number, SourceMapping, check_inside
 
-_T = TypeVar("_T")
 _TOP = "Which number of which robot goes where in the merged recording. Edit it and merge again with this file."
 _ROWS = {
     "fps": "rows a second of the merged recording",
@@ -148,102 +146,52 @@ def read_mapping(path: str | Path) -> MergeMapping:
 
 
 def mapping_of(tables: dict) -> MergeMapping:
-    """The mapping that parsed TOML holds; DatasetError where a key or a value is wrong."""
-    known = ("rows", "action", "state", "cameras", "source")
-    for key, value in tables.items():
-        if key not in known:
-            raise DatasetError(f"the file has an unknown key '{key}'; it may have {', '.join(known)}.")
-        if not isinstance(value, list if key == "source" else dict):
-            raise DatasetError(f"the file: '{key}' must be {'[[source]] tables' if key == 'source' else 'a table'}.")
-    rows = {"max_gap_s": None, **tables.get("rows", {})}
-    for key, hint in get_type_hints(Rows).items():
-        policies = [policy for part in (hint, *get_args(hint)) for policy in get_args(part) if isinstance(policy, str)]
-        if policies and isinstance(rows.get(key), str) and rows[key] not in policies:
-            raise DatasetError(f"[rows] {key} = '{rows[key]}' is no policy; choose {', '.join(policies)}.")
-    found = _made(Rows, rows, "[rows]")
-    for key in ("fps", "max_gap_s"):
-        _positive(getattr(found, key), f"[rows] {key}")
+    """The mapping that parsed TOML holds; DatasetError where a key is unknown or missing, or a value of another type."""
     sources = tables.get("source", [])
-    if not sources:
-        raise DatasetError("it has no [[source]]; add one for each recording to merge.")
-    return MergeMapping(
-        rows=replace(found, fps=float(found.fps)),
-        action={name: _made(Dimension, it, f"[action] '{name}'") for name, it in tables.get("action", {}).items()},
-        state={name: _made(Dimension, it, f"[state] '{name}'") for name, it in tables.get("state", {}).items()},
-        cameras={name: _camera(it, f"[cameras] '{name}'") for name, it in tables.get("cameras", {}).items()},
-        sources=tuple(_read_source(source, f"source {i}") for i, source in enumerate(sources, 1)),
-    )
-
-
-def _camera(values: Any, where: str) -> Camera:
-    camera = _made(Camera, values, where)
-    if camera.kind not in ("image", "depth"):
-        raise DatasetError(f"{where} has kind '{camera.kind}'; choose image or depth.")
-    if not (0 < camera.height <= 16384 and 0 < camera.width <= 16384):
-        raise DatasetError(f"{where} is {camera.height} x {camera.width}; give 1 to 16384 pixels each way.")
-    return camera
+    if not isinstance(sources, list) or not sources:
+        raise DatasetError("it has no [[source]] tables; add one for each recording to merge.")
+    known = ("rows", "action", "state", "cameras")
+    for key in tables:
+        if key not in (*known, "source"):
+            raise DatasetError(f"the file has an unknown key '{key}'; it may have {', '.join(known)}, source.")
+    hints = get_type_hints(MergeMapping)
+    given = {**dict.fromkeys(known, {}), **tables}
+    if isinstance(given["rows"], dict):
+        given["rows"] = {"max_gap_s": None, **given["rows"]}
+    found = {key: _value(hints[key], given[key], f"[{key}]") for key in known}
+    return MergeMapping(**found, sources=tuple(_read_source(it, f"source {i}") for i, it in enumerate(sources, 1)))
 
 
 def _read_source(values: Any, where: str) -> SourceMapping:
-    source = _made(SourceMapping, values, where)
-    where = f"{where} ({source.embodiment})"
-    _positive(source.fps, f"{where} fps")
-    for table in ("cameras", "keep", "out", "notes"):
-        given = getattr(source, table)
-        for key, value in given.items() if isinstance(given, dict) else enumerate(given):
-            if not isinstance(value, str):
-                raise DatasetError(f"{where} {table} has {key} = {value!r}, which should be of type str.")
-    vectors = {}
-    for name, given in source.vectors.items():
-        place = f"{where} vectors '{name}'"
-        vector = _made(Vector, given, place)
-        numbers = (_number(it, f"{place} number {i}") for i, it in enumerate(vector.numbers))
-        vectors[name] = replace(vector, numbers=tuple(numbers))
-    fps = None if source.fps is None else float(source.fps)
-    return replace(source, fps=fps, vectors=vectors, notes=tuple(source.notes))
+    named = isinstance(values, dict) and isinstance(values.get("embodiment"), str)
+    return _value(SourceMapping, values, f"{where} ({values['embodiment']})" if named else where)
 
 
-def _number(values: Any, where: str) -> Number:
-    number = _made(Number, values, where)
-    for key in ("scale", "offset"):
-        if not math.isfinite(getattr(number, key) or 0):
-            raise DatasetError(f"{where} {key} = {getattr(number, key)} must be finite.")
-    if number.scale == 0:
-        raise DatasetError(f"{where} has scale 0, which keeps nothing of it; give `out` and why instead.")
-    scale = None if number.scale is None else float(number.scale)
-    return replace(number, scale=scale, offset=float(number.offset))
+def _value(hint: Any, value: Any, where: str) -> Any:
+    """What TOML has of that type; DatasetError where it is another, or (of a table) has an unknown key or lacks one."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if NoneType in parts:
+        return None if value is None else _value(parts[0], value, where)
+    kind = list if origin is tuple else str if origin is Literal else dict if origin or is_dataclass(hint) else hint
+    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
+        raise DatasetError(f"{where} = {value!r} should be of type {'table' if kind is dict else kind.__name__}.")
+    if origin is Literal and value not in parts:
+        raise DatasetError(f"{where} = '{value}' is unknown; choose {' or '.join(parts)}.")
+    if origin is tuple:
+        return tuple(_value(parts[0], it, f"{where.removesuffix('s')} {i}") for i, it in enumerate(value))
+    if is_dataclass(hint):
+        return _table_as(hint, value, where)
+    if kind is dict:
+        return {key: _value(parts[1], it, f"{where} '{key}'") for key, it in value.items()}
+    return float(value) if kind is float else value
 
 
-def _positive(value: float | None, what: str) -> None:
-    if value is not None and not 0 < value < math.inf:
-        raise DatasetError(f"{what} = {value} must be positive and finite.")
-
-
-def _made(cls: type[_T], values: Any, where: str) -> _T:
-    """cls(**values); DatasetError where a key is unknown or missing, or a value is not of its field's type."""
+def _table_as(cls: Any, values: dict, where: str) -> Any:
     hints = get_type_hints(cls)
-    if not isinstance(values, dict):
-        raise DatasetError(f"{where} must be a table {{ {', '.join(hints)} }}.")
-    for key, value in values.items():
+    for key in values:
         if key not in hints:
             raise DatasetError(f"{where} has an unknown key '{key}'; it may have {', '.join(hints)}.")
-        allowed = _kinds(hints[key])
-        if not isinstance(value, allowed) or isinstance(value, bool):
-            wanted = " or ".join(kind.__name__ for kind in allowed if kind is not NoneType)
-            raise DatasetError(f"{where} has {key} = {value!r}, which should be of type {wanted}.")
-    for field in fields(cls):  # type: ignore[arg-type]
+    for field in fields(cls):
         if field.default is MISSING and field.default_factory is MISSING and field.name not in values:
             raise DatasetError(f"{where} lacks '{field.name}'; add it.")
-    return cls(**values)
-
-
-def _kinds(hint: Any) -> tuple[type, ...]:
-    """What TOML may give for a field of that type."""
-    origin, parts = get_origin(hint), get_args(hint)
-    if origin is tuple:
-        return (list,)
-    if origin is not None and issubclass(origin if isinstance(origin, type) else str, Mapping):
-        return (dict,)
-    if parts:  # a choice of texts, or of types
-        return (str,) if isinstance(parts[0], str) else tuple(kind for part in parts for kind in _kinds(part))
-    return (int, float) if hint is float else (hint,)
+    return cls(**{key: _value(hints[key], it, f"{where} {key}") for key, it in values.items()})

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from ...data import stats
+
 _SAMPLE = 1 << 18  # quantiles are exact up to this many values of a number, then from every 2nd, 4th, …
 
 
@@ -14,56 +16,34 @@ class Running:
     """Statistics of named numbers, each over its own valid rows, gathered bit by bit."""
 
     def __init__(self, names: Sequence[str]):
-        self.names = tuple(names)
-        size = len(self.names)
-        self._count = np.zeros(size, np.int64)
-        self._mean, self._squares = np.zeros(size), np.zeros(size)
-        self._min, self._max = np.full(size, np.inf), np.full(size, -np.inf)
-        self._samples: list[list[np.ndarray]] = [[] for _ in self.names]
-        self._kept, self._stride = np.zeros(size, np.int64), np.ones(size, np.int64)
+        self._names = tuple(names)
+        self._summaries: dict[str, stats.Summary] = {}
+        self._samples = {name: np.zeros(0, np.float32) for name in names}
+        self._strides = dict.fromkeys(names, 1)
 
     def add(self, values: np.ndarray, mask: np.ndarray) -> None:
         """values float [T, D], mask bool [T, D]."""
-        rows = values.astype(np.float64)
-        count = mask.sum(0)
-        mean = np.where(mask, rows, 0).sum(0) / np.maximum(count, 1)
-        squares = (np.where(mask, rows - mean, 0) ** 2).sum(0)
-        total = np.maximum(self._count + count, 1)
-        self._squares += squares + (mean - self._mean) ** 2 * self._count * count / total
-        self._mean += (mean - self._mean) * count / total
-        self._min = np.minimum(self._min, np.where(mask, rows, np.inf).min(0, initial=np.inf))
-        self._max = np.maximum(self._max, np.where(mask, rows, -np.inf).max(0, initial=-np.inf))
-        for number in np.flatnonzero(count).tolist():
-            self._sample(number, values[mask[:, number], number])
-        self._count += count
+        for place, name in enumerate(self._names):
+            new = values[mask[:, place], place]
+            if len(new):
+                self._sample(name, new)
+                self._summaries = stats.merge([self._summaries, {name: stats.summarise(new)}])
 
-    def _sample(self, number: int, values: np.ndarray) -> None:
+    def _sample(self, name: str, values: np.ndarray) -> None:
         """Keeps value j of all that this number ever had where j is a multiple of the stride."""
-        stride, samples = self._stride[number], self._samples[number]
-        new = values[-self._count[number] % stride :: stride].astype(np.float32)
-        samples.append(new)
-        self._kept[number] += len(new)
-        while self._kept[number] > _SAMPLE:
-            samples[:] = [np.concatenate(samples)[::2]]
-            self._kept[number], self._stride[number] = len(samples[0]), self._stride[number] * 2
+        before = int(self._summaries[name]["count"][0]) if name in self._summaries else 0
+        new = values[-before % self._strides[name] :: self._strides[name]].astype(np.float32)
+        self._samples[name] = np.concatenate([self._samples[name], new])
+        while len(self._samples[name]) > _SAMPLE:
+            self._samples[name], self._strides[name] = self._samples[name][::2], self._strides[name] * 2
 
     def to_json(self) -> dict[str, dict]:
-        """name -> min, max, mean, std, q01, q99, count; of a number without a valid row its count 0 alone."""
+        """name -> min, max, mean, std, q01, q99, count, of all numbers that have a valid row."""
         found: dict[str, dict] = {}
-        for number, name in enumerate(self.names):
-            count = int(self._count[number])
-            found[name] = {"count": count}
-            if count:
-                low, high = np.quantile(np.concatenate(self._samples[number]).astype(np.float64), (0.01, 0.99))
-                found[name] = {
-                    "min": float(self._min[number]),
-                    "max": float(self._max[number]),
-                    "mean": float(self._mean[number]),
-                    "std": float(np.sqrt(self._squares[number] / count)),
-                    "q01": float(low),
-                    "q99": float(high),
-                    "count": count,
-                }
+        for name, summary in self._summaries.items():
+            low, high = np.quantile(self._samples[name].astype(np.float64), (0.01, 0.99))
+            numbers = {key: float(value[0]) for key, value in summary.items() if key != "count"}
+            found[name] = {**numbers, "q01": float(low), "q99": float(high), "count": int(summary["count"][0])}
         return found
 
 
@@ -125,11 +105,7 @@ class Report:
         found = []
         for number, (name, facts) in enumerate(self._robots.items()):
             mine = [source for source in self.sources.values() if source.embodiment == name]
-            statistics = {
-                key: {number: it for number, it in running.to_json().items() if it["count"]}
-                for (robot, key), running in self._statistics.items()
-                if robot == name
-            }
+            statistics = {key: it.to_json() for (robot, key), it in self._statistics.items() if robot == name}
             counts = {"takes": sum(source.takes for source in mine), "rows": sum(source.rows for source in mine)}
             found.append({"id": number, "name": name, **facts, **counts, "stats": statistics})
         return found
