@@ -6,6 +6,7 @@ import json
 import re
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +23,12 @@ from .poses import pose_columns
 MARKS = ".terrella-marks.json"  # in the folder of the recording
 _OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
+_SEE = "look for the cause with `terrella data doctor`"
+_FORMS = {
+    "image": "a picture, uint8 [H, W, 3]",
+    "depth": "depth in metres, [h, w]",
+    "points": "a cloud, [n, 3 or more]",
+}
 
 Report = Callable[[int, int], None]  # (episodes done, episodes in all)
 Export = Callable[[Path, Sequence[int], Report], Sequence[str] | None]  # gives notes on what was left out
@@ -51,11 +58,9 @@ class Entry:
 class Browse:
     """Looks into a recording: what `terrella.serve.viewer.Viewable` asks for.
 
-    source:  the recording.
+    source:  the recording; where its takes are no sequence, they are walked from the first on.
     marks:   JSON file that keeps which episodes are bad; it is made when the first is marked.
     entries: the list of episodes; without it, every take is opened once to learn its length.
-    take:    opens one episode by its number; without it, `source.takes()[number]` where that is a sequence, else takes
-             are walked from the first on.
     export:  writes the episodes of the given numbers into a new folder, and calls `report` as it goes along; returns
              sentences on what it left out or changed.
 
@@ -68,11 +73,10 @@ class Browse:
         source: Source,
         marks: str | Path,
         entries: Sequence[Entry] | None = None,
-        take: Callable[[int], Take] | None = None,
         export: Export | None = None,
     ):
         self.source, self._marks_path, self._export = source, Path(marks), export
-        self._open = take or _Walk(source).take
+        self._open = _Walk(source).take
         self._texts = {name for name, sensor in source.sensors.items() if sensor.dtype == "string"}
         self.entries = tuple(entries if entries is not None else map(Entry.of, source.takes()))
         self._takes: OrderedDict[int, _OpenTake] = OrderedDict()
@@ -216,22 +220,17 @@ class _OpenTake:
         count = len(self.times(sensor))
         if not 0 <= index < count:
             raise DatasetError(f"{self._where(sensor)} has {count} readings, no reading {index}.")
-        try:
+        what = f"reading {index} of {self._where(sensor)}"
+        with _decoding(what):
             value = np.asarray(self._readings(sensor).values[index])
-        except DatasetError:
-            raise
-        except Exception as error:  # whatever a decoder makes of a broken file
-            raise DatasetError(
-                f"reading {index} of {self._where(sensor)} does not decode ({type(error).__name__}: {error}); look for "
-                "the cause with `terrella data doctor`."
-            ) from error
         kind = self._source.sensors[sensor].kind
-        if kind == "image" and (value.dtype != np.uint8 or value.ndim != 3 or value.shape[2] != 3 or not value.size):
-            raise self._foreign(sensor, index, value, "a picture, uint8 [H, W, 3]")
-        if kind == "depth" and (value.ndim != 2 or value.dtype.kind not in "fiu" or not value.size):
-            raise self._foreign(sensor, index, value, "depth in metres, [h, w]")
-        if kind == "points" and (value.ndim != 2 or value.shape[1] < 3 or value.dtype.kind not in "fiu"):
-            raise self._foreign(sensor, index, value, "a cloud, [n, 3 or more]")
+        flat = value.ndim == 2 and value.dtype.kind in "fiu"
+        if kind == "image":
+            good = value.dtype == np.uint8 and value.ndim == 3 and value.shape[2] == 3 and value.size
+        else:
+            good = kind == "vector" or (flat and (value.shape[1] >= 3 if kind == "points" else value.size))
+        if not good:
+            raise DatasetError(f"{what} is {value.dtype} {list(value.shape)} and not {_FORMS[kind]}; {_SEE}.")
         return value
 
     def series(self, sensor: str) -> np.ndarray:
@@ -239,16 +238,9 @@ class _OpenTake:
             if self._source.sensors[sensor].kind != "vector":
                 raise DatasetError(f"{self._where(sensor)} is no vector; it is shown one reading at a time.")
             times, values = self.times(sensor), self._readings(sensor).values
-            try:
+            with _decoding(self._where(sensor)):
                 whole = np.asarray(values if isinstance(values, np.ndarray) else [np.asarray(v) for v in values])
                 whole = whole.astype(np.float64).reshape(len(times), -1) if len(times) else np.zeros((0, 1))
-            except DatasetError:
-                raise
-            except Exception as error:
-                raise DatasetError(
-                    f"{self._where(sensor)} is not a series of numbers ({error}); look for the cause with "
-                    "`terrella data doctor`."
-                ) from error
             self._series[sensor] = whole
         return self._series[sensor]
 
@@ -269,13 +261,10 @@ class _OpenTake:
         times = np.asarray(readings.time_s, dtype=np.float64).reshape(-1)
         if len(times) != len(readings.values):
             raise DatasetError(
-                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} readings; see "
-                "`terrella data doctor`."
+                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} readings; {_SEE}."
             )
         if not np.isfinite(times).all() or (np.diff(times) < 0).any():
-            raise DatasetError(
-                f"the times of {self._where(sensor)} do not ascend, or are no numbers; see `terrella data doctor`."
-            )
+            raise DatasetError(f"the times of {self._where(sensor)} do not ascend, or are no numbers; {_SEE}.")
         return times
 
     def _readings(self, sensor: str) -> Readings:
@@ -289,11 +278,15 @@ class _OpenTake:
     def _where(self, sensor: str) -> str:
         return f"{sensor} in episode {self._number}"
 
-    def _foreign(self, sensor: str, index: int, value: np.ndarray, wanted: str) -> DatasetError:
-        return DatasetError(
-            f"reading {index} of {self._where(sensor)} is {value.dtype} {list(value.shape)} and not {wanted}; see "
-            "`terrella data doctor`."
-        )
+
+@contextmanager
+def _decoding(what: str) -> Iterator[None]:
+    try:
+        yield
+    except DatasetError:
+        raise
+    except Exception as error:  # whatever a decoder makes of a broken file
+        raise DatasetError(f"{what} does not decode ({type(error).__name__}: {error}); {_SEE}.") from error
 
 
 class _Walk:

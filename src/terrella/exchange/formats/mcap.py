@@ -346,9 +346,7 @@ class _File:
         found.sort(key=lambda item: (order.index(item[0]), "") if item[0] in order else (len(order), item[0]))
         for topic, stream in found:
             name = stream.sensor.name or key_of(topic, stream.sensor)
-            free, number = name, 2
-            while free in self.streams:
-                free, number = f"{name}_{number}", number + 1
+            free = rows.unique(name, self.streams)
             self.streams[free] = replace(stream, sensor=replace(stream.sensor, name=free))
 
     def _calibrate(self, found: list[tuple[str, _Stream]]) -> None:
@@ -392,10 +390,7 @@ def topics(sensors: Mapping[str, Sensor]) -> dict[str, str]:
     """A topic for each sensor; names that differ only in "." and "/" still get topics of their own."""
     found: dict[str, str] = {}
     for name in sensors:
-        topic, number = topic_of(name), 2
-        while topic in found.values():
-            topic, number = f"{topic_of(name)}_{number}", number + 1
-        found[name] = topic
+        found[name] = rows.unique(topic_of(name), set(found.values()))
     return found
 
 

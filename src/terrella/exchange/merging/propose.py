@@ -11,6 +11,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...data.resample import quaternions
 from ...data.source import Sensor, Source
+from ..formats.rows import unique
 from .mapping import (
     ACTION,
     FOLLOWS,
@@ -251,9 +252,7 @@ def _share(places: list[_Place], filled: dict[_Place, str], notes: _Notes) -> di
 
 
 def _fill(part: list[_Place], name: str, dimension: Dimension, found: dict, filled: dict[_Place, str]) -> None:
-    free, number = name, 2
-    while free in found:
-        free, number = f"{name}_{number}", number + 1
+    free = unique(name, found)
     found[free] = dimension
     filled.update(dict.fromkeys(part, free))
 
