@@ -69,12 +69,13 @@ def columns(file, entity: str) -> dict[str, list]:
 def test_every_reading_is_there_at_its_time(tmp_path):
     from terrella.exchange.formats import rerun
 
-    notes = rerun.write(source_of(2), tmp_path / "small")
-    assert notes == [f"units, frames and calibration of {POSE} have no place in Rerun"]
-    files = sorted((tmp_path / "small").iterdir())
-    assert [file.name for file in files] == ["episode-000000.rrd", "episode-000001.rrd"]
-    for number, file in enumerate(files):
-        take = take_of(number)
+    assert rerun._left_out(source_of(2)) == [f"units, frames and calibration of {POSE} have no place in Rerun"]
+    for number, take in enumerate(source_of(2).takes()):
+        file = tmp_path / f"{number}.rrd"
+        stream = rerun._stream(source_of(2), number)
+        stream.save(file)
+        rerun._log(stream, source_of(2), take)
+        stream.disconnect()
         poses = columns(file, "/observation/pose")
         clock = np.round(take.readings[POSE].time_s * 1e9).astype(int)
         np.testing.assert_allclose(poses["time"], clock, atol=1)
@@ -94,17 +95,6 @@ def test_every_reading_is_there_at_its_time(tmp_path):
         np.testing.assert_allclose([place[0] for place in path], take.readings[POSE].values[:, :3], atol=1e-6)
 
 
-def test_one_take_is_one_file_and_nothing_is_overwritten(tmp_path):
-    from terrella.exchange.formats import rerun
-
-    rerun.write(source_of(1), tmp_path / "one.rrd")
-    assert len(columns(tmp_path / "one.rrd", "/next/done")["time"]) == 31
-    for target, count in (("one.rrd", 1), ("two.rrd", 2), ("none.rrd", 0)):
-        with pytest.raises(DatasetError):
-            rerun.write(source_of(count), tmp_path / target)
-    assert [file.name for file in tmp_path.iterdir()] == ["one.rrd"]
-
-
 def test_a_viewer_that_cannot_be_reached_is_a_sentence(monkeypatch):
     import rerun as rr
 
@@ -116,17 +106,3 @@ def test_a_viewer_that_cannot_be_reached_is_a_sentence(monkeypatch):
     monkeypatch.setattr(rr.RecordingStream, "spawn", nowhere)
     with pytest.raises(DatasetError, match="cannot be reached"):
         rerun.show(source_of(1))
-
-
-def test_a_broken_reading_leaves_nothing_behind(tmp_path):
-    from terrella.exchange.formats import rerun
-
-    def torn(index):
-        raise DatasetError("the video is torn.")
-
-    broken = Source(
-        "torn", {CAMERA: SENSORS[0]}, lambda: iter([Take({CAMERA: Readings(np.arange(2.0), Lazy(2, torn))})])
-    )
-    with pytest.raises(DatasetError, match="torn"):
-        rerun.write(broken, tmp_path / "torn")
-    assert list(tmp_path.iterdir()) == []

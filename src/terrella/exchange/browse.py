@@ -190,7 +190,7 @@ class Browse:
     def _check(self, number: int) -> None:
         if not 0 <= number < len(self.entries):
             raise DatasetError(
-                f"{self.source.name} has no episode {number}; its {len(self.entries)} episodes are numbered from 0."
+                f"{self.source.name} has no episode {number}; it has {len(self.entries)}, numbered from 0."
             )
 
     def _take(self, number: int) -> _OpenTake:
@@ -261,7 +261,7 @@ class _OpenTake:
         times = np.asarray(readings.time_s, dtype=np.float64).reshape(-1)
         if len(times) != len(readings.values):
             raise DatasetError(
-                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} readings; {_SEE}."
+                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} values; {_SEE}."
             )
         if not np.isfinite(times).all() or (np.diff(times) < 0).any():
             raise DatasetError(f"the times of {self._where(sensor)} do not ascend, or are no numbers; {_SEE}.")

@@ -103,9 +103,7 @@ def readings(
             raise DatasetError(f"{what} is not an array of numbers with a row for each step; restore it from a copy.")
         if array.shape[1:] != want:
             shape = list(array.shape[1:])
-            raise DatasetError(
-                f"{what} is {shape} a row where the first episode has {list(want)}; mend it, or drop it."
-            )
+            raise DatasetError(f"{what} is {shape} a row where the first episode has {list(want)}; mend or drop it.")
         count = len(time_s[: array.shape[0]])
         if count < array.shape[0]:
             raise DatasetError(f"{what} has {array.shape[0]} rows where there are {count} observations; mend it.")

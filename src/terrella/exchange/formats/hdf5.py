@@ -141,9 +141,7 @@ def numbers(parent: Group, name: str | int, count: int | None = None) -> Dataset
     if size > max(_UNTOLD_BYTES, _BEST_RATIO * found.id.get_storage_size()):
         raise DatasetError(f"{where} claims {size} bytes but the file does not hold them; restore it from a copy.")
     if count is not None and len(found) != count:
-        raise DatasetError(
-            f"{where} has {len(found)} rows where {count} are needed; the file is truncated or inconsistent."
-        )
+        raise DatasetError(f"{where} has {len(found)} rows where {count} are needed; the file is inconsistent.")
     return found
 
 
@@ -284,9 +282,7 @@ def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
     first = parts[0]
     for part, file in zip(parts, files):
         if part.sensors != first.sensors or part.fps != first.fps:
-            raise DatasetError(
-                f"{file} has other sensors than {files[0]}; convert them one by one and merge the results."
-            )
+            raise DatasetError(f"{file} has other sensors than {files[0]}; convert each, and merge the results.")
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
     facts = {"files": {file.name: part.facts for file, part in zip(files, parts)}}
 

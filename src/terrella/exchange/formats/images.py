@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
@@ -17,16 +17,7 @@ from . import folders, rows
 from .folders import IMAGES
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
-_TURNS = {  # EXIF orientation -> what undoes it
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-_ON_ITS_SIDE = {_TURNS[orientation] for orientation in (5, 6, 7, 8)}
+_ORIENTATION = 0x0112  # in EXIF; from 5 on the picture lies on its side
 _MM = 1000.0
 
 
@@ -94,7 +85,7 @@ def _look(path: Path) -> tuple[Literal["image", "depth"], tuple[int, ...]]:
     """Kind and shape of an image's readings, from its header."""
     with _image(path) as picture:
         height, width = picture.height, picture.width
-        if _turn(picture) in _ON_ITS_SIDE:
+        if _orientation(picture) > 4:
             height, width = width, height
         if picture.mode == "F":
             raise DatasetError(f"{path} has numbers with fractions, of unknown unit; make it an 8-bit or 16-bit image.")
@@ -103,8 +94,7 @@ def _look(path: Path) -> tuple[Literal["image", "depth"], tuple[int, ...]]:
 
 def _load(path: Path, sensor: Sensor) -> np.ndarray:
     with _image(path) as picture:
-        turn = _turn(picture)
-        upright = picture if turn is None else picture.transpose(turn)
+        upright = ImageOps.exif_transpose(picture)
         if sensor.kind == "depth":
             depth_mm = np.asarray(upright).astype(np.float32)
             found = np.where(depth_mm > 0, depth_mm / np.float32(_MM), np.float32(np.inf))
@@ -115,12 +105,12 @@ def _load(path: Path, sensor: Sensor) -> np.ndarray:
     return np.array(found)
 
 
-def _turn(picture: Image.Image) -> Image.Transpose | None:
-    """What makes the image upright, by its EXIF orientation."""
+def _orientation(picture: Image.Image) -> int:
     exif = picture.getexif() if picture.format != "PNG" else Image.Exif()
     if picture.format == "PNG":  # Pillow would decode the whole image to look behind it
         exif.load(picture.info.get("exif", b""))
-    return _TURNS.get(exif.get(0x0112, 1))
+    found = exif.get(_ORIENTATION, 1)
+    return found if isinstance(found, int) else 1
 
 
 @contextmanager
@@ -130,9 +120,7 @@ def _image(path: Path) -> Iterator[Image.Image]:
             rows.check_size(picture.height, picture.width, f"the image {path}")
             yield picture
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise DatasetError(
-            f"the image {path} is damaged or of an unknown kind ({error}); restore it from a copy."
-        ) from error
+        raise DatasetError(f"the image {path} is damaged or of an unknown kind ({error}); restore it.") from error
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:

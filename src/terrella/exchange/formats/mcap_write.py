@@ -54,9 +54,7 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
     first = min((int(time_ns.min()) for time_ns in times if len(time_ns)), default=0)
     zero_ns = take.start_ns if take.start_ns is not None else max(0, -first)
     if not 0 <= zero_ns + first < 2**63:
-        raise DatasetError(
-            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot hold; mend its start."
-        )
+        raise DatasetError(f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot hold; mend that.")
     whose = np.concatenate([np.full(len(time_ns), i) for i, time_ns in enumerate(times)] or [np.zeros(0, int)])
     which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
     order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
@@ -157,9 +155,7 @@ class Recording:
             self._writer.add_metadata(name, {key: json.dumps(value) for key, value in values.items()})
         except (TypeError, ValueError) as error:
             self._file.close()
-            raise DatasetError(
-                f"The facts of a source, take or sensor are no JSON ({error}); leave them out."
-            ) from error
+            raise DatasetError(f"The facts of a source, take or sensor are no JSON ({error}); drop them.") from error
 
 
 def _plain(sensor: Sensor) -> dict[str, Any]:

@@ -209,9 +209,7 @@ def _raw_image(fields: Mapping[str, Any]) -> Reading:
     _small_enough(width, height)
     channels = _COLOUR[encoding][0] if encoding in _COLOUR else {"16UC1": 2, "32FC1": 4}.get(encoding, 0)
     if not channels:
-        raise DatasetError(
-            f"its pixels are '{encoding}', of which only rgb8, bgr8, mono8, rgba8, 16UC1, 32FC1 are read"
-        )
+        raise DatasetError(f"its pixels are '{encoding}', only rgb8, bgr8, mono8, rgba8, 16UC1, 32FC1 are read")
     if step < width * channels or len(data) < step * (height - 1) + width * channels:
         raise DatasetError(f"its {len(data)} bytes are too few for {width} x {height} pixels of {encoding}")
     rows = np.ndarray((height, width * channels), np.uint8, data, strides=(step, 1))

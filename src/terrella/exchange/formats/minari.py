@@ -76,9 +76,7 @@ def _opened(path: Path) -> tuple[Path, dict, int]:
     """The folder that has the data, its metadata, and how many episodes it claims."""
     data = path / "data" if (path / "data").is_dir() else path
     if not (data / "metadata.json").is_file():
-        raise DatasetError(
-            f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name a dataset's folder."
-        )
+        raise DatasetError(f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name another folder.")
     meta = rows.read_json(data / "metadata.json")
     count = meta.get("total_episodes")
     if not isinstance(count, int) or not 0 < count <= 1 << 32:
@@ -91,13 +89,9 @@ def _space(meta: dict, key: str, data: Path) -> dict:
     try:
         found = json.loads(text) if isinstance(text, str) else text
     except (ValueError, RecursionError) as error:
-        raise DatasetError(
-            f"{key} in {data / 'metadata.json'} is damaged ({error}); restore it from a copy."
-        ) from error
+        raise DatasetError(f"{key} in {data / 'metadata.json'} is damaged ({error}); restore it.") from error
     if not isinstance(found, dict):
-        raise DatasetError(
-            f"{data / 'metadata.json'} has no {key}; open the dataset once with minari, which writes it."
-        )
+        raise DatasetError(f"{data / 'metadata.json'} has no {key}; open it once with minari, which writes that.")
     return found
 
 
@@ -148,7 +142,7 @@ def write(
     dataset_id = dataset_id or path.name
     if not _ID.fullmatch(dataset_id) or path.parts[-len(Path(dataset_id).parts) :] != Path(dataset_id).parts:
         raise DatasetError(
-            f"'{dataset_id}' is no Minari id for {path}: it must be the end of the path and look like name-v0 or group/name-v0."
+            f"'{dataset_id}' is no Minari id for {path}: the end of the path, like name-v0 or group/name-v0."
         )
     notes: dict[str, None] = {}
     given, places = _places(source)
@@ -191,9 +185,7 @@ def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, 
     """The space of a role, and what lies at each of its leaves."""
     mine = {n: s for n, s in source.sensors.items() if rows.role_of(n) == role and s.kind != "points"}
     if not mine:
-        raise DatasetError(
-            f"{source.name or 'the source'} has no {root}, which Minari needs; write it in another format."
-        )
+        raise DatasetError(f"{source.name or 'the source'} has no {root}, which Minari needs; choose another format.")
     own = source.facts.get(f"{role}_space")
     try:
         leaves = spaces.leaves(own, role, "the source") if isinstance(own, dict) else {}
@@ -241,9 +233,7 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
     where = f"take {number}"
     missing = [name for place, name in places.items() if place[0] in _ROLES and name not in (None, *take.readings)]
     if missing:
-        raise DatasetError(
-            f"{where} lacks '{missing[0]}', which Minari needs in every episode; leave out the one or the other."
-        )
+        raise DatasetError(f"{where} lacks '{missing[0]}', which Minari needs in every episode; leave it out.")
     named = [name for place, name in places.items() if name is not None and place[0] != "infos"]
     found = rows.rows_of(replace(take, readings={n: take.readings[n] for n in named if n in take.readings}), where)
     steps = min(found.steps, found.observations - 1)

@@ -90,9 +90,7 @@ class TableEpisode:
             columns = {name: table.column(name).combine_chunks() for name in table.column_names}
             self._leaves = {place: leaf for name, column in columns.items() for place, leaf in _leaves(column, (name,))}
         except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError) as error:
-            raise DatasetError(
-                f"{folder} cannot be read ({str(error)[:200]}); restore the episode from a copy."
-            ) from error
+            raise DatasetError(f"{folder} cannot be read ({str(error)[:200]}); restore it from a copy.") from error
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
         known = {tuple(map(str, place)): place for place in shapes}

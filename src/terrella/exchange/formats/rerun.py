@@ -1,21 +1,17 @@
-"""Hands a recording to Rerun (https://rerun.io), whose viewer shows it, or writes the .rrd files that it opens."""
+"""Hands a recording to Rerun (https://rerun.io), whose viewer shows it."""
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import simplejpeg
 
 from ...core.errors import DatasetError
 from ...data.source import Readings, Sensor, Source, Take
-from ...data.storage import durable
-from ...data.storage.durable import sync_file
 from ..poses import pose_columns
-from . import rows
 
 try:
     import rerun as rr  # pyright: ignore[reportMissingImports]
@@ -26,33 +22,13 @@ _QUALITY = 90  # of JPEG pictures
 _PATIENCE_S = 60.0  # for the viewer to take in one episode
 
 
-def write(source: Source, path: str | Path) -> list[str]:
-    """Writes a folder with one .rrd file for each take, or the file `path` where its name ends in .rrd and the source has
-    a single take; gives back sentences about what Rerun has no place for.
-
-    Pictures become JPEG, depth has 0 where nothing was hit; each sensor keeps its own times (timeline "time", seconds
-    since the take began; "wall_time" where that is known). Units and frames of coordinates are left out.
-    DatasetError where `path` exists, or a single file is asked for and there is no take or more than one.
-    """
-    path = Path(path)
-    with durable.in_whole(path) as staged:
-        for number, take in rows.numbered(source, None):
-            if path.suffix == ".rrd" and number:
-                raise DatasetError(f"{source.name} has more than one episode; name a folder for Rerun's files.")
-            if path.suffix != ".rrd":
-                staged.mkdir(exist_ok=True)
-            file = staged if path.suffix == ".rrd" else staged / f"episode-{number:06d}.rrd"
-            stream = _stream(source, number)
-            stream.save(file)
-            _log(stream, source, take)
-            stream.disconnect()
-            sync_file(file)
-    return _left_out(source)
-
-
 def show(source: Source) -> list[str]:
     """Sends all takes to Rerun's viewer, which is opened on this machine; returns what Rerun has no place for.
-    DatasetError where there is none."""
+
+    Pictures become JPEG, depth has 0 where nothing was hit; each sensor keeps its own times (timeline "time", seconds
+    since the take began; "wall_time" where that is known). Units and frames of coordinates are left out. DatasetError
+    where there is no viewer.
+    """
     for number, take in enumerate(source.takes()):
         stream = _stream(source, number)
         try:
@@ -72,7 +48,7 @@ def _reached() -> Iterator[None]:
         yield
     except (RuntimeError, ValueError, OSError) as error:
         raise DatasetError(
-            f"a viewer of Rerun cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`, or write .rrd files."
+            f"a viewer of Rerun cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`."
         ) from error
 
 

@@ -54,9 +54,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     sensors, notes = arrays.columns(unknown, partial(arrays.named, _NAMES), "the key", mine)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
         keys = ", ".join(map(arrays.spelled, first)) or "nothing"
-        raise DatasetError(
-            f"{files[0]} has no observations; it holds {keys}, where keys like observations or obs.NAME are known."
-        )
+        raise DatasetError(f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME.")
 
     def takes(rate: float) -> Iterator[Take]:
         return (_take(file, sensors, rate) for file in files)
@@ -92,16 +90,12 @@ def _arrays(path: Path) -> dict[Place, Array]:
                 key = info.filename.removesuffix(".npy")
                 size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
                 if dtype.hasobject or size > min(rows.MOST_BYTES, info.file_size):
-                    raise DatasetError(
-                        f"'{key}' in {path} is {dtype} {list(shape)}: it is pickled, too large or cut off; write it anew."
-                    )
+                    raise DatasetError(f"'{key}' in {path} is {dtype} {list(shape)}: pickled, too large or cut off.")
                 found[_place(key)] = Array(tuple(shape), dtype, _reader(path, key))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} does not exist; name a folder of .npz files.") from error
     except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise DatasetError(
-            f"{path} is truncated or no .npz file ({error}); restore it from a copy, or remove it."
-        ) from error
+        raise DatasetError(f"{path} is truncated or no .npz file ({error}); restore or remove it.") from error
     return found
 
 
@@ -134,7 +128,7 @@ def _take(path: Path, sensors: Mapping[Place, Sensor], fps: float) -> Take:
         time_s = _load(path, TIME)
         if time_s.shape != (count,) or time_s.dtype.kind != "f":
             raise DatasetError(
-                f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have one for each."
+                f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have as many."
             )
     single = {key: _load(path, key) for key in (TASK, START) if (key,) in there and there[key,].shape == ()}
     start_ns = int(single[START]) if START in single else None

@@ -107,7 +107,7 @@ def check_size(height: int, width: int, what: str) -> None:
     """DatasetError for a picture that no camera takes (a damaged or hostile file)."""
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
         raise DatasetError(
-            f"{what} is {width} x {height}; pictures are read up to {MAX_PIXELS >> 20} megapixels: remove it, or scale it down."
+            f"{what} is {width} x {height}; more than {MAX_PIXELS >> 20} megapixels are not read: scale it down."
         )
 
 
@@ -171,24 +171,18 @@ def rows_of(take: Take, where: str) -> Rows:
         check_times(readings, f"'{name}' in {where}")
     if len(set(seen.values())) > 1 or len(set(done.values())) > 1:
         counts = ", ".join(f"{name} {count}" for name, count in {**seen, **done}.items())
-        raise DatasetError(
-            f"{where} has sensors of different rates ({counts} readings); convert it to LeRobot first, which brings it to one rate."
-        )
+        raise DatasetError(f"{where} has sensors of different rates ({counts} readings); convert it to LeRobot first.")
     steps = next(iter(done.values()), 0)
     count = next(iter(seen.values()), steps)
     if not count or (done and steps not in (count, count - 1)):
-        raise DatasetError(
-            f"{where} has {count} observations and {steps} actions; it must have as many actions, or one less."
-        )
+        raise DatasetError(f"{where} has {count} observations and {steps} actions; it must have as many, or one less.")
     first = next(iter(seen or done))
     time_s = np.asarray(take.readings[first].time_s, np.float64)
     row_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.inf
     for name in (*seen, *done):
         other = take.readings[name].time_s
         if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
-            raise DatasetError(
-                f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first, which brings it to one rate."
-            )
+            raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first.")
     return Rows(count, steps, time_s)
 
 
@@ -216,9 +210,7 @@ def batches(
         for i, value in enumerate(part):
             if np.shape(value) != sensor.shape:
                 shape = list(np.shape(value))
-                raise DatasetError(
-                    f"'{sensor.name}' in {where} is {shape} at reading {start + i}, not {list(sensor.shape)}."
-                )
+                raise DatasetError(f"'{sensor.name}' in {where} is {shape} at {start + i}, not {list(sensor.shape)}.")
         yield np.asarray(part).reshape(len(part), *sensor.shape)
 
 
@@ -264,9 +256,7 @@ def sensors_described(text: object, where: str) -> dict[str, Sensor]:
     try:
         found = [sensor_of(item) for item in text["sensors"]]  # type: ignore[index]
     except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"the description of sensors in {where} is damaged ({error}); delete it to read without."
-        ) from error
+        raise DatasetError(f"the description of sensors in {where} is damaged ({error}); delete it.") from error
     return {sensor.name: sensor for sensor in found}
 
 

@@ -57,9 +57,7 @@ def _video_take(name: str, folder: Mapping[str, list[Path]], sensors: Mapping[st
     for sensor, video in videos.items():
         if video.shape != sensors[sensor].shape:
             size, want = (f"{shape[1]} x {shape[0]}" for shape in (video.shape, sensors[sensor].shape))
-            raise DatasetError(
-                f"{video.path} is {size} where the first of its camera is {want}; keep sizes in folders of their own."
-            )
+            raise DatasetError(f"{video.path} is {size} where the first of its camera is {want}; keep them apart.")
     begin = min(video.time_s[0] for video in videos.values())
     readings = {n: Readings(v.time_s - begin, Lazy(len(v.time_s), v.frame)) for n, v in videos.items()}
     return Take(readings, facts={"file": name})
@@ -138,9 +136,7 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
                 raise DatasetError(f"{path} has no pictures that can be decoded; remove it from the folder of videos.")
             yield container, container.streams.video[0]
     except (av.FFmpegError, OSError, ValueError, MemoryError) as error:
-        raise DatasetError(
-            f"the video {path} is missing, damaged or of an unknown kind ({error}); restore it."
-        ) from error
+        raise DatasetError(f"the video {path} is missing, damaged or unknown ({error}); restore it.") from error
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
@@ -154,9 +150,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     for name in cameras:
         height, width = source.sensors[name].shape[:2]
         if height % 2 or width % 2:
-            raise DatasetError(
-                f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write it as images."
-            )
+            raise DatasetError(f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write images.")
     with durable.in_whole(path) as staged:
         staged.mkdir()
         for number, take in folders.numbered(source, cameras, progress):

@@ -175,9 +175,7 @@ def check_inside(mapping: MergeMapping) -> None:
             filled: dict[str, str] = {}
             for sensor, to in getattr(source, table).items():
                 if to in filled:
-                    raise DatasetError(
-                        f"{where} {table}: '{filled[to]}' and '{sensor}' both fill '{to}'; take one out."
-                    )
+                    raise DatasetError(f"{where} {table}: '{filled[to]}' and '{sensor}' both fill '{to}'; drop one.")
                 if table == "cameras" and to not in mapping.cameras:
                     raise DatasetError(f"{where} cameras: '{sensor}' goes to '{to}', which [cameras] does not have.")
                 filled[to] = sensor
@@ -266,7 +264,7 @@ def check_mapping(mapping: MergeMapping, sources: Mapping[str, Source]) -> None:
                 )
             if name == ACTION or name.startswith(FOLLOWS) != to.startswith(FOLLOWS):
                 raise DatasetError(
-                    f"{where} keep: '{name}' cannot be kept as '{to}'; begin both with '{FOLLOWS}', or none."
+                    f"{where} keep: '{name}' cannot be kept as '{to}'; begin both with '{FOLLOWS}' or none."
                 )
             form = (sensor.kind, sensor.shape, sensor.dtype, sensor.names)
             form = form[:2] if name.startswith(FOLLOWS) else form

@@ -6,22 +6,24 @@ import math
 
 from ...core.errors import DatasetError
 
+_PREFIXES = {"": 1.0, "k": 1000.0, "h": 100.0, "c": 0.01, "m": 0.001, "u": 1e-6, "n": 1e-9}
+_PREFIXED = {
+    "m": "length",
+    "rad": "angle",
+    "s": "time",
+    "N": "force",
+    "V": "voltage",
+    "A": "current",
+    "T": "field",
+    "Pa": "pressure",
+}
 # unit -> (quantity, how many of that quantity's first unit it is, what is added then)
 _PLAIN: dict[str, tuple[str, float, float]] = {
-    "m": ("length", 1, 0),
-    "km": ("length", 1000, 0),
-    "cm": ("length", 0.01, 0),
-    "mm": ("length", 0.001, 0),
-    "um": ("length", 1e-6, 0),
+    **{sign + unit: (what, by, 0) for unit, what in _PREFIXED.items() for sign, by in _PREFIXES.items()},
     "in": ("length", 0.0254, 0),
     "ft": ("length", 0.3048, 0),
-    "rad": ("angle", 1, 0),
     "deg": ("angle", math.pi / 180, 0),
     "turn": ("angle", 2 * math.pi, 0),
-    "s": ("time", 1, 0),
-    "ms": ("time", 0.001, 0),
-    "us": ("time", 1e-6, 0),
-    "ns": ("time", 1e-9, 0),
     "min": ("time", 60, 0),
     "h": ("time", 3600, 0),
     "0..1": ("share", 1, 0),
@@ -30,20 +32,9 @@ _PLAIN: dict[str, tuple[str, float, float]] = {
     "-1..1": ("share", 0.5, 0.5),
     "%": ("share", 0.01, 0),
     "kg": ("mass", 1, 0),
-    "N": ("force", 1, 0),
-    "kN": ("force", 1000, 0),
     "N m": ("torque", 1, 0),
-    "V": ("voltage", 1, 0),
-    "mV": ("voltage", 0.001, 0),
-    "A": ("current", 1, 0),
-    "mA": ("current", 0.001, 0),
     "K": ("temperature", 1, 0),
     "degC": ("temperature", 1, 273.15),
-    "T": ("field", 1, 0),
-    "uT": ("field", 1e-6, 0),
-    "Pa": ("pressure", 1, 0),
-    "hPa": ("pressure", 100, 0),
-    "kPa": ("pressure", 1000, 0),
     "rpm": ("angle/s", 2 * math.pi / 60, 0),
     "g": ("length/s2", 9.80665, 0),  # as accelerometers count
 }
