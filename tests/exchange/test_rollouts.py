@@ -264,7 +264,7 @@ def test_bad_folders_are_named(tmp_path):
         ({"observations": np.array([{"a": 1}], object)}, "pickled"),
         ({**good, "actions": np.zeros((2, 1))}, "4 observations and 2 actions"),
         ({**good, "rewards": np.zeros(4)}, "different rates"),
-        ({**good, "time_s": np.array([0, 1, np.nan, 3])}, "backwards"),
+        ({**good, "time_s": np.array([0, 1, np.nan, 3])}, "ascending"),
         ({**good, "time_s": np.arange(3.0)}, "3] times for 4 rows"),
         ({**good, "infos": np.zeros(9)}, "'infos' .* 9 rows"),
         ({"observations": np.zeros((0, 2))}, "0 observations"),
@@ -329,7 +329,7 @@ def test_what_does_not_march_in_step_is_refused_and_nothing_is_left_behind(tmp_p
     for readings, match in [
         ({"observation.state": [0, 1], "observation.imu": [0, 1, 2]}, "different rates"),
         ({"observation.state": [0, 1, 2], "observation.imu": [0, 1, 2.9]}, "was not read when"),
-        ({"observation.state": [0, 2, 1]}, "backwards"),
+        ({"observation.state": [0, 2, 1]}, "ascending"),
         ({"lidar": [0, 1]}, "0 observations"),
     ]:
         with pytest.raises(DatasetError, match=match):

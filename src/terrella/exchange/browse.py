@@ -15,6 +15,7 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..data.dataset import Dataset
 from ..data.format import INFO
+from ..data.resample import clock_of
 from ..data.source import Readings, Sensor, Source, Take
 from ..data.storage.durable import write_json
 from .convert import open_source, write_source
@@ -213,7 +214,7 @@ class _OpenTake:
 
     def times(self, sensor: str) -> np.ndarray:
         if sensor not in self._times:
-            self._times[sensor] = self._checked_times(sensor)
+            self._times[sensor] = clock_of(self._readings(sensor), self._where(sensor))
         return self._times[sensor]
 
     def reading(self, sensor: str, index: int) -> np.ndarray:
@@ -240,8 +241,7 @@ class _OpenTake:
             times, values = self.times(sensor), self._readings(sensor).values
             with _decoding(self._where(sensor)):
                 whole = np.asarray(values if isinstance(values, np.ndarray) else [np.asarray(v) for v in values])
-                whole = whole.astype(np.float64).reshape(len(times), -1) if len(times) else np.zeros((0, 1))
-            self._series[sensor] = whole
+                self._series[sensor] = whole.astype(np.float64).reshape(len(times), -1 if len(times) else 1)
         return self._series[sensor]
 
     def texts(self, sensor: str) -> list[list]:
@@ -255,17 +255,6 @@ class _OpenTake:
         except DatasetError as error:
             found.append([0.0, str(error)])
         return found
-
-    def _checked_times(self, sensor: str) -> np.ndarray:
-        readings = self._readings(sensor)
-        times = np.asarray(readings.time_s, dtype=np.float64).reshape(-1)
-        if len(times) != len(readings.values):
-            raise DatasetError(
-                f"{self._where(sensor)} has {len(times)} times for {len(readings.values)} values; {_SEE}."
-            )
-        if not np.isfinite(times).all() or (np.diff(times) < 0).any():
-            raise DatasetError(f"the times of {self._where(sensor)} do not ascend, or are no numbers; {_SEE}.")
-        return times
 
     def _readings(self, sensor: str) -> Readings:
         if sensor not in self._source.sensors:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ...core.errors import DatasetError
+from ...data.resample import clock_of
 from ...data.source import Source, Take
 from . import rows
 
@@ -86,5 +87,5 @@ def numbered(source: Source, cameras: Mapping[str, str], progress) -> Iterator[t
         if not seen:
             raise DatasetError(f"take {number} has no pictures; leave it out.")
         for name in seen:
-            rows.check_times(take.readings[name], f"'{name}' in take {number}")
+            clock_of(take.readings[name], f"'{name}' in take {number}")
         yield number, Take({name: take.readings[name] for name in seen}, take.task)

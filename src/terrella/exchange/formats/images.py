@@ -96,8 +96,7 @@ def _load(path: Path, sensor: Sensor) -> np.ndarray:
     with _image(path) as picture:
         upright = ImageOps.exif_transpose(picture)
         if sensor.kind == "depth":
-            depth_mm = np.asarray(upright).astype(np.float32)
-            found = np.where(depth_mm > 0, depth_mm / np.float32(_MM), np.float32(np.inf))
+            found = rows.metres(np.asarray(upright))
         else:
             found = np.asarray(upright.convert("RGB"))
     if found.shape != sensor.shape:

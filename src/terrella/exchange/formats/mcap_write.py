@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...data.format import sensor_json
+from ...data.resample import clock_of
 from ...data.source import Readings, Sensor, Source, Take
 from ...data.storage import durable
 from . import encoder, rows
@@ -54,7 +56,9 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
     first = min((int(time_ns.min()) for time_ns in times if len(time_ns)), default=0)
     zero_ns = take.start_ns if take.start_ns is not None else max(0, -first)
     if not 0 <= zero_ns + first < 2**63:
-        raise DatasetError(f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot hold; mend that.")
+        raise DatasetError(
+            f"A take begins {first / 1e9:g} s from {zero_ns} ns, which MCAP cannot hold; mend its start."
+        )
     whose = np.concatenate([np.full(len(time_ns), i) for i, time_ns in enumerate(times)] or [np.zeros(0, int)])
     which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
     order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
@@ -69,10 +73,9 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
 
 
 def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
-    time_s = np.asarray(readings.time_s, np.float64)
-    if time_s.shape != (len(readings.values),) or not np.isfinite(time_s).all() or (np.abs(time_s) > 2**62 / 1e9).any():
-        what = f"'{name}' has times {list(time_s.shape)} for {len(readings.values)} values, or times that are none"
-        raise DatasetError(f"{what}; mend them.")
+    time_s = clock_of(readings, name)
+    if (np.abs(time_s) > 2**62 / 1e9).any():
+        raise DatasetError(f"'{name}' has times that are none; mend them.")
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
@@ -101,7 +104,7 @@ class Recording:
         topic = topics(sensors)
         about = {"name": source.name, "fps": source.fps, "robot": source.robot, "notes": list(source.notes)}
         self._add_metadata(SOURCE, {**about, "facts": dict(source.facts)})
-        self._add_metadata(SENSORS, {name: {**_plain(sensors[name]), "topic": topic[name]} for name in sensors})
+        self._add_metadata(SENSORS, {name: {**sensor_json(sensors[name]), "topic": topic[name]} for name in sensors})
         known = {"start_ns": take.start_ns, "task": take.task}
         self._add_metadata(TAKE, {**known, "facts": dict(take.facts), "zero_ns": zero_ns})
         self._schemas: dict[str, int] = {}
@@ -156,8 +159,3 @@ class Recording:
         except (TypeError, ValueError) as error:
             self._file.close()
             raise DatasetError(f"The facts of a source, take or sensor are no JSON ({error}); drop them.") from error
-
-
-def _plain(sensor: Sensor) -> dict[str, Any]:
-    fields = {**sensor.__dict__, "units": dict(sensor.units), "facts": dict(sensor.facts)}
-    return {key: value for key, value in fields.items() if key != "name"}

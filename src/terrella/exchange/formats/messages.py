@@ -17,6 +17,7 @@ from PIL import Image
 
 from ...core.errors import DatasetError
 from ...data.source import Kind, Sensor
+from . import rows
 
 try:
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -29,7 +30,6 @@ VECTOR = "terrella.Vector"
 CALIBRATION = "foxglove.CameraCalibration"
 TRANSFORM, TRANSFORMS = "foxglove.FrameTransform", "foxglove.FrameTransforms"
 VIDEO = "foxglove.CompressedVideo"
-MAX_PIXELS = 2**26
 MAX_NUMBERS = 2**16  # in one vector
 _DEEPEST = 16  # levels of nesting that are looked into
 _POINT_TYPES = {i + 1: np.dtype(name) for i, name in enumerate(("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"))}
@@ -189,15 +189,15 @@ def _compressed_image(fields: Mapping[str, Any]) -> Reading:
     if data[:2] == b"\xff\xd8":
         try:
             height, width = simplejpeg.decode_jpeg_header(data)[:2]
-            _small_enough(int(width), int(height))
+            rows.check_size(int(height), int(width), "its picture")
             return Reading("image", simplejpeg.decode_jpeg(data, colorspace="RGB"), frame=frame)
         except ValueError as error:
             raise DatasetError(f"its JPEG is broken ({error})") from error
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "WEBP")) as picture:
-            _small_enough(*picture.size)
+            rows.check_size(picture.height, picture.width, "its picture")
             if picture.mode.startswith("I"):
-                return Reading("depth", _from_mm(np.asarray(picture)), frame=frame)
+                return Reading("depth", rows.metres(np.asarray(picture)), frame=frame)
             return Reading("image", np.asarray(picture.convert("RGB")), frame=frame)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise DatasetError(f"its picture is no whole JPEG, PNG or WebP ({error})") from error
@@ -206,19 +206,19 @@ def _compressed_image(fields: Mapping[str, Any]) -> Reading:
 def _raw_image(fields: Mapping[str, Any]) -> Reading:
     width, height, step = (int(fields[name]) for name in ("width", "height", "step"))
     encoding, data = str(fields["encoding"]), _bytes(fields)
-    _small_enough(width, height)
+    rows.check_size(height, width, "its picture")
     channels = _COLOUR[encoding][0] if encoding in _COLOUR else {"16UC1": 2, "32FC1": 4}.get(encoding, 0)
     if not channels:
         raise DatasetError(f"its pixels are '{encoding}', only rgb8, bgr8, mono8, rgba8, 16UC1, 32FC1 are read")
     if step < width * channels or len(data) < step * (height - 1) + width * channels:
         raise DatasetError(f"its {len(data)} bytes are too few for {width} x {height} pixels of {encoding}")
-    rows = np.ndarray((height, width * channels), np.uint8, data, strides=(step, 1))
+    lines = np.ndarray((height, width * channels), np.uint8, data, strides=(step, 1))
     frame = str(fields.get("frame_id") or "")
     if encoding == "32FC1":
-        return Reading("depth", np.ascontiguousarray(rows).view("<f4").astype(np.float32), frame=frame)
+        return Reading("depth", np.ascontiguousarray(lines).view("<f4").astype(np.float32), frame=frame)
     if encoding == "16UC1":
-        return Reading("depth", _from_mm(np.ascontiguousarray(rows).view("<u2")), frame=frame)
-    pixels = rows.reshape(height, width, channels)[:, :, list(_COLOUR[encoding][1])]
+        return Reading("depth", rows.metres(np.ascontiguousarray(lines).view("<u2")), frame=frame)
+    pixels = lines.reshape(height, width, channels)[:, :, list(_COLOUR[encoding][1])]
     return Reading("image", pixels, frame=frame, left_out=("alpha",) if channels == 4 else ())
 
 
@@ -317,18 +317,6 @@ def _joined(position: Any, orientation: Any) -> np.ndarray:
     position, orientation = position or {}, orientation or {}
     where = [float(position.get(axis) or 0.0) for axis in "xyz"]
     return np.array([*where, *(float(orientation.get(part) or 0.0) for part in "wxyz")])
-
-
-def _small_enough(width: int, height: int) -> None:
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise DatasetError(f"its picture claims {width} x {height} pixels, and at most {MAX_PIXELS} are read")
-
-
-def _from_mm(values: np.ndarray) -> np.ndarray:
-    """Depth in metres; 0 is how millimetres say that nothing was measured."""
-    depth_m = (values / 1000).astype(np.float32)
-    depth_m[values == 0] = np.inf
-    return depth_m
 
 
 _DECODERS: dict[str, Callable[[Mapping[str, Any]], Reading]] = {

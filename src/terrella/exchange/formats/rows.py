@@ -6,12 +6,14 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...data.format import sensor_from_json, sensor_json
+from ...data.resample import clock_of
 from ...data.source import Readings, Sensor, Source, Take
 
 OBSERVATION, ACTION, INFO = "observation", "action", "info"
@@ -111,6 +113,11 @@ def check_size(height: int, width: int, what: str) -> None:
         )
 
 
+def metres(depth_mm: np.ndarray) -> np.ndarray:
+    """Depth float32 in metres of whole millimetres; 0 is how these say that nothing was measured (inf)."""
+    return np.where(depth_mm > 0, depth_mm.astype(np.float32) / np.float32(1000), np.float32(np.inf))
+
+
 def depth_lost(name: str, depth_m: np.ndarray, unit_m: float = 0.001) -> list[str]:
     """What depth in metres loses as 16-bit counts of `unit_m`, in sentences; inf and NaN lose nothing."""
     steps = np.asarray(depth_m, np.float64) / unit_m
@@ -168,7 +175,7 @@ def rows_of(take: Take, where: str) -> Rows:
     seen = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) == OBSERVATION}
     done = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) not in (OBSERVATION, INFO, "")}
     for name, readings in take.readings.items():
-        check_times(readings, f"'{name}' in {where}")
+        clock_of(readings, f"'{name}' in {where}")
     if len(set(seen.values())) > 1 or len(set(done.values())) > 1:
         counts = ", ".join(f"{name} {count}" for name, count in {**seen, **done}.items())
         raise DatasetError(f"{where} has sensors of different rates ({counts} readings); convert it to LeRobot first.")
@@ -184,15 +191,6 @@ def rows_of(take: Take, where: str) -> Rows:
         if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
             raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first.")
     return Rows(count, steps, time_s)
-
-
-def check_times(readings: Readings, what: str) -> None:
-    """DatasetError unless there is one finite time, not before the last one, for each value."""
-    time_s = np.asarray(readings.time_s)
-    if time_s.ndim != 1 or len(time_s) != len(readings.values):
-        raise DatasetError(f"{what} has {len(readings.values)} values and {time_s.size} times; it must have as many.")
-    if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
-        raise DatasetError(f"{what} has times that are not numbers or run backwards; repair its clock first.")
 
 
 def even(time_s: np.ndarray, fps: float | None) -> bool:
@@ -243,7 +241,7 @@ def rate_of(given: float | None, known: object, what: str) -> tuple[float, tuple
 def describe(source: Source) -> dict:
     """JSON of everything about a source that its arrays do not say."""
     return {
-        "sensors": [asdict(sensor) for sensor in source.sensors.values()],
+        "sensors": [{"name": name, **sensor_json(sensor)} for name, sensor in source.sensors.items()],
         "fps": source.fps,
         "robot": source.robot,
         "name": source.name,
@@ -262,23 +260,14 @@ def sensors_described(text: object, where: str) -> dict[str, Sensor]:
 
 def sensor_of(item: Mapping) -> Sensor:
     """A sensor out of a file's description of it; ValueError, TypeError or KeyError where it is none."""
-    known = {field.name for field in fields(Sensor)}
-    sensor = Sensor(**{key: value for key, value in item.items() if key in known})
-    shape, kinds = tuple(int(n) for n in sensor.shape), np.dtype(sensor.dtype).kind
-    dimensions = {"image": 3, "depth": 2, "points": 2, "vector": len(shape)}
-    wanted = {"image": "uint8", "depth": "float32", "points": "float32"}.get(sensor.kind, sensor.dtype)
-    if (
-        sensor.kind not in dimensions
-        or not isinstance(sensor.name, str)
-        or sensor.dtype != wanted
-        or kinds not in "biuf"
-    ):
+    sensor = sensor_from_json(str(item["name"]), item)
+    dimensions = {"image": 3, "depth": 2, "points": 2}.get(sensor.kind, len(sensor.shape))
+    dtype = {"image": "uint8", "depth": "float32", "points": "float32"}.get(sensor.kind, sensor.dtype)
+    if sensor.dtype != dtype or np.dtype(dtype).kind not in "biuf":
         raise ValueError(f"'{sensor.name}' is {sensor.kind} of {sensor.dtype}")
-    if len(shape) != dimensions[sensor.kind] or min(shape, default=0) < 0 or not isinstance(sensor.frame, str):
-        raise ValueError(f"the shape of '{sensor.name}' is {list(shape)}")
-    names, units = tuple(map(str, sensor.names)), {str(key): str(unit) for key, unit in dict(sensor.units).items()}
-    rate = None if sensor.rate_hz is None else float(sensor.rate_hz)
-    return replace(sensor, shape=shape, names=names, units=units, rate_hz=rate, facts=dict(sensor.facts))
+    if len(sensor.shape) != dimensions or min(sensor.shape, default=0) < 0:
+        raise ValueError(f"the shape of '{sensor.name}' is {list(sensor.shape)}")
+    return sensor
 
 
 def read_json(path: Path, missing: dict | None = None) -> dict:
