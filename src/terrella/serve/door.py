@@ -11,9 +11,9 @@ import socket
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import h11
@@ -28,6 +28,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..core.errors import ServeError
 from .guard import Guard, is_loopback
 
+WEB = Path(__file__).parent / "web"
+KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 REQUEST_S = 10.0  # from the first to the last byte of a request
 MOST_WAITING = 64  # connections that have not finished a request; beyond it the oldest of them goes
 COMPLAIN_EVERY_S = 60.0
@@ -66,16 +68,17 @@ def page_address(host: str, port: int, token: str | None) -> str:
 
 
 def application(
-    files: Mapping[str, tuple[str, str]],
+    index: str,
     routes: Sequence[BaseRoute],
     lifespan: Callable[[Starlette], AbstractAsyncContextManager[None]],
     host: str,
     token: str | None,
 ) -> Starlette:
-    """A page as an ASGI application. files: path -> the file below web/ that answers it, and its type; `host` is the address
-    that it is bound to, which decides what Host headers it answers to."""
-    web = resources.files("terrella.serve") / "web"
-    contents = {path: ((web / name).read_bytes(), kind) for path, (name, kind) in files.items()}
+    """A page as an ASGI application. index: the file below web/ that is shown first; `host` is the address that it is bound
+    to, which decides what Host headers it answers to."""
+    kinds = {f"/{file.relative_to(WEB).as_posix()}": KINDS.get(file.suffix) for file in WEB.rglob("*.*")}
+    contents = {path: ((WEB / path[1:]).read_bytes(), kind) for path, kind in kinds.items() if kind}
+    contents["/"] = (WEB / index).read_bytes(), "text/html"
 
     def show(request: Request) -> Response:
         content, kind = contents[request.url.path]

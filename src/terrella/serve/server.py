@@ -32,14 +32,6 @@ from .recording import SinkFactory
 from .session import Session
 from .timeline import Timeline, check_playable, no_rewind, vitals
 
-_SCRIPTS = ("app", "axes", "card", "controls", "keycaps", "link", "map", "picture", "screens", "uncertainty")
-_FILES = {
-    "/": ("index.html", "text/html"),
-    "/style.css": ("style.css", "text/css"),
-    "/icon.svg": ("icon.svg", "image/svg+xml"),
-    **{f"/{name}.js": (f"{name}.js", "text/javascript") for name in _SCRIPTS},
-}
-
 
 @dataclass(frozen=True)
 class ServeConfig:
@@ -188,7 +180,7 @@ def build_app(sessions: Sessions, host: str = "127.0.0.1", token: str | None = N
         await _play(websocket, sessions)
 
     routes = [Route("/check", check), Route("/clip/{session}.mp4", clip), WebSocketRoute("/play", play)]
-    return application(_FILES, routes, lifespan, host, token)
+    return application("index.html", routes, lifespan, host, token)
 
 
 async def _sweep(sessions: Sessions) -> None:

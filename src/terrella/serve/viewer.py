@@ -22,14 +22,6 @@ from ..core.errors import ServeError, TerrellaError
 from . import readings
 from .door import application, serve_page
 
-_SCRIPTS = ("app", "library", "tiles", "depth", "points", "map", "tracks", "colours")
-_FILES = {
-    "/": ("view/index.html", "text/html"),
-    "/style.css": ("style.css", "text/css"),
-    "/icon.svg": ("icon.svg", "image/svg+xml"),
-    "/view/view.css": ("view/view.css", "text/css"),
-    **{f"/view/{name}.js": (f"view/{name}.js", "text/javascript") for name in _SCRIPTS},
-}
 _LONGEST_MESSAGE = 4096  # bytes that the page may post at once
 _BUCKETS = 4096  # of one series, at most
 
@@ -255,7 +247,7 @@ def build_viewer(
         Route("/mark", asks(desk.mark, _mark_of), methods=["POST"]),
         Route("/export", asks(desk.export), methods=["GET", "POST"]),
     ]
-    return application(_FILES, routes, lifespan, host, token)
+    return application("view/index.html", routes, lifespan, host, token)
 
 
 async def _mark_of(request: Request) -> tuple[int, bool]:
