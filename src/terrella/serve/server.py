@@ -133,7 +133,6 @@ def _describe(world: World, label: str) -> dict:
             for name in spec.kinds("rgb")
         ],
         "dt_s": spec.dt_s,
-        "forkable": spec.forkable,
         "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
         "action_names": list(spec.action_names),
         "action_mode": spec.action_mode,
