@@ -155,8 +155,6 @@ def test_what_cannot_be_rows_is_said_and_the_rest_is_kept(tmp_path):
         write_source(bad, tmp_path / "set")
     with pytest.raises(DatasetError, match="no take"):
         write_source(some(9, ()), tmp_path / "none")
-    with pytest.raises(DatasetError, match="no sensor 'sonar'"):
-        write_source(bad, tmp_path / "lead", rows=Rows(lead="sonar"))
 
 
 @pytest.mark.parametrize(

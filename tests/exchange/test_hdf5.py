@@ -106,8 +106,8 @@ def everything(file) -> dict:
 @pytest.mark.parametrize("next_obs", [True, False])
 def test_robomimic_comes_back_as_it_was(tmp_path, next_obs):
     robomimic_file(tmp_path / "a.hdf5", next_obs=next_obs)
-    assert hdf5.write(hdf5.read(tmp_path / "a.hdf5"), tmp_path / "b.hdf5") == []
-    hdf5.write(hdf5.read(tmp_path / "b.hdf5"), tmp_path / "c.hdf5")
+    assert robomimic.write(hdf5.read(tmp_path / "a.hdf5"), tmp_path / "b.hdf5") == []
+    robomimic.write(hdf5.read(tmp_path / "b.hdf5"), tmp_path / "c.hdf5")
     with h5py.File(tmp_path / "a.hdf5") as a, h5py.File(tmp_path / "b.hdf5") as b, h5py.File(tmp_path / "c.hdf5") as c:
         assert everything(a) == everything(b) == everything(c)
 
@@ -138,9 +138,9 @@ def test_write_read_write_is_the_identity(tmp_path_factory, state, action, pictu
               "next.done": done[:steps], "next.truncated": ~done[:steps]}  # fmt: skip
     take = Take({name: Readings(time_s[: len(v)], v) for name, v in values.items()}, task)
     source = Source("made", sensors, lambda: iter([take, take]), 8.0, "arm", facts={"x": [1]})
-    assert hdf5.write(source, folder / "a.hdf5") == []
+    assert robomimic.write(source, folder / "a.hdf5") == []
     first = hdf5.read(folder / "a.hdf5")
-    hdf5.write(first, folder / "b.hdf5")
+    robomimic.write(first, folder / "b.hdf5")
     for found in (first, hdf5.read(folder / "b.hdf5")):
         assert (found.fps, found.robot, found.name, found.facts["x"]) == (8.0, "arm", "made", [1])
         for name, sensor in sensors.items():
@@ -213,14 +213,14 @@ def test_what_robomimic_cannot_hold_is_said_and_nothing_is_left_behind(tmp_path)
         ({"observation.a": state, "observation.b": state[:2], "action": action}, "different rates"),
     ]:
         with pytest.raises(DatasetError, match=match):
-            hdf5.write(source_of(**values), tmp_path / "out.hdf5")
+            robomimic.write(source_of(**values), tmp_path / "out.hdf5")
     assert list(tmp_path.iterdir()) == []
-    notes = hdf5.write(
+    notes = robomimic.write(
         source_of(**{"observation.state": state, "action": action, "lidar": state}), tmp_path / "out.hdf5"
     )
     assert notes == ["'lidar' has no place in robomimic's layout and was left out."]
     with pytest.raises(DatasetError, match="exists already"):
-        hdf5.write(source_of(action=action), tmp_path / "out.hdf5")
+        robomimic.write(source_of(action=action), tmp_path / "out.hdf5")
 
 
 # -- Counter-Strike
@@ -316,7 +316,7 @@ def test_flat_arrays_are_cut_at_terminals_and_timeouts(tmp_path, next_observatio
     assert takes[1].readings["next.truncated"].values.ravel().tolist() == [False] * 3 + [True]
     np.testing.assert_array_equal(takes[2].readings["info.qpos"].values, [[16, 17], [18, 19]])
     assert "1/10 s" in hdf5.read(tmp_path / "hopper.hdf5").notes[0]
-    hdf5.write(source, tmp_path / "again.hdf5")
+    robomimic.write(source, tmp_path / "again.hdf5")
     again = list(hdf5.read(tmp_path / "again.hdf5").takes())
     for mine, theirs in zip(takes, again, strict=True):
         for name in ("observation.state", "action", "next.reward", "next.done", "next.truncated"):
@@ -431,7 +431,7 @@ def test_a_reward_that_is_one_number_is_robomimics_flat_array(tmp_path):
     assert robomimic._place(Sensor("observation.depth", "depth", (2, 2))) == ("obs", "rgb_depth")
     sensors = {n: Sensor(n, "vector", (1,), "float64") for n in ("action", "next.reward")}
     take = Take({n: Readings(np.arange(2.0), np.ones((2, 1))) for n in sensors})
-    hdf5.write(Source("s", sensors, lambda: iter([take]), 1.0), tmp_path / "a.hdf5")
+    robomimic.write(Source("s", sensors, lambda: iter([take]), 1.0), tmp_path / "a.hdf5")
     with h5py.File(tmp_path / "a.hdf5") as file:
         assert file["data/demo_0/rewards"].shape == (2,) and file["data/demo_0/actions"].shape == (2, 1)
         assert file["data"].attrs["total"] == 2 and file["data/demo_0"].attrs["num_samples"] == 2

@@ -286,13 +286,11 @@ def test_what_minari_cannot_hold_is_refused_and_nothing_is_left_behind(store):
     ]:
         with pytest.raises(DatasetError, match=match):
             ours.write(source, store / name)
-    with pytest.raises(DatasetError, match="no Minari id"):
-        ours.write(plain(), store / "a-v0", dataset_id="b-v0")
     assert list(store.iterdir()) == []
-    ours.write(plain(), store / "group" / "a-v0", dataset_id="group/a-v0")
-    assert minari.load_dataset("group/a-v0").total_steps == 3
+    ours.write(plain(), store / "a-v0")
+    assert minari.load_dataset("a-v0").total_steps == 3
     with pytest.raises(DatasetError, match="exists already"):
-        ours.write(plain(), store / "group" / "a-v0")
+        ours.write(plain(), store / "a-v0")
 
 
 def test_texts_that_change_are_kept(store):

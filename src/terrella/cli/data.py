@@ -94,7 +94,7 @@ def convert(
     from ..exchange.formats.lerobot import Rows
 
     found = open_source(source, fps, episodes, seed)
-    rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, None, pictures)
+    rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, pictures)
     with _whole_or_nothing(target), progress.shown(f"converting {found.name}") as report:
         left_out = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
     facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "left_out": left_out}

@@ -50,7 +50,7 @@ _KINDS: dict[str, _Kind] = {
     "robomimic": _Kind(
         "HDF5",
         "hdf5.read",
-        "hdf5.write",
+        "robomimic.write",
         frozenset({".hdf5", ".h5", ".hdf"}),
         frozenset({"task", "sensors", "robomimic"}),
     ),

@@ -34,10 +34,8 @@ class Live:
         target: str | Path,
         sensors: Mapping[str, Sensor],
         name: str,
-        *,
-        start_ns: int | None = None,
     ):
-        self.start_ns = time.time_ns() if start_ns is None else start_ns
+        self.start_ns = time.time_ns()
         self._sensors = dict(sensors)
         self._notes: list[str] = []
         self._lost = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -56,13 +56,6 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     one = robomimic.read if layout == "robomimic" else d4rl.read
     parts = [one(file, fps) for file in files]
     return parts[0] if len(parts) == 1 else _chained(path.name, parts, files)
-
-
-def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source as one robomimic file: see robomimic.write."""
-    from . import robomimic
-
-    return robomimic.write(source, path, progress)
 
 
 def _layout_of(path: Path) -> str:

@@ -31,16 +31,14 @@ class Rows:
     """How a Source becomes rows.
 
     fps:      rows a second; None for the rows that the source has, or, where each sensor has its own clock, one row for
-              each reading of `lead`.
+              each reading of the fastest camera, else the fastest observation.
     policy:   what a row holds of a sensor that has no reading at its time, as `resample` says; images and depth never
               mix: "linear" means "nearest" for them.
-    lead:     the sensor whose readings are the rows; None for the fastest camera, else the fastest observation.
     pictures: "video" (H.264) or "png" (exact).
     """
 
     fps: float | None = None
     policy: Policy = "previous"
-    lead: str | None = None
     pictures: Literal["video", "png"] = "video"
 
 
@@ -63,7 +61,7 @@ def write(
     first = next(iter(source.takes()), None)
     if first is None:
         raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
-    lead = _lead(source, first, how)
+    lead = _lead(source, first)
     layout, notes = _layout(source, first, lead, how)
     with durable.in_whole(root) as staged:
         try:
@@ -97,11 +95,7 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: Rows, pro
     return [*left_out, *notes]
 
 
-def _lead(source: Source, first: Take, how: Rows) -> str:
-    if how.lead is not None:
-        if how.lead not in source.sensors:
-            raise DatasetError(f"{source.name} has no sensor '{how.lead}'; it has {', '.join(source.sensors)}.")
-        return how.lead
+def _lead(source: Source, first: Take) -> str:
     there = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
     if not there:
         raise DatasetError(f"the first take of {source.name} has no readings at all.")

@@ -7,8 +7,9 @@ few and documented, so they are read here one value at a time, and nothing in th
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,9 +24,10 @@ from .arrays import Place
 from .minari_stored import Episode, Shapes, open_storage
 
 VERSION = "0.5.4"  # of the layout that `write` writes (the first with pictures that are not JPEG)
-_ID = re.compile(r"(?:[-\w][-\w/]*/)?[-\w]+-v\d+", re.ASCII)
+_ID = re.compile(r"[-\w]+-v\d+", re.ASCII)
 _ROLES = {"observations": rows.OBSERVATION, "actions": rows.ACTION}
-_FOLLOW = {"rewards": rows.REWARD, "terminations": rows.DONE, "truncations": rows.TRUNCATED}
+_FOLLOW = {root: name for root, name in arrays.GYMNASIUM.items() if root not in _ROLES}
+_ROOTS = {name: root for root, name in _FOLLOW.items()}
 _NAMES = {**arrays.GYMNASIUM, "infos": rows.INFO}
 _KEPT_ELSEWHERE = ("observation_space", "action_space", "total_episodes", "total_steps", "dataset_size", "terrella")
 
@@ -100,10 +102,7 @@ def _take(episode: Episode, where: str, sensors: Mapping, shapes: Shapes, texts:
     steps = there["rewards",].shape[0] if ("rewards",) in there else 0
     if not steps:
         raise DatasetError(f"{where} has no steps (rewards); remove it from the dataset.")
-    lacking = [
-        place for place, sensor in sensors.items() if place[0] == "infos" and not _fits(there.get(place), sensor)
-    ]
-    mine = {place: sensor for place, sensor in sensors.items() if place not in lacking}
+    mine = {place: it for place, it in sensors.items() if place[0] != "infos" or _fits(there.get(place), it)}
     readings = arrays.readings(there, mine, np.arange(steps + 1) / fps, where)
     rows.rows_of(Take(readings), where)
     facts = episode.facts()
@@ -121,16 +120,11 @@ def _fits(array: arrays.Array | None, sensor: Sensor) -> bool:
     return array is not None and array.is_numbers and array.shape[1:] == rows.stored_shape(sensor)
 
 
-def write(
-    source: Source,
-    path: str | Path,
-    progress: Callable[[int, int], None] | None = None,
-    dataset_id: str | None = None,
-) -> list[str]:
+def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
     """Writes a source as a Minari dataset (HDF5, pictures lossless); returns sentences on what had no place in it.
 
-    With MINARI_DATASETS_PATH set to the folder that holds `path`, `minari.load_dataset(path.name)` opens it. `dataset_id`
-    is the last parts of `path` ("doom/maze-v0" for …/doom/maze-v0), by default the last alone; it must end in -v0, -v1, ….
+    With MINARI_DATASETS_PATH set to the folder that holds `path`, `minari.load_dataset(path.name)` opens it. The name must
+    end in -v0, -v1, ….
     Spaces are the source's own where its sensors still are the leaves of facts["observation_space"], else a Dict of one
     Box for each sensor. Minari needs an observation after the last action: where a take has none, its last action is
     left out. Missing rewards are 0, missing ends a truncation at the last step; names, units, frames and fps are kept in
@@ -139,11 +133,8 @@ def write(
     from . import hdf5
 
     path = Path(path)
-    dataset_id = dataset_id or path.name
-    if not _ID.fullmatch(dataset_id) or path.parts[-len(Path(dataset_id).parts) :] != Path(dataset_id).parts:
-        raise DatasetError(
-            f"'{dataset_id}' is no Minari id for {path}: the end of the path, like name-v0 or group/name-v0."
-        )
+    if not _ID.fullmatch(path.name):
+        raise DatasetError(f"'{path.name}' is no Minari id: name the folder like name-v0.")
     notes: dict[str, None] = {}
     given, places = _places(source)
     for name in source.sensors:
@@ -157,7 +148,7 @@ def write(
             for number, take in rows.numbered(source, progress):
                 group = file.create_group(f"episode_{number}")
                 steps += _write_take(group, number, source, take, places, notes)
-        meta = _metadata(source, given, dataset_id)
+        meta = _metadata(source, given, path.name)
         size = round((data / "main_data.hdf5").stat().st_size / 1e6, 1)
         meta |= {"total_episodes": number + 1, "total_steps": steps, "dataset_size": size}
         (data / "metadata.json").write_text(json.dumps(meta), encoding="utf-8")
@@ -173,8 +164,8 @@ def _places(source: Source) -> tuple[dict[str, dict], dict[Place, str | None]]:
         places |= {(root, *place): name for place, name in found.items()}
     for name in source.sensors:
         flat = any(other != name and f"{name}.".startswith(f"{other}.") for other in source.sensors)
-        if name in _FOLLOW.values():
-            places[next(root for root in _FOLLOW if _FOLLOW[root] == name),] = name
+        if name in _ROOTS:
+            places[_ROOTS[name],] = name
         elif rows.role_of(name) == rows.INFO and source.sensors[name].kind != "points":
             below = name.removeprefix("info.")  # info.deep.count -> deep/count, where "info.deep" is no array itself
             places["infos", *([below] if flat else below.split("."))] = name
@@ -194,9 +185,7 @@ def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, 
     except DatasetError:
         leaves, found = {}, {}
     names = {place[1:]: sensor.name for place, sensor in found.items()}
-    if isinstance(own, dict) and {it.name: _form(it) for it in found.values()} == {
-        n: _form(s) for n, s in mine.items()
-    }:
+    if isinstance(own, dict) and _forms(found.values()) == _forms(mine.values()):
         return own, {place: names.get(place) for place in leaves}
     if len(mine) == 1:
         (sensor,) = mine.values()
@@ -206,8 +195,8 @@ def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, 
     return {"type": "Dict", "subspaces": parts}, {(key,): name for name, key in keys.items()}
 
 
-def _form(sensor: Sensor) -> tuple:
-    return sensor.dtype, rows.stored_shape(sensor)
+def _forms(sensors: Iterable[Sensor]) -> dict[str, tuple]:
+    return {sensor.name: (sensor.dtype, rows.stored_shape(sensor)) for sensor in sensors}
 
 
 def _metadata(source: Source, given: dict, dataset_id: str) -> dict:
@@ -253,40 +242,28 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
             given = texts.get(arrays.spelled(place)) if isinstance(texts, Mapping) else None
             texts = given if isinstance(given, list) and len(given) == count else [take.task] * count
             group.create_dataset(keys, data=texts, dtype=hdf5.TEXT)
-        elif place[0] not in _FOLLOW and name in take.readings:
+        elif name in take.readings:
             sensor, readings = source.sensors[name], take.readings[name]
             if len(readings.values) < steps:
                 notes[f"'{name}' has not a reading for each step and was left out."] = None
                 continue
+            shape = rows.stored_shape(sensor)
+            if place[0] in _FOLLOW:
+                if math.prod(shape) != 1:
+                    raise DatasetError(f"'{name}' in {where} has {list(shape)} numbers a row; Minari has one.")
+                shape = ()
             count = min(len(readings.values), steps + 1) if place[0] == "infos" else count
-            hdf5.store(group, {keys: 0}, (count, *rows.stored_shape(sensor)), sensor, readings, where)
-    for root, values in _follow(source, take, steps, where, notes):
-        group.create_dataset(root, data=values)
-    own = take.facts.get("minari")
-    attrs = {"task": take.task} if take.task else {}
-    attrs |= {} if take.start_ns is None else {"start_ns": take.start_ns}
-    own = {**(own if isinstance(own, Mapping) else {}), **attrs, "id": number, "total_steps": steps}
-    hdf5.set_attributes(group, own)
-    return steps
-
-
-def _follow(
-    source: Source, take: Take, steps: int, where: str, notes: dict[str, None]
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Rewards, terminations and truncations of the steps, each [steps]."""
-    found: dict[str, np.ndarray] = {}
-    for root, name in _FOLLOW.items():
-        if name in take.readings:
-            values = rows.whole(take.readings[name], source.sensors[name], where)
-            if values.size != len(values):
-                raise DatasetError(f"'{name}' in {where} has {values.shape[1:]} numbers a row; Minari has one.")
-            values = values.reshape(-1)[:steps]
-            found[root] = values if root == "rewards" else values.astype(bool)
-    if "rewards" not in found:
+            flag = place[0] in ("terminations", "truncations")
+            hdf5.store(group, {keys: 0}, (count, *shape), sensor, readings, where, "bool" if flag else "")
+    if "rewards" not in group:
         notes["there were no rewards: Minari's are 0."] = None
-        found["rewards"] = np.zeros(steps)
-    done = found.setdefault("terminations", np.zeros(steps, bool))
-    if "truncations" not in found:
-        found["truncations"] = np.zeros(steps, bool)
-        found["truncations"][-1] = not done[-1]
-    yield from found.items()
+        group["rewards"] = np.zeros(steps)
+    if "terminations" not in group:
+        group["terminations"] = np.zeros(steps, bool)
+    if "truncations" not in group:
+        group["truncations"] = (np.arange(steps) == steps - 1) & ~group["terminations"][-1]
+    own = take.facts.get("minari")
+    hdf5.set_attributes(group, own)
+    told = {"task": take.task or None, "start_ns": take.start_ns, "id": number, "total_steps": steps}
+    hdf5.set_attributes(group, told)
+    return steps

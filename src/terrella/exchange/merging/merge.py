@@ -39,7 +39,6 @@ from .mapping import (
     EMBODIMENT,
     FOLLOWS,
     STATE,
-    Camera,
     MergeMapping,
     SourceMapping,
     affine,
@@ -198,7 +197,7 @@ def _take(
             merged[key] = _until_last(values, mask) if key == ACTION and terminal else values
             merged[mask_of(key)] = mask
     if mapping.cameras:
-        merged |= _pictures(take, at_s, source, origin, mapping, count)
+        merged |= _pictures(take, at_s, source, origin, mapping, sensors, count)
     merged[EMBODIMENT] = np.full((len(at_s), 1), mapping.embodiments.index(source.embodiment))
     merged |= _kept(take, at_s, source, origin, mapping, sensors, count)
     time_s = np.arange(len(at_s)) / mapping.rows.fps
@@ -268,34 +267,30 @@ def _until_last(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return values[: rows[-1] + 1 if len(rows) else 0]
 
 
-def _pictures(take, at_s, source, origin, mapping, count) -> dict[str, np.ndarray | Lazy]:
+def _pictures(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.ndarray | Lazy]:
     found: dict[str, np.ndarray | Lazy] = {}
     mask = np.zeros((len(at_s), len(mapping.cameras)), bool)
     filled = {to: name for name, to in source.cameras.items()}
-    for place, (to, camera) in enumerate(mapping.cameras.items()):
+    for place, to in enumerate(mapping.cameras):
         name = filled.get(to, "")
+        seen = None
         if name and _has(take, name):
             sensor, policy = origin.sensors[name], mapping.rows.images
             seen, mask[:, place] = resample(take.readings[name], sensor, at_s, policy, mapping.rows.max_gap_s)
             count.sensors[name].rows_without += int((~mask[:, place]).sum())
-            found[to] = _fitted(seen, mask[:, place], camera, name)
-        else:
-            found[to] = _fitted(Lazy(len(at_s), lambda row: np.zeros(0)), mask[:, place], camera, name)
+        found[to] = _fitted(seen, mask[:, place], sensors[to], name)
     return {**found, CAMERAS_MASK: mask}
 
 
-def _fitted(seen, valid: np.ndarray, camera: Camera, name: str) -> Lazy:
-    image = camera.kind == "image"
-    shape = (camera.height, camera.width, 3) if image else (camera.height, camera.width)
-
+def _fitted(seen, valid: np.ndarray, sensor: Sensor, name: str) -> Lazy:
     def look(row: int) -> np.ndarray:
         if not valid[row]:
-            return blank(Sensor("", camera.kind, shape, "uint8" if image else "float32"))
-        picture = np.asarray(seen[row])
-        kind = np.uint8 if image else np.float32
-        if picture.ndim != len(shape) or picture.shape[2:] != shape[2:] or not picture.size or picture.dtype != kind:
-            raise DatasetError(f"row {row} of {name} is {picture.dtype} {picture.shape}, which is no {camera.kind}.")
-        return letterbox(picture, camera.height, camera.width)
+            return blank(sensor)
+        picture, shape = np.asarray(seen[row]), sensor.shape
+        good = picture.ndim == len(shape) and picture.shape[2:] == shape[2:] and picture.size
+        if not good or picture.dtype != sensor.dtype:
+            raise DatasetError(f"row {row} of {name} is {picture.dtype} {picture.shape}, which is no {sensor.kind}.")
+        return letterbox(picture, shape[0], shape[1])
 
     return Lazy(len(valid), look)
 

@@ -66,9 +66,7 @@ class _Place:
         return f"{self.embodiment}.{self.stem or f'{_short(self.sensor)}_{self.index}'}"
 
 
-def propose(
-    sources: Mapping[str, Source], fps: float | None = None, size: tuple[int, int] | None = None
-) -> MergeMapping:
+def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMapping:
     """A first mapping of the sources (path -> Source), to be written, looked at and edited.
 
     Numbers of the same name fill one dimension: names compared without case and punctuation, a unit at the end (x_mm) taken
@@ -78,8 +76,7 @@ def propose(
     "aloha.state_3", which sources of one embodiment share. Cameras of the same name are one, at the smallest of their sizes.
     Each guess worth a look is in its source's `notes`.
 
-    fps:  of the merged rows; None: the slowest of the sources'.
-    size: (height, width) of every merged image; None: as above.
+    fps: of the merged rows; None: the slowest of the sources'.
     DatasetError without a source, or where no fps is known.
     """
     if not sources:
@@ -94,7 +91,7 @@ def propose(
     filled: dict[_Place, str] = {}
     action = _share([place for place in places if place.sensor == ACTION], filled, notes)
     state = _share([place for place in places if place.sensor != ACTION], filled, notes)
-    cameras = _cameras(sources, size, notes)
+    cameras = _cameras(sources, notes)
     several = len(set(names.values())) > 1
     mapped = []
     for path, source in sources.items():
@@ -281,7 +278,7 @@ def _common_unit(part: list[_Place]) -> str:
     return units.pop() if len(units) == 1 else (basic(min(units)) if units else "")
 
 
-def _cameras(sources: Mapping[str, Source], size: tuple[int, int] | None, notes: _Notes) -> dict[str, Camera]:
+def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, Camera]:
     """Every image and depth sensor by its name, at the size of its smallest; an image wins where kinds differ."""
     found: dict[str, Camera] = {}
     for path, source in sources.items():
@@ -290,8 +287,7 @@ def _cameras(sources: Mapping[str, Source], size: tuple[int, int] | None, notes:
                 continue
             if not NAME.fullmatch(name):
                 continue
-            height, width = size if size and sensor.kind == "image" else sensor.shape[:2]
-            camera, before = Camera(sensor.kind, int(height), int(width)), found.get(name)
+            camera, before = Camera(sensor.kind, *map(int, sensor.shape[:2])), found.get(name)
             if before and before.kind != camera.kind:
                 said = f"of kind {camera.kind} here and {before.kind} elsewhere."
                 notes[path].setdefault(said, []).append(name)
