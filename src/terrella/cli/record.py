@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from .. import progress
 from .say import Json, Port, Seed, result, say
@@ -15,62 +15,61 @@ from .say import Json, Port, Seed, result, say
 if TYPE_CHECKING:
     from ..core.world import World
 
-Watch = Annotated[
-    str | None,
-    arg(name="live-mcap", help="Also log to a file NAME.mcap, or to Foxglove at a port of this machine."),
-]
+
+@dataclass(frozen=True)
+class Recording:
+    """Options of every recording.
+
+    Args:
+        out: Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
+        human: Play in the browser yourself; without it a script explores.
+        live_mcap: Also log to a file NAME.mcap, or to Foxglove at a port of this machine.
+    """
+
+    out: Path
+    human: bool = False
+    live_mcap: str | None = None
+    seed: Seed = 0
+    port: Port = 8765
+    json: Json = False
 
 
 def record_doom(
-    out: Path,
+    recording: Recording,
     scenario: str = "my_way_home",
     skill: int | None = None,
     frames: int = 100_000,
     height: int = 192,
-    human: bool = False,
-    live_mcap: Watch = None,
-    seed: Seed = 0,
-    port: Port = 8765,
-    json: Json = False,
 ) -> None:
     """Record the game Doom: pictures, depth, camera pose, actions and rewards.
 
     Args:
-        out: Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
         scenario: A ViZDoom scenario, or maps of a game: freedoom2/MAP01,MAP02 (each episode uses one of them).
         skill: Difficulty, 1 to 5; default: the scenario's own.
         frames: Frames to record in all. With --human there is no limit.
         height: Height of the pictures in pixels; the width is 4/3 of it.
-        human: Play in the browser yourself; without it a script explores.
     """
     from .. import library
 
     depth = (min(max(height, 1), 96), min(max(height, 1), 96) * 4 // 3)
     world = library.load(f"doom:{scenario}", size=(height, height * 4 // 3), depth_size=depth, skill=skill)
-    _record(world, out, frames, human, live_mcap, seed, port, json)
+    _record(world, recording, frames)
 
 
 def record_world(
     name: Positional[str],
-    out: Path,
+    recording: Recording,
     frames: int = 10_000,
     size: tuple[int, int] | None = None,
     pictures: Literal["auto", "png", "video"] = "auto",
-    human: bool = False,
-    live_mcap: Watch = None,
-    seed: Seed = 0,
-    port: Port = 8765,
-    json: Json = False,
 ) -> None:
     """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5) or a learned world.
 
     Args:
         name: A name that `terrella list` shows, or the path of a checkpoint.
-        out: Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
         frames: Frames to record in all. With --human there is no limit.
         size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
         pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above.
-        human: Play in the browser yourself; without it a script explores.
     """
     from .. import library
     from ..core.errors import TerrellaError
@@ -82,51 +81,45 @@ def record_world(
     if pictures == "auto":
         drawn = world.spec.channels.get("rgb")
         pictures = "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
-    _record(world, out, frames, human, live_mcap, seed, port, json, pictures)
+    _record(world, recording, frames, pictures)
 
 
-def _record(
-    world: World,
-    out: Path,
-    frames: int,
-    human: bool,
-    watch: str | None,
-    seed: int,
-    port: int,
-    json: bool,
-    pictures: Literal["video", "png"] = "video",
-) -> None:
+def _record(world: World, recording: Recording, frames: int, pictures: Literal["video", "png"] = "video") -> None:
     from ..act.explorer import Explorer
     from ..core.errors import DatasetError
     from ..core.world import make_rng
     from ..data import Dataset, Layout, Recorder, record
 
-    layout = replace(Layout.of(world.spec), pictures=pictures)
+    layout, out = replace(Layout.of(world.spec), pictures=pictures), recording.out
     facts: dict[str, object] = {"dataset": str(out)}
-    with _watched(watch, layout, world.spec.name, facts) as live:
-        if human:
+    with _watched(recording.live_mcap, layout, world.spec.name, facts) as live:
+        if recording.human:
             from ..serve import serve
 
             def ready(address: str) -> None:
                 say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
 
             sink = lambda: Recorder(out, layout, "play", live=live)  # noqa: E731
-            serve([world], port=port, sink_factory=sink, on_ready=ready, seed=seed)
+            serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed)
         else:
             with progress.shown("recording") as report:
-                player, rng = Explorer(world.spec), make_rng(seed)
+                player, rng = Explorer(world.spec), make_rng(recording.seed)
                 done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out) if out.exists() else None
     if dataset is None or not dataset.length:
         raise DatasetError(
             "nothing was recorded: an episode has two frames or more"
-            + ("; press the record button on the page before you play." if human else "; ask for more --frames.")
+            + (
+                "; press the record button on the page before you play."
+                if recording.human
+                else "; ask for more --frames."
+            )
         )
     facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
     if dataset.has("rgb"):
         facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
-    result(facts, json)
+    result(facts, recording.json)
 
 
 @contextmanager
