@@ -21,7 +21,7 @@ from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import messages, rows
 from .films import decodable, film
-from .mcap_index import Index, Metadata, Schema
+from .mcap_index import Index, Messages, Metadata, Schema
 
 SOURCE, SENSORS, TAKE = "terrella.source", "terrella.sensors", "terrella.take"
 _KEYS = {"image": "observation.images", "depth": "observation.depth", "points": "observation.points"}
@@ -113,13 +113,10 @@ class _Group:
     topic: str
     schema: Schema
     unpack: Callable[[bytes], dict[str, Any]]
-    log_ns: np.ndarray
-    channel: np.ndarray
-    number: np.ndarray
-    after_gap: np.ndarray  # bool: whether a damaged chunk lies just before the message
+    found: Messages
 
     def fields(self, i: int) -> dict[str, Any]:
-        data = self.index.data(int(self.channel[i]), int(self.number[i]))
+        data = self.index.data(self.topic, int(self.found.chunk[i]), int(self.found.place[i]))
         with _naming(self, i):
             return self.unpack(data)
 
@@ -145,19 +142,21 @@ class _File:
 
     def __post_init__(self):
         index = Index(self.path)
-        self.notes += index.notes
         self._declared, self._take = self._metadata(index.metadata)
-        if not index.messages and not self._declared:
+        groups = list(self._groups(index))
+        self.notes = [*index.notes, *self.notes]
+        every = index.of(index.channels)
+        self._first_ns = int(every.log_ns[0]) if len(every.log_ns) else 0
+        if not len(every.log_ns) and not self._declared:
             raise DatasetError(f"'{self.path}' holds no messages that can be read; there is nothing to take from it.")
         self._calibrations: list[tuple[str, dict[str, object]]] = []
         found: list[tuple[str, _Stream]] = []
-        for group in self._groups(index):
+        for group in groups:
             found += self._streams_of(group)
         self._name(found)
         self._calibrate(found)
         if not self.streams:
             raise DatasetError(f"'{self.path}' holds nothing that is understood: {' '.join(self.notes[:3])}")
-        self._first_ns = min((int(messages.log_ns[0]) for messages in index.messages.values()), default=0)
 
     @property
     def sensors(self) -> dict[str, Sensor]:
@@ -204,38 +203,32 @@ class _File:
             members.setdefault((channel.topic, schema.name, channel.message_encoding), []).append(number)
         for (topic, name, encoding), numbers in members.items():
             schema = index.schemas.get(index.channels[numbers[0]].schema_id, _NO_SCHEMA)
-            there = {number: index.messages[number] for number in numbers if number in index.messages}
-            if not there and topic not in self._declared:
+            found = index.of(numbers)
+            if not len(found.log_ns) and topic not in self._declared:
                 if name != messages.CALIBRATION:
                     self._note(topic, "it has no messages")
                 continue
             try:
                 unpack = messages.foreign(name, schema.encoding, schema.data, encoding)
             except DatasetError as error:
-                self._note(topic, f"its {sum(len(it.log_ns) for it in there.values())} messages are left out: {error}")
+                self._note(topic, f"its {len(found.log_ns)} messages are left out: {error}")
                 continue
-            columns = [np.zeros(0, kind) for kind in (np.uint64, np.uint16, np.int64, bool)]
-            for number, it in there.items():
-                size = len(it.log_ns)
-                parts = it.log_ns, np.full(size, number, np.uint16), np.arange(size), it.after_gap
-                columns = [np.concatenate(pair) for pair in zip(columns, parts)]
-            order = np.argsort(columns[0], kind="stable")
-            yield _Group(index, topic, schema, unpack, *(column[order] for column in columns))
+            yield _Group(index, topic, schema, unpack, found)
 
     def _streams_of(self, group: _Group) -> list[tuple[str, _Stream]]:
         """(topic, stream) for each sensor in a group; what cannot be understood is noted."""
-        if not len(group.log_ns):
+        if not len(group.found.log_ns):
             sensor = self._declared_for(group)
-            return [(group.topic, _Stream(sensor, group.log_ns, lambda i: np.zeros(0)))] if sensor else []
+            return [(group.topic, _Stream(sensor, group.found.log_ns, lambda i: np.zeros(0)))] if sensor else []
         try:
             if group.schema.name == messages.CALIBRATION:
-                first, last = (messages.calibration_of(group.fields(i)) for i in (0, len(group.log_ns) - 1))
+                first, last = (messages.calibration_of(group.fields(i)) for i in (0, len(group.found.log_ns) - 1))
                 self._calibrations.append((group.topic, first))
                 if first != last:
                     self._note(group.topic, "the calibration changes on the way; only the first is carried over")
                 return []
             if group.schema.name == _LOG:
-                self._note(group.topic, f"its {len(group.log_ns)} log texts are left out")
+                self._note(group.topic, f"its {len(group.found.log_ns)} log texts are left out")
                 return []
             if group.schema.name in (messages.TRANSFORM, messages.TRANSFORMS):
                 return self._transforms(group)
@@ -261,13 +254,13 @@ class _File:
             with _naming(group, i):
                 return messages.fit(found, sensor)
 
-        return [(group.topic, _Stream(sensor, group.log_ns, value))]
+        return [(group.topic, _Stream(sensor, group.found.log_ns, value))]
 
     def _sample(self, group: _Group, reading: Callable[[int], messages.Reading]) -> messages.Reading:
         """What the first message of a group shows, or a later one if it is broken; noted where others show else."""
         found: list[messages.Reading] = []
         broken: list[DatasetError] = []
-        for i in sorted({0, len(group.log_ns) // 2, len(group.log_ns) - 1}):
+        for i in sorted({0, len(group.found.log_ns) // 2, len(group.found.log_ns) - 1}):
             try:
                 found.append(reading(i))
             except DatasetError as error:
@@ -287,8 +280,8 @@ class _File:
         def data(i: int) -> bytes:
             return said(group.fields(i))[1]
 
-        format, count = said(first)[0], len(group.log_ns)
-        good = decodable(data, group.after_gap, format)
+        format, count = said(first)[0], len(group.found.log_ns)
+        good = decodable(data, group.found.after_gap, format)
         if not len(good):
             raise DatasetError("its video has no keyframe to start from")
         if begin := int(good[0]):
@@ -305,13 +298,13 @@ class _File:
             with _naming(group, int(good[i])):
                 return messages.fit(messages.Reading("image", decoder(i)), chosen)
 
-        return [(group.topic, _Stream(sensor, group.log_ns[good], value))]
+        return [(group.topic, _Stream(sensor, group.found.log_ns[good], value))]
 
     def _transforms(self, group: _Group) -> list[tuple[str, _Stream]]:
         """A stream for each child frame: one topic mostly carries them all."""
         values: dict[tuple[str, str], list[tuple[int, np.ndarray]]] = {}
         broken: list[DatasetError] = []
-        for i, log_ns in enumerate(group.log_ns.tolist()):
+        for i, log_ns in enumerate(group.found.log_ns.tolist()):
             try:
                 found = list(messages.transforms_of(group.schema.name, group.fields(i)))
             except DatasetError as error:

@@ -11,6 +11,7 @@ import os
 import struct
 import threading
 from collections import OrderedDict
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,7 +39,7 @@ _DAMAGE = (McapError, struct.error, ValueError, OverflowError, MemoryError, Runt
 
 @dataclass(frozen=True)
 class Messages:
-    """A channel's messages by log time: uint64 [n] times; int64 [n] where the chunk's record begins in the file, and the
+    """A topic's messages by log time: uint64 [n] times; int64 [n] where the chunk's record begins in the file, and the
     message's number in it (of one outside chunks: 0, and where it begins itself).
 
     after_gap: bool [n], whether a damaged chunk lies between this message and the one before it.
@@ -61,7 +62,6 @@ class Index:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[Metadata] = []
-        self.messages: dict[int, Messages] = {}
         self.notes: list[str] = []
         self._found: dict[int, list[np.ndarray]] = {}  # channel -> [n, 3] of time, chunk, place
         self._gaps: list[int] = []  # where damaged chunks begin
@@ -72,21 +72,34 @@ class Index:
                 self._scan(file, os.fstat(file.fileno()).st_size)
         except OSError as error:
             raise DatasetError(f"'{path}' cannot be read ({error.strerror}); check the path.") from error
-        for channel, found in sorted(self._found.items()):
-            self._order(channel, np.concatenate(found))
+        for channel in sorted(set(self._found) - set(self.channels)):
+            count = sum(map(len, self._found[channel]))
+            self.notes.append(f"{self.path.name}: {count} messages belong to no known channel and are left out.")
 
-    def data(self, channel_id: int, index: int) -> bytes:
-        """The content of a channel's message; DatasetError where the file has changed since."""
-        messages = self.messages[channel_id]
-        chunk, place = int(messages.chunk[index]), int(messages.place[index])
+    def of(self, channels: Collection[int]) -> Messages:
+        """The messages of these channels, in order of time."""
+        parts = [part for channel in channels for part in self._found.get(channel, ())]
+        found = np.concatenate([np.zeros((0, 3), np.uint64), *parts])
+        log_ns, (chunk, place) = found[:, 0], found[:, 1:].astype(np.int64).T
+        order = np.argsort(log_ns, kind="stable")
+        possible = int((log_ns < 2**63).sum())
+        if possible < len(order):
+            what = f"{len(order) - possible} messages of '{self.channels[min(channels)].topic}' have impossible times"
+            self.notes.append(f"{self.path.name}: {what} and are left out.")
+        order = order[:possible]
+        gaps_before = np.searchsorted(np.array(self._gaps, np.int64), np.where(chunk, chunk, place)[order])
+        after_gap = np.diff(gaps_before, prepend=gaps_before[:1]) != 0
+        return Messages(log_ns[order], chunk[order], place[order], after_gap)
+
+    def data(self, topic: str, chunk: int, place: int) -> bytes:
+        """The content of a topic's message; DatasetError where the file has changed since."""
         try:
             message = self._messages(chunk)[place] if chunk else self._record(place)
-            if message.channel_id != channel_id:
+            if self.channels[message.channel_id].topic != topic:
                 raise ValueError("another message lies there")
             return message.data
-        except (*_DAMAGE, OSError, IndexError, AttributeError) as error:
-            topic = self.channels[channel_id].topic
-            raise DatasetError(f"message {index} of '{topic}' in '{self.path}' cannot be read any more.") from error
+        except (*_DAMAGE, OSError, LookupError, AttributeError) as error:
+            raise DatasetError(f"a message of '{topic}' in '{self.path}' cannot be read any more.") from error
 
     def _scan(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MAGIC)) != MAGIC:
@@ -151,22 +164,6 @@ class Index:
             while len(self._unpacked) > 1 and sum(size for size, _ in self._unpacked.values()) > _KEPT:
                 self._unpacked.popitem(last=False)
         return messages
-
-    def _order(self, channel: int, found: np.ndarray) -> None:
-        if channel not in self.channels:
-            self.notes.append(f"{self.path.name}: {len(found)} messages belong to no known channel and are left out.")
-            return
-        log_ns, (chunk, place) = found[:, 0], found[:, 1:].astype(np.int64).T
-        order = np.argsort(log_ns, kind="stable")
-        possible = int((log_ns < 2**63).sum())
-        if possible < len(order):
-            what = f"{len(order) - possible} messages of '{self.channels[channel].topic}' have impossible times"
-            self.notes.append(f"{self.path.name}: {what} and are left out.")
-        if possible:
-            order = order[:possible]
-            gaps_before = np.searchsorted(np.array(self._gaps, np.int64), np.where(chunk, chunk, place)[order])
-            after_gap = np.diff(gaps_before, prepend=gaps_before[:1]) != 0
-            self.messages[channel] = Messages(log_ns[order], chunk[order], place[order], after_gap)
 
 
 def _parsed(opcode: int, length: int, file: BinaryIO) -> Any:
