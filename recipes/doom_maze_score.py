@@ -1,4 +1,5 @@
-"""The reported scorecard of doom-maze, on a recording that training saw nothing of; goes on where it was stopped.
+"""The reported scorecard of doom-maze, on a recording that training saw nothing of; goes on where it was stopped;
+and its targets, which of them are met, and which surely (their whole interval is on that side), in targets.json.
 
 python recipes/doom_maze_score.py RECORDING OUT [--clips 50]
 
@@ -9,8 +10,11 @@ sharpened and nothing invented.
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -22,7 +26,6 @@ from terrella.measure import (
     CLIPS,
     LONG,
     Album,
-    Bar,
     Exam,
     ExamConfig,
     Row,
@@ -32,7 +35,6 @@ from terrella.measure import (
     in_box,
     out_of_sight,
     verdict,
-    worst_of,
     write_report,
 )
 from terrella.space.keyframes import merge
@@ -40,6 +42,45 @@ from terrella.worlds.generator import encode_depth
 
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
 DRIFT, DRIFT_CLIPS = 256, 24
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A target and its figure: low <= figure <= high. `sure`: its whole interval lies on the same side."""
+
+    name: str
+    row: Row | None
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def status(self) -> str:
+        if self.row is None or not math.isfinite(self.row.figure.value):
+            return "not measured"
+        if self.row.void:
+            return "void"
+        return "met" if self.low <= self.row.figure.value <= self.high else "missed"
+
+    @property
+    def sure(self) -> bool:
+        if self.row is None or self.status not in ("met", "missed"):
+            return False
+        inside = self.low <= self.row.figure.low and self.row.figure.high <= self.high
+        outside = self.row.figure.high < self.low or self.row.figure.low > self.high
+        return inside if self.status == "met" else outside
+
+    @property
+    def target(self) -> str:
+        unit = f" {self.row.unit}" if self.row and self.row.unit else ""
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            return f"{self.low:g} to {self.high:g}{unit}"
+        return f"\u2265 {self.low:g}{unit}" if math.isfinite(self.low) else f"\u2264 {self.high:g}{unit}"
+
+
+def worst_of(rows: list[Row]) -> Row | None:
+    """Of ratios that should be 1, the one farthest from it; what could not be measured is never the worst."""
+    known = [row for row in rows if math.isfinite(row.figure.value)]
+    return max(known, key=lambda row: abs(row.figure.value - 1), default=None)
 
 
 class Average(torch.nn.Module):
@@ -119,7 +160,15 @@ def main() -> None:
         tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
         card = examine(exam, given.out / "parts", f"{given.world} {cache.path}", tell)
     print(*verdict(card), sep="\n")
-    print(*write_report(card, list(bars(card)), given.out, "doom-maze: the scorecard"))
+    print(*write_report(card, given.out, "doom-maze: the scorecard"))
+    targets = []
+    for bar in bars(card):
+        figure = str(bar.row.figure) if bar.row else ""
+        print(f"{bar.status + ('' if bar.sure else '?'):>14}  {bar.name}, {bar.target}: {figure}")
+        targets.append(
+            {"name": bar.name, "target": bar.target, "figure": figure, "status": bar.status, "sure": bar.sure}
+        )
+    (given.out / "targets.json").write_text(json.dumps(targets, indent=1) + "\n")
     shutil.rmtree(given.out / "parts")
 
 

@@ -75,8 +75,6 @@ def test_keys_are_mapped_by_a_few_labelled_frames(recording, run):
     for action, code in keys.pairs.items():
         assert tuple(keys.actions[code]) == action
     assert keys.code_of(np.array([1, 1, 1, 1])) is None
-    only = map_keys(run, recording, quiet, frames=60, names=("left", "right"))
-    assert only.accuracy > 0.9 and only.actions.shape == (4, 2)
 
 
 def test_a_labelled_copy_has_codes_for_actions(recording, run, tmp_path):
@@ -130,8 +128,6 @@ def test_bad_input_is_refused_in_one_sentence(recording, run, tmp_path):
         load_latent(tmp_path)
     with pytest.raises(DatasetError, match="ask for fewer"):
         map_keys(run, recording, quiet, frames=100_000)
-    with pytest.raises(DatasetError, match="no action 'fire'"):
-        map_keys(run, recording, quiet, names=("fire",))
     with Recorder(tmp_path / "blind", Layout.of_channels(10.0, ("a",), pose=True)) as recorder:
         for _ in range(3):
             recorder.add({"pose": np.eye(7, dtype=np.float32)[3]}, np.zeros(1))

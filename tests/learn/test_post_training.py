@@ -21,8 +21,7 @@ from terrella.learn.objectives import distillation
 from terrella.learn.objectives.distillation import Matching, drawn
 from terrella.learn.objectives.dreams import Rollouts, beginnings
 from terrella.learn.paired import paired
-from terrella.learn.recipes.distillation import DistilConfig, distil
-from terrella.learn.recipes.dreams import DreamsConfig, train_dreams
+from terrella.learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.trainer import Now
 from terrella.worlds.folder import load_world

@@ -75,7 +75,7 @@ def test_the_interval_comes_from_the_clips():
 
 
 def test_the_page_holds_the_curves(card):
-    html = page(card, [], "x", PROBES)
+    html = page(card, "x", PROBES)
     section = html.partition("<h2>How far can it be used?</h2>")[2].partition("</section>")[0]
     assert section.count("<svg viewBox") >= 2 and section.count('class="mark"') >= 5
     assert "perfect, true motion" in section and "nan" not in section.lower()

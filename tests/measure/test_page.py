@@ -1,4 +1,4 @@
-"""Bars judge rightly, the page stands alone, and pictures come out as asked."""
+"""The page stands alone, and pictures come out as asked."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from panorama import Panorama, card_of, some_clips
 from PIL import Image
 
 from terrella.core.errors import TerrellaError
-from terrella.measure import LONG, Bar, ExamConfig, Row, strip, write_report
+from terrella.measure import LONG, ExamConfig, strip, write_report
 from terrella.measure.plot import Line, line_chart
-from terrella.measure.statistics import Figure
 from terrella.measure.strip import jpeg
 
 
@@ -29,33 +28,15 @@ def card():
     return card_of(arms, places, config, sets={LONG: {"recorded": some_clips(3, 110)}})
 
 
-def row(value, low, high, void=False):
-    return Row("pixels", "rgb", "PSNR", "dB", "recorded", "a", "predicted", 8, Figure(value, low, high, 9), void=void)
-
-
-def test_targets_are_judged_by_the_figure_and_sure_by_its_interval():
-    judged = [Bar("x", row(*figure), 26.0) for figure in ((30, 28, 32), (27, 25, 29), (20, 18, 22), (25, 24, 27))]
-    assert [(bar.status, bar.sure) for bar in judged] == [
-        ("met", True),
-        ("met", False),
-        ("missed", True),
-        ("missed", False),
-    ]
-    assert judged[0].target == "\u2265 26 dB" and Bar("x", row(1, 1, 1), 0.7, 1.3).target == "0.7 to 1.3 dB"
-    assert Bar("x", None, 1.0).status == Bar("x", row(*[float("nan")] * 3), 1.0).status == "not measured"
-    assert Bar("x", row(30, 28, 32, void=True), 26.0).status == "void"
-
-
 def test_the_report_stands_alone(card, tmp_path):
-    paths = write_report(card, [Bar("PSNR", card.rows[1], 26.0)], tmp_path / "new" / "folder", "A <world>")
+    paths = write_report(card, tmp_path / "new" / "folder", "A <world>")
     html = paths[1].read_text(encoding="utf-8")
     assert paths[0].read_text(encoding="utf-8").endswith("}\n")
     assert "A &lt;world&gt;" in html and "no &lt;memory&gt;" in html and "no <memory>" not in html
     assert not re.search(r"(src|href)=(?!\"data:)|url\(|@import|https?://", html)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
-    assert html.index("better than copying the last frame") < html.index("<h2>Targets")
+    assert html.index("better than copying the last frame") < html.index("<h2>Likeness")
     for heading in (
-        "Targets",
         "Likeness over time",
         "Does it obey?",
         "Position",
@@ -71,7 +52,7 @@ def test_the_report_stands_alone(card, tmp_path):
 def test_a_report_that_cannot_be_written_is_one_sentence(card, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(TerrellaError, match="cannot write the report"):
-        write_report(card, [], tmp_path / "file" / "inside", "x")
+        write_report(card, tmp_path / "file" / "inside", "x")
 
 
 def test_a_strip_shows_its_frames_where_they_belong():

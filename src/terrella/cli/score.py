@@ -1,4 +1,5 @@
-"""The command `terrella score`: is a world better than copying the last frame, and how far can it be trusted?"""
+"""The command `terrella score`: is a world better than copying the last frame, and how far can it be trusted? Imported only
+when it is asked for."""
 
 from __future__ import annotations
 
@@ -7,17 +8,34 @@ import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from .. import __version__, progress
+from .. import __version__, library, progress
+from ..core.errors import DatasetError, TerrellaError
+from ..core.world import World, make_rng
+from ..data import ClipCache, Dataset, split
+from ..measure import (
+    CLIPS,
+    ENDINGS,
+    LONG,
+    Album,
+    Exam,
+    ExamConfig,
+    Scorecard,
+    as_dict,
+    check_recording,
+    clips_from_cache,
+    examine,
+    in_box,
+    out_of_sight,
+    passages,
+    verdict,
+    write_report,
+)
 from .named import Device, Fast, device_of, load_named
 from .say import Json, Seed, result, say
-
-if TYPE_CHECKING:
-    from ..core.world import World
-    from ..measure import Exam, ExamConfig, Scorecard
 
 CONTEXT = 10  # frames that a world is shown before it predicts: longer than the effect of a key lasts
 DRIFT_STEPS, DRIFT_CLIPS, ENDING_CLIPS = 256, 24, 24
@@ -58,9 +76,6 @@ def score(
         drift: Steps of the drift curves, on clips of their own (at most 24); 0 leaves them out. Unless said, 256 where the
             recordings have clips that long.
     """
-    from ..core.errors import TerrellaError
-    from ..measure import ExamConfig, as_dict, examine, verdict, write_report
-
     horizons = tuple(sorted(horizons or (QUICK_HORIZONS if quick else HORIZONS)))
     clips = clips if clips is not None else QUICK_CLIPS if quick else 50
     long_steps = long_steps if long_steps is not None else 0 if quick else 1000
@@ -76,7 +91,7 @@ def score(
     with progress.shown("scoring") as report:
         tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
         card = examine(exam, out / "parts", identity, tell)
-    files = write_report(card, (), out, f"{next(iter(card.worlds.values()))}: the scorecard")
+    files = write_report(card, out, f"{next(iter(card.worlds.values()))}: the scorecard")
     shutil.rmtree(out / "parts", ignore_errors=True)
     facts = {**as_dict(card), "files": [str(file) for file in files]}
     result(facts, json, "\n".join([*verdict(card), *_lines(card), f"the page: {files[1]}"]))
@@ -84,8 +99,6 @@ def score(
 
 def _arms(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
     """The world, with its memory and without where it has one; and more of which only memory is asked."""
-    from .. import library
-
     world = load_named(name, device, fast=fast)
     if library.is_truth(name) or "pose" not in world.spec.observes:
         return {"world": world}, {}
@@ -107,11 +120,6 @@ def _exam(
     seed: int,
 ) -> tuple[Exam, str]:
     """Clips of the recordings, of ground that training saw and of ground that it did not."""
-    from ..core.errors import DatasetError
-    from ..core.world import make_rng
-    from ..data import split
-    from ..measure import CLIPS, ENDINGS, LONG, Album, Exam, clips_from_cache, in_box, out_of_sight, passages
-
     world = next(iter(arms.values()))
     cache = _cache(data, world)
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
@@ -154,9 +162,6 @@ def _exam(
 
 def _cache(data: Path, world: World) -> Any:
     """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
-    from ..data import ClipCache, Dataset
-    from ..measure import check_recording
-
     dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
     for channel in world.spec.kinds("rgb"):
         height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
@@ -173,9 +178,6 @@ def _cache(data: Path, world: World) -> Any:
 
 def _files_of(name: str) -> str:
     """A digest of a learned world's files: other weights are another world."""
-    from .. import library
-    from ..core.errors import TerrellaError
-
     try:
         folder = library.folder_of(name)
     except TerrellaError:  # a simulator

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from tyro.conf import Positional
 
 from .. import progress
-from ..learn.recipes.distillation import DistilConfig, distil
-from ..learn.recipes.dreams import DreamsConfig, train_dreams
 from ..learn.recipes.estimator import EstimatorTraining, train_estimator
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
 from ..learn.recipes.objects import ObjectsTraining, train_objects
+from ..learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
 from ..learn.recipes.uncertainty import SensesConfig, train_uncertainty
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.trainer import device_named
@@ -19,30 +20,18 @@ from ..worlds.learned import LearnedWorld
 from .named import Device
 from .say import Json, result
 
-VIDEO, ESTIMATOR, UNCERTAINTY, LATENT, DISTIL, DREAMS, OBJECTS = (
-    TrainConfig(),
-    EstimatorTraining(),
-    SensesConfig(),
-    LatentConfig(),
-    DistilConfig(),
-    DreamsConfig(),
-    ObjectsTraining(),
-)
 
-
-def video(data: Positional[str], out: str, config: TrainConfig = VIDEO, json: Json = False) -> None:
+def video(data: Positional[str], out: str, config: TrainConfig, json: Json = False) -> None:
     """Train a playable world on a recording. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
-    with progress.shown("training") as report:
-        facts = train_video(data, out, config, report)
-    result({"run": out, **facts}, json)
+    _shown(lambda report: train_video(data, out, config, report), json, run=out)
 
 
-def estimator(data: Positional[str], out: str, config: EstimatorTraining = ESTIMATOR, json: Json = False) -> None:
+def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: Json = False) -> None:
     """Train a depth and odometry estimator on a recording with depth and poses. It reads depth off one picture, and motion
     off two.
 
@@ -50,14 +39,10 @@ def estimator(data: Positional[str], out: str, config: EstimatorTraining = ESTIM
         data: The recording: a folder, or an address.
         out: Folder for estimator.safetensors, and estimator.json with its errors on held-out episodes.
     """
-    with progress.shown("training") as report:
-        facts = train_estimator(data, out, config, report)
-    result(facts, json)
+    _shown(lambda report: train_estimator(data, out, config, report), json)
 
 
-def uncertainty(
-    name: Positional[str], data: str, out: str, config: SensesConfig = UNCERTAINTY, json: Json = False
-) -> None:
+def uncertainty(name: Positional[str], data: str, out: str, config: SensesConfig, json: Json = False) -> None:
     """Train a world's estimator, so that it can begin with a single picture, and its uncertainty, so that it says when it
     invents. `train video` ends with both.
 
@@ -66,12 +51,10 @@ def uncertainty(
         data: The recording that it was trained on.
         out: Folder of the run; the world is in OUT/world.
     """
-    with progress.shown("training") as report:
-        facts = train_uncertainty(folder_of(name), data, out, config, report)
-    result(facts, json)
+    _shown(lambda report: train_uncertainty(folder_of(name), data, out, config, report), json)
 
 
-def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining = OBJECTS, json: Json = False) -> None:
+def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining, json: Json = False) -> None:
     """Train a world's objects on another recording: how they look, move, change and vanish. Takes minutes.
 
     Args:
@@ -79,28 +62,24 @@ def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining 
         data: A recording of the same game that tells objects apart.
         out: Folder of the run; the world is in OUT/world.
     """
-    with progress.shown("training") as report:
-        facts = train_objects(folder_of(name), data, out, config, report)
-    result(facts, json)
+    _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json)
 
 
-def latent_actions(data: Positional[str], out: str, config: LatentConfig = LATENT, json: Json = False) -> None:
+def latent_actions(data: Positional[str], out: str, config: LatentConfig, json: Json = False) -> None:
     """Learn a few actions from pictures alone. `terrella data label` then writes them into a recording.
 
     Args:
         data: The recording: a folder, or an address. Its own actions, if it has any, are not used.
         out: Folder of the run: checkpoint, log, and pictures of true, inferred and random actions.
     """
-    with progress.shown("training") as report:
-        facts = train_latent_actions(data, out, config, report)
-    result(facts, json)
+    _shown(lambda report: train_latent_actions(data, out, config, report), json)
 
 
 def few_steps(
     name: Positional[str],
     data: str,
     out: str,
-    config: DistilConfig = DISTIL,
+    config: DistilConfig,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
@@ -111,16 +90,14 @@ def few_steps(
         data: A recording of the same game.
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
-    with progress.shown("training") as report:
-        facts = distil(_learned(name, device), data, out, config, report)
-    result({"run": out, **facts}, json)
+    _shown(lambda report: distil(_learned(name, device), data, out, config, report), json, run=out)
 
 
 def dreams(
     name: Positional[str],
     data: str,
     out: str,
-    config: DreamsConfig = DREAMS,
+    config: DreamsConfig,
     teacher: str | None = None,
     device: Device = "auto",
     json: Json = False,
@@ -134,9 +111,13 @@ def dreams(
         teacher: A world that draws a frame in many steps, whose sharpness the predictions should reach; see `train distil`.
     """
     master = None if teacher is None else _learned(teacher, device)
+    _shown(lambda report: train_dreams(_learned(name, device), data, out, config, report, master), json, run=out)
+
+
+def _shown(train: Callable[[Callable[..., None]], dict], json: bool, **more: str) -> None:
     with progress.shown("training") as report:
-        facts = train_dreams(_learned(name, device), data, out, config, report, master)
-    result({"run": out, **facts}, json)
+        facts = train(report)
+    result({**more, **facts}, json)
 
 
 def _learned(name: str, device: str) -> LearnedWorld:

@@ -10,7 +10,7 @@ import torch
 
 from ..space.keyframes import Glimpse, Keyframes, gathered, look, retrieve
 from ..worlds.config import THUMBNAIL, VideoConfig
-from ..worlds.generator import Conditioning, context_thumbnail, decode_depth, encode_depth, pixels
+from ..worlds.generator import Conditioning, Generator, context_thumbnail, decode_depth, encode_depth, generate, pixels
 from ..worlds.places import carry
 from .recording import Recording
 from .trainer import Now
@@ -35,6 +35,15 @@ class Batch:
     def to(self, device) -> Batch:
         weight, instruction = (None if part is None else part.to(device) for part in (self.weight, self.instruction))
         return Batch(self.shown.to(device), self.truth.to(device), weight, instruction)
+
+
+@torch.no_grad()
+def drawn_now(generator: Generator, shown: Conditioning, now: Now, steps: int = 1) -> torch.Tensor:
+    """Frames [B, 4 or 5, H, W] as a generator under training draws them, on the CPU: see Dream."""
+    batch, _, height, width = shown.last.shape
+    noise = now.randn(batch, 4, height, width)
+    with now.half():
+        return generate(generator, noise, shown.to(now.device), steps).float().cpu()
 
 
 def as_drawn(truth: torch.Tensor) -> torch.Tensor:
@@ -65,10 +74,7 @@ class Views:
         Both learn to complete: the first where memory is dense, the second where it is sparse. `back` rows before each
         target are of its episode and usable.
         """
-        rows = recording.usable & (np.arange(len(recording.usable)) - recording.start >= back)
-        for age in range(1, back + 1):
-            rows &= np.roll(recording.usable, age)
-        target = rng.choice(np.flatnonzero(rows), batch)
+        target = rng.choice(recording.within(back, 0), batch)
         chosen = []
         for index, row in enumerate(target):
             pose = recording.pose([row])[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,9 +34,7 @@ class Labels:
     facts: dict
 
 
-def labelled(
-    run: str | Path, data: str | Path, report: Report, keys: KeyMap | None = None, device: str = "auto"
-) -> Labels:
+def labelled(run: str | Path, data: str | Path, report: Report, keys: KeyMap | None = None) -> Labels:
     """A copy of a recording with inferred codes for actions, so that any training that reads recordings makes a world of it
     that is played with codes. An action has a number, 0 or 1, for each code but the stillest, which is what happens while
     no key is held. Actions that were recorded are left out; the digits 1, 2, ... stand for codes (and so do the keys of
@@ -45,7 +42,7 @@ def labelled(
 
     The code of a row is that of the motion over the next `stride` rows; near an episode's end, that of its last ones.
     """
-    model = load_latent(run, device)
+    model = load_latent(run)
     cache, dataset = pictures(data, model.size, report), Dataset(data)
     stride, codes, source = model.stride, model.codes, dataset.source()
     still = stillest(model, cache)
@@ -69,12 +66,8 @@ def labelled(
     world |= {"name": f"{dataset.world.get('name', dataset.name)}, latent actions", "dt_s": 1 / dataset.fps}
     world |= {"action_names": list(names), "discrete": False, "keys": _keys_of_codes(buttons, dataset, keys)}
     facts = {**source.facts, "world": world, "latent_actions": {"codes": codes, "stride": stride, "still": still + 1}}
-    relabelled = replace(
-        source,
-        sensors=sensors,
-        takes=lambda: (take(number, recorded) for number, recorded in enumerate(source.takes())),
-        facts=facts,
-    )
+    takes = lambda: (take(number, recorded) for number, recorded in enumerate(source.takes()))  # noqa: E731
+    relabelled = replace(source, sensors=sensors, takes=takes, facts=facts)
     exact = dataset.features[dataset.rgb_key or ""]["dtype"] == "image"
     return Labels(relabelled, exact, {"codes": codes, "still": still + 1, "frames": cache.length})
 
@@ -99,110 +92,61 @@ def _keys_of_codes(buttons: np.ndarray, dataset: Dataset, keys: KeyMap | None) -
     return found
 
 
-# -- keys -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class KeyMap:
     """Which recorded action each code stands for, as a few labelled frames say, and how often that is right elsewhere.
 
-    names:      the numbers of an action that were mapped.
+    names:      of the numbers of an action.
     actions:    float32 [K, A]: what was most often recorded where code k was inferred.
     pairs:      recorded action -> the code that was most often inferred where it was recorded.
     used:       labelled frames.
-    tested:     held-out frames.
-    accuracy:   share of held-out frames whose whole action (all of `names`) is that of their code.
-    steady:     the same over the frames in which the action does not change while the code's motion lasts.
+    accuracy:   share of held-out frames whose whole action is that of their code.
     commonest:  share that the commonest action alone would get right.
-    each:       per name, the share of held-out frames in which that number alone is right.
     """
 
     names: tuple[str, ...]
     actions: np.ndarray
     pairs: dict[tuple[float, ...], int]
     used: int
-    tested: int
     accuracy: float
-    steady: float
     commonest: float
-    each: dict[str, float]
 
     def code_of(self, action: np.ndarray) -> int | None:
-        """The code for the numbers `names` of an action; None where they were never seen together."""
+        """The code for the numbers of an action; None where they were never seen together."""
         return self.pairs.get(tuple(float(number) for number in np.asarray(action).reshape(-1)))
 
 
-def map_keys(
-    run: str | Path,
-    data: str | Path,
-    report: Report,
-    frames: int = 200,
-    names: Sequence[str] = (),
-    test: str | Path | None = None,
-    seed: int = 0,
-    device: str = "auto",
-) -> KeyMap:
+def map_keys(run: str | Path, data: str | Path, report: Report, frames: int = 200, seed: int = 0) -> KeyMap:
     """Maps recorded actions to codes by `frames` labelled frames in clips of 10 from the training episodes of `data`, and tests
-    the map on its held-out episodes, or on the whole of the recording `test`.
-
-    names: of the action's numbers, those that are mapped together (("TURN_LEFT", "TURN_RIGHT") for turning alone); all
-    without. DatasetError where the recording has no actions, or too few.
-    """
-    model = load_latent(run, device)
+    the map on its held-out episodes. DatasetError where the recording has no actions, or too few."""
+    model = load_latent(run)
     cache = pictures(data, model.size, report)
+    if cache.action is None or not cache.action_names:
+        raise DatasetError(f"{data} has no recorded actions; keys are mapped by a few labelled clips.")
     train, held_out = split(len(cache.episodes))
-    exam = cache if test is None else pictures(test, model.size, report)
-    chosen = _columns(cache, names, data)
     clips = clips_of(pair_rows(cache, train, model.stride), 10)
     if len(clips) * 10 < frames or frames < 1:
         raise DatasetError(f"{data} has {len(clips) * 10} rows with actions to label, not {frames}; ask for fewer.")
     order = np.random.default_rng(seed).permutation(len(clips))[: -(-frames // 10)]
     rows = np.concatenate([clips[i] for i in order])[:frames]
-    recorded, code = _recorded(cache, rows, chosen), infer_codes(model, cache, rows)
+    recorded, code = np.asarray(cache.action[rows], np.float32), infer_codes(model, cache, rows)
     common = _commonest(recorded)
     actions = np.stack([_commonest(recorded[code == k]) if (code == k).any() else common for k in range(model.codes)])
     kinds, which = np.unique(recorded, axis=0, return_inverse=True)
     which = which.reshape(-1)
     pairs = {tuple(kind.tolist()): int(np.bincount(code[which == i]).argmax()) for i, kind in enumerate(kinds)}
-    tested = pair_rows(exam, held_out if test is None else list(range(len(exam.episodes))), model.stride)
+    tested = pair_rows(cache, held_out, model.stride)
     if not len(tested):
-        raise DatasetError(f"{test or data} has no held-out frames to test keys on; record two episodes or more.")
-    chosen = _columns(exam, names, test or data)
-    truth, guess = _recorded(exam, tested, chosen), actions[infer_codes(model, exam, tested)]
-    steady = np.ones(len(tested), bool)
-    for later in range(1, model.stride):
-        steady &= (_recorded(exam, tested + later, chosen) == truth).all(1)
-    right = truth == guess
-    return KeyMap(
-        tuple(cache.action_names[i] for i in chosen),
-        actions,
-        pairs,
-        len(rows),
-        len(tested),
-        float(right.all(1).mean()),
-        float(right.all(1)[steady].mean()),
-        float((truth == common).all(1).mean()),
-        {cache.action_names[i]: float(right[:, at].mean()) for at, i in enumerate(chosen)},
-    )
-
-
-def _columns(cache: ClipCache, names: Sequence[str], data: str | Path) -> list[int]:
-    if cache.action is None or not cache.action_names:
-        raise DatasetError(f"{data} has no recorded actions; keys are mapped by a few labelled clips.")
-    unknown = sorted(set(names) - set(cache.action_names))
-    if unknown:
-        raise DatasetError(f"{data} has no action '{unknown[0]}'; it has {', '.join(cache.action_names)}.")
-    return [cache.action_names.index(name) for name in names] if names else list(range(len(cache.action_names)))
+        raise DatasetError(f"{data} has no held-out frames to test keys on; record two episodes or more.")
+    truth, guess = np.asarray(cache.action[tested], np.float32), actions[infer_codes(model, cache, tested)]
+    right, usual = (truth == guess).all(1).mean(), (truth == common).all(1).mean()
+    return KeyMap(tuple(cache.action_names), actions, pairs, len(rows), float(right), float(usual))
 
 
 def clips_of(rows: np.ndarray, length: int) -> list[np.ndarray]:
     """Runs of `length` rows that follow each other."""
     breaks = np.flatnonzero(np.diff(rows) != 1) + 1
     return [run[at : at + length] for run in np.split(rows, breaks) for at in range(0, len(run) - length + 1, length)]
-
-
-def _recorded(cache: ClipCache, rows: np.ndarray, columns: list[int]) -> np.ndarray:
-    return np.asarray(cache.action[rows], np.float32)[:, columns]
 
 
 def _commonest(actions: np.ndarray) -> np.ndarray:

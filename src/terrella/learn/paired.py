@@ -1,29 +1,22 @@
-"""Paired: a finished world with a recording on which it goes on learning, and what further training leaves behind."""
+"""Paired: a finished world with a recording on which it goes on learning."""
 
 from __future__ import annotations
 
-import copy
 import hashlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from ..core.errors import DatasetError
 from ..space.keyframes import Keyframes
-from ..worlds.folder import save_world
 from ..worlds.generator import Generator
 from ..worlds.learned import LearnedWorld
 from .batches import Batch, Dream
 from .feeds import frames_feed
 from .history_batches import clips_at, history_batch
 from .recording import INSTANCES, OBJECTS, THINGS, Box, Recording, box_of
-from .strips import draw_strip
 from .trainer import Feed, Now, Report
-
-TRANSIENT = ("save_every_s", "strip_every_s", "device")  # settings that may change within a run
 
 
 @dataclass(frozen=True)
@@ -73,28 +66,9 @@ def paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, report: 
     return Paired(world, replace(recording, controls=controls).enough())
 
 
-def with_generator(world: LearnedWorld, generator: Generator, steps: int, card: dict) -> LearnedWorld:
-    """The same world around a copy of another generator, which draws a frame in `steps`; `card` is added to its facts. Its
-    uncertainty is left out, for it knew the errors of the old one: `terrella train uncertainty` learns another."""
-    fresh = copy.deepcopy(generator)
-    return world.replaced(generator=fresh, steps=steps, uncertainty=None, card={"uncertainty": None, **card})
-
-
 def fingerprint(generator: Generator) -> str:
     """Of its weights, so that a run goes on only with the world that it began from."""
     digest = hashlib.sha256()
     for weight in generator.state_dict().values():
         digest.update(weight.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
-
-
-def recipe_of(config: Any, pair: Paired, **more: Any) -> Mapping[str, Any]:
-    """What must not change within a run; where and how often it is saved may."""
-    fixed = {name: value for name, value in asdict(config).items() if name not in TRANSIENT}
-    return {**fixed, "world": fingerprint(pair.world.generator), "frames": pair.recording.cache.length, **more}
-
-
-def keep_world(pair: Paired, world: LearnedWorld, out: Path, step: int) -> None:
-    """The world in the run's folder, and a strip of the old world's dream above the new one's."""
-    save_world(world, out / "world")
-    draw_strip((pair.world, world), pair.recording, out / f"strip-{step:06d}.png")

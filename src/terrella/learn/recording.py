@@ -98,6 +98,13 @@ class Recording:
         """Whether it has depth, poses and a camera."""
         return all(there(self.cache, name) for name in ("depth", "pose", "camera"))
 
+    def within(self, before: int, after: int, acted: bool = False) -> np.ndarray:
+        """Rows that may be seen together with so many `before` and `after` them in their episode, by valid actions if `acted`."""
+        seen = self.usable & np.asarray(self.cache.action_valid) if acted else self.usable
+        upto, rows = np.append(0, np.cumsum(seen)), np.arange(before, len(seen) - after)
+        whole = upto[rows + after + 1] - upto[rows - before] == before + after + 1
+        return rows[whole & (self.start[rows - before] == self.start[rows + after])]
+
     def rgb(self, rows) -> torch.Tensor:
         """uint8 [n, 3, H, W]"""
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()

@@ -1,4 +1,4 @@
-"""Trainer: the one training loop. A feed gives batches, an objective gives losses, a schedule says how long.
+"""Trainer: the one training loop. A feed gives batches, an objective gives losses.
 
 All of a step's randomness comes from (seed, step), so a run that was stopped sees what an unbroken one would. Ctrl-C
 lets the step that is under way end, saves it and stops; the same command goes on exactly from there.
@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -27,19 +28,8 @@ from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 
 Report = Callable[[float, float, str], None]
 LOG_EVERY = 20  # steps
+CPU = torch.device("cpu")
 Module = TypeVar("Module", bound=nn.Module)
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How long a training lasts, and where. It ends after `steps`, or `hours`, those of earlier runs counted in."""
-
-    steps: int
-    hours: float = float("inf")
-    seed: int = 0
-    device: torch.device = torch.device("cpu")
-    save_every_s: float = 60.0
-    strip_every_s: float = 300.0
 
 
 @dataclass(frozen=True)
@@ -97,6 +87,28 @@ class Learner:
     clip: float = 1.0
 
 
+def adamw(
+    modules: Sequence[nn.Module],
+    rate: Callable[[Now], float],
+    decay: float = 1e-4,
+    betas: tuple[float, float] = (0.9, 0.99),
+    average: Average[Any] | None = None,
+) -> Learner:
+    """AdamW for all weights of the modules, which moves them by `rate`."""
+    weights = [weight for module in modules for weight in module.parameters()]
+    return Learner(torch.optim.AdamW(weights, betas=betas, weight_decay=decay), modules, rate, average)
+
+
+def warmed(peak: float, steps: int, low: float = 0.0) -> Callable[[Now], float]:
+    """A rate that goes up to `peak` over so many steps, and down to `low` of it along a cosine over the training."""
+    return lambda now: peak * min(1, (now.step + 1) / steps) * cosine(now.share, low)
+
+
+def held(peak: float, steps: int) -> Callable[[Now], float]:
+    """A rate that goes up to `peak` over so many steps, stays there, and goes down to 0 over the last 30% of the training."""
+    return lambda now: peak * min(1, (now.step + 1) / steps, (1 - now.share) / 0.3)
+
+
 @dataclass(frozen=True)
 class Loss:
     """What the learner of this name descends next; `parts` are what the log tells of it."""
@@ -125,58 +137,97 @@ class Feed(Protocol):
     def resume(self, state: Mapping) -> None: ...
 
 
-class Trainer:
-    """A stage of the run in the folder `out`; it goes on where it was stopped.
+@dataclass(frozen=True)
+class Run:
+    """The folder of a training run, and what its stages share.
 
-    TrainingError where the folder holds a run with another `recipe` (JSON values that must not change within a run).
+    recipe: JSON values that must not change within the run.
+    """
+
+    out: Path
+    recipe: Mapping[str, Any]
+    report: Report
+    seed: int = 0
+    device: torch.device = CPU
+    save_every_s: float = 60.0
+    strip_every_s: float = 300.0
+
+    @staticmethod
+    def of(
+        out: str | Path, config: Any, report: Report, device: torch.device = CPU, free: Sequence[str] = (), **facts: Any
+    ) -> Run:
+        """The run of a recipe's settings, a dataclass, of which all but `free` and where and how often it is saved must not
+        change, nor may `facts`."""
+        settings = asdict(config)
+        times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
+        fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
+        return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times)
+
+    def stage(
+        self,
+        name: str,
+        feed: Feed,
+        objective: Objective,
+        steps: int,
+        hours: float = math.inf,
+        device: torch.device | None = None,
+    ) -> Trainer:
+        """A stage that goes on where it was stopped, and ends after `steps` or `hours`, those of earlier runs counted in.
+        `device`: where it is to run, if not where the others do."""
+        return Trainer(self, name, feed, objective, steps, hours, device or self.device)
+
+
+class Trainer:
+    """A stage of a run; it goes on where it was stopped.
+
+    TrainingError where the run's folder holds one with another recipe.
 
     facts: recipe, step, seconds, and what `once` added; saved with the rest.
     """
 
     def __init__(
-        self, out: str | Path, stage: str, feed: Feed, objective: Objective, schedule: Schedule, recipe: Mapping
+        self, run: Run, stage: str, feed: Feed, objective: Objective, steps: int, hours: float, device: torch.device
     ):
-        self.out, self.stage, self.feed, self.objective, self.schedule = Path(out), stage, feed, objective, schedule
-        self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(recipe)), "step": 0, "seconds": 0.0, "recent": []}
-        self._file = resume_file(self.out, stage)
+        self.within, self.stage, self.feed, self.objective = run, stage, feed, objective
+        self.steps, self.hours, self.device = steps, hours, device
+        self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
+        self.facts |= {"seconds": 0.0, "recent": []}
+        self._file = resume_file(run.out, stage)
         found = load_run(self._file, {}, {})
         if found and found.get("recipe") != self.facts["recipe"]:
-            raise TrainingError(f"{self.out} holds a run with other settings; repeat them, or give another --out.")
+            raise TrainingError(f"{run.out} holds a run with other settings; repeat them, or give another --out.")
         for module in objective.modules.values():
-            module.to(schedule.device)
+            module.to(device)
         if found:
             self.facts |= load_run(self._file, objective.modules, self._optimisers) or {}
             feed.resume(self.facts["feed"])
-        trim_log(self.out, stage, self.facts["step"])
+        trim_log(run.out, stage, self.facts["step"])
 
     @property
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
         return {f"optimiser of {name}": learner.optimiser for name, learner in self.objective.learners.items()}
 
     @property
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """The facts that people read."""
         return {name: fact for name, fact in self.facts.items() if name not in ("recipe", "recent", "feed")}
 
     @property
     def finished(self) -> bool:
-        return self.facts["step"] >= self.schedule.steps or self.facts["seconds"] >= 3600 * self.schedule.hours
+        return self.facts["step"] >= self.steps or self.facts["seconds"] >= 3600 * self.hours
 
-    def run(self, report: Report, draw: Callable[[], None] | None = None) -> None:
-        """Trains to the end of the schedule; `draw()` now and then, which leaves what there is to look at."""
+    def run(self, draw: Callable[[], None] | None = None) -> None:
+        """Trains to the end; `draw()` now and then, which leaves what there is to look at."""
         if self.finished:
             return
-        modes = {module: module.training for module in self.objective.modules.values()}
         for learner in self.objective.learners.values():
             for module in learner.modules:
                 module.train()
         with _stoppable() as stop:
-            self._run(report, draw, stop)
-        for module, mode in modes.items():
-            module.train(mode)
+            self._run(draw, stop)
 
-    def _run(self, report: Report, draw: Callable[[], None] | None, stop: threading.Event) -> None:
-        facts, schedule = self.facts, self.schedule
+    def _run(self, draw: Callable[[], None] | None, stop: threading.Event) -> None:
+        facts, run = self.facts, self.within
         began = saved = drawn = time.monotonic()
         before = facts["seconds"]
         while not self.finished and not stop.is_set():
@@ -186,31 +237,29 @@ class Trainer:
             now = time.monotonic()
             facts["seconds"] = before + now - began
             if len(facts["recent"]) == LOG_EVERY or self.finished:
-                self._log(report)
-            if now - saved > schedule.save_every_s:
+                self._log()
+            if now - saved > run.save_every_s:
                 self.save()
                 saved = now
-            if draw is not None and now - drawn > schedule.strip_every_s:
+            if draw is not None and now - drawn > run.strip_every_s:
                 draw()
                 drawn = time.monotonic()
         self.save()
         if stop.is_set():
-            words = (
-                f"{facts['step']} steps of '{self.stage}' are saved in {self.out}; the same command goes on from there."
-            )
-            raise KeyboardInterrupt(words)
+            done = f"{facts['step']} steps of '{self.stage}' are saved in {run.out}"
+            raise KeyboardInterrupt(f"{done}; the same command goes on from there.")
 
     def _step(self, step: int) -> dict[str, float]:
         """One whole step: a batch, and down each of its losses in turn. Returns the means of their parts."""
-        rng = np.random.default_rng([self.schedule.seed, step])
+        rng = np.random.default_rng([self.within.seed, step])
         noise = make_rng(int(rng.integers(2**62)))
-        now = Now(step, step / self.schedule.steps, self.schedule.device, rng, noise)
+        now = Now(step, step / self.steps, self.device, rng, noise)
         for learner in self.objective.learners.values():
             if learner.rate is not None:
                 for group in learner.optimiser.param_groups:
                     group["lr"] = learner.rate(now) * group.get("pace", 1.0)
         found: dict[str, list[float]] = {}
-        with torch.random.fork_rng([self.schedule.device] if self.schedule.device.type == "cuda" else []):
+        with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
             torch.manual_seed(int(rng.integers(2**62)))  # dropout knows no generator of its own
             for loss in self.objective.losses(self.feed.batch(now), now):
                 self._descend(loss, step)
@@ -234,7 +283,7 @@ class Trainer:
 
     def save(self) -> None:
         """The run as it is after its last whole step."""
-        self.out.mkdir(parents=True, exist_ok=True)
+        self.within.out.mkdir(parents=True, exist_ok=True)
         self.facts["feed"] = self.feed.state()
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)
 
@@ -245,44 +294,16 @@ class Trainer:
             self.save()
         return self.facts[name]
 
-    def _log(self, report: Report) -> None:
+    def _log(self) -> None:
         facts, recent = self.facts, self.facts["recent"]
         mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
-        write_log(self.out, {"stage": self.stage, "step": facts["step"], "seconds": round(facts["seconds"]), **mean})
+        write_log(
+            self.within.out, {"stage": self.stage, "step": facts["step"], "seconds": round(facts["seconds"]), **mean}
+        )
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
-        by_steps, by_hours = facts["step"] / self.schedule.steps, facts["seconds"] / (3600 * self.schedule.hours)
-        report(max(by_steps, by_hours), 1.0, f"{self.stage}: {words}")
-
-
-@dataclass(frozen=True)
-class Run:
-    """The folder of a training run, and what its stages share.
-
-    recipe: JSON values that must not change within the run.
-    """
-
-    out: Path
-    recipe: Mapping[str, Any]
-    report: Report
-    seed: int = 0
-    device: torch.device = torch.device("cpu")
-    save_every_s: float = 60.0
-    strip_every_s: float = 300.0
-
-    def stage(
-        self,
-        name: str,
-        feed: Feed,
-        objective: Objective,
-        steps: int,
-        hours: float = float("inf"),
-        device: torch.device | None = None,
-    ) -> Trainer:
-        """A stage that goes on where it was stopped; `device`: where it is to run, if not where the others do."""
-        there = self.device if device is None else device
-        schedule = Schedule(steps, hours, self.seed, there, self.save_every_s, self.strip_every_s)
-        return Trainer(self.out, name, feed, objective, schedule, self.recipe)
+        by_steps, by_hours = facts["step"] / self.steps, facts["seconds"] / (3600 * self.hours)
+        self.within.report(max(by_steps, by_hours), 1.0, f"{self.stage}: {words}")
 
 
 def _not_a_number(what: str, step: int) -> str:

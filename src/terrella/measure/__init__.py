@@ -6,9 +6,9 @@ from .exam import CLIPS, ENDINGS, LONG, Exam, ExamConfig
 from .examine import PROBES, examine, write_report
 from .outcomes import passages
 from .page import page
-from .scorecard import Bar, Row, Scorecard, as_dict, to_json, verdict, worst_of
+from .scorecard import Row, Scorecard, as_dict, to_json, verdict
 from .strip import strip
 
-__all__ = ["CLIPS", "ENDINGS", "LONG", "PROBES", "Album", "Bar", "Clip", "Exam", "ExamConfig", "Row", "Scorecard"]
+__all__ = ["CLIPS", "ENDINGS", "LONG", "PROBES", "Album", "Clip", "Exam", "ExamConfig", "Row", "Scorecard"]
 __all__ += ["as_dict", "check_recording", "clips_from_cache", "examine", "in_box", "out_of_sight", "page", "passages"]
-__all__ += ["strip", "to_json", "verdict", "worst_of", "write_report"]
+__all__ += ["strip", "to_json", "verdict", "write_report"]

@@ -132,7 +132,7 @@ def clips_from_cache(
     starts: list[tuple[int, int]] = []
     for episode in episodes:
         begin, end = cache.episodes[episode]
-        for first, stop in _runs(cache, begin, end, where):
+        for first, stop in runs(cache, begin, end, where):
             spare = (stop - first) % length
             if stop - first < length:
                 continue
@@ -191,17 +191,18 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
     return seen
 
 
-def _runs(cache, first: int, stop: int, where: Where | None):
-    """Stretches [first, stop) of consecutive rows, each reached from the one before by a valid action."""
+def runs(cache, first: int, stop: int, where: Where | None, unbroken: bool = True) -> list[tuple[int, int]]:
+    """Stretches [first, stop) of the rows of an episode that `where` allows; where `unbroken`, each row is reached from the one
+    before by a valid action."""
     if where is not None and cache.pose is None:
         raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
     allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache, first, stop), bool)
-    linked = np.asarray(cache.action_valid[first : stop - 1], bool).copy()
-    if cache.done is not None:
-        linked &= ~np.asarray(cache.done[first : stop - 1], bool)
-    linked &= allowed[1:] & allowed[:-1]
-    breaks = np.flatnonzero(~linked) + 1
-    edges = [0, *breaks.tolist(), stop - first]
+    linked = allowed[1:] & allowed[:-1]
+    if unbroken:
+        linked &= np.asarray(cache.action_valid[first : stop - 1], bool)
+        if cache.done is not None:
+            linked &= ~np.asarray(cache.done[first : stop - 1], bool)
+    edges = [0, *(np.flatnonzero(~linked) + 1).tolist(), stop - first]
     return [(first + a, first + b) for a, b in zip(edges[:-1], edges[1:]) if allowed[a]]
 
 

@@ -170,7 +170,7 @@ def rows_of(where: tuple, way: Way, gone: Results, rng: Callable[[], torch.Gener
 def _report(exam: Exam, found: Found) -> Report:
     whole, strips = Report(), {}
     for arm, _, place, which, way, _ in _asked(exam):
-        if gone := found.joined(f"memory|{arm}|{place}|{which}"):
+        if gone := found.of("memory", arm, place, str(which)):
             rows = rows_of((place, arm), way, gone, exam.rng)
             whole.rows += rows
             strips.setdefault(f"{way.name}, {place} places", {})[_words(arm, rows)] = gone["frames"][0].numpy()
@@ -194,7 +194,7 @@ def _turns(exam: Exam, world: World):
 
 
 def _missing(exam: Exam, world: World) -> str:
-    if "rgb" not in exam.shared(world, "rgb") or not world.spec.observes:
+    if "rgb" not in exam.shared(world, "rgb"):
         return "needs rgb"
     if exam.follows_poses(world):
         return ""

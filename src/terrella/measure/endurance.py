@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -138,21 +139,16 @@ def _units(exam: Exam) -> list[Unit]:
             lanes = min(config.long_rollouts, len(clips), world.spec.max_batch or config.long_rollouts)
             calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * config.long_steps}
             words = f"{arm}: {config.long_steps:,} steps on end"
-            units.append(
-                Unit(f"endurance|{arm}|0", words, calls, lambda tick, world=world: _go(exam, world, clips, tick))
-            )
+            run = partial(long_rollout, world, clips, exam.rng(4), config.long_steps, config.long_rollouts)
+            units.append(Unit(f"endurance|{arm}|0", words, calls, run))
     return units
-
-
-def _go(exam: Exam, world: World, clips: Sequence[Clip], tick: Tick) -> Results:
-    return long_rollout(world, clips, exam.rng(4), exam.config.long_steps, exam.config.long_rollouts, tick)
 
 
 def _report(exam: Exam, found: Found) -> Report:
     whole = Report()
     place, clips = next(iter(exam.places.items()))
     for arm in exam.arms:
-        if gone := found.results.get(f"endurance|{arm}|0"):
+        if gone := found.of("endurance", arm):
             one = rows_of(gone, clips, exam.album, arm, place, exam.rng())
             whole.rows += one.rows
             whole.curves += one.curves
@@ -163,7 +159,7 @@ def _report(exam: Exam, found: Found) -> Report:
 def _missing(exam: Exam, world: World) -> str:
     if not exam.config.long_steps:
         return "needs long rollouts, which were not asked for"
-    return "" if "rgb" in exam.shared(world, "rgb") and world.spec.observes else "needs rgb"
+    return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
 ENDURANCE = Probe("endurance", "A long rollout", LEAD, _missing, _report, units=_units)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,10 @@ class Exam:
         return self._known[name]
 
     def shared(self, world: World, *names: str) -> list[str]:
-        """Channels of these kinds that the world shows and every clip holds at the world's shape, the main one first."""
+        """Channels of these kinds that the world shows and every clip holds at the world's shape, the main one first; none
+        where the world takes no evidence."""
+        if not world.spec.observes:
+            return []
         clip = next(iter(self.places.values()))[0]
         both = [name for kind in names for name in world.spec.kinds(kind) if name in clip.channels]
         return [name for name in both if tuple(world.spec.channels[name].shape or ()) == clip.channels[name].shape[1:]]
@@ -112,11 +116,13 @@ class Exam:
 
     def fingerprint(self, identity: str = "") -> str:
         """What must be the same for kept results to count; of every clip its actions and the last row that a world is shown."""
+
+        def seen(clip: Clip) -> tuple:
+            last = {name: _sum(array[clip.context - 1]) for name, array in clip.channels.items()}
+            return int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action), last
+
         drawn = {
-            f"{kind} {place}": [
-                (int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action), _last_shown(clip))
-                for clip in some
-            ]
+            f"{kind} {place}": list(map(seen, some))
             for kind, places in self.sets.items()
             for place, some in places.items()
         }
@@ -126,27 +132,33 @@ class Exam:
 
 @dataclass(frozen=True)
 class Found:
-    """Results of units by key."""
+    """Results of units by kind, batches of clips as one."""
 
     results: Mapping[str, Results]
 
-    def joined(self, kind: str) -> Results:
-        """Batches of clips as one; empty where nothing of that kind was done."""
-        parts, number = [], 0
-        while (part := self.results.get(f"{kind}|{number}")) is not None:
-            parts.append(part)
-            number += 1
-        return {name: torch.cat([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+    def of(self, *kind: str) -> Results:
+        """Empty where nothing of that kind was done."""
+        return self.results.get("|".join(kind), {})
 
     def dreamt(self, of: str, arm: str, place: str, motion: str) -> Results:
-        return self.joined(f"dream|{of}|{arm}|{place}|{motion}")
+        return self.of("dream", of, arm, place, motion)
+
+    def dreams(
+        self, exam: Exam, of: str, motions: Sequence[str] = (PREDICTED, TRUE)
+    ) -> Iterator[tuple[str, Sequence[Clip], str, str, Results]]:
+        """Place, clips, arm, motion and results of all that was dreamt of a set of clips."""
+        for place, clips in exam.sets.get(of, {}).items():
+            for arm, motion in product(exam.arms, motions):
+                if dreamt := self.dreamt(of, arm, place, motion):
+                    yield place, clips, arm, motion, dreamt
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A question to every arm. name and `question` head its section, `lead` is the text below; missing(exam, world): what it
-    needs and lacks ("needs pose"), "" where it can be asked; watch(exam, world, of): what it keeps of the dreams that the
-    probes share; units: work of its own; report: figures of what was found."""
+    """A question to every arm that takes evidence, and where `any_world` to the others too. name and `question` head its
+    section, `lead` is the text below; missing(exam, world): what it needs and lacks ("needs pose"), "" where it can be
+    asked; watch(exam, world, of): what it keeps of the dreams that the probes share; units: work of its own; report:
+    figures of what was found."""
 
     name: str
     question: str
@@ -155,6 +167,7 @@ class Probe:
     report: Callable[[Exam, Found], Report]
     watch: Callable[[Exam, World, str, int], list[Watch]] = lambda exam, world, of, first: []
     units: Callable[[Exam], list[Unit]] = lambda exam: []
+    any_world: bool = False
 
 
 def batches(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[int, Sequence[Clip]]]:
@@ -203,17 +216,9 @@ def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Cl
         watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
         others = [clips[turn[first + at]] for at in range(len(some))]
         calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * steps}
-        run = partial(_dream, exam, world, some, motion, steps, first, watches, others)
+        run = partial(dream, world, some, motion, steps, exam.rng(1000 + first), watches, others)
         units += [Unit(f"dream|{'|'.join(names)}|{number}", words, calls, run)] if watches else []
     return units
-
-
-def _dream(exam, world, clips, motion, steps, first, watches, others, tick) -> Results:
-    return dream(world, clips, motion, steps, exam.rng(1000 + first), watches, others, tick)
-
-
-def _last_shown(clip: Clip) -> dict[str, float]:
-    return {name: _sum(array[clip.context - 1]) for name, array in clip.channels.items()}
 
 
 def _sum(values: np.ndarray) -> float:

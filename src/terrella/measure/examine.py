@@ -21,7 +21,7 @@ from .pixels import series as pixel_series
 from .poses import POSES
 from .poses import series as pose_series
 from .risk import CALIBRATION
-from .scorecard import Bar, Missing, Place, Scorecard, to_json
+from .scorecard import Missing, Place, Scorecard, to_json
 from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
@@ -62,7 +62,8 @@ def examine(
     card = Scorecard({arm: world.spec.name for arm, world in exam.arms.items()}, first.spec.dt_s, _places(exam))
     for probe in probes:
         for arm, world in exam.arms.items():
-            if why := probe.missing(exam, world):
+            asked = probe.any_world or world.spec.observes
+            if why := probe.missing(exam, world) if asked else "needs a world that takes evidence":
                 card.missing.append(Missing(probe.name, arm, why))
         report = probe.report(exam, found)
         card.rows.extend(report.rows)
@@ -71,13 +72,13 @@ def examine(
     return card
 
 
-def write_report(card: Scorecard, bars: Sequence[Bar], folder: str | Path, title: str) -> tuple[Path, Path]:
+def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path, Path]:
     """Writes scorecard.json and scorecard.html (one self-contained page) into `folder`; returns both paths."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "scorecard.json").write_text(to_json(card, bars) + "\n", encoding="utf-8")
-        (folder / "scorecard.html").write_text(page(card, bars, title, PROBES), encoding="utf-8")
+        (folder / "scorecard.json").write_text(to_json(card) + "\n", encoding="utf-8")
+        (folder / "scorecard.html").write_text(page(card, title, PROBES), encoding="utf-8")
     except OSError as error:
         raise TerrellaError(f"cannot write the report to {folder} ({error}); choose another folder.") from error
     return folder / "scorecard.json", folder / "scorecard.html"

@@ -32,9 +32,8 @@ def ssim(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         raise ValueError(f"SSIM needs frames of at least 11x11 pixels; got {tuple(first.shape[-3:-1])}.")
     lead = first.shape[:-3]
     a, b = (luma(frame).reshape(-1, 1, *frame.shape[-3:-1]) for frame in (first, second))
-    mean_a, mean_b = _window(a), _window(b)
-    var_a, var_b = _window(a * a) - mean_a.square(), _window(b * b) - mean_b.square()
-    cov = _window(a * b) - mean_a * mean_b
+    mean_a, mean_b, square_a, square_b, product = (_smoothed(part, 1.5, 5) for part in (a, b, a * a, b * b, a * b))
+    var_a, var_b, cov = square_a - mean_a.square(), square_b - mean_b.square(), product - mean_a * mean_b
     c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
     top = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     bottom = (mean_a.square() + mean_b.square() + c1) * (var_a + var_b + c2)
@@ -61,17 +60,16 @@ def colour_statistics(frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 def blurred(frames: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
     """uint8 [N, H, W, 3] behind a Gaussian blur of `sigma` pixels, edges mirrored; uint8 of the same shape."""
     reach = math.ceil(3 * sigma)
-    taps = torch.exp(-((torch.arange(-reach, reach + 1, device=frames.device) / sigma) ** 2) / 2)
-    taps = taps / taps.sum()
     image = F.pad(frames.permute(0, 3, 1, 2).float(), (reach,) * 4, mode="reflect").flatten(0, 1)[:, None]
-    image = F.conv2d(F.conv2d(image, taps.view(1, 1, 1, -1)), taps.view(1, 1, -1, 1))
+    image = _smoothed(image, sigma, reach)
     return image.unflatten(0, (len(frames), 3))[:, :, 0].permute(0, 2, 3, 1).round().to(torch.uint8)
 
 
-def _window(image: torch.Tensor) -> torch.Tensor:
-    taps = torch.exp(-((torch.arange(11, dtype=image.dtype, device=image.device) - 5) ** 2) / (2 * 1.5**2))
+def _smoothed(image: torch.Tensor, sigma: float, reach: int) -> torch.Tensor:
+    """Images [N, 1, H, W] under a Gaussian of `sigma` pixels, cut off `reach` pixels away, where it fits."""
+    taps = torch.exp(-((torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device) / sigma) ** 2) / 2)
     taps = taps / taps.sum()
-    return F.conv2d(F.conv2d(image, taps.view(1, 1, 1, 11)), taps.view(1, 1, 11, 1))
+    return F.conv2d(F.conv2d(image, taps.view(1, 1, 1, -1)), taps.view(1, 1, -1, 1))
 
 
 def _check_alike(first: torch.Tensor, second: torch.Tensor) -> None:

@@ -21,7 +21,7 @@ import torch
 
 from .statistics import Figure
 
-_LEAST_GROUPS = 8  # with fewer the jackknife's interval means little
+_LEAST_GROUPS, _MOST_GROUPS = 8, 50  # with fewer the jackknife's interval means little; more take long
 
 
 def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
@@ -47,21 +47,19 @@ def frechet_of_moments(
     return ((mean_a - mean_b).square().sum(-1) + traces - 2 * cross).clamp_min(0)
 
 
-def frechet_interval(
-    real: torch.Tensor, dreamt: torch.Tensor, groups: torch.Tensor | None = None, seed: int = 0
-) -> Figure:
+def frechet_interval(real: torch.Tensor, dreamt: torch.Tensor) -> Figure:
     """The distance with its 1/n bias taken off, and a 95% interval, of features [n, D] of as many real as dreamt frames.
 
-    groups: long [n], the clip of each row (in both sets), so that frames of one clip leave together; each row by itself
-    where None. At most 50 are left out one after another: more are joined at random by `seed`. Figure.count is the
-    number of frames. NaN where there are fewer than two groups; without an interval below eight.
+    Each row is left out by itself; of more than 50, as many groups, joined at random, are. Figure.count is the number of
+    frames. NaN of fewer than three rows; without an interval below eight.
     """
     _check(real, dreamt)
     if len(real) != len(dreamt):
         raise ValueError(f"only equally many frames compare fairly; got {len(real)} real and {len(dreamt)} dreamt.")
-    mine = _joined(torch.arange(len(real)) if groups is None else groups, seed)
-    count = int(mine.max()) + 1 if len(mine) else 0
-    if count < 2 or len(real) - int(mine.bincount().max()) < 2:
+    mine, count = torch.arange(len(real)), min(len(real), _MOST_GROUPS)
+    if len(real) > count:
+        mine = torch.randperm(len(real), generator=torch.Generator().manual_seed(0)) % count
+    if count < 3:
         return Figure(math.nan, math.nan, math.nan, len(real))
     whole = frechet(real, dreamt)
     left = torch.stack([frechet(real[mine != group], dreamt[mine != group]) for group in range(count)])
@@ -83,16 +81,6 @@ def _root(matrix: torch.Tensor) -> torch.Tensor:
     rounding = values.amax(-1, keepdim=True) * matrix.shape[-1] * torch.finfo(matrix.dtype).eps
     values = values.where(values > rounding, 0)  # the root of what rounding left would be large
     return (vectors * values.sqrt()[..., None, :]) @ vectors.mT
-
-
-def _joined(groups: torch.Tensor, seed: int, most: int = 50) -> torch.Tensor:
-    """Groups numbered from 0 without gaps, at most `most` of them."""
-    _, number = torch.unique(groups, return_inverse=True)
-    count = int(number.max()) + 1 if len(number) else 0
-    if count <= most:
-        return number
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
-    return order[number] % most
 
 
 def _check(real: torch.Tensor, dreamt: torch.Tensor) -> None:

@@ -72,19 +72,14 @@ def drift(exam: Exam, found: Found, series_of: SeriesOf) -> Report:
     A dream's PSNR can be used up to the last step before it has fallen by 3.01 dB (twice the squared error) from its own
     first, and from copy-last's first, one yardstick for all; whatever else, as long as it is better than copy-last.
     """
-    whole = Report()
-    for place, clips in exam.sets.get(LONG, {}).items():
-        still: dict[str, tuple[Where, Series]] = {}
-        for arm in exam.arms:
-            for motion in (PREDICTED, TRUE):
-                dreamt = found.dreamt(LONG, arm, place, motion)
-                made = series_of(exam, found, LONG, place, clips, dreamt) if dreamt else []
-                for series in _asked(motion, made):
-                    where = "drift", series.channel, series.what, series.unit, place
-                    _add_usable(exam, whole, where, arm, motion, series.values, series)
-                    still.setdefault(f"{series.channel} {series.what}", (where, series))
-        for where, series in still.values():
-            _add_usable(exam, whole, where, COPY_LAST, "", series.copied, series)
+    whole, still = Report(), dict[Where, Series]()
+    for place, clips, arm, motion, dreamt in found.dreams(exam, LONG):
+        for series in _asked(motion, series_of(exam, found, LONG, place, clips, dreamt)):
+            where = "drift", series.channel, series.what, series.unit, place
+            _add_usable(exam, whole, where, arm, motion, series.values, series)
+            still.setdefault(where, series)
+    for where, series in still.items():
+        _add_usable(exam, whole, where, COPY_LAST, "", series.copied, series)
     return whole
 
 
@@ -147,7 +142,7 @@ def _add_usable(
 
 
 def _long_missing(exam: Exam, world) -> str:
-    return "" if exam.sets.get(LONG) and world.spec.observes else "needs longer clips"
+    return "" if exam.sets.get(LONG) else "needs longer clips"
 
 
 def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:

@@ -11,7 +11,7 @@ import torch
 from ..core.errors import DatasetError
 from ..core.spec import Spec, neutral_action
 from ..core.world import World
-from .clips import Clip, Where, recorded_channels
+from .clips import Clip, Where, recorded_channels, runs
 from .exam import ENDINGS, Exam, Found, Probe
 from .roll import Results, Watch
 from .scorecard import COPY_LAST, PREDICTED, Report, Row
@@ -41,7 +41,7 @@ def passages(
     After the end they stand still under neutral actions of the world's `spec`. They are of rows that `where` allows, half of
     them shortly before an end where there are ends; DatasetError without any."""
     spans = [cache.episodes[number] for number in episodes]
-    whole = [part for first, stop in spans for part in _allowed(cache, first, stop, where)]
+    whole = [part for first, stop in spans for part in runs(cache, first, stop, where, False)]
     long = [(first, stop) for first, stop in whole if stop - first > context + 1]
     ends = cache.done is not None
     ending = [(first, stop) for first, stop in long if ends and bool(np.asarray(cache.done[first:stop]).any())]
@@ -124,7 +124,7 @@ def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
 def _compared(exam: Exam, world: World) -> list[str]:
     """reward, done, and the single numbers that both the world and the passages say."""
     shown = next(iter(exam.sets.get(ENDINGS, {}).values()), None)
-    if not shown or not world.spec.observes:
+    if not shown:
         return []
     single = [name for name, array in shown[0].channels.items() if array[0].size == 1 and name in world.spec.channels]
     return [name for name in single if not name.startswith("uncertainty")]
@@ -138,34 +138,18 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 
 def _report(exam: Exam, found: Found) -> Report:
     whole = Report()
-    for place, clips in exam.sets.get(ENDINGS, {}).items():
+    for place, clips, arm, _, dreamt in found.dreams(exam, ENDINGS, (PREDICTED,)):
         going = torch.from_numpy(np.stack(exam.going[place]))
-        for arm in exam.arms:
-            if dreamt := found.dreamt(ENDINGS, arm, place, PREDICTED):
-                whole.rows += outcomes(exam, place, arm, clips, going, dreamt)
+        whole.rows += outcomes(exam, place, arm, clips, going, dreamt)
     return whole
 
 
 def _missing(exam: Exam, world: World) -> str:
-    if not world.spec.observes:
-        return "needs a world that takes evidence"
-    return (
-        ""
-        if _compared(exam, world)
-        else "needs reward, done or a number such as health, of the world and of the recording"
-    )
+    needs = "needs reward, done or a number such as health, of the world and of the recording"
+    return "" if _compared(exam, world) else needs
 
 
 OUTCOMES = Probe("outcomes", "Rewards, numbers and ends", LEAD, _missing, _report, _watch)
-
-
-def _allowed(cache, first: int, stop: int, where: Where | None) -> list[tuple[int, int]]:
-    """The stretches [first, stop) of an episode whose rows `where` allows."""
-    if where is None:
-        return [(first, stop)]
-    inside = np.concatenate([[False], np.asarray(where(cache, first, stop), bool), [False]]).astype(int)
-    begins, ends = np.flatnonzero(np.diff(inside) > 0), np.flatnonzero(np.diff(inside) < 0)
-    return [(first + int(a), first + int(b)) for a, b in zip(begins, ends)]
 
 
 def _passage(cache, neutral: np.ndarray, start: int, stop: int, context: int, horizon: int) -> tuple[Clip, np.ndarray]:

@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .page_parts import bar_table, charts_of, figure_table, number, picture_of, section, steps_words, table_of
-from .scorecard import BETTER, WORSE, Bar, Row, Scorecard, compared, judged, verdict
+from .page_parts import charts_of, figure_table, number, picture_of, section, steps_words, table_of
+from .scorecard import BETTER, WORSE, Row, Scorecard, compared, judged, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
@@ -16,12 +16,11 @@ if TYPE_CHECKING:
 _HERE = Path(__file__).parent
 
 
-def page(card: Scorecard, bars: Sequence[Bar], title: str, probes: Sequence[Probe]) -> str:
+def page(card: Scorecard, title: str, probes: Sequence[Probe]) -> str:
     """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it. A section a probe that found something."""
     style = (_HERE / "page.css").read_text(encoding="utf-8")
     sections = [
         _verdict(card),
-        _bars(bars),
         *(_section(card, probe) for probe in probes),
         _missing(card),
         _method(card),
@@ -57,18 +56,6 @@ def _gain(row: Row) -> str:
     words = number(abs(row.gain.value)) if row.gain else ""
     sign = "" if row.gain is None else "\u2212" if row.gain.value < 0 else "+"
     return f"<span class='status {kind}' title='{judged(row)}'>{sign}{words}</span>"
-
-
-def _bars(bars: Sequence[Bar]) -> str:
-    if not bars:
-        return ""
-    counts = [
-        (status, sum(bar.status == status for bar in bars)) for status in ("met", "missed", "void", "not measured")
-    ]
-    words = ", ".join(f"{count} {status}" for status, count in counts if count)
-    return section(
-        "Targets", f"{words}. An outlined status means that the 95% interval reaches over it.", bar_table(bars)
-    )
 
 
 def _section(card: Scorecard, probe: Probe) -> str:

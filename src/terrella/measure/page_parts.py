@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 
 from .plot import Line, line_chart, y_span
-from .scorecard import COPY_LAST, TRUE, Bar, Curve, Picture, Row, Scorecard
+from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard
 from .statistics import Figure
 from .strip import join_row, jpeg
 
@@ -83,25 +83,6 @@ def _cell(row: Row) -> str:
     baselines = "".join(f"<small>{escape(name)} {number(fig.value)}</small>" for name, fig in row.baselines.items())
     note = f"<small>{escape(row.note)}</small>" if row.note else ""
     return ("void" if row.void else figure_text(row.figure)) + baselines + note
-
-
-def bar_table(bars: Sequence[Bar]) -> str:
-    lines = []
-    for bar in bars:
-        kind, row = bar.status.replace(" ", "-") + ("" if bar.sure else " unsure"), bar.row
-        words = (
-            ""
-            if row is None
-            else f"{row.place} places \N{MIDDLE DOT} {row.horizon:,} steps"
-            + (f" \N{MIDDLE DOT} {row.note}" if row.note else "")
-        )
-        figure = figure_text(row.figure, row.unit) if row and not row.void else "&ndash;"
-        lines.append(
-            f"<tr><td>{escape(bar.name)}<small>{escape(words)}</small></td><td class=n>{figure}</td>"
-            f"<td class=n>{escape(bar.target)}</td><td><span class='status {kind}'>{bar.status}</span></td></tr>"
-        )
-    head = "<tr><th>target</th><th class=n>measured</th><th class=n>wanted</th><th></th></tr>"
-    return f"<table class=bars><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
 def charts_of(card: Scorecard, probe: str) -> str:

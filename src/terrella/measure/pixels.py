@@ -28,13 +28,9 @@ LEAD = (
 _LEAST_SSIM = 11  # pixels: the size of its window
 
 
-def cameras(exam: Exam, world: World) -> list[str]:
-    return exam.shared(world, "rgb")
-
-
 def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
     """PSNR of every camera that was dreamt."""
-    truth = found.joined(f"truth|{of}|{place}")
+    truth = found.of("truth", of, place)
     made = []
     for name in [key.removesuffix("/psnr") for key in dreamt if key.endswith("/psnr")]:
         values = dreamt[f"{name}/psnr"]
@@ -46,7 +42,7 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
     if of == ENDINGS:
         return []
     horizons = exam.config.horizons if of == CLIPS else ()
-    return [Watch((name,), partial(_see, exam, name, horizons, first)) for name in cameras(exam, world)]
+    return [Watch((name,), partial(_see, exam, name, horizons, first)) for name in exam.shared(world, "rgb")]
 
 
 def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip], row: int, step: int) -> Results:
@@ -64,8 +60,8 @@ def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip
 def _units(exam: Exam) -> list[Unit]:
     """What the recording says by itself, of each place: how alike the last frame shown is to those that follow."""
     world, units = next(iter(exam.arms.values())), []
-    names = cameras(exam, world)
-    for of in (CLIPS, LONG) if names and world.spec.observes else ():
+    names = exam.shared(world, "rgb")
+    for of in (CLIPS, LONG) if names else ():
         for place, clips in exam.sets.get(of, {}).items():
             for number, (_, some) in enumerate(batches(exam, world, clips)):
                 steps = clips[0].horizon if of == LONG else max(exam.config.horizons)
@@ -103,7 +99,7 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
 def _report(exam: Exam, found: Found) -> Report:
     whole = report(exam, found, "pixels", series)
     for place, clips in exam.places.items():
-        truth, strips = found.joined(f"truth|{CLIPS}|{place}"), [{} for _ in clips[: exam.config.strips]]
+        truth, strips = found.of("truth", CLIPS, place), [{} for _ in clips[: exam.config.strips]]
         for name in [key.removesuffix("/copied") for key in truth if key.endswith("/copied")]:
             shown = [clip.context - 1 + step for clip in clips[:1] for step in (0, *exam.config.horizons)]
             for strip, clip in zip(strips, clips):
@@ -161,9 +157,7 @@ def _sharpness(exam: Exam, where, dreamt: Results, truth: Results) -> Curve:
 
 
 def _missing(exam: Exam, world: World) -> str:
-    if not world.spec.observes:
-        return "needs a world that takes evidence"
-    return "" if cameras(exam, world) else "needs rgb, of the world and of the recording"
+    return "" if exam.shared(world, "rgb") else "needs rgb, of the world and of the recording"
 
 
 PIXELS = Probe("pixels", "Likeness over time", LEAD, _missing, _report, _watch, _units)

@@ -45,24 +45,20 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 
 def _report(exam: Exam, found: Found) -> Report:
     whole, config = report(exam, found, "pose", series), exam.config
-    for place, clips in exam.places.items():
-        for arm in exam.arms:
-            dreamt = found.dreamt(CLIPS, arm, place, PREDICTED)
-            for made in series(exam, found, CLIPS, place, clips, dreamt) if dreamt else ():
-                walked = torch.from_numpy(np.stack([clip.walked_m(made.channel) for clip in clips]))
-                for step in config.horizons if made.unit == "m" else ():
-                    went = walked[:, step - 1] > config.walked_m
-                    if went.any():
-                        share = 100 * made.values[went, step - 1] / walked[went, step - 1]
-                        for what, figure in (("mean", mean_interval), ("median", median_interval)):
-                            where = "pose", made.channel, f"distance over the way gone, {what}", "%", place, arm
-                            whole.rows.append(Row(*where, PREDICTED, step, figure(share, exam.rng()), -1))
+    for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS, (PREDICTED,)):
+        for made in series(exam, found, CLIPS, place, clips, dreamt):
+            walked = torch.from_numpy(np.stack([clip.walked_m(made.channel) for clip in clips]))
+            for step in config.horizons if made.unit == "m" else ():
+                went = walked[:, step - 1] > config.walked_m
+                if went.any():
+                    share = 100 * made.values[went, step - 1] / walked[went, step - 1]
+                    for what, figure in (("mean", mean_interval), ("median", median_interval)):
+                        where = "pose", made.channel, f"distance over the way gone, {what}", "%", place, arm
+                        whole.rows.append(Row(*where, motion, step, figure(share, exam.rng()), -1))
     return whole
 
 
 def _missing(exam: Exam, world: World) -> str:
-    if not world.spec.observes:
-        return "needs a world that takes evidence"
     return "" if exam.shared(world, "pose") else "needs pose, of the world and of the recording"
 
 

@@ -16,7 +16,7 @@ from .clips import Clip
 from .exam import CLIPS, Exam, Found, Probe
 from .roll import Results, Watch, rows_at
 from .scorecard import PREDICTED, TRUE, Curve, Report, Row
-from .statistics import Band, Figure
+from .statistics import Band, figure_of
 
 RESAMPLES = 400
 POINTS, BINS = 50, 8
@@ -49,15 +49,18 @@ def risk(
     for part in orders[0].tensor_split(BINS):
         off += (shares[:, clip[part]] @ (wrong[part] - expected[part])).abs()
     where, found = ("calibration", "rgb"), Report()
-    reference = {"by chance": _figure(chance, clips), "by an oracle": _figure(least, clips)}
+    reference = {
+        "by chance": figure_of(chance[0], chance[1:], clips),
+        "by an oracle": figure_of(least[0], least[1:], clips),
+    }
     closed = 100 * (chance - areas) / (chance - least).clamp_min(1e-12)
     for what, values, better, baselines in (
         ("AURC", areas, -1, reference),
         ("order worth", closed, 1, {}),
-        ("error expected", mean_expected, 0, {"error found": _figure(chance, clips)}),
+        ("error expected", mean_expected, 0, {"error found": figure_of(chance[0], chance[1:], clips)}),
         ("calibration error", off, -1, {}),
     ):
-        figure = _figure(values, clips)
+        figure = figure_of(values[0], values[1:], clips)
         found.rows.append(Row(*where, what, "%", place, arm, motion, steps, figure, better, baselines))
     at = [max(1, round(len(wrong) * (k + 1) / POINTS)) - 1 for k in range(POINTS)]
     x = [100 * (k + 1) / len(wrong) for k in at]
@@ -86,11 +89,8 @@ def _report(exam: Exam, found: Found) -> Report:
             parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
             known = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
             if len(known) > 1:
-                pairs = list(known.values())
-                known["all"] = (
-                    torch.cat([error for error, _ in pairs]),
-                    torch.cat([uncertainty for _, uncertainty in pairs]),
-                )
+                error, uncertainty = zip(*known.values())
+                known["all"] = torch.cat(error), torch.cat(uncertainty)
             for place, (error, uncertainty) in known.items():
                 one = risk(place, arm, motion, error, uncertainty, exam.rng())
                 whole.rows += one.rows
@@ -101,7 +101,7 @@ def _report(exam: Exam, found: Found) -> Report:
 def _missing(exam: Exam, world: World) -> str:
     if "uncertainty" not in world.spec.channels:
         return "needs uncertainty, a channel of the world"
-    return "" if "rgb" in exam.shared(world, "rgb") and world.spec.observes else "needs rgb"
+    return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
 CALIBRATION = Probe("calibration", "Does it know when it invents?", LEAD, _missing, _report, _watch)
@@ -116,11 +116,3 @@ def _area(weights: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
 
 def _running(error: torch.Tensor) -> torch.Tensor:
     return error.cumsum(0) / torch.arange(1, len(error) + 1)
-
-
-def _figure(values: torch.Tensor, clips: int) -> Figure:
-    """The first value, with the 2.5% and 97.5% quantiles of the others."""
-    if clips < 2:
-        return Figure(float(values[0]), float("nan"), float("nan"), clips)
-    low, high = values[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
-    return Figure(float(values[0]), low, high, clips)

@@ -102,39 +102,6 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Bar:
-    """A target and its figure: low <= figure <= high. `sure`: its whole interval lies on the same side."""
-
-    name: str
-    row: Row | None
-    low: float = -math.inf
-    high: float = math.inf
-
-    @property
-    def status(self) -> str:
-        if self.row is None or not math.isfinite(self.row.figure.value):
-            return "not measured"
-        if self.row.void:
-            return "void"
-        return "met" if self.low <= self.row.figure.value <= self.high else "missed"
-
-    @property
-    def sure(self) -> bool:
-        if self.row is None or self.status not in ("met", "missed"):
-            return False
-        inside = self.low <= self.row.figure.low and self.row.figure.high <= self.high
-        outside = self.row.figure.high < self.low or self.row.figure.low > self.high
-        return inside if self.status == "met" else outside
-
-    @property
-    def target(self) -> str:
-        unit = f" {self.row.unit}" if self.row and self.row.unit else ""
-        if math.isfinite(self.low) and math.isfinite(self.high):
-            return f"{self.low:g} to {self.high:g}{unit}"
-        return f"\u2265 {self.low:g}{unit}" if math.isfinite(self.low) else f"\u2264 {self.high:g}{unit}"
-
-
-@dataclass(frozen=True)
 class Scorecard:
     """Everything measured, as data; `pictures` are for the page and stay out of the JSON. worlds: arm -> its world."""
 
@@ -155,24 +122,15 @@ class Scorecard:
         ]
 
 
-def worst_of(rows: Sequence[Row]) -> Row | None:
-    """Of ratios that should be 1, the one farthest from it; what could not be measured is never the worst."""
-    known = [row for row in rows if math.isfinite(row.figure.value)]
-    return max(known, key=lambda row: abs(row.figure.value - 1), default=None)
+def to_json(card: Scorecard) -> str:
+    """The scorecard as one strict JSON document: no pictures, NaN as null, six digits."""
+    return json.dumps(as_dict(card), indent=1, allow_nan=False)
 
 
-def to_json(card: Scorecard, bars: Sequence[Bar] = ()) -> str:
-    """The scorecard, and bars where given, as one strict JSON document: no pictures, NaN as null, six digits."""
-    return json.dumps(as_dict(card, bars), indent=1, allow_nan=False)
-
-
-def as_dict(card: Scorecard, bars: Sequence[Bar] = ()) -> dict:
+def as_dict(card: Scorecard) -> dict:
     """What `to_json` writes, as plain data; the verdict comes first."""
-    parts = {
-        part.name: _plain(getattr(card, part.name)) for part in dataclasses.fields(card) if part.name != "pictures"
-    }
-    judged = [_plain(bar) | {"status": bar.status, "sure": bar.sure, "target": bar.target} for bar in bars]
-    return {"verdict": verdict(card), **parts, "bars": judged}
+    names = [part.name for part in dataclasses.fields(card) if part.name != "pictures"]
+    return {"verdict": verdict(card), **{name: _plain(getattr(card, name)) for name in names}}
 
 
 def verdict(card: Scorecard) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 
@@ -47,14 +48,11 @@ def speed(
 
 def _units(exam: Exam) -> list[Unit]:
     clips, steps = next(iter(exam.places.values())), exam.config.speed_steps
-    return [
-        Unit(
-            f"speed|{arm}|0", f"{arm}: speed", {(arm, "alone"): float(steps + _WARM)},
-            lambda tick, world=world: speed(world, clips, exam.rng(5), steps, tick),
-        )
-        for arm, world in exam.arms.items()
-        if steps
-    ]  # fmt: skip
+    units = []
+    for arm, world in exam.arms.items() if steps else ():
+        run = partial(speed, world, clips, exam.rng(5), steps)
+        units.append(Unit(f"speed|{arm}|0", f"{arm}: speed", {(arm, "alone"): float(steps + _WARM)}, run))
+    return units
 
 
 def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
@@ -73,8 +71,8 @@ def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
 
 def _report(exam: Exam, found: Found) -> Report:
     place = next(iter(exam.places))
-    timed = {arm: found.results.get(f"speed|{arm}|0") for arm in exam.arms}
+    timed = {arm: found.of("speed", arm) for arm in exam.arms}
     return Report([row for arm, one in timed.items() if one for row in rows_of(one, arm, place)])
 
 
-SPEED = Probe("speed", "Speed", LEAD, lambda exam, world: "", _report, units=_units)
+SPEED = Probe("speed", "Speed", LEAD, lambda exam, world: "", _report, units=_units, any_world=True)

@@ -14,7 +14,7 @@ from .clips import Clip
 from .exam import CLIPS, ENDINGS, Exam, Found, Probe
 from .likeness import Series, report
 from .roll import Results, Watch
-from .scorecard import PREDICTED, TRUE, Report, Row
+from .scorecard import Report, Row
 from .statistics import Figure, last_step_above, ratio_interval
 
 LEAD = (
@@ -84,21 +84,18 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 
 def _report(exam: Exam, found: Found) -> Report:
     whole = report(exam, found, "state", series)
-    for place, clips in exam.places.items():
-        for arm in exam.arms:
-            for motion in (PREDICTED, TRUE):
-                dreamt = found.dreamt(CLIPS, arm, place, motion)
-                for made in series(exam, found, CLIPS, place, clips, dreamt) if dreamt else ():
-                    where = "state", made.channel
-                    steps = made.values.shape[1]
-                    usable = last_step_above(made.gain, torch.zeros(len(clips)), exam.rng())
-                    words = "steps better than copy-last"
-                    whole.rows.append(Row(*where, words, "steps", place, arm, motion, steps, usable, 1))
-                    vector = _Vector.of(clips, made.channel)
-                    away = vector.away(dreamt[f"{made.channel}/vector"])
-                    for step in exam.config.horizons:
-                        share = _explained(exam, vector, away, step)
-                        whole.rows.append(Row(*where, "R\u00b2", "", place, arm, motion, step, share, 1))
+    for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS):
+        for made in series(exam, found, CLIPS, place, clips, dreamt):
+            where = "state", made.channel
+            steps = made.values.shape[1]
+            usable = last_step_above(made.gain, torch.zeros(len(clips)), exam.rng())
+            words = "steps better than copy-last"
+            whole.rows.append(Row(*where, words, "steps", place, arm, motion, steps, usable, 1))
+            vector = _Vector.of(clips, made.channel)
+            away = vector.away(dreamt[f"{made.channel}/vector"])
+            for step in exam.config.horizons:
+                share = _explained(exam, vector, away, step)
+                whole.rows.append(Row(*where, "R\u00b2", "", place, arm, motion, step, share, 1))
     return whole
 
 
@@ -110,8 +107,6 @@ def _explained(exam: Exam, vector: _Vector, away: torch.Tensor, step: int) -> Fi
 
 
 def _missing(exam: Exam, world: World) -> str:
-    if not world.spec.observes:
-        return "needs a world that takes evidence"
     return "" if vectors(exam, world) else "needs a vector of numbers, of the world and of the recording"
 
 

@@ -62,7 +62,7 @@ def median_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
     if not len(values):
         return Figure(math.nan, math.nan, math.nan, 0)
     picks = torch.randint(len(values), (RESAMPLES, len(values)), generator=rng)
-    return _figure(values.quantile(0.5), values[picks].quantile(0.5, dim=1), len(values))
+    return figure_of(values.quantile(0.5), values[picks].quantile(0.5, dim=1), len(values))
 
 
 def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Generator) -> Figure:
@@ -77,9 +77,7 @@ def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Genera
         return (means >= -1e-9).cumprod(-1).sum(-1).double()
 
     centre = last(over.mean(0))
-    if len(over) < 2:
-        return Figure(float(centre), math.nan, math.nan, len(over))
-    return _figure(centre, last(_weights(len(over), rng) @ over / len(over)), len(over))
+    return figure_of(centre, last(_weights(len(over), rng) @ over / len(over)), len(over))
 
 
 def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Generator) -> Band:
@@ -97,7 +95,8 @@ def _weights(count: int, rng: torch.Generator) -> torch.Tensor:
     return torch.zeros_like(ones).scatter_add_(1, picks, ones)
 
 
-def _figure(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figure:
+def figure_of(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figure:
+    """The value, with the 2.5% and 97.5% quantiles of its resamples [R] where there are two clips or more."""
     if count < 2:
         return Figure(float(centre), math.nan, math.nan, count)
     low, high = resampled.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
@@ -116,7 +117,7 @@ def _writing(folder: Path) -> Iterator[None]:
 
 
 def run_all(units: Sequence[Unit], store: Store, prices: Calls, clock: Clock, progress: Progress) -> dict[str, Results]:
-    """The results of all units by key, those that are in `store` as they were kept."""
+    """The results of all units by kind, batches as one; those that are in `store` as they were kept."""
     forecast = Forecast(prices)
     found = {unit.key: kept for unit in units if (kept := store.get(unit.key)) is not None}
     whole = sum(map(forecast.priced, units)) or 1.0
@@ -129,25 +130,29 @@ def run_all(units: Sequence[Unit], store: Store, prices: Calls, clock: Clock, pr
             pace = (1 - share) * forecast.seconds(unit) + clock() - began  # believes its own pace more and more
             progress((behind + share * forecast.priced(unit)) / whole, unit.words, (1 - share) * pace + later)
 
-        result = unit.run(_Ticks(sum(unit.calls.values()), tell))
+        result = unit.run(_ticks(sum(unit.calls.values()), tell))
         found[unit.key] = {name: tensor.cpu() for name, tensor in result.items()}
         store.put(unit.key, found[unit.key])
         forecast.done(unit, clock() - began)
         behind += forecast.priced(unit)
     progress(1.0, "measured", 0.0)
-    return found
+    parts: dict[str, list[Results]] = {}
+    for unit in units:
+        parts.setdefault(unit.kind, []).append(found[unit.key])
+    return {kind: {name: torch.cat([one[name] for one in some]) for name in some[0]} for kind, some in parts.items()}
 
 
-class _Ticks:
+def _ticks(whole: float, tell: Callable[[float], None]) -> Tick:
     """Counts what was done of a unit and tells the share."""
+    done = 0.0
 
-    def __init__(self, whole: float, tell: Callable[[float], None]):
-        self.whole, self.tell, self.done = whole or 1.0, tell, 0.0
-        tell(0.0)
+    def tick(count: float) -> None:
+        nonlocal done
+        done += count
+        tell(min(done / (whole or 1.0), 1.0))
 
-    def __call__(self, done: float) -> None:
-        self.done += done
-        self.tell(min(self.done / self.whole, 1.0))
+    tick(0.0)
+    return tick
 
 
 UNSEEN = ", unseen"  # of steps of which few are looked at

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from collections.abc import Generator as Generating
 
 import numpy as np
 import torch
 
-from ...worlds.generator import Conditioning, Generator, generate
-from ..batches import Batch
+from ...worlds.generator import Conditioning, Generator
+from ..batches import Batch, drawn_now
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, sharpened, total, truth_losses
-from ..trainer import Average, Learner, Loss, Now, half_precision
+from ..trainer import Average, Learner, Loss, Now, adamw, half_precision
 
 
 class Matching:
@@ -60,54 +61,63 @@ def drawn(generator: Generator, noise: torch.Tensor, shown: Conditioning, steps:
     return clean
 
 
-class Distillation:
-    """`student` draws in `flow_steps`; the weights say how hard the recorded frames, the teacher's distribution and a critic
-    of small patches pull."""
+class Student:
+    """A copy of a generator, called `name` in its run, that draws a frame in `flow_steps`. `weights` say how hard the recorded
+    frames, the distribution of a `teacher`, where there is one, and a critic of small patches pull."""
 
     def __init__(
-        self, teacher: Generator, flow_steps: int, learning_rate: float, truth: float, matching: float, critic: float
+        self,
+        name: str,
+        generator: Generator,
+        flow_steps: int,
+        rate: Callable[[Now], float],
+        momentum: float,
+        weights: tuple[float, float, float],
+        teacher: Generator | None,
     ):
-        self.flow_steps, self.weights = flow_steps, (truth, matching, critic)
-        self.student = copy.deepcopy(teacher).train().requires_grad_(True)
-        self.smooth, self.matching, self.critic = Average(self.student, 0.995), Matching(teacher), Critic()
-        self.modules = {
-            "student": self.student,
-            "smooth": self.smooth,
-            "mimic": self.matching.mimic,
-            "critic": self.critic,
-        }
-        optimiser = torch.optim.AdamW(self.student.parameters(), learning_rate, (0.0, 0.99), weight_decay=1e-4)
+        self.name, self.flow_steps, self.weights = name, flow_steps, weights
+        self.generator = copy.deepcopy(generator).train().requires_grad_(True)
+        self.smooth, self.critic = Average(self.generator, 0.995), Critic()
+        self.matching = None if teacher is None else Matching(teacher)
+        self.modules = {name: self.generator, "smooth": self.smooth, "critic": self.critic}
+        generating = adamw((self.generator,), rate, betas=(momentum, 0.99), average=self.smooth)
+        self.learners = {name: generating, "critic": critic_learner(self.critic)}
+        if self.matching is not None:
+            self.modules["mimic"] = self.matching.mimic
+            self.learners["mimic"] = self.matching.learner
 
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 50, (1 - now.share) / 0.3)
-
-        self.learners = {
-            "student": Learner(optimiser, (self.student,), rate, self.smooth),
-            "mimic": self.matching.learner,
-            "critic": critic_learner(self.critic),
-        }
-
-    @torch.no_grad()
     def dream(self, shown: Conditioning, now: Now) -> torch.Tensor:
-        """A frame as the student now draws it."""
-        batch, _, height, width = shown.last.shape
-        noise = now.randn(batch, 4, height, width)
-        with now.half():
-            return generate(self.student, noise, shown.to(now.device), self.flow_steps).float().cpu()
+        """A frame as it is now drawn."""
+        return drawn_now(self.generator, shown, now, self.flow_steps)
+
+    def descent(
+        self, asked: Batch, real: Callable[[], Batch], heeded: int, now: Now
+    ) -> Generating[Loss, None, torch.Tensor]:
+        """The losses of one batch, whose frames as they were drawn are returned; `real` gives what the critic is shown as
+        true, and it has judged `heeded` batches before."""
+        truth, matching, critic = self.weights
+        noise = now.randn(len(asked.truth), 4, *asked.truth.shape[2:])
+        fresh = drawn(self.generator, noise, asked.shown, self.flow_steps, now.rng)
+        clean = asked.judged(fresh)
+        parts = truth_losses(clean, asked)
+        loss = truth * total(parts)
+        if self.matching is not None:
+            parts["teacher"] = self.matching.towards_teacher(clean, asked.shown, now.noise)
+            loss = loss + matching * parts["teacher"]
+        if critic:
+            loss = loss + sharpened(self.critic, clean, loss, asked.shown.glimpse, critic * trusted(heeded))
+        yield Loss(self.name, loss, parts)
+        if self.matching is not None:
+            yield self.matching.loss(clean, asked.shown, now.noise)
+        found = real()
+        judged = critic_loss(self.critic, clean, asked.shown.glimpse, found.truth, found.shown.glimpse)
+        yield Loss("critic", judged, {"critic": judged})
+        return fresh
 
     def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
+        """Those of a distillation: the critic sees the same recorded frames."""
         batch = batch.to(now.device)
-        truth, matching, critic = self.weights
-        noise = now.randn(len(batch.truth), 4, *batch.truth.shape[2:])
-        clean = batch.judged(drawn(self.student, noise, batch.shown, self.flow_steps, now.rng))
-        parts = truth_losses(clean, batch)
-        pull = self.matching.towards_teacher(clean, batch.shown, now.noise)
-        loss = truth * total(parts) + matching * pull
-        loss = loss + sharpened(self.critic, clean, loss, batch.shown.glimpse, critic * trusted(now.step))
-        yield Loss("student", loss, {**parts, "teacher": pull})
-        yield self.matching.loss(clean, batch.shown, now.noise)
-        judged = critic_loss(self.critic, clean, batch.shown.glimpse, batch.truth, batch.shown.glimpse)
-        yield Loss("critic", judged, {"critic": judged})
+        yield from self.descent(batch, lambda: batch, now.step, now)
 
 
 def trusted(step: int) -> float:

@@ -9,21 +9,19 @@ teacher's distribution where there is one, say what a frame should look like.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 
 from ...core.errors import DatasetError
-from ...worlds.generator import Generator, encode_depth
+from ...worlds.generator import encode_depth
 from ...worlds.learned import LearnedWorld
 from ..batches import Batch, as_drawn, coded
 from ..history_batches import changing
-from ..losses import Critic, critic_learner, critic_loss, sharpened, total, truth_losses
 from ..recording import Recording
-from ..trainer import Average, Learner, Loss, Now
-from .distillation import Matching, drawn, trusted
+from ..trainer import Loss, Now
+from .distillation import Student
 
 CONTEXT = 10  # recorded frames before a dream
 
@@ -76,11 +74,7 @@ class Rollouts:
 
 def beginnings(recording: Recording, horizon: int) -> np.ndarray:
     """Rows from which `horizon` more can be dreamt, CONTEXT rows being known before them, within one episode and all usable."""
-    usable, start = recording.usable, recording.start
-    rows = np.arange(CONTEXT - 1, len(usable) - horizon)
-    runs = np.cumsum(np.concatenate([[0], usable]))
-    whole = runs[rows + horizon + 1] - runs[rows - CONTEXT + 1] == CONTEXT + horizon
-    rows = rows[whole & (start[rows - CONTEXT + 1] == start[rows + horizon])]
+    rows = recording.within(CONTEXT - 1, horizon)
     if not len(rows):
         raise DatasetError(
             f"no stretch of {CONTEXT + horizon} rows of the recording may be trained on; record more, or dream a shorter --horizon."
@@ -89,58 +83,15 @@ def beginnings(recording: Recording, horizon: int) -> np.ndarray:
 
 
 class Dreams:
-    """`real(now)` gives recorded batches for the critic; the weights say how hard the recorded frames, the distribution of a
-    `teacher`, where there is one, and the critic pull. Each of the `horizon` frames of a dream is one update."""
+    """What a student learns of dreams, each of whose `horizon` frames is one update; `real(now)` gives recorded batches for its
+    critic."""
 
-    def __init__(
-        self,
-        generator: Generator,
-        flow_steps: int,
-        horizon: int,
-        learning_rate: float,
-        real: Callable[[Now], Batch],
-        teacher: Generator | None = None,
-        truth: float = 0.05,
-        matching: float = 1.0,
-        critic: float = 1.0,
-    ):
-        self.flow_steps, self.horizon, self.real, self.weights = flow_steps, horizon, real, (truth, matching, critic)
-        self.generator = copy.deepcopy(generator).train().requires_grad_(True)
-        self.smooth, self.critic = Average(self.generator, 0.995), Critic()
-        self.matching = None if teacher is None else Matching(teacher)
-        self.modules = {"generator": self.generator, "smooth": self.smooth, "critic": self.critic}
-        optimiser = torch.optim.AdamW(self.generator.parameters(), learning_rate, (0.9, 0.99), weight_decay=1e-4)
-
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 10, (1 - now.share) / 0.3)
-
-        self.learners = {
-            "generator": Learner(optimiser, (self.generator,), rate, self.smooth),
-            "critic": critic_learner(self.critic),
-        }
-        if self.matching is not None:
-            self.modules["mimic"] = self.matching.mimic
-            self.learners["mimic"] = self.matching.learner
+    def __init__(self, student: Student, horizon: int, real: Callable[[Now], Batch]):
+        self.student, self.horizon, self.real = student, horizon, real
+        self.modules, self.learners = student.modules, student.learners
 
     def losses(self, batch: Rollouts, now: Now) -> Iterator[Loss]:
-        truth, matching, critic = self.weights
         for frame in range(self.horizon):
-            asked = batch.next_batch().to(now.device)
-            noise = now.randn(len(asked.truth), 4, *asked.truth.shape[2:])
-            fresh = drawn(self.generator, noise, asked.shown, self.flow_steps, now.rng)
-            clean = asked.judged(fresh)
-            parts = truth_losses(clean, asked)
-            loss = truth * total(parts)
-            if self.matching is not None:
-                parts["teacher"] = self.matching.towards_teacher(clean, asked.shown, now.noise)
-                loss = loss + matching * parts["teacher"]
-            if critic:
-                heeded = critic * trusted(now.step * self.horizon + frame)
-                loss = loss + sharpened(self.critic, clean, loss, asked.shown.glimpse, heeded)
-            yield Loss("generator", loss, parts)
-            real = self.real(now).to(now.device)
-            judged = critic_loss(self.critic, clean, asked.shown.glimpse, real.truth, real.shown.glimpse)
-            yield Loss("critic", judged, {"critic": judged})
-            if self.matching is not None:
-                yield self.matching.loss(clean, asked.shown, now.noise)
+            asked, judged = batch.next_batch().to(now.device), now.step * self.horizon + frame
+            fresh = yield from self.student.descent(asked, lambda: self.real(now).to(now.device), judged, now)
             batch.go_on(fresh)

@@ -18,7 +18,7 @@ from ...space.estimator import Estimator, EstimatorConfig, normalised
 from ...space.floorplan import Box
 from ..feeds import Drawn
 from ..recording import Recording
-from ..trainer import Learner, Loss, Now, Run, cosine
+from ..trainer import CPU, Loss, Now, Run, adamw, warmed
 
 DRIFT = 64  # steps over which odometry is summed when it is judged
 
@@ -27,21 +27,15 @@ class Depths:
     """By L1 on the logarithm of depth and on its slopes. (Motion follows from depth, by space/align.py.)"""
 
     def __init__(self, recording: Recording, batch: int, learning_rate: float, seed: int):
-        self.recording, self.size, self.rows = recording, batch, _pairs(recording)
+        self.recording, self.size, self.rows = recording, batch, recording.within(0, 1)
         if len(self.rows) < 64:
             raise DatasetError(
                 f"the recording leaves {len(self.rows)} pairs of pictures to learn an estimator from; record more."
             )
         self.some = np.random.default_rng(seed).choice(self.rows, min(len(self.rows), 2000), replace=False)
         self.estimator = _fresh(recording, self.some, seed)
-        weights = self.estimator.parameters()
-        optimiser = torch.optim.AdamW(weights, learning_rate, (0.9, 0.99), weight_decay=1e-4)
-
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 50) * cosine(now.share, 0.02)
-
         self.modules = {"estimator": self.estimator}
-        self.learners = {"estimator": Learner(optimiser, (self.estimator,), rate)}
+        self.learners = {"estimator": adamw((self.estimator,), warmed(learning_rate, 50, 0.02))}
 
     def picked(self, now: Now) -> tuple[torch.Tensor, torch.Tensor]:
         """Pictures [n, 3, H, W] in 0..1 and their depth: mirrored, and in other colours."""
@@ -83,8 +77,8 @@ def learn_estimator(
 ) -> Estimator:
     """A depth and odometry estimator, learned on the CPU."""
     objective = Depths(recording, batch, learning_rate, run.seed)
-    trainer = run.stage("estimator", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
-    trainer.run(run.report)
+    trainer = run.stage("estimator", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.run()
     estimator = objective.estimator.eval().requires_grad_(False)
     with torch.inference_mode():
         looks = [estimator.looks(recording.rgb(part)) for part in np.array_split(np.sort(objective.some), 40)]
@@ -125,7 +119,7 @@ def sight(estimator: Estimator, cache: ClipCache, episodes: list[int], keep_out:
 
 @torch.inference_mode()
 def _errors(estimator: Estimator, recording: Recording, frames: int) -> dict[str, float]:
-    pairs = _pairs(recording)
+    pairs = recording.within(0, 1)
     if not len(pairs):
         return {}
     rows = pairs[:: max(1, len(pairs) // frames)]
@@ -170,13 +164,6 @@ def _summed(steps: torch.Tensor) -> torch.Tensor:
     x = (steps[..., 0] * c - steps[..., 1] * s).sum(1)
     y = (steps[..., 0] * s + steps[..., 1] * c).sum(1)
     return torch.stack([x, y, steps[..., 2].sum(1)], 1)
-
-
-def _pairs(recording: Recording) -> np.ndarray:
-    """Rows that, with the next of the same episode, may be seen."""
-    usable, start = recording.usable, recording.start
-    rows = np.flatnonzero(usable[:-1] & usable[1:])
-    return rows[start[rows] == start[rows + 1]]
 
 
 def _size(recording: Recording) -> tuple[int, int]:

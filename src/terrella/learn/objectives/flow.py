@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ...worlds.generator import Conditioning, Generator, channels_last, generate
-from ..batches import Batch
+from ...worlds.generator import Conditioning, Generator, channels_last
+from ..batches import Batch, drawn_now
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, frame_losses, sharpened, total
-from ..trainer import Average, Learner, Loss, Now, cosine
+from ..trainer import Average, Loss, Now, adamw, warmed
 
 CRITIC_AHEAD = 200  # steps that the critic learns before it is heeded
 
@@ -26,23 +26,12 @@ class Flow:
         self.one_step, self.critic_from, self.critic_weight = flow_steps == 1, critic_from, critic_weight
         self.smooth = Average(self.generator, 0.999)
         self.modules = {"generator": self.generator, "smooth": self.smooth, "critic": self.critic}
-        optimiser = torch.optim.AdamW(self.generator.parameters(), learning_rate, (0.9, 0.99), weight_decay=1e-4)
+        generating = adamw((self.generator,), warmed(learning_rate, 200, 0.05), average=self.smooth)
+        self.learners = {"generator": generating, "critic": critic_learner(self.critic)}
 
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 200) * cosine(now.share, 0.05)
-
-        self.learners = {
-            "generator": Learner(optimiser, (self.generator,), rate, self.smooth),
-            "critic": critic_learner(self.critic),
-        }
-
-    @torch.no_grad()
     def dream(self, shown: Conditioning, now: Now) -> torch.Tensor:
         """A frame [B, 4 or 5, H, W] as the generator now draws it."""
-        batch, _, height, width = shown.last.shape
-        noise = now.randn(batch, 4, height, width)
-        with now.half():
-            return generate(self.generator, noise, shown.to(now.device), 1).float().cpu()
+        return drawn_now(self.generator, shown, now)
 
     def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
         batch = batch.to(now.device)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..trainer import Learner, Loss, Now, cosine
+from ..trainer import Loss, Now, adamw, warmed
 from .latent_model import LatentModel
 
 EVEN_FOR = 0.5  # share of the training in which the codes are shared out evenly
@@ -26,13 +26,7 @@ class Codes:
     def __init__(self, model: LatentModel, learning_rate: float):
         self.model = model
         self.modules = {"inverse": model.inverse, "forward": model.forward}
-        weights = [weight for module in self.modules.values() for weight in module.parameters()]
-        optimiser = torch.optim.AdamW(weights, learning_rate, (0.9, 0.99), weight_decay=1e-4)
-
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 50) * cosine(now.share, 0.05)
-
-        self.learners = {"codes": Learner(optimiser, tuple(self.modules.values()), rate)}
+        self.learners = {"codes": adamw(tuple(self.modules.values()), warmed(learning_rate, 50, 0.05))}
 
     def losses(self, batch: np.ndarray, now: Now) -> Iterator[Loss]:
         model = self.model

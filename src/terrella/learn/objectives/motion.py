@@ -17,7 +17,7 @@ from ...worlds.body import Motion
 from ...worlds.config import MotionConfig
 from ..feeds import Drawn
 from ..recording import Recording
-from ..trainer import Learner, Loss, Now, Run
+from ..trainer import CPU, Learner, Loss, Now, Run
 
 _WINDOWS, _LENGTH = 512, 24  # walks, and steps of each, on which the body is fitted
 _BATCH, _RARE = 512, 64  # steps a batch, and those of them with which an episode ended
@@ -30,8 +30,8 @@ def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyfram
     motion.middle.copy_((seen.place.amin(0) + seen.place.amax(0)) / 2)
     motion.span.copy_((seen.place.amax(0) - seen.place.amin(0)).max().clamp_min(1e-3))
     objective, ended = Moving(motion, seen), bool(seen.ended.any())
-    trainer = run.stage("motion", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
-    trainer.run(run.report)
+    trainer = run.stage("motion", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.run()
     if not ended:  # nothing was seen to end
         last = list(motion.ending.parameters())[-2:]
         last[0].data.zero_()
@@ -116,10 +116,7 @@ def _actions(recording: Recording, rows: np.ndarray, history: int) -> torch.Tens
 @torch.no_grad()
 def fit_body(motion: Motion, recording: Recording, memory: Keyframes, seed: int) -> dict[str, float]:
     """The body whose walks end nearest to the recorded ones: coarse widths first, then finer ones around the best."""
-    usable = np.append(0, np.cumsum(recording.usable & np.array(recording.cache.action_valid)))
-    first = np.arange(2, recording.cache.length - _LENGTH)
-    whole = usable[first + _LENGTH + 1] - usable[first - 1] == _LENGTH + 2
-    first = first[whole & (recording.start[first - 1] == recording.start[first + _LENGTH])]
+    first = recording.within(1, _LENGTH, acted=True)
     if not len(first):
         return {"body_m": 0.0, "short": 0.0}  # no walk is long enough to tell: nothing will stop it
     first = np.random.default_rng(seed).choice(first, min(_WINDOWS, len(first)), replace=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +18,9 @@ from ...space.camera import Intrinsics, project
 from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, fresh, likest, marks, noted
 from ..feeds import Drawn
 from ..recording import INSTANCES, OBJECTS, Recording
-from ..trainer import Learner, Loss, Now, Report, Run, cosine
+from ..trainer import CPU, Loss, Now, Report, Run, adamw, warmed
 
-CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a card's look is known; from which it may stand for a look
+CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a thing's look is known; from which it may stand for a look
 FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
 TWICE = 2  # times that a look was seen to follow another, below which that was a mistake
 SELDOM = 4  # sightings below which a look is none
@@ -34,9 +35,9 @@ WITHOUT = ", or train without (train video --objects-steps 0)"
 
 
 class Sightings(NamedTuple):
-    """The n cards that frames show: frame and row of its list [n]; marks [n, D] (worlds/objects.py) and box [n, 4]; share [n] of
-    the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their pictures
-    uint8 [m, 4, *PICTURE]."""
+    """The n things that frames show: frame and row of its list [n]; marks [n, D] (worlds/objects.py) and box [n, 4]; share [n]
+    of the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their
+    pictures uint8 [m, 4, *PICTURE]."""
 
     frame: np.ndarray
     row: np.ndarray
@@ -49,11 +50,11 @@ class Sightings(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """What was seen to follow what: cards [n, COLUMNS], and the pose [n, 7] from which they were seen a step later; their
+    """What was seen to follow what: billboards [n, COLUMNS], and the pose [n, 7] from which they were seen a step later; their
     next look [n] (NONE: not known) and move [n], and whether they were gone [n]; acts [n, history], rows of the last actions
     (-1: none)."""
 
-    cards: torch.Tensor
+    billboards: torch.Tensor
     pose: torch.Tensor
     look: torch.Tensor
     move: torch.Tensor
@@ -89,14 +90,14 @@ def learn_objects(
     objects.solid[:] = _reach(objects, tokens)
     objects.follows[:] = _follows(objects, tokens)
     begun = [first for first, _ in cache.episodes if recording.usable[first]]
-    for story, start in enumerate(starts if begun else []):
+    for episode, start in enumerate(starts if begun else []):
         off = (recording.pose(begun) - start).norm(dim=1)
-        cards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
-        for row, card in enumerate(cards[: objects.config.rows]):
-            objects.begun[story, row] = card
+        billboards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
+        for row, billboard in enumerate(billboards[: objects.config.rows]):
+            objects.begun[episode, row] = billboard
     objective = Next(objects, tokens, recording)
-    trainer = run.stage("objects", Drawn(objective.picked), objective, steps, device=torch.device("cpu"))
-    trainer.run(report)
+    trainer = run.stage("objects", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.run()
     objects.eval()
     facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
     return {**facts, "objects_steps": steps}
@@ -123,8 +124,8 @@ def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Re
         if first // chunk % 16 == 0:
             report(first / len(rows), 1.0, "cutting out what stands in the frames")
     frame, row, marked, box, share, whole, clear, picture = map(torch.cat, zip(*parts))
-    numbers = frame.numpy(), row.numpy(), marked, box, share.numpy(), whole.numpy(), clear.numpy().nonzero()[0]
-    return Sightings(*numbers, picture)
+    shares = share.numpy(), whole.numpy(), clear.numpy().nonzero()[0]
+    return Sightings(frame.numpy(), row.numpy(), marked, box, *shares, picture)
 
 
 def _looks(seen: Sightings, count: int, seed: int) -> tuple[np.ndarray, torch.Tensor]:
@@ -166,7 +167,7 @@ def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray
 def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
     """bool [looks + 1, looks]: a look follows itself, and what it was seen to more than by mistake."""
     looks, known = objects.config.looks, tokens.look != NONE
-    pair = (tokens.cards[known, LOOK].long() + 1) * looks + tokens.look[known]
+    pair = (tokens.billboards[known, LOOK].long() + 1) * looks + tokens.look[known]
     seen = torch.bincount(pair, minlength=(looks + 1) * looks).view(looks + 1, looks) >= TWICE
     seen[0] = objects.boxes[:, 3] < NEVER_M
     return seen | torch.cat([torch.zeros(1, looks), torch.eye(looks)]).bool()
@@ -175,30 +176,27 @@ def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
 def _reach(objects: Objects, tokens: Tokens) -> torch.Tensor:
     """How near [looks], along x or y in metres, a camera can come to what looks upright: as near as it ever did (the nearest
     few of a thousand left out); 0 for what is low, and for all where it came into them."""
-    look = tokens.cards[:, LOOK].long()
+    look = tokens.billboards[:, LOOK].long()
     upright = (objects.boxes[:, 3] >= UPRIGHT_M) & (objects.boxes[:, 3] < NEVER_M)
-    near = (
-        (tokens.cards[:, PLACE] - tokens.pose[:, :3])[:, :2].abs().amax(1)[(look != NONE) & upright[look.clamp_min(0)]]
-    )
+    off = (tokens.billboards[:, PLACE] - tokens.pose[:, :3])[:, :2].abs().amax(1)
+    near = off[(look != NONE) & upright[look.clamp_min(0)]]
     reach = float(near.quantile(0.002)) if len(near) >= FEWEST else 0.0
     return torch.where(upright, reach if reach > BODY_M else 0.0, 0.0)
 
 
 def _moves(cache: ClipCache, rows: np.ndarray, count: int, seed: int) -> torch.Tensor:
     """The moves [m, 3] that things make in a step, in metres, the first of them none: k-means."""
-    cards = listed(cache)
+    things = listed(cache)
     follows = rows[:-1][np.diff(rows) == 1]
     follows = follows[~np.isin(follows + 1, [first for first, _ in cache.episodes])]
-    same = (cards[follows, :, None, 0] == cards[follows + 1, None, :, 0]) & (cards[follows, :, 0] > 0)[:, :, None]
+    number, later = things[follows, :, 0], things[follows + 1, :, 0]
+    same = (number[:, :, None] == later[:, None]) & (number > 0)[:, :, None]
     index, slot, after = same.nonzero()
-    moved = cards[follows[index] + 1, after, 1:] - cards[follows[index], slot, 1:]
+    moved = things[follows[index] + 1, after, 1:] - things[follows[index], slot, 1:]
     far = np.linalg.norm(moved, axis=1)
     moved = torch.from_numpy(moved[(far > 1e-3) & (far < 2)])
-    none = torch.zeros(1, 3)
-    if not len(moved):
-        return none
     moved = moved[torch.randperm(len(moved), generator=make_rng(seed))[:20000]]
-    return torch.cat([none, _means(moved, count - 1, seed)])
+    return torch.cat([torch.zeros(1, 3), _means(moved, count - 1, seed) if len(moved) else moved])
 
 
 def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
@@ -221,102 +219,104 @@ def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
 def _followed(
     objects: Objects, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
 ) -> tuple[Tokens, dict[int, list[torch.Tensor]]]:
-    """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the cards that waited
-    in it. The recording is walked through as a dream is, card by card."""
+    """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the billboards that
+    waited in it. The recording is walked through as a dream is, one billboard after another."""
     cache, back = recording.cache, np.arange(objects.config.history)[::-1]
-    cards = torch.from_numpy(listed(cache).copy())
-    poses = torch.from_numpy(np.array(cache.pose, np.float32))
-    looks, share = torch.full(cards.shape[:2], float(NONE)), np.zeros(cards.shape[:2])
+    things, poses = torch.from_numpy(listed(cache).copy()), torch.from_numpy(np.array(cache.pose, np.float32))
+    looks, share = torch.full(things.shape[:2], float(NONE)), np.zeros(things.shape[:2])
     looks[seen.frame, seen.row] = torch.from_numpy(known).float()
     share[seen.frame, seen.row] = seen.share
-    before, at, look, place, gone, acts = [], [], [], [], [], []
+    steps: list[
+        tuple
+    ] = []  # a billboard, the row after, the look, place and end that it then has, and rows of last actions
     waiting: dict[int, list[torch.Tensor]] = {}
     for first, stop in cache.episodes:
-        were: dict[float, torch.Tensor] = {}  # cards by number, and the row of the list in which each was
+        were: dict[float, torch.Tensor] = {}  # billboards by number, and the row of the list in which each was
         slots: dict[float, int] = {}
         met: dict[float, _Met] = {}
         for row in range(first, stop):
             here = {}
             if recording.usable[row]:
-                here = {float(number): slot for slot, number in enumerate(cards[row, :, 0]) if number > 0}
+                here = {float(number): slot for slot, number in enumerate(things[row, :, 0]) if number > 0}
                 lost = [n for n in were if n not in here and share[row - 1, slots[n]] >= 2 * CLEAR]
                 led = np.where(row - 1 - back >= first, row - 1 - back, -1)
-                for number in (*(n for n in here if n in were), *_in_sight(lost, were, poses[row], camera)):
-                    slot = here.get(number)
-                    before.append(were[number])
-                    at.append(row)
-                    acts.append(led)
-                    gone.append(slot is None)
-                    look.append(float(NONE) if slot is None else looks[row, slot])
-                    place.append(were[number][PLACE] if slot is None else cards[row, slot, 1:])
+                for number in (n for n in here if n in were):
+                    slot = here[number]
+                    steps.append((were[number], row, looks[row, slot], things[row, slot, 1:], False, led))
+                for number in _in_sight(lost, were, poses[row], camera):
+                    steps.append((were[number], row, torch.tensor(float(NONE)), were[number][PLACE], True, led))
             now = {}
             for number, slot in here.items():
-                old, seen_as = were.get(number), looks[row, slot]
+                old, look, place = were.get(number), looks[row, slot], things[row, slot, 1:]
                 if old is None:
-                    now[number] = fresh(number, cards[row, slot, 1:], seen_as)
+                    now[number] = fresh(number, place, look)
                 else:
-                    kept = torch.where(seen_as == NONE, old[LOOK], seen_as)
-                    now[number] = noted(old[None], cards[row, slot, 1:][None], kept[None])[0]
+                    now[number] = noted(old[None], place[None], torch.where(look == NONE, old[LOOK], look)[None])[0]
                 if number not in met and row < first + WAITS:
-                    met[number] = _Met(now[number].clone(), row > first and _open(now[number], row - 1, cache, camera))
+                    born = row > first and _open(now[number], row - 1, cache, camera)
+                    met[number] = _Met(now[number].clone(), born)
                 if number in met:
-                    met[number].again(seen_as)
+                    met[number].again(look)
             were, slots = now, here
-        waiting[first] = [one.card for one in met.values() if one.waited]
-    if not before:
+        waiting[first] = [one.billboard for one in met.values() if one.waited]
+    if not steps:
         raise DatasetError(f"the recording shows no thing in two frames that follow each other{WITHOUT}.")
+    before, at, look, place, gone, acts = zip(*steps)
     moved = torch.stack(place) - torch.stack(before)[:, PLACE]
     move = torch.cdist(moved, objects.moves).argmin(1)
     move[moved.norm(dim=1) <= 1e-3] = 0
-    parts = torch.stack(before), poses[at], torch.tensor(look).long(), move, torch.tensor(gone), np.stack(acts)
-    return Tokens(*parts), waiting
+    follows = torch.stack(look).long(), move, torch.tensor(gone), np.stack(acts)
+    return Tokens(torch.stack(before), poses[list(at)], *follows), waiting
 
 
+@dataclass
 class _Met:
-    """A thing of an episode: its card as it was first seen, and whether it was seen to come into being."""
+    """A thing of an episode: its billboard as it was first seen, and whether it was seen to come into being."""
 
-    def __init__(self, card: torch.Tensor, born: bool):
-        self.card, self.born, self.often = card, born, 0
+    billboard: torch.Tensor
+    born: bool
+    often: int = 0
 
     def again(self, look: torch.Tensor) -> None:
         self.often += 1
-        if self.card[LOOK] == NONE:
-            self.card[LOOK] = look
+        if self.billboard[LOOK] == NONE:
+            self.billboard[LOOK] = look
 
     @property
     def waited(self) -> bool:
-        return self.often >= LASTS and not self.born and bool(self.card[LOOK] != NONE)
+        return self.often >= LASTS and not self.born and bool(self.billboard[LOOK] != NONE)
 
 
 def _gathered(episodes: list[list[torch.Tensor]]) -> list[torch.Tensor]:
-    """The cards [COLUMNS] that waited in episodes which began alike, those of one place as one, the most frequent first: no
+    """The billboards [COLUMNS] that waited in episodes which began alike, those of one place as one, the most frequent first: no
     episode sees all of them."""
-    found: list[tuple[torch.Tensor, int]] = []
-    for card in (card for cards in episodes for card in cards):
-        same = [at for at, (other, _) in enumerate(found) if (other - card)[PLACE].norm() < SAME_M]
-        if same:
-            found[same[0]] = (found[same[0]][0], found[same[0]][1] + 1)
+    found: list[list[torch.Tensor]] = []
+    for billboard in (one for billboards in episodes for one in billboards):
+        alike = [some for some in found if (some[0] - billboard)[PLACE].norm() < SAME_M]
+        if alike:
+            alike[0].append(billboard)
         else:
-            found.append((card, 1))
-    often = sorted((one for one in found if one[1] >= OFTEN * len(episodes)), key=lambda one: -one[1])
-    for number, (card, _) in enumerate(often):
-        card[NUMBER] = number + 1
-    return [card.clone() for card, _ in often]
+            found.append([billboard])
+    often = sorted((some for some in found if len(some) >= OFTEN * len(episodes)), key=len, reverse=True)
+    first = [some[0].clone() for some in often]
+    for number, billboard in enumerate(first):
+        billboard[NUMBER] = number + 1
+    return first
 
 
-def _in_sight(numbers: list[float], cards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
-    """Those of `numbers` whose cards should be well in sight from `pose` [7]."""
+def _in_sight(numbers: list[float], billboards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
+    """Those of `numbers` whose billboards should be well in sight from `pose` [7]."""
     if not numbers:
         return []
-    where, ahead = project(torch.stack([cards[number][PLACE] for number in numbers]), pose, camera)
+    where, ahead = project(torch.stack([billboards[number][PLACE] for number in numbers]), pose, camera)
     seen = ((where[:, 0] - 0.5).abs() < 0.35) & (ahead > 0.5)
     return [number for number, is_seen in zip(numbers, seen.tolist()) if is_seen]
 
 
-def _open(card: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
-    """Whether the camera of `row` saw as far as the place of `card`, a little above the ground."""
+def _open(billboard: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
+    """Whether the camera of `row` saw as far as the place of `billboard`, a little above the ground."""
     pose = torch.from_numpy(np.array(cache.pose[row], np.float32))
-    where, ahead = project(card[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
+    where, ahead = project(billboard[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
     (u, v), far = where[0].tolist(), float(ahead[0])
     if far < 0.3 or not (0 < u < 1 and 0 < v < 1):
         return False
@@ -331,27 +331,22 @@ class Next:
     def __init__(self, objects: Objects, tokens: Tokens, recording: Recording, batch: int = 512):
         self.objects, self.tokens, self.size = objects, tokens, batch
         look = tokens.look
-        happens = ((look != NONE) & (look != tokens.cards[:, LOOK])) | (tokens.move > 0) | tokens.gone
+        happens = ((look != NONE) & (look != tokens.billboards[:, LOOK])) | (tokens.move > 0) | tokens.gone
         often = torch.where(happens, 0.5 / happens.float().mean().clamp_min(1e-3), 0.5)
         self.often = often / often.sum()
         self.actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
         self.actions[torch.from_numpy(tokens.acts < 0)] = 0
-        optimiser = torch.optim.AdamW(objects.parameters(), 2e-3, weight_decay=1e-2)
-
-        def rate(now: Now) -> float:
-            return 2e-3 * min(1, (now.step + 1) / 100) * cosine(now.share, 0.02)
-
         self.modules = {"objects": objects}
-        self.learners = {"objects": Learner(optimiser, (objects,), rate)}
+        self.learners = {"objects": adamw((objects,), warmed(2e-3, 100, 0.02), decay=1e-2, betas=(0.9, 0.999))}
 
     def picked(self, now: Now) -> torch.Tensor:
         return torch.multinomial(self.often, self.size, replacement=True, generator=now.noise)
 
     def losses(self, batch: torch.Tensor, now: Now) -> Iterator[Loss]:
         weight = 1 / len(self.often) / self.often[batch]
-        cards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
-        said = self.objects.foresee(cards, pose, self.actions[batch])
-        possible = (look != NONE) & self.objects.follows[cards[:, LOOK].long() + 1, look.clamp_min(0)]
+        billboards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
+        said = self.objects.foresee(billboards, pose, self.actions[batch])
+        possible = (look != NONE) & self.objects.follows[billboards[:, LOOK].long() + 1, look.clamp_min(0)]
         error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
         error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")

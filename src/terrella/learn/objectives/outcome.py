@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ...data import ClipCache
 from ...worlds.outcome import Logits, Outcome, OutcomeConfig
 from ..feeds import Drawn
-from ..trainer import Learner, Loss, Now, Run, cosine
+from ..trainer import Learner, Loss, Now, Run, warmed
 
 PIECE = 8  # steps that are learned from at a time
 _LEVELS = 33  # values, at most, that a reward or a change is told apart into
@@ -106,17 +106,10 @@ class Pieces:
         heads = [weight for head in (outcome.paid, outcome.ending, *outcome.changed) for weight in head.parameters()]
         known = {id(weight) for weight in heads}
         body = [weight for weight in outcome.parameters() if id(weight) not in known]
-        groups = [
-            {"params": body, "pace": 1.0},
-            {"params": heads, "pace": 8.0},
-        ]  # what is rare is heard by the heads alone
+        groups = [{"params": body}, {"params": heads, "pace": 8.0}]  # what is rare is heard by the heads alone
         optimiser = torch.optim.AdamW(groups, weight_decay=1e-3)
-
-        def rate(now: Now) -> float:
-            return learning_rate * min(1, (now.step + 1) / 50) * cosine(now.share, 0.03)
-
         self.modules = {"outcome": outcome}
-        self.learners = {"outcome": Learner(optimiser, (outcome,), rate)}
+        self.learners = {"outcome": Learner(optimiser, (outcome,), warmed(learning_rate, 50, 0.03))}
 
     def picked(self, now: Now) -> tuple[np.ndarray, torch.Tensor]:
         """The first rows of a batch of pieces, and how much each counts."""
@@ -147,7 +140,7 @@ def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
     """Trains the objective's Outcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    run.stage("outcome", Drawn(objective.picked), objective, steps).run(run.report)
+    run.stage("outcome", Drawn(objective.picked), objective, steps).run()
     objective.outcome.eval()
     return {"outcome_steps": steps}
 

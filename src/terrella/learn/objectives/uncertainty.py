@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,6 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
 from ...core.errors import DatasetError
-from ...core.state import State
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
@@ -26,18 +26,16 @@ from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyC
 from ..feeds import Drawn
 from ..recording import Recording
 from ..run_folder import resume_file
-from ..trainer import Learner, Loss, Now, Report, Run, cosine
+from ..trainer import CPU, Loss, Now, Report, Run, adamw, warmed
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
 SHOWN = (1, 3, 10)  # frames that a dream may be shown before it goes on alone
 DREAMT = "dreamt"  # the folder of the run that keeps them until the training is over
 _APART = 5  # one in so many episodes is for calibration
-_TENSORS = ("clues", "situation", "cells", "error", "episode", "arm")
 
 
-@dataclass(frozen=True)
-class Dreamt:
+class Dreamt(NamedTuple):
     """N frames of dreams: their clues [N, CLUES, h, w] (half precision) and situations [N, S], how wrong they are in
     cells [N, h / 2, w / 2] and on the whole [N], the number of their episode [N], and which of ARMS they are of [N]."""
 
@@ -50,10 +48,10 @@ class Dreamt:
 
     @staticmethod
     def joined(parts: list[Dreamt]) -> Dreamt:
-        return Dreamt(*(torch.cat([vars(part)[name] for part in parts]) for name in _TENSORS))
+        return Dreamt(*map(torch.cat, zip(*parts)))
 
     def at(self, index: torch.Tensor) -> Dreamt:
-        return Dreamt(*(vars(self)[name][index] for name in _TENSORS))
+        return Dreamt(*(part[index] for part in self))
 
 
 @dataclass(frozen=True)
@@ -80,13 +78,13 @@ def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frame
         )
     seen = _kept(run.out / DREAMT, world, recording, Rollout(frames, horizon, seed=run.seed), run.report)
     apart = seen.episode % _APART == 0
-    learned, others = seen.at((~apart).nonzero()[:, 0]), seen.at(apart.nonzero()[:, 0])
+    learned, others = seen.at(~apart), seen.at(apart)
     uncertainty = fit(run, learned, min(1500, max(20, frames // 6)))
     half = others.episode // _APART % 2 == 0
     if half.all() or not half.any():
         half = torch.arange(len(half)) % 2 == 0
-    calibrate(uncertainty, others.at(half.nonzero()[:, 0]))
-    others = others.at((~half).nonzero()[:, 0])
+    calibrate(uncertainty, others.at(half))
+    others = others.at(~half)
     expected = answers(uncertainty, others)
     facts = {"sure": float(uncertainty.sure), "invents": float(uncertainty.invents), "frames": len(others.error)}
     facts |= {"error": float(others.error.mean()), "expected": float(expected.mean())}
@@ -109,14 +107,11 @@ def _kept(folder: Path, world: LearnedWorld, recording: Recording, rollout: Roll
         path = folder / f"{number:05d}.safetensors"
         if not path.exists():
             made = dream(world, recording, rollout, number)
-            save_file({name: vars(made)[name].contiguous() for name in _TENSORS}, path.with_suffix(".partial"))
+            save_file({name: part.contiguous() for name, part in made._asdict().items()}, path.with_suffix(".partial"))
             path.with_suffix(".partial").replace(path)
         parts.append(Dreamt(**load_file(path)))
-        report(
-            number + 1,
-            rollout.batches,
-            f"uncertainty: dreamt {(number + 1) * rollout.batch * rollout.horizon:,} frames",
-        )
+        frames = (number + 1) * rollout.batch * rollout.horizon
+        report(number + 1, rollout.batches, f"uncertainty: dreamt {frames:,} frames")
     return Dreamt.joined(parts)
 
 
@@ -130,23 +125,30 @@ def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: i
         arm = NONE
     alone, horizon = arm == LONE, rollout.horizon
     shown = 1 if alone else int(rng.choice(SHOWN))
-    begins = _begins(recording, shown + horizon, rollout.batch, rng)
+    begins = rng.choice(np.flatnonzero(_ahead(recording) >= shown + horizon), rollout.batch)
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
     noted: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def note(conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor) -> None:
         noted.append((clues(conditioning, clean).half().cpu(), situation.cpu()))
 
+    def evidence(rows: np.ndarray) -> Observation:
+        seen = recording.evidence(world.config, rows)
+        return {"rgb": seen["rgb"]} if alone else seen
+
     dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=Asked(note))
     chance = make_rng(int(rng.integers(2**62)))
-    state = dreamer.observe(_evidence(dreamer, recording, begins, alone), None, chance)
+    state = dreamer.observe(evidence(begins), None, chance)
     for row in range(1, shown):
         state = dreamer.imagine(state, recording.played(dreamer.spec, begins + row - 1), chance)
-        state = dreamer.observe(_evidence(dreamer, recording, begins + row, alone), state, chance)
+        state = dreamer.observe(evidence(begins + row), state, chance)
     parts, episodes = [], torch.arange(len(begins)) + number * rollout.batch
     for step in range(horizon):
         rows = begins + shown + step
-        state = _onward(dreamer, state, recording, rows, posed, chance)
+        if posed:
+            state = dreamer.observe({"pose": recording.pose(rows)}, state, chance)
+        else:
+            state = dreamer.imagine(state, recording.played(dreamer.spec, rows - 1), chance)
         drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float() / 255
         maps, situation = noted.pop()
         off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)
@@ -154,14 +156,6 @@ def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: i
         kind = torch.full((len(begins),), ARMS.index(arm))
         parts.append(Dreamt(maps, situation, cells, off.mean((1, 2)), episodes, kind))
     return Dreamt.joined(parts)
-
-
-def _onward(
-    world: LearnedWorld, state: State, recording: Recording, rows: np.ndarray, pose: bool, chance: torch.Generator
-) -> State:
-    if pose:
-        return world.observe({"pose": recording.pose(rows)}, state, chance)
-    return world.imagine(state, recording.played(world.spec, rows - 1), chance)
 
 
 def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int, arm: str, rng) -> LearnedWorld:
@@ -176,11 +170,6 @@ def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int
     return world.with_memory(world.memory.at(left))
 
 
-def _evidence(world: LearnedWorld, recording: Recording, rows: np.ndarray, alone: bool) -> Observation:
-    seen = recording.evidence(world.config, rows)
-    return {"rgb": seen["rgb"]} if alone else seen
-
-
 def _ahead(recording: Recording) -> np.ndarray:
     """Of each row, how many follow one another from it on that may be seen, by valid actions in one episode: [N]."""
     fine = recording.usable & np.asarray(recording.cache.action_valid)
@@ -193,24 +182,14 @@ def _ahead(recording: Recording) -> np.ndarray:
     return np.where(fine, end - rows + fine[end], 0)
 
 
-def _begins(recording: Recording, length: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows from which `length` of the same episode may be seen."""
-    return rng.choice(np.flatnonzero(_ahead(recording) >= length), count)
-
-
 class Errors:
     """By the likelihood of errors that scatter exponentially around the expected one, of frames and of their cells: the
     expectation, not the median, is learned, and small errors count as much as large ones."""
 
     def __init__(self, uncertainty: Uncertainty, seen: Dreamt):
         self.uncertainty, self.seen = uncertainty, seen
-        optimiser = torch.optim.AdamW(uncertainty.parameters(), 3e-3, (0.9, 0.99), weight_decay=1e-3)
-
-        def rate(now: Now) -> float:
-            return 3e-3 * min(1, (now.step + 1) / 50) * cosine(now.share)
-
         self.modules = {"uncertainty": uncertainty}
-        self.learners = {"uncertainty": Learner(optimiser, (uncertainty,), rate)}
+        self.learners = {"uncertainty": adamw((uncertainty,), warmed(3e-3, 50), decay=1e-3)}
 
     def picked(self, now: Now) -> tuple[torch.Tensor, ...]:
         """64 frames: their clues, situations, cells and errors; mirrored and in other colours now and then."""
@@ -235,14 +214,14 @@ def fit(run: Run, seen: Dreamt, steps: int) -> Uncertainty:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(run.seed)
         objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
-    run.stage("uncertainty", Drawn(objective.picked), objective, steps, device=torch.device("cpu")).run(run.report)
+    run.stage("uncertainty", Drawn(objective.picked), objective, steps, device=CPU).run()
     return objective.uncertainty.eval().requires_grad_(False)
 
 
 def calibrate(uncertainty: Uncertainty, seen: Dreamt) -> None:
     """Isotonic regression (pool adjacent violators) of the error on the answer, in KNOTS bins of as many frames; and the
     levels at which the page of play calls a world sure or inventing."""
-    answer = answers(uncalibrated(uncertainty), seen)
+    answer = _learned(uncertainty, seen).clamp(0, 1)
     order = answer.argsort()
     bins = [part for part in np.array_split(order.numpy(), KNOTS) if len(part)]
     found = [float(answer[part].mean()) for part in bins]
@@ -258,20 +237,16 @@ def calibrate(uncertainty: Uncertainty, seen: Dreamt) -> None:
     uncertainty.invents.copy_(torch.maximum(rest, 1.5 * sure))
 
 
-def uncalibrated(uncertainty: Uncertainty) -> Uncertainty:
-    """The same network, answering as it was learned."""
-    plain = Uncertainty(uncertainty.config)
-    plain.load_state_dict({**plain.state_dict(), **dict(uncertainty.named_parameters())})
-    return plain.eval().requires_grad_(False)
+def answers(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
+    """The calibrated error that `uncertainty` expects of each frame [N]."""
+    return uncertainty.calibrated(_learned(uncertainty, seen))
 
 
 @torch.inference_mode()
-def answers(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
-    """The calibrated error that `uncertainty` expects of each frame [N]."""
+def _learned(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
+    """The error before it is calibrated [N]."""
     parts = torch.arange(len(seen.error)).split(256)
-    return torch.cat(
-        [uncertainty.calibrated(uncertainty(seen.clues[p].float(), seen.situation[p]).mean((1, 2))) for p in parts]
-    )
+    return torch.cat([uncertainty(seen.clues[part].float(), seen.situation[part]).mean((1, 2)) for part in parts])
 
 
 def pooled(values: list[float], weights: list[float]) -> list[float]:

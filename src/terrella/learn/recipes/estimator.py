@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from ...space.estimator import save_estimator
@@ -40,7 +40,7 @@ def train_estimator(data: str | Path, out: str | Path, config: EstimatorTraining
     episodes and in the box kept out to `out`/estimator.json; these are returned."""
     why = "an estimator is learned from pictures, depth, poses and a camera"
     recording = Recording.open(data, config.size, report, config.keep_out, NEEDS, why)
-    run = Run(Path(out), {**asdict(config), "frames": recording.cache.length}, report, config.seed)
+    run = Run.of(out, config, report, frames=recording.cache.length)
     estimator = learn_estimator(run, recording, config.steps, config.batch, config.learning_rate)
     facts = sight(estimator, recording.cache, list(recording.held_out), config.keep_out)
     save_estimator(estimator, run.out / "estimator.safetensors")

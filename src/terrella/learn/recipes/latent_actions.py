@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -66,11 +66,7 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
             f"{recording.cache.length} rows leave {pairs} pairs of frames, {config.stride} rows apart, to learn from; "
             "64 are needed: record more, or give a smaller --stride."
         )
-    fixed = {
-        name: value for name, value in asdict(config).items() if name not in ("device", "save_every_s", "strip_every_s")
-    }
-    times = {"save_every_s": config.save_every_s, "strip_every_s": config.strip_every_s}
-    run = Run(Path(out), {**fixed, "frames": recording.cache.length}, report, config.seed, device, **times)
+    run = Run.of(out, config, report, device, frames=recording.cache.length)
     torch.manual_seed(config.seed)
     model = LatentModel(config.codes, config.stride, config.size, device)
     objective = Codes(model, config.learning_rate)
@@ -82,9 +78,9 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
     def draw() -> None:
         draw_strip(model, recording, config.seed, run.out / f"strip-{trainer.facts['step']:06d}.png")
 
-    trainer.run(report, draw)
+    trainer.run(draw)
     draw()
-    return {"run": str(out), **trainer.told}
+    return {"run": str(out), **trainer.summary}
 
 
 def load_latent(run: str | Path, device: str = "auto") -> LatentModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -43,8 +43,8 @@ def train_objects(
     torch.manual_seed(config.seed)
     objects = Objects(ObjectsConfig(learned.config.actions, learned.config.history))
     pair = paired(learned.replaced(objects=objects), data, None, report)
-    recipe = {**asdict(config), "frames": pair.recording.cache.length}
-    run, recording = Run(Path(out), recipe, report, config.seed), pair.recording
+    recording = pair.recording
+    run = Run.of(out, config, report, frames=recording.cache.length)
     objects.requires_grad_(True)
     starts = cast(Keyframes, learned.starts).pose
     facts = learn_objects(

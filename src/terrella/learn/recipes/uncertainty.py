@@ -3,7 +3,7 @@ uncertainty). `train video` ends with both."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,8 @@ def train_uncertainty(
     learned = load_world(world)
     box = box_of(learned.about.card.get("keep_out"))
     pair = paired(learned, data, box, report)
-    recipe = {**asdict(config), "world": fingerprint(learned.generator), "frames": pair.recording.cache.length}
-    run = Run(Path(out), recipe, report, config.seed)
+    facts = {"world": fingerprint(learned.generator), "frames": pair.recording.cache.length}
+    run = Run.of(out, config, report, **facts)
     sensing, facts = learn_senses(run, learned, pair.recording, box, config)
     save_world(sensing.replaced(card=facts), run.out / "world", remembered=world)
     return {"world": str(run.out / "world"), **facts}

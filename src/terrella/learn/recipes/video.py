@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,6 @@ from .uncertainty import SensesConfig, learn_senses
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
 )
-MAY_CHANGE = ("hours", "device", "learning_rate", "save_every_s", "strip_every_s")  # settings, within a run
 
 
 @dataclass(frozen=True)
@@ -102,9 +101,7 @@ def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: 
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
     recording = Recording.open(data, config.size, report, needs=("rgb", "action"), why=NEEDS)
-    recipe = {name: value for name, value in asdict(config).items() if name not in MAY_CHANGE}
-    times = {"save_every_s": config.save_every_s, "strip_every_s": config.strip_every_s}
-    run = Run(Path(out), {**recipe, "frames": recording.cache.length}, report, config.seed, device, **times)
+    run = Run.of(out, config, report, device, ("hours", "learning_rate"), frames=recording.cache.length)
     torch.manual_seed(config.seed)
     return _Learned(run, recording, config).learn()
 
@@ -187,11 +184,11 @@ class _Learned:
             forget(run.out)  # it knew the errors of an earlier generator
             trainer.facts.pop("senses", None)
             done = False
-        trainer.run(run.report, lambda: self.draw_strip(trainer))
+        trainer.run(lambda: self.draw_strip(trainer))
         if not done:
             self._finish(trainer)
         senses = trainer.facts.pop("senses")
-        return {"world": str(run.out / "world"), **trainer.told, **self.facts, **senses}
+        return {"world": str(run.out / "world"), **trainer.summary, **self.facts, **senses}
 
     def _finish(self, trainer: Trainer) -> None:
         """The last strip, and the estimator and uncertainty of the finished world."""
