@@ -17,7 +17,7 @@ from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.data import ClipCache, record
 from terrella.learn import moving_batches
 from terrella.learn.moving_batches import mirrored, moving_batch, other_side
-from terrella.learn.recipes.objects import ObjectsTraining, train_objects
+from terrella.learn.recipes.parts import ObjectsTraining, train_objects
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
 from terrella.learn.trainer import Now

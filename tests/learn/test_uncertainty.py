@@ -18,8 +18,7 @@ from terrella.core.errors import DatasetError, ObservationError
 from terrella.data import ClipCache, Dataset, Layout, Recorder, record, split
 from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative
 from terrella.learn.objectives.uncertainty import ARMS, Dreamt, Rollout, answers, calibrate, dream, fit, pooled
-from terrella.learn.recipes.estimator import EstimatorTraining, train_estimator
-from terrella.learn.recipes.uncertainty import SensesConfig, train_uncertainty
+from terrella.learn.recipes.parts import EstimatorTraining, SensesConfig, train_estimator, train_uncertainty
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run

@@ -7,11 +7,16 @@ from collections.abc import Callable
 from tyro.conf import Positional
 
 from .. import progress
-from ..learn.recipes.estimator import EstimatorTraining, train_estimator
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
-from ..learn.recipes.objects import ObjectsTraining, train_objects
+from ..learn.recipes.parts import (
+    EstimatorTraining,
+    ObjectsTraining,
+    SensesConfig,
+    train_estimator,
+    train_objects,
+    train_uncertainty,
+)
 from ..learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
-from ..learn.recipes.uncertainty import SensesConfig, train_uncertainty
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.trainer import device_named
 from ..library import folder_of

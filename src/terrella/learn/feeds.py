@@ -11,7 +11,7 @@ from ..space.keyframes import Keyframes
 from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
 from .batches import Dream, place_batch
-from .history_batches import history_batch, history_clips
+from .history_batches import clip_length, history_batch
 from .moving_batches import moving_batch
 from .recording import Recording
 from .trainer import Feed, Now
@@ -60,6 +60,7 @@ def frames_feed(
     whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
-    clips = history_clips(recording.cache, config, size, seed, whole)
+    channels = ("rgb", "action", *("instruction",) * ("task" in recording.cache.arrays))
+    clips = Clips(recording.cache, clip_length(config), channels, size, config.size, seed=seed, episodes=whole)
     controls = recording.controls or Controls.buttons(config.actions)
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))

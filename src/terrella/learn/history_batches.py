@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from ..data import ClipCache, Clips
 from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
 from ..worlds.generator import Conditioning, context_thumbnail, encode_depth, pixels
@@ -26,14 +25,8 @@ def clip_length(config: VideoConfig) -> int:
     return config.slots + max(DREAMT) + 1
 
 
-def history_clips(cache: ClipCache, config: VideoConfig, batch: int, seed: int, episodes: list[int]) -> Clips:
-    """Clips for `history_batch`, with what was asked for where the recording says it."""
-    channels = ("rgb", "action", *("instruction",) * ("task" in cache.arrays))
-    return Clips(cache, clip_length(config), channels, batch, config.size, seed=seed, episodes=episodes)
-
-
 def clips_at(recording: Recording, config: VideoConfig, batch: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """The same drawn at random, of rows that training may see."""
+    """Clips for `history_batch` drawn at random, of rows that training may see."""
     length = clip_length(config)
     whole = recording.usable & (np.arange(len(recording.usable)) - recording.start >= length - 1)
     rows = rng.choice(np.flatnonzero(whole), batch)[:, None] + np.arange(1 - length, 1)

@@ -163,33 +163,28 @@ class Run:
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
         return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times)
 
-    def stage(
+
+class Trainer:
+    """A stage of a run; it goes on where it was stopped, and ends after `steps` or `hours`, those of earlier runs counted in.
+
+    TrainingError where the run's folder holds one with another recipe.
+
+    device: where it is to run, if not where the others do.
+    facts:  recipe, step, seconds, and what `once` added; saved with the rest.
+    """
+
+    def __init__(
         self,
-        name: str,
+        run: Run,
+        stage: str,
         feed: Feed,
         objective: Objective,
         steps: int,
         hours: float = math.inf,
         device: torch.device | None = None,
-    ) -> Trainer:
-        """A stage that goes on where it was stopped, and ends after `steps` or `hours`, those of earlier runs counted in.
-        `device`: where it is to run, if not where the others do."""
-        return Trainer(self, name, feed, objective, steps, hours, device or self.device)
-
-
-class Trainer:
-    """A stage of a run; it goes on where it was stopped.
-
-    TrainingError where the run's folder holds one with another recipe.
-
-    facts: recipe, step, seconds, and what `once` added; saved with the rest.
-    """
-
-    def __init__(
-        self, run: Run, stage: str, feed: Feed, objective: Objective, steps: int, hours: float, device: torch.device
     ):
-        self.within, self.stage, self.feed, self.objective = run, stage, feed, objective
-        self.steps, self.hours, self.device = steps, hours, device
+        self.run, self.stage, self.feed, self.objective = run, stage, feed, objective
+        self.steps, self.hours, self.device = steps, hours, device or run.device
         self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
         self.facts |= {"seconds": 0.0, "recent": []}
         self._file = resume_file(run.out, stage)
@@ -197,7 +192,7 @@ class Trainer:
         if found and found.get("recipe") != self.facts["recipe"]:
             raise TrainingError(f"{run.out} holds a run with other settings; repeat them, or give another --out.")
         for module in objective.modules.values():
-            module.to(device)
+            module.to(self.device)
         if found:
             self.facts |= load_run(self._file, objective.modules, self._optimisers) or {}
             feed.resume(self.facts["feed"])
@@ -216,7 +211,7 @@ class Trainer:
     def finished(self) -> bool:
         return self.facts["step"] >= self.steps or self.facts["seconds"] >= 3600 * self.hours
 
-    def run(self, draw: Callable[[], None] | None = None) -> None:
+    def train(self, draw: Callable[[], None] | None = None) -> None:
         """Trains to the end; `draw()` now and then, which leaves what there is to look at."""
         if self.finished:
             return
@@ -224,10 +219,10 @@ class Trainer:
             for module in learner.modules:
                 module.train()
         with _stoppable() as stop:
-            self._run(draw, stop)
+            self._train(draw, stop)
 
-    def _run(self, draw: Callable[[], None] | None, stop: threading.Event) -> None:
-        facts, run = self.facts, self.within
+    def _train(self, draw: Callable[[], None] | None, stop: threading.Event) -> None:
+        facts, run = self.facts, self.run
         began = saved = drawn = time.monotonic()
         before = facts["seconds"]
         while not self.finished and not stop.is_set():
@@ -251,7 +246,7 @@ class Trainer:
 
     def _step(self, step: int) -> dict[str, float]:
         """One whole step: a batch, and down each of its losses in turn. Returns the means of their parts."""
-        rng = np.random.default_rng([self.within.seed, step])
+        rng = np.random.default_rng([self.run.seed, step])
         noise = make_rng(int(rng.integers(2**62)))
         now = Now(step, step / self.steps, self.device, rng, noise)
         for learner in self.objective.learners.values():
@@ -283,7 +278,7 @@ class Trainer:
 
     def save(self) -> None:
         """The run as it is after its last whole step."""
-        self.within.out.mkdir(parents=True, exist_ok=True)
+        self.run.out.mkdir(parents=True, exist_ok=True)
         self.facts["feed"] = self.feed.state()
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)
 
@@ -297,13 +292,12 @@ class Trainer:
     def _log(self) -> None:
         facts, recent = self.facts, self.facts["recent"]
         mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
-        write_log(
-            self.within.out, {"stage": self.stage, "step": facts["step"], "seconds": round(facts["seconds"]), **mean}
-        )
+        line = {"stage": self.stage, "step": facts["step"], "seconds": round(facts["seconds"]), **mean}
+        write_log(self.run.out, line)
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
         by_steps, by_hours = facts["step"] / self.steps, facts["seconds"] / (3600 * self.hours)
-        self.within.report(max(by_steps, by_hours), 1.0, f"{self.stage}: {words}")
+        self.run.report(max(by_steps, by_hours), 1.0, f"{self.stage}: {words}")
 
 
 def _not_a_number(what: str, step: int) -> str:

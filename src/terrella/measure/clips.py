@@ -128,6 +128,8 @@ def clips_from_cache(
     No window holds a row without a valid action or an end (`done`), nor a row that `where` refuses. Still windows are
     kept: Clip.moves tells them apart. Fewer come back where the recording has no more; DatasetError where it has none.
     """
+    if where is not None and cache.pose is None:
+        raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
     length = context + horizon
     starts: list[tuple[int, int]] = []
     for episode in episodes:
@@ -194,8 +196,6 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
 def runs(cache, first: int, stop: int, where: Where | None, unbroken: bool = True) -> list[tuple[int, int]]:
     """Stretches [first, stop) of the rows of an episode that `where` allows; where `unbroken`, each row is reached from the one
     before by a valid action."""
-    if where is not None and cache.pose is None:
-        raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
     allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache, first, stop), bool)
     linked = allowed[1:] & allowed[:-1]
     if unbroken:

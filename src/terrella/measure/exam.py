@@ -26,10 +26,9 @@ CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: of figures, 
 @dataclass(frozen=True)
 class ExamConfig:
     """horizons: steps at which figures are given; control_horizons: where true actions are set against another player's and
-    against none; batch: clips rolled together; strips: clips of each place whose pictures are kept; walked_m: clips that
-    went less far have no share of it; drop: PSNR at the first horizon less that at the second; frechet: compare looks
-    through the fixed encoder; true_motion: also along the true poses; closure_deg: how far the camera turns before it comes
-    back; closure_walk: steps of the walk there and back, 0 for none; long_steps: of the long rollouts, 0 for none;
+    against none; batch: clips rolled together; strips: clips of each place whose pictures are kept; drop: PSNR at the
+    first horizon less that at the second; true_motion: also along the true poses; closure_deg: how far the camera turns
+    before it comes back; closure_walk: steps of the walk there and back, 0 for none; long_steps: of the long rollouts, 0 for none;
     speed_steps: 0 for none."""
 
     horizons: tuple[int, ...] = (1, 8, 32, 64, 128)
@@ -37,8 +36,6 @@ class ExamConfig:
     drop: tuple[int, int] = (8, 64)
     batch: int = 16
     strips: int = 3
-    walked_m: float = 0.5
-    frechet: bool = True
     true_motion: bool = True
     closure_deg: tuple[float, ...] = (90.0, 180.0)
     closure_step_deg: float = 6.0

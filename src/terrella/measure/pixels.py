@@ -51,7 +51,7 @@ def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip
     if step in horizons:
         if min(mine.shape[1:3]) >= _LEAST_SSIM:
             kept[f"{name}/ssim"] = ssim(mine, truth)
-        if exam.config.frechet and min(mine.shape[1:3]) >= MIN_SIDE:
+        if min(mine.shape[1:3]) >= MIN_SIDE:
             kept[f"{name}/features"] = frame_features(mine)
         kept[f"{name}/frames"] = mine[: max(0, exam.config.strips - first)]
     return kept
@@ -76,7 +76,7 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
     context = clips[0].context
     for name in names:
         last = rows_at(clips, name, context - 1)
-        looks = exam.config.frechet and min(last.shape[1:3]) >= MIN_SIDE
+        looks = min(last.shape[1:3]) >= MIN_SIDE
         alone = {f"{name}/first": gradient_energy(last)} | ({f"{name}/last": frame_features(last)} if looks else {})
         for step in range(1, steps + 1):
             frames = rows_at(clips, name, context - 1 + step)

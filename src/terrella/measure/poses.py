@@ -20,6 +20,8 @@ LEAD = (
     "The table adds the distance as a share of the length of the true path."
 )
 
+WALKED_M = 0.5  # clips that went less far have no share of it
+
 
 def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
     """Distance and turn between the predicted and the true pose."""
@@ -44,12 +46,12 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 
 
 def _report(exam: Exam, found: Found) -> Report:
-    whole, config = report(exam, found, "pose", series), exam.config
+    whole = report(exam, found, "pose", series)
     for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS, (PREDICTED,)):
         for made in series(exam, found, CLIPS, place, clips, dreamt):
             walked = torch.from_numpy(np.stack([clip.walked_m(made.channel) for clip in clips]))
-            for step in config.horizons if made.unit == "m" else ():
-                went = walked[:, step - 1] > config.walked_m
+            for step in exam.config.horizons if made.unit == "m" else ():
+                went = walked[:, step - 1] > WALKED_M
                 if went.any():
                     share = 100 * made.values[went, step - 1] / walked[went, step - 1]
                     for what, figure in (("mean", mean_interval), ("median", median_interval)):

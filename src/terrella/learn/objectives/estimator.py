@@ -18,7 +18,7 @@ from ...space.estimator import Estimator, EstimatorConfig, normalised
 from ...space.floorplan import Box
 from ..feeds import Drawn
 from ..recording import Recording
-from ..trainer import CPU, Loss, Now, Run, adamw, warmed
+from ..trainer import CPU, Loss, Now, Run, Trainer, adamw, warmed
 
 DRIFT = 64  # steps over which odometry is summed when it is judged
 
@@ -77,8 +77,8 @@ def learn_estimator(
 ) -> Estimator:
     """A depth and odometry estimator, learned on the CPU."""
     objective = Depths(recording, batch, learning_rate, run.seed)
-    trainer = run.stage("estimator", Drawn(objective.picked), objective, steps, device=CPU)
-    trainer.run()
+    trainer = Trainer(run, "estimator", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.train()
     estimator = objective.estimator.eval().requires_grad_(False)
     with torch.inference_mode():
         looks = [estimator.looks(recording.rgb(part)) for part in np.array_split(np.sort(objective.some), 40)]

@@ -17,7 +17,7 @@ from ...worlds.body import Motion
 from ...worlds.config import MotionConfig
 from ..feeds import Drawn
 from ..recording import Recording
-from ..trainer import CPU, Learner, Loss, Now, Run
+from ..trainer import CPU, Learner, Loss, Now, Run, Trainer
 
 _WINDOWS, _LENGTH = 512, 24  # walks, and steps of each, on which the body is fitted
 _BATCH, _RARE = 512, 64  # steps a batch, and those of them with which an episode ended
@@ -30,8 +30,8 @@ def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyfram
     motion.middle.copy_((seen.place.amin(0) + seen.place.amax(0)) / 2)
     motion.span.copy_((seen.place.amax(0) - seen.place.amin(0)).max().clamp_min(1e-3))
     objective, ended = Moving(motion, seen), bool(seen.ended.any())
-    trainer = run.stage("motion", Drawn(objective.picked), objective, steps, device=CPU)
-    trainer.run()
+    trainer = Trainer(run, "motion", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.train()
     if not ended:  # nothing was seen to end
         last = list(motion.ending.parameters())[-2:]
         last[0].data.zero_()

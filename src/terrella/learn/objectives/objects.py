@@ -18,7 +18,7 @@ from ...space.camera import Intrinsics, project
 from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, fresh, likest, marks, noted
 from ..feeds import Drawn
 from ..recording import INSTANCES, OBJECTS, Recording
-from ..trainer import CPU, Loss, Now, Report, Run, adamw, warmed
+from ..trainer import CPU, Loss, Now, Report, Run, Trainer, adamw, warmed
 
 CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a thing's look is known; from which it may stand for a look
 FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
@@ -96,8 +96,8 @@ def learn_objects(
         for row, billboard in enumerate(billboards[: objects.config.rows]):
             objects.begun[episode, row] = billboard
     objective = Next(objects, tokens, recording)
-    trainer = run.stage("objects", Drawn(objective.picked), objective, steps, device=CPU)
-    trainer.run()
+    trainer = Trainer(run, "objects", Drawn(objective.picked), objective, steps, device=CPU)
+    trainer.train()
     objects.eval()
     facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
     return {**facts, "objects_steps": steps}

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ...data import ClipCache
 from ...worlds.outcome import Logits, Outcome, OutcomeConfig
 from ..feeds import Drawn
-from ..trainer import Learner, Loss, Now, Run, warmed
+from ..trainer import Learner, Loss, Now, Run, Trainer, warmed
 
 PIECE = 8  # steps that are learned from at a time
 _LEVELS = 33  # values, at most, that a reward or a change is told apart into
@@ -140,7 +140,7 @@ def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
     """Trains the objective's Outcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    run.stage("outcome", Drawn(objective.picked), objective, steps).run()
+    Trainer(run, "outcome", Drawn(objective.picked), objective, steps).train()
     objective.outcome.eval()
     return {"outcome_steps": steps}
 

@@ -26,7 +26,7 @@ from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyC
 from ..feeds import Drawn
 from ..recording import Recording
 from ..run_folder import resume_file
-from ..trainer import CPU, Loss, Now, Report, Run, adamw, warmed
+from ..trainer import CPU, Loss, Now, Report, Run, Trainer, adamw, warmed
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
@@ -214,7 +214,7 @@ def fit(run: Run, seen: Dreamt, steps: int) -> Uncertainty:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(run.seed)
         objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
-    run.stage("uncertainty", Drawn(objective.picked), objective, steps, device=CPU).run()
+    Trainer(run, "uncertainty", Drawn(objective.picked), objective, steps, device=CPU).train()
     return objective.uncertainty.eval().requires_grad_(False)
 
 

@@ -16,7 +16,7 @@ from ..objectives.latent_model import LatentModel
 from ..recording import Recording
 from ..run_folder import load_run, resume_file
 from ..strips import write_lines
-from ..trainer import Report, Run, device_named
+from ..trainer import Report, Run, Trainer, device_named
 
 STAGE = "codes"
 WHY = "latent actions are learned from pictures"
@@ -73,12 +73,12 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
     clips = Clips(
         recording.cache, 2, ("rgb",), config.batch, stride=config.stride, seed=config.seed, episodes=recording.seen
     )
-    trainer = run.stage(STAGE, Streamed(clips, lambda found, now: found["rgb"]), objective, config.steps)
+    trainer = Trainer(run, STAGE, Streamed(clips, lambda found, now: found["rgb"]), objective, config.steps)
 
     def draw() -> None:
         draw_strip(model, recording, config.seed, run.out / f"strip-{trainer.facts['step']:06d}.png")
 
-    trainer.run(draw)
+    trainer.train(draw)
     draw()
     return {"run": str(out), **trainer.summary}
 

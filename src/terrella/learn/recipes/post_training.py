@@ -96,7 +96,7 @@ def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: Dis
     weights, rate = (config.truth_weight, config.teacher_weight, config.critic_weight), held(config.learning_rate, 50)
     student = Student("student", teacher.generator, config.flow_steps, rate, 0.0, weights, teacher.generator)
     run = _run(pair, out, config, report)
-    trainer = run.stage("distil", pair.feed(config.batch, config.seed, student.dream), student, config.steps)
+    trainer = Trainer(run, "distil", pair.feed(config.batch, config.seed, student.dream), student, config.steps)
     about = f"{steps} to {config.flow_steps} steps a frame, {{}} updates"
     return _trained(pair, run, trainer, student, lambda step: {"distilled": about.format(step)})
 
@@ -125,7 +125,7 @@ def train_dreams(
     dreams = Dreams(student, config.horizon, lambda now: pair.real(config.batch, now))
     run = _run(pair, out, config, report, **more)
     feed = Drawn(lambda now: Rollouts(world, pair.recording, config.horizon, config.batch, now))
-    trainer = run.stage("dreams", feed, dreams, config.steps)
+    trainer = Trainer(run, "dreams", feed, dreams, config.steps)
     about = lambda step: {"dreams": f"{step * config.batch:,} of {config.horizon} frames"}  # noqa: E731
     return _trained(pair, run, trainer, student, about)
 
@@ -158,6 +158,6 @@ def _trained(pair: Paired, run: Run, trainer: Trainer, student: Student, about: 
         save_world(world, run.out / "world")
         draw_strip((pair.world, world), pair.recording, run.out / f"strip-{step:06d}.png")
 
-    trainer.run(draw)
+    trainer.train(draw)
     draw()
     return {"world": str(run.out / "world"), **trainer.summary}

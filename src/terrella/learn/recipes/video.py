@@ -29,7 +29,7 @@ from ..objectives.uncertainty import forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..strips import draw_strip
 from ..trainer import Report, Run, Trainer, device_named
-from .uncertainty import SensesConfig, learn_senses
+from .parts import SensesConfig, learn_senses
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -169,7 +169,7 @@ class _Learned:
         batch = config.batch or (64 if run.device.type == "cuda" else 8)
         dream = self.flow.dream if config.flow_steps == 1 else None  # a teacher sees recorded frames alone
         feed = frames_feed(recording, self.memory, self.video, batch, config.seed, dream)
-        trainer = run.stage("flow", feed, self.flow, config.steps, config.hours)
+        trainer = Trainer(run, "flow", feed, self.flow, config.steps, config.hours)
         if self.memory is not None:
             self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
         if self.outcome is not None:
@@ -184,7 +184,7 @@ class _Learned:
             forget(run.out)  # it knew the errors of an earlier generator
             trainer.facts.pop("senses", None)
             done = False
-        trainer.run(lambda: self.draw_strip(trainer))
+        trainer.train(lambda: self.draw_strip(trainer))
         if not done:
             self._finish(trainer)
         senses = trainer.facts.pop("senses")
