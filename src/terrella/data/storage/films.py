@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import shutil
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +12,9 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from . import durable, mp4
+from .durable import FULL
 from .mp4 import Mp4Writer
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MOST = 50_000_000  # frames of one file; more is damage
 _PACKED, _ZEROS = ("h264", "hevc", "av1", "libdav1d", "vp9"), bytes(24)  # entropy coding leaves no such run of zeros
 
@@ -79,8 +77,11 @@ def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel
             if first == 0 and len(reel.frames) == count:
                 shutil.copyfile(path, target)
             else:
-                with suppress(DatasetError):  # what this mp4 writer cannot hold may still be decoded
-                    _copy(path, at, count, target)
+                try:
+                    mp4.finish(path, target, count, at)
+                except (DatasetError, *mp4.BROKEN) as error:  # what this mp4 writer cannot hold may still be decoded
+                    if getattr(error, "errno", None) in FULL:
+                        raise
             if np.array_equal(np.sort(mp4_frames(target, fps)), np.arange(count)):
                 durable.sync_file(target)
                 return True
@@ -94,29 +95,6 @@ def mp4_frames(path: Path, fps: float) -> np.ndarray:
         return reel(path, fps).frames
     except DatasetError:
         return np.zeros(0, np.int64)
-
-
-def _copy(path: Path, at: int, count: int, target: Path) -> None:
-    """Packets number `at` .. `at + count - 1` of the file."""
-    try:
-        options = mp4.FINISHED
-        with mp4.opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
-            out = copy.add_stream_from_template(stream, opaque=True)
-            begin = None
-            for number, packet in enumerate(source.demux(stream)):
-                if number < at:
-                    continue
-                if number == at + count or packet.pts is None:
-                    break
-                begin = packet.pts if begin is None else begin
-                packet.pts -= begin
-                packet.dts = None if packet.dts is None else packet.dts - begin
-                packet.stream = out
-                copy.mux(packet)
-    except mp4.BROKEN as error:
-        if getattr(error, "errno", None) in _FULL:
-            raise
-        raise mp4.broken(path, str(error)) from error
 
 
 def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:

@@ -7,7 +7,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 
 import av
@@ -38,16 +40,22 @@ _WAITING = 64  # frames that may wait for the encoder; then `add` waits, no fram
 _LARGEST = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
 
 
-class Mp4Writer:
-    """Encodes uint8 [H, W, 3] frames in a thread of its own; errors of that thread surface in `add` or `finish`.
+@dataclass
+class Pressure:
+    """How far behind encoders were. waited_s: time that `add` stood still; most_waiting: frames that queued at worst."""
 
-    The file at `path` grows frame by frame. waited_s: seconds that `add` waited for the encoder; most_waiting: the most
-    frames that ever waited.
+    waited_s: float = 0.0
+    most_waiting: int = 0
+
+
+class Mp4Writer:
+    """Encodes uint8 [H, W, 3] frames in a thread of its own; errors of that thread surface in `add` or `close`.
+
+    The file at `path` grows frame by frame; `pressure` is told where the encoder is behind.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], fps: float):
-        self.path, self.waited_s, self.most_waiting = path, 0.0, 0
-        self._size = size
+    def __init__(self, path: Path, size: tuple[int, int], fps: float, pressure: Pressure | None = None):
+        self.path, self._size, self._pressure = path, size, pressure or Pressure()
         self._rate = Fraction(fps).limit_denominator(10_000)
         self._frames: queue.Queue[np.ndarray | None] = queue.Queue(_WAITING)
         self._error: BaseException | None = None
@@ -63,8 +71,8 @@ class Mp4Writer:
         except queue.Full:
             began = time.perf_counter()
             self._frames.put(frame)
-            self.waited_s += time.perf_counter() - began
-        self.most_waiting = max(self.most_waiting, self._frames.qsize())
+            self._pressure.waited_s += time.perf_counter() - began
+        self._pressure.most_waiting = max(self._pressure.most_waiting, self._frames.qsize())
 
     def close(self) -> None:
         """Ends the growing file; raises what went wrong in the encoder."""
@@ -116,19 +124,22 @@ def ticks(stream: VideoStream, fps: float) -> Fraction:
     return (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
 
 
-def finish(growing: Path, target: Path, frames: int | None = None) -> int:
-    """Copies a grown file, which is cut after its last whole frame, to `target` with its index in front.
+def finish(path: Path, target: Path, frames: int | None = None, first: int = 0) -> int:
+    """Copies frames to a file of their own with its index in front; returns how many it holds.
 
-    At most `frames` are taken; returns how many it holds. Nothing is encoded anew. DatasetError where not one is whole.
+    At most `frames` are taken, from packet number `first` on, which begins at time 0. Nothing is encoded anew. DatasetError
+    where not one is whole.
     """
-    count, options = 0, FINISHED
+    count, begin, options = 0, 0, FINISHED
     try:
-        boxes.trim(growing)
-        with opened(growing) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
-            out = copy.add_stream_from_template(stream)
-            for packet in source.demux(stream):
-                if packet.size == 0 or packet.is_corrupt or count == frames:
+        with opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
+            out = copy.add_stream_from_template(stream, opaque=True)
+            for packet in islice(source.demux(stream), first, None):
+                if packet.size == 0 or packet.is_corrupt or packet.pts is None or count == frames:
                     break
+                begin = begin if count else packet.pts
+                packet.pts -= begin
+                packet.dts = None if packet.dts is None else packet.dts - begin
                 packet.stream = out
                 copy.mux(packet)
                 count += 1
@@ -136,9 +147,9 @@ def finish(growing: Path, target: Path, frames: int | None = None) -> int:
         if isinstance(error, OSError) and error.errno and not isinstance(error, av.InvalidDataError):
             raise
         if not count:
-            raise broken(growing, str(error)) from error
+            raise broken(path, str(error)) from error
     if not count:
-        raise broken(growing, "it holds no frame")
+        raise broken(path, "it holds no frame")
     durable.sync_file(target)
     return count
 
