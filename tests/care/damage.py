@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from layouts import layout_of
 
 from terrella.care.doctor import examine
 from terrella.care.repair import repair
@@ -25,7 +26,7 @@ from terrella.data.source import Sensor
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"
 LAYOUT = Layout(
     20,
-    Layout.of_channels(20, ("go", "turn"), rgb=(32, 48), depth=(3, 4), pose=True).sensors,
+    layout_of(20, ("go", "turn"), rgb=(32, 48), depth=(3, 4), pose=True).sensors,
     streams={LIDAR: Sensor(LIDAR, "points", (0, 3)), SIDE: Sensor(SIDE, "image", (16, 16, 3), "uint8", rate_hz=5)},
     clock=True,
 )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from layouts import layout_of
 
 from terrella.care import repair
 from terrella.core.errors import DatasetError
@@ -23,7 +24,7 @@ from terrella.data.source import Sensor
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"
 LAYOUT = Layout(
     20,
-    Layout.of_channels(20, ("go",), rgb=(32, 48), pose=True).sensors,
+    layout_of(20, ("go",), rgb=(32, 48), pose=True).sensors,
     streams={LIDAR: Sensor(LIDAR, "points", (0, 3)), SIDE: Sensor(SIDE, "image", (16, 16, 3), "uint8", rate_hz=5)},
     clock=True,
 )

@@ -19,6 +19,8 @@ from terrella.learn.objectives.latent_actions import posterior
 from terrella.learn.objectives.latent_model import Forward, warped
 from terrella.learn.recipes.latent_actions import LatentConfig, load_latent, train_latent_actions
 
+from ..data.layouts import layout_of
+
 CONFIG = LatentConfig(codes=4, stride=1, size=(32, 32), steps=100, batch=8, strip_every_s=1e9)
 MOVES = {"up": (-2, 0), "down": (2, 0), "left": (0, -2), "right": (0, 2)}
 
@@ -29,7 +31,7 @@ def scrolling(folder, acted=True, episodes=4, length=120):
     coarse = torch.from_numpy(rng.random((1, 3, 16, 16), np.float32))
     wide = torch.nn.functional.interpolate(coarse.repeat(1, 1, 3, 3), (192, 192), mode="bicubic")[0, :, 64:128, 64:128]
     picture = (wide.clamp(0, 1) * 255).to(torch.uint8).permute(1, 2, 0).numpy()
-    sensors = Layout.of_channels(10.0, tuple(MOVES), rgb=(32, 32)).sensors
+    sensors = layout_of(10.0, tuple(MOVES), rgb=(32, 32)).sensors
     kept = {name: sensor for name, sensor in sensors.items() if acted or name != "action"}
     layout = Layout(10.0, kept, pictures="png", world={"name": "scroll"})
     with Recorder(folder, layout) as recorder:
@@ -128,7 +130,7 @@ def test_bad_input_is_refused_in_one_sentence(recording, run, tmp_path):
         load_latent(tmp_path)
     with pytest.raises(DatasetError, match="ask for fewer"):
         map_keys(run, recording, quiet, frames=100_000)
-    with Recorder(tmp_path / "blind", Layout.of_channels(10.0, ("a",), pose=True)) as recorder:
+    with Recorder(tmp_path / "blind", layout_of(10.0, ("a",), pose=True)) as recorder:
         for _ in range(3):
             recorder.add({"pose": np.eye(7, dtype=np.float32)[3]}, np.zeros(1))
     with pytest.raises(DatasetError, match="holds no rgb"):

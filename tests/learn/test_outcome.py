@@ -11,7 +11,7 @@ from gymnasium import spaces
 from tests.learn.stopping import quiet
 
 from terrella.core import check_world, make_rng
-from terrella.data import ClipCache, Layout, Recorder
+from terrella.data import ClipCache, Recorder
 from terrella.learn.history_batches import changing, clips_at, history_batch
 from terrella.learn.objectives.outcome import Happenings, Pieces, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
@@ -23,6 +23,8 @@ from terrella.worlds.generator import Generator
 from terrella.worlds.history import FrameHistory, Starts
 from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import Outcome
+
+from ..data.layouts import layout_of
 
 SIZE, FACTS = (16, 24), {"discrete": True, "action_low": [0], "action_high": [2], "action_names": ["STAY", "L", "R"]}
 
@@ -37,7 +39,7 @@ def picture(place: int) -> np.ndarray:
 def recording(tmp_path_factory):
     """Six places in a row: the rightmost pays 2 on arrival, the leftmost takes one of 3 lives, and the last life ends it."""
     folder, rng = tmp_path_factory.mktemp("outcome") / "set", np.random.default_rng(0)
-    layout = Layout.of_channels(15.0, ("action_0",), rgb=SIZE, vectors={"lives": 1}, world=FACTS)
+    layout = layout_of(15.0, ("action_0",), rgb=SIZE, vectors={"lives": 1}, world=FACTS)
     with Recorder(folder, layout) as recorder:
         for _ in range(24):
             place, lives = int(rng.integers(1, 5)), 3

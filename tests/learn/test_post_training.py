@@ -16,7 +16,7 @@ from tests.learn.test_moving import Haunted
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.data import Layout, Recorder, record
+from terrella.data import Recorder, record
 from terrella.learn.objectives import distillation
 from terrella.learn.objectives.distillation import Matching, drawn
 from terrella.learn.objectives.dreams import Rollouts, beginnings
@@ -27,6 +27,8 @@ from terrella.learn.trainer import Now
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
 from terrella.worlds.uncertainty import Asked
+
+from ..data.layouts import layout_of
 
 TEACHER = TrainConfig(
     size=(24, 32),
@@ -254,7 +256,7 @@ def test_a_world_of_one_step_teaches_nobody(recording, places, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
-    with Recorder(tmp_path / "other", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "other", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(2):
             for step in range(60):
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)

@@ -29,6 +29,8 @@ from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import Conditioning, context_thumbnail
 
+from ..data.layouts import layout_of
+
 CONFIG = TrainConfig(
     size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, estimator_steps=0,
     uncertainty_frames=0,
@@ -145,7 +147,7 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp
 
 
 def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path):
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(3):
             for step in range(60):
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)
@@ -213,7 +215,7 @@ def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
 
 @pytest.mark.parametrize("posed", [False, True])
 def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
-    layout = Layout.of_channels(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
+    layout = layout_of(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
     layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
     with Recorder(tmp_path / "set", layout) as recorder:
         for _ in range(2):
@@ -268,7 +270,7 @@ def test_of_two_cameras_the_main_one_is_learned_and_the_other_named_as_ignored(t
 
 
 def test_what_was_asked_for_reaches_training(tmp_path):
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for task in ("open the door", "close the door", "open the door"):
             recorder.task = task
             for step in range(40):

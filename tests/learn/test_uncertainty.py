@@ -15,7 +15,7 @@ from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.data import ClipCache, Dataset, Layout, Recorder, record, split
+from terrella.data import ClipCache, Dataset, Recorder, record, split
 from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative
 from terrella.learn.objectives.uncertainty import ARMS, Dreamt, Rollout, answers, calibrate, dream, fit, pooled
 from terrella.learn.recipes.parts import EstimatorTraining, SensesConfig, train_estimator, train_uncertainty
@@ -26,6 +26,8 @@ from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
 from terrella.worlds.folder import load_world
 from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
+
+from ..data.layouts import layout_of
 
 BARE = TrainConfig(
     size=(24, 32),
@@ -97,7 +99,7 @@ def test_pictures_are_recoloured_now_and_then():
 
 
 def test_a_recording_without_poses_is_refused(tmp_path):
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left",), rgb=(24, 32))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for step in range(60):
             recorder.add({"rgb": np.full((24, 32, 3), step, np.uint8)}, np.array([step % 2]), 0.0, False)
     with pytest.raises(DatasetError, match="holds no depth"):
