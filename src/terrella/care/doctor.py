@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..core.errors import DatasetError
 from ..data.format import INFO, STATS
-from ..data.storage import boxes, journal
+from ..data.storage import journal, mp4
 from .film_checks import Shown, examine_films, same
 from .motion_checks import misaligned
 from .row_checks import Rows, examine_rows
@@ -219,7 +219,7 @@ def _interrupted(found: Survey) -> Iterator[Fault]:
     try:
         about = journal.about(found.path(_STAGING))
         rows = sum(1 for number, _, _ in journal.readings(found.path(_STAGING)) if number == 0)
-        frames = {name: boxes.whole(found.path(f".staging/{name}.growing.mp4"))[1] for name in found.cameras}
+        frames = {name: mp4.whole_fragments(found.path(f".staging/{name}.growing.mp4"))[1] for name in found.cameras}
     except (OSError, ValueError, RecursionError, DatasetError):
         rows = 0
     if about and about.get("episode") != found.info.get("total_episodes") and found.info:

@@ -14,9 +14,8 @@ from ..data import stats
 from ..data.channels import ACTION, DONE, STATE
 from ..data.format import ACTION_VALID, TASKS, schema, to_numpy
 from ..data.storage.tables import open_parquet
-from .pieces import whole_pictures
+from .pieces import batches, whole_pictures
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey
-from .tables import batches
 
 _LEAVE_OUT = "let --repair split the episode around such rows, or leave it out of training"
 _COUNT_ANEW = "let --repair count anew"

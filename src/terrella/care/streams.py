@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DatasetError
-from ..data.episodes import Episode
 from ..data.format import TIME, stream_path
+from ..data.meta import Episode
 from ..data.source import Sensor
 from ..data.storage import mp4
 from ..data.storage.films import cut, reel, whole_frames

@@ -12,10 +12,9 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from ..data.episodes import MOST, OPTIONAL, Episode, EpisodeTable, read_part
 from ..data.features import checked_features
 from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, sensor_from_json
-from ..data.meta import sentences
+from ..data.meta import MOST, OPTIONAL, Episode, EpisodeTable, read_part, sentences
 from ..data.source import Sensor
 from ..data.storage.remote import LocalFiles
 from ..data.storage.tables import open_parquet, read_json

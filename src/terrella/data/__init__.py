@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from .dataset import Dataset
-from .episodes import Episode
 from .format import Layout
+from .meta import Episode
 from .recorder import Recorder
 from .source import Readings, Sensor, Source, Take
 from .training.cache import ClipCache, split

@@ -14,7 +14,7 @@ from ..core.errors import DatasetError
 from . import stats
 from .format import Layout, sensor_from_json, sensor_json
 from .source import Sensor
-from .storage import boxes, journal, mp4
+from .storage import journal, mp4
 from .storage.films import whole_frames
 from .writer import Draft, group_columns
 
@@ -129,7 +129,7 @@ class Staged:
 
     def _finished(self, film: Path, name: str, length: int) -> Path:
         target = self.folder / f"{name}.mp4"
-        boxes.trim(film)
+        mp4.trim(film)
         kept = mp4.finish(film, target, length)
         if kept != length:
             raise DatasetError(f"the film {film} has {kept} of the {length} frames that are needed.")
@@ -164,7 +164,7 @@ def _good(film: Path, target: Path, most: int, fps: float) -> int:
     if not most:
         return 0
     try:
-        boxes.trim(film)
+        mp4.trim(film)
         count = mp4.finish(film, target, most)
         good = whole_frames(target, 0, count, fps)
         return int(count if good.all() else good.argmin())
