@@ -13,10 +13,9 @@ from ..data.format import INFO, STATS
 from ..data.storage import journal, mp4
 from .film_checks import Shown, examine_films, same
 from .motion_checks import misaligned
-from .row_checks import Rows, examine_rows
+from .row_checks import Rows, constants, examine_rows, frozen, statistics
 from .streams import examine_streams
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey, survey
-from .value_checks import constants, frozen, statistics
 
 __all__ = ["Fault", "Findings", "Group", "doctor", "examine"]
 
