@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,49 +95,47 @@ class Table:
     path: Path
     columns: dict[str, np.ndarray]
     good: np.ndarray
-    missing: dict[str, np.ndarray] = field(default_factory=dict)  # column -> rows in which it is no finite number
+    missing: dict[str, np.ndarray]  # column -> rows in which it is no finite number
 
 
 def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dict]) -> Table:
     """Reads all columns of a data file, keeps the counters; DatasetError where the file as a whole cannot be read."""
+    stored = [name for name, feature in features.items() if feature["dtype"] != "video"]
+    floats = [name for name in stored if features[name]["dtype"].startswith("float") and name != "timestamp"]
     with open_parquet(path) as opened:
         names = opened.schema_arrow.names
-    columns = [name for name, feature in features.items() if name in names and feature["dtype"] != "video"]
-    lacks = sorted(
-        name for name, f in features.items() if name not in names and f["dtype"] != "video" and name not in AUTOMATIC
-    )
-    if lacks:
-        raise DatasetError(f"{file} lacks the column '{lacks[0]}' that other rows have.")
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in AUTOMATIC}
-    missing: dict[str, list[np.ndarray]] = {}
-    good: list[np.ndarray] = []
-    for _, count, table in batches(path, features, columns):
+    for name in sorted(set(stored) - set(names) - set(AUTOMATIC)):
+        raise DatasetError(f"{file} lacks the column '{name}' that other rows have.")
+    parts: dict[str, list[np.ndarray]] = {name: [np.zeros(0)] for name in AUTOMATIC}
+    missing: dict[str, list[np.ndarray]] = {name: [np.zeros(0, bool)] for name in floats}
+    good = [np.zeros(0, bool)]
+    for _, count, table in batches(path, features, [name for name in stored if name in names]):
         if isinstance(table, DatasetError) and count > _MOST_LOST:
             raise table  # who claims so many rows has none
-        whole = np.ones(count, bool)
-        found: dict[str, np.ndarray] = {}
-        if isinstance(table, DatasetError):
-            whole[:] = False
-        else:
-            for name in columns:
-                try:
-                    if features[name]["dtype"] == "image":
-                        whole &= whole_pictures(table[name], tuple(features[name]["shape"]))
-                    else:
-                        found[name] = to_numpy(table[name], tuple(features[name]["shape"]))
-                except (ValueError, TypeError, NotImplementedError):
-                    whole[:] = False
-        for name in AUTOMATIC:
-            there = found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan)
-            parts[name].append(there)
-        for name, feature in features.items():
-            if feature["dtype"].startswith("float") and name != "timestamp":
-                bad = ~np.isfinite(found[name].reshape(count, -1)).all(1) if name in found else np.zeros(count, bool)
-                missing.setdefault(name, []).append(np.asarray(bad))
+        found, whole = ({}, np.zeros(count, bool)) if isinstance(table, DatasetError) else _numbers_of(table, features)
         good.append(whole)
-    joined = {name: np.concatenate(some) if some else np.zeros(0) for name, some in parts.items()}
-    bad = {name: np.concatenate(some) for name, some in missing.items()}
-    return Table(file, path, joined, np.concatenate(good) if good else np.zeros(0, bool), bad)
+        for name, some in parts.items():
+            some.append(found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan))
+        for name, some in missing.items():
+            there = name in found
+            some.append(~np.isfinite(found[name].reshape(count, -1)).all(1) if there else np.zeros(count, bool))
+    joined, bad = ({name: np.concatenate(some) for name, some in kind.items()} for kind in (parts, missing))
+    return Table(file, path, joined, np.concatenate(good), bad)
+
+
+def _numbers_of(table: pa.Table, features: Mapping[str, dict]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """(columns of numbers, bool [n]: the rows of which all columns can be read)."""
+    found, whole = {}, np.ones(len(table), bool)
+    for name in table.column_names:
+        shape = tuple(features[name]["shape"])
+        try:
+            if features[name]["dtype"] == "image":
+                whole &= whole_pictures(table[name], shape)
+            else:
+                found[name] = to_numpy(table[name], shape)
+        except (ValueError, TypeError, NotImplementedError):
+            whole[:] = False
+    return found, whole
 
 
 def whole_pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
