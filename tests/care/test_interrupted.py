@@ -31,7 +31,7 @@ LAYOUT = Layout(
 
 SCRIPT = """
 import sys
-sys.path.insert(0, {folder!r})
+sys.path[:0] = {folders!r}
 from test_interrupted import drive
 from terrella.data import Recorder
 from test_interrupted import LAYOUT
@@ -75,7 +75,7 @@ def check(root: Path, number: int, least: int) -> int:
 @pytest.mark.parametrize("rows", [90, 300])
 def test_kill_9_keeps_every_whole_frame_of_the_episode_in_flight(tmp_path, rows):
     root = tmp_path / "killed"
-    script = SCRIPT.format(folder=str(Path(__file__).parent), root=str(root))
+    script = SCRIPT.format(folders=[str(Path(__file__).parents[i]) + end for i, end in ((0, ""), (1, "/data"))], root=str(root))
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         while int(process.stdout.readline()) < rows:
