@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,18 +64,18 @@ def reel(path: Path, fps: float) -> Reel:
     return Reel(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
 
 
-def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel) -> bool:
+def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Reel) -> bool:
     """Frames `first` .. `first + count - 1` of a video as one of its own.
 
     True where its packets were copied; False where they had to be decoded and encoded again. DatasetError where a frame
     cannot be had.
     """
-    begin = np.flatnonzero(reel.frames == first)
-    if len(begin) == 1 and reel.keys[begin[0]]:
+    begin = np.flatnonzero(packed.frames == first)
+    if len(begin) == 1 and packed.keys[begin[0]]:
         at = int(begin[0])
-        packets = reel.frames[at : at + count]
+        packets = packed.frames[at : at + count]
         if len(packets) == count and np.array_equal(np.sort(packets), first + np.arange(count)):
-            if first == 0 and len(reel.frames) == count:
+            if first == 0 and len(packed.frames) == count:
                 shutil.copyfile(path, target)
             else:
                 try:
@@ -82,19 +83,12 @@ def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel
                 except (DatasetError, *mp4.BROKEN) as error:  # what this mp4 writer cannot hold may still be decoded
                     if getattr(error, "errno", None) in FULL:
                         raise
-            if np.array_equal(np.sort(mp4_frames(target, fps)), np.arange(count)):
-                durable.sync_file(target)
-                return True
+            with suppress(DatasetError):
+                if np.array_equal(np.sort(reel(target, fps).frames), np.arange(count)):
+                    durable.sync_file(target)
+                    return True
     _encode(path, first, count, fps, target)
     return False
-
-
-def mp4_frames(path: Path, fps: float) -> np.ndarray:
-    """Which frames a video holds; none where it is broken."""
-    try:
-        return reel(path, fps).frames
-    except DatasetError:
-        return np.zeros(0, np.int64)
 
 
 def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:
