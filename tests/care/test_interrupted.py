@@ -75,7 +75,9 @@ def check(root: Path, number: int, least: int) -> int:
 @pytest.mark.parametrize("rows", [90, 300])
 def test_kill_9_keeps_every_whole_frame_of_the_episode_in_flight(tmp_path, rows):
     root = tmp_path / "killed"
-    script = SCRIPT.format(folders=[str(Path(__file__).parents[i]) + end for i, end in ((0, ""), (1, "/data"))], root=str(root))
+    script = SCRIPT.format(
+        folders=[str(Path(__file__).parents[i]) + end for i, end in ((0, ""), (1, "/data"))], root=str(root)
+    )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         while int(process.stdout.readline()) < rows:

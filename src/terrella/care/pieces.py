@@ -117,8 +117,9 @@ def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dic
         for name, some in parts.items():
             some.append(found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan))
         for name, some in missing.items():
-            there = name in found
-            some.append(~np.isfinite(found[name].reshape(count, -1)).all(1) if there else np.zeros(count, bool))
+            some.append(np.zeros(count, bool))
+            if name in found:
+                some[-1] |= ~np.isfinite(found[name].reshape(count, -1)).all(1)
     joined, bad = ({name: np.concatenate(some) for name, some in kind.items()} for kind in (parts, missing))
     return Table(file, path, joined, np.concatenate(good), bad)
 
