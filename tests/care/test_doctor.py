@@ -366,11 +366,11 @@ def test_faults_of_streams_are_named(tmp_path, name):
 def test_a_file_of_many_episodes_is_read_once(recording, monkeypatch):
     from strangers import shared
 
-    from terrella.care import tables
+    from terrella.care import pieces
 
     root = shared(recording, recording.parent / "shared")
     opened: list[Path] = []
-    real = tables.open_parquet
-    monkeypatch.setattr(tables, "open_parquet", lambda path: opened.append(path) or real(path))
+    real = pieces.open_parquet
+    monkeypatch.setattr(pieces, "open_parquet", lambda path: opened.append(path) or real(path))
     assert doctor(root) == []
     assert sum("data" in str(path.relative_to(root)) for path in opened) <= 2
