@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .core.errors import TerrellaError
 from .core.world import World
 from .similar import did_you_mean
 from .space.estimator import Estimator
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
@@ -73,6 +76,15 @@ def load(
 
         return GymnasiumWorld(text.partition(":")[2], **options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
+
+
+def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:
+    """`num_envs` episodes of a world as a VecEnv of Stable-Baselines3: see core/stable_baselines3.py for the options, which
+    are those of `as_env`. TerrellaError where that is not installed."""
+    _require("stable_baselines3", "as_sb3 needs Stable-Baselines3", "sb3")
+    from .core.stable_baselines3 import WorldVecEnv
+
+    return WorldVecEnv(world, num_envs, **options)
 
 
 def is_truth(name: str | Path) -> bool:

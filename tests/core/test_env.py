@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import gymnasium
@@ -219,14 +220,24 @@ def test_it_draws_what_the_world_shows(film, cartpole):
     assert blind.render_mode is None and blind.render() is None
 
 
+def test_a_time_limit_is_kept_and_is_no_termination(cartpole):
+    assert as_env(cartpole).max_steps == 500 and as_env(cartpole, max_steps=math.inf).max_steps == math.inf
+    car = GymnasiumWorld("MountainCar-v0", rgb=False)
+    own = GymnasiumWorld(lambda: gymnasium.make("MountainCar-v0", max_episode_steps=200), rgb=False)
+    for env in (as_env(car, 2), as_env(own, 2, max_steps=math.inf)):
+        env.reset(seed=0)
+        ends = [tuple(int(flag.sum()) for flag in env.step(np.array([1, 1]))[2:4]) for _ in range(200)]
+        assert ends == [(0, 0)] * 199 + [(0, 2)]
+
+
 def test_a_world_that_cannot_fork_is_one_environment():
     world = GymnasiumWorld("CartPole-v1", rgb=False, forkable=False)
     env = as_env(world, max_steps=30)
     env.reset(seed=0)
     ends = sum(int((end := env.step(np.array([step % 2])))[2][0] or end[3][0]) for step in range(100))
     assert ends >= 2
-    with pytest.raises(TerrellaError, match="1 to 1 episodes"):
-        as_env(world, num_envs=2)
+    with pytest.raises(TerrellaError, match="1 to 64 episodes"):
+        as_env(world, num_envs=65)
 
 
 def test_bad_requests_are_answered_in_one_sentence(cartpole):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +13,13 @@ import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from layouts import layout_of
 from two_cameras import MOUNT, WRIST, TwoCameras
 
 from terrella.care import doctor
 from terrella.core import Camera, Spec, check_world, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.policy import Replay
-from terrella.data import ClipCache, Clips, Dataset, Layout, Recorder, record
+from terrella.data import ClipCache, Clips, Dataset, Layout, Recorder, check_game, record
 from terrella.data.channels import channel_of, feature_of, features_of
 
 STEPS = 7
@@ -54,7 +54,7 @@ def test_names_are_kept_for_the_main_camera_and_go_back_to_their_channels(tmp_pa
     assert "observation" in dataset.features and "observation.observation" not in dataset.features
     assert dataset.features["observation.pose"]["shape"] == [7]  # since `state` is a channel of its own
     assert set(TwoCameras().spec.channels) | {"action"} == set(dataset.channels)
-    assert layout_of(10, ("go",), rgb=(8, 8), depth=(4, 4), pose=True).sensors.keys() >= {
+    assert Layout.of_channels(10, ("go",), rgb=(8, 8), depth=(4, 4), pose=True).sensors.keys() >= {
         "observation.images.rgb",
         "observation.depth",
         "observation.state",
@@ -101,7 +101,7 @@ def test_an_old_recording_of_one_camera_still_has_it(recording):
 
 
 def test_old_recordings_of_objects_are_read_by_their_name_of_now(tmp_path):
-    layout = layout_of(10, ("go",), rgb=(8, 8), pose=True, arrays={"cast": ((2, 4), "float32")})
+    layout = Layout.of_channels(10, ("go",), rgb=(8, 8), pose=True, arrays={"cast": ((2, 4), "float32")})
     with Recorder(tmp_path / "recording", layout) as recorder:
         for i in range(6):
             seen = {"rgb": np.zeros((8, 8, 3), np.uint8), "pose": np.arange(7), "cast": np.full((2, 4), i)}
@@ -136,7 +136,7 @@ def test_what_cannot_be_recorded_is_refused_by_its_name(name, space, words):
 
 
 def test_a_channel_without_a_place_is_an_error_and_not_left_out(tmp_path):
-    layout = layout_of(10, ("go",), pose=True)
+    layout = Layout.of_channels(10, ("go",), pose=True)
     with Recorder(tmp_path / "recording", layout) as recorder:
         with pytest.raises(DatasetError, match=r"no place for 'observation\.heat'"):
             recorder.add({"pose": np.arange(7), "heat": np.ones(1)}, [0.0])
@@ -171,6 +171,7 @@ def test_clips_of_any_channel(tmp_path):
 
 NO_TORCH = """
 import sys
+from dataclasses import replace
 class Block:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] == "torch":
@@ -200,3 +201,31 @@ def test_recordings_are_read_examined_converted_and_cut_into_clips_without_torch
         [sys.executable, "-W", "error", "-c", NO_TORCH, recording, tmp_path], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize(
+    ("recorded", "why"),
+    [
+        ((spaces.Discrete(6), ("observation",)), "holds no pictures, which learned observes"),
+        ((spaces.Discrete(5), ("rgb",)), r"actions in Discrete\(5\), which are not those of learned \(Discrete\(6\)\)"),
+        ((spaces.MultiBinary(6), ("rgb",)), r"action_0, .*action_5, which are not those of learned \(Discrete\(6\)\)"),
+        ((spaces.Discrete(6), ("rgb",), tuple("uvwxyz")), r"actions u, v, .* not those of learned \(a, b, c"),
+        ((spaces.Discrete(6), ("rgb",), tuple("abcdef")), ""),
+        ((spaces.Discrete(6), ("rgb",)), ""),
+    ],
+)
+def test_a_recording_of_another_game_is_known_by_what_it_says_of_itself(recorded, why, tmp_path):
+    shown = {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8), "observation": spaces.Box(-1, 1, (2,), np.float32)}
+    space, channels, names = (*recorded, ())[:3]
+    spec = Spec("game", space, {name: shown[name] for name in channels}, (), 0.1, action_names=names)
+    learned = Spec("learned", spaces.Discrete(6), shown, ("rgb",), 0.1, action_names=tuple("abcdef"))
+    with Recorder(tmp_path, replace(Layout.of(spec), pictures="png")) as recorder:
+        for action in (space.sample(), None):
+            recorder.add({name: np.zeros(shown[name].shape, shown[name].dtype) for name in channels}, action)
+    if why:
+        with pytest.raises(DatasetError, match=f"{why}.*recordings of its own game"):
+            check_game(Dataset(tmp_path), learned)
+    else:
+        assert check_game(Dataset(tmp_path), learned) == ""
+        other = replace(learned, card={"game": "chess"})
+        assert "is of game; learned learned chess" in check_game(Dataset(tmp_path), other)

@@ -100,6 +100,7 @@ def test_after_done_the_world_stands_still_without_reward():
 
 def test_the_time_limit_is_left_to_the_training():
     world, rng = GymnasiumWorld("MountainCar-v0", rgb=False), make_rng(0)
+    assert world.spec.max_episode_steps == 200
     state = world.start(1, rng)
     for _ in range(220):
         state = world.imagine(state, torch.tensor([1]), rng)
@@ -199,7 +200,7 @@ class Collecting(Box2DLike):
 @pytest.mark.parametrize("make", [Box2DLike, Secretive, Entangled, Collecting])
 def test_what_cannot_be_copied_exactly_gives_tickets(make):
     world = GymnasiumWorld(make)
-    assert not world.spec.forkable and world.spec.max_batch == 1
+    assert not world.spec.forkable
     rng = make_rng(0)
     first = world.start(1, rng)
     second = world.imagine(first, torch.tensor([1]), rng)

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from .. import __version__, library, progress
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
-from ..data import ClipCache, Dataset, split
+from ..data import ClipCache, Dataset, check_game, split
 from ..measure import (
     CLIPS,
     ENDINGS,
@@ -163,6 +163,8 @@ def _exam(
 def _cache(data: Path, world: World) -> Any:
     """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
     dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
+    if doubt := check_game(dataset, world.spec):
+        say(f"{doubt} Figures of another game say little.")
     for channel in world.spec.kinds("rgb"):
         height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
         feature = dataset.channels.get(channel)

@@ -18,7 +18,8 @@ from .world import World, make_rng
 class WorldEnv(VectorEnv):
     """`as_env(world)`: `num_envs` episodes of `world` side by side. Arrays lead with num_envs; the world is not closed with it.
 
-    max_steps:      an episode is truncated after that many steps.
+    max_steps:      an episode is truncated after that many steps: the world's own time limit (Spec.max_episode_steps) unless
+                    it is given; math.inf for none.
     observation:    a channel's name, whose arrays are the observations; or several names, for a dictionary of arrays.
                     By default "observation" where the world has it, else "rgb".
     seed:           of the first `reset()`; later resets go on from there unless they are given one.
@@ -26,7 +27,8 @@ class WorldEnv(VectorEnv):
                     SAME_STEP: the last observation is in infos["final_obs"], its infos in infos["final_info"].
                     DISABLED: call reset(options={"reset_mask": bool [num_envs]}).
 
-    Reward is the channel `reward` (0 where the world has none), terminated the channel `done`.
+    Reward is the channel `reward` (0 where the world has none), terminated the channel `done`; where the state has `truncated`,
+    bool [num_envs], that says which of the done were cut off instead.
     Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` episodes.
     """
 
@@ -34,19 +36,20 @@ class WorldEnv(VectorEnv):
         self,
         world: World,
         num_envs: int = 1,
-        max_steps: int | None = None,
+        max_steps: float | None = None,
         observation: str | Sequence[str] | None = None,
         seed: int = 0,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     ):
         spec = world.spec
-        most = spec.max_batch if spec.forkable else 1
+        most, max_steps = spec.max_batch, spec.max_episode_steps if max_steps is None else max_steps
         if num_envs < 1 or (most is not None and num_envs > most):
             raise TerrellaError(
                 f"{spec.name} holds 1 to {most or 'any number of'} episodes at once; num_envs is {num_envs}."
             )
-        if max_steps is not None and max_steps < 1:
-            raise TerrellaError(f"max_steps is a number of steps from 1 on, or None for no end; got {max_steps}.")
+        max_steps = np.inf if max_steps is None else max_steps
+        if not max_steps >= 1:
+            raise TerrellaError(f"max_steps is a number of steps from 1 on, or math.inf for no end; got {max_steps}.")
         if observation is None:
             observation = "observation" if "observation" in spec.channels else "rgb"
         self._single = isinstance(observation, str)
@@ -112,8 +115,9 @@ class WorldEnv(VectorEnv):
         seen = self._look()
         nothing = np.zeros(self.num_envs)
         rewards = np.where(fresh, 0.0, seen["reward"].astype(np.float64)) if "reward" in seen else nothing
-        terminated = seen["done"] & ~fresh if "done" in seen else np.zeros(self.num_envs, np.bool_)
-        truncated = np.zeros(self.num_envs, np.bool_) if self.max_steps is None else self._steps >= self.max_steps
+        done = seen["done"] & ~fresh if "done" in seen else np.zeros(self.num_envs, np.bool_)
+        cut = done & self.state["truncated"].cpu().numpy() if "truncated" in self.state else np.zeros_like(done)
+        terminated, truncated = done & ~cut, cut | (self._steps >= self.max_steps)
         self._ended = terminated | truncated
         observations, infos = self._observations(seen), {}
         if self._ended.any() and self.autoreset_mode == AutoresetMode.SAME_STEP:

@@ -96,6 +96,7 @@ class Spec:
                   flat list of floats; keys held together are combined by element-wise maximum.
     forkable:     False where a state cannot be kept and returned to (an external game process).
     max_batch:    the largest batch that `start` accepts; None for no limit.
+    max_episode_steps: steps after which whoever trains in the world cuts an episode off (truncates it); None for no limit.
     differentiable: True where gradients flow from the channels through `imagine` to the action.
     card:         free facts for people: training data, hardware, scores.
     """
@@ -114,6 +115,7 @@ class Spec:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     forkable: bool = True
     max_batch: int | None = None
+    max_episode_steps: int | None = None
     differentiable: bool = False
     card: Mapping[str, object] = field(default_factory=dict)
     may_observe: tuple[str, ...] = ()

@@ -8,9 +8,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from .channels import check_game
 from .dataset import Dataset
+from .episodes import Episode
 from .format import Layout
-from .meta import Episode
 from .recorder import Recorder
 from .source import Readings, Sensor, Source, Take
 from .training.cache import ClipCache, split
@@ -30,6 +31,7 @@ __all__ = [
     "Sensor",
     "Source",
     "Take",
+    "check_game",
     "record",
     "split",
 ]

@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -19,6 +20,7 @@ from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, REWARD, Camera, Spec
 from ..core.state import State
 from ..core.world import make_rng
+from .processes import MOST, Processes
 from .snapshot import NotCopyable, Snapshots
 
 _KNOWN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
@@ -65,7 +67,7 @@ class Adapter:
 class GymnasiumWorld:
     """`GymnasiumWorld("CartPole-v1")`, or a function that builds an environment.
 
-    env:      an id, which is made without its time limit (that belongs to the training: `as_env(max_steps=...)`),
+    env:      an id, which is made without its time limit (that is Spec.max_episode_steps, which `as_env` keeps),
               or a function that returns a new environment each time it is called.
     rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array". Where its observation is
               a picture already (uint8 [H, W, 3]), that is `rgb`, and takes the place of `observation`.
@@ -73,7 +75,7 @@ class GymnasiumWorld:
     info_channels: numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
     forkable: None finds out: an environment whose Python state is plain numbers is copied between two instances on
               trial, and only if every step agrees bit for bit are its states values. False makes states tickets for
-              the present.
+              the present, and several episodes at once run in processes, each with an environment of its own.
     snapshots: what copies the environment's state, by default sim/snapshot.py.
     name:     for the spec, where the environment's own says too little.
     adapter:  further channels (depth, pose, more cameras) and what actions mean; by default the attribute `terrella` of
@@ -82,8 +84,8 @@ class GymnasiumWorld:
     options:  handed to gymnasium.make.
 
     Channels: observation [B, *shape], reward float32 [B], done bool [B] (terminated, or truncated by the environment
-    itself), rgb uint8 [B, H, W, 3]. After `done` the world stands still with reward 0. Chance comes from `rng`: at
-    `start`, and where states are values at each `imagine` too.
+    itself; then the state's `truncated` says so), rgb uint8 [B, H, W, 3]. After `done` the world stands still with reward 0.
+    Chance comes from `rng`: at `start`, and where states are values at each `imagine` too.
     Raises TerrellaError for unknown ids and for Dict or Tuple spaces.
     """
 
@@ -122,9 +124,22 @@ class GymnasiumWorld:
                 if forkable:
                     raise TerrellaError(f"{name} cannot be copied ({why}); leave out forkable=True.")
         self._ticket = 0
+        self._processes: Processes | None = None
+        same = {
+            "rgb": rgb,
+            "size": size,
+            "info_channels": info_channels,
+            "dt_s": dt_s,
+            "name": name,
+            "adapter": adapter,
+        }
+        self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
         self._env.reset(seed=0)
         self._adapter = adapter or getattr(self._env.unwrapped, "terrella", None) or Adapter()
-        self.spec = self._describe(name, dt_s, rgb)
+        limit = self._env.spec.max_episode_steps if self._env.spec else None
+        if isinstance(env, str) and "max_episode_steps" not in options:
+            limit = gymnasium.registry[self._env.spec.id].max_episode_steps
+        self.spec = self._describe(name, dt_s, rgb, limit)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` resets of the environment, seeded from `rng`."""
@@ -133,11 +148,20 @@ class GymnasiumWorld:
                 f"{self.spec.name} starts a batch of 1 to {self.spec.max_batch or 'any number'}; got {batch}."
             )
         with self._lock:
-            rows = []
-            for seed in _seeds(batch, rng):
-                observation, info = self._env.reset(seed=seed)
-                rows.append(self._row(observation, 0.0, False, info))
-            return self._state(rows)
+            if self._snapshots is None and batch > 1 and self._processes is None:
+                self._processes = Processes(self.spec.name, self._another)
+            if self._processes is not None:
+                return self._processes.start(_seeds(batch, rng))
+            return self._state([self.begin(seed) for seed in _seeds(batch, rng)])
+
+    def begin(self, seed: int) -> dict[str, np.ndarray]:
+        """Resets the one environment: what is seen of it."""
+        observation, info = self._env.reset(seed=seed)
+        return self._row(observation, 0.0, False, False, info)
+
+    def move(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Steps the one environment: what is seen of it."""
+        return self._row(*self._env.step(action))
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
@@ -149,10 +173,12 @@ class GymnasiumWorld:
         """One step of the environment for each batch entry; entries that are done stand still with reward 0."""
         self._check(state)
         actions = self.spec.check_action(action, state.batch).cpu().numpy()
-        done = state["done"].tolist()
         with self._lock:
-            rows = []
-            for entry, seed in enumerate(_seeds(state.batch, rng)):
+            seeds, rows = _seeds(state.batch, rng), []
+            if self._processes is not None:
+                return self._processes.imagine(state, actions)
+            done = state["done"].tolist()
+            for entry, seed in enumerate(seeds):
                 if done[entry]:
                     still = {name: tensor[entry].numpy() for name, tensor in state.items()}
                     rows.append({**still, "reward": np.float32(0)})
@@ -160,26 +186,31 @@ class GymnasiumWorld:
                 if self._snapshots is not None:
                     self._snapshots.put(self._env, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
                     _reseed(self._env, seed)
-                seen, reward, terminated, truncated, info = self._env.step(actions[entry])
-                rows.append(self._row(seen, reward, terminated or truncated, info))
+                rows.append(self.move(actions[entry]))
             return self._state(rows)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
         self._check(state)
+        if self._processes is not None:
+            with self._lock:
+                return self._processes.render(state, channels)
         return {name: state[name] if name in state else self._read(name, state) for name in channels}
 
     def close(self) -> None:
         self._env.close()
         self._viewer.close()
+        if self._processes is not None:
+            self._processes.close()
 
-    def _row(self, observation, reward, done, info: Mapping) -> dict[str, np.ndarray]:
+    def _row(self, observation, reward, terminated, truncated, info: Mapping) -> dict[str, np.ndarray]:
         space = self._env.observation_space
         seen = np.array(observation, dtype=space.dtype).reshape(space.shape)
         row = {
             **({"rgb": resized(seen, self._size)} if self._pictured else {"observation": seen}),
             "reward": np.float32(reward),
-            "done": np.bool_(done),
+            "done": np.bool_(terminated or truncated),
+            "truncated": np.bool_(truncated and not terminated),
             **{name: np.float32(info[name]) for name in self._info},
         }
         if self._snapshots is not None:
@@ -201,7 +232,10 @@ class GymnasiumWorld:
         return State(tensors)
 
     def _check(self, state: State) -> None:
-        if self._snapshots is None:
+        if self._processes is not None:
+            if "episode" not in state:
+                raise StaleStateError(f"{self.spec.name} plays in processes since this state; start again.")
+        elif self._snapshots is None:
             if "ticket" not in state or state.batch != 1 or int(state["ticket"][0]) != self._ticket:
                 raise StaleStateError(
                     f"{self.spec.name} has moved on since this state and cannot go back (forkable=False)."
@@ -211,22 +245,24 @@ class GymnasiumWorld:
 
     def _read(self, name: str, state: State) -> torch.Tensor:
         """A channel that is made when it is asked for: what the environment draws, or what its adapter reads off it."""
-        space, channel = self.spec.channels[name], self._adapter.channels.get(name)
         with self._lock:
             found = []
             for entry in range(state.batch):
                 if self._snapshots is not None:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
-                drawn = self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped)
-                seen = np.asarray(drawn)
-                found.append(np.array(resized(seen, self._size) if channel is None else seen, space.dtype))
-                if found[-1].shape != space.shape:
-                    raise TerrellaError(
-                        f"{self.spec.name} gave '{name}' of shape {found[-1].shape}; its space is {space}."
-                    )
+                found.append(self.look(name))
         return torch.from_numpy(np.stack(found))
 
-    def _describe(self, name: str, dt_s: float | None, rgb: bool) -> Spec:
+    def look(self, name: str) -> np.ndarray:
+        """One channel of the environment as it now stands."""
+        space, channel = self.spec.channels[name], self._adapter.channels.get(name)
+        drawn = np.asarray(self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped))
+        seen = np.array(resized(drawn, self._size) if channel is None else drawn, space.dtype)
+        if seen.shape != space.shape:
+            raise TerrellaError(f"{self.spec.name} gave '{name}' of shape {seen.shape}; its space is {space}.")
+        return seen
+
+    def _describe(self, name: str, dt_s: float | None, rgb: bool, limit: int | None) -> Spec:
         channels = {} if self._pictured else {"observation": self._env.observation_space}
         channels |= {"reward": REWARD, "done": DONE}
         channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}
@@ -253,7 +289,8 @@ class GymnasiumWorld:
             action_frame=more.action_frame,
             keys=more.keys if more.keys is not None else _arrow_keys(self._env.action_space),
             forkable=self._snapshots is not None,
-            max_batch=None if self._snapshots is not None else 1,
+            max_batch=None if self._snapshots is not None else MOST,
+            max_episode_steps=limit,
             card={"what": f"the Gymnasium environment {name.removeprefix('gym:')}", "kind": "simulator"},
         )
 

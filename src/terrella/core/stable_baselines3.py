@@ -1,0 +1,99 @@
+"""as_sb3: any World as a vector environment of Stable-Baselines3."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from .env import WorldEnv
+from .errors import TerrellaError
+from .world import World
+
+
+class WorldVecEnv(VecEnv):
+    """`num_envs` episodes of `world` side by side; the arguments are those of WorldEnv, and the world is not closed with it.
+
+    Pictures lead with their channels, single numbers have one axis, choices count from 0. An episode that ends begins anew in
+    the same step: its last observation is infos[i]["terminal_observation"], and infos[i]["TimeLimit.truncated"] says whether it
+    was cut off.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        num_envs: int = 1,
+        max_steps: float | None = None,
+        observation: str | Sequence[str] | None = None,
+        seed: int = 0,
+    ):
+        self.env = WorldEnv(world, num_envs, max_steps, observation, seed, AutoresetMode.SAME_STEP)
+        self.render_mode, self.metadata = self.env.render_mode, self.env.metadata
+        action = self.env.single_action_space
+        self._first = int(action.start) if isinstance(action, spaces.Discrete) else 0
+        self._actions = np.zeros(0)
+        shown = self.env.single_observation_space
+        seen = (
+            spaces.Dict({k: _space(v) for k, v in shown.items()}) if isinstance(shown, spaces.Dict) else _space(shown)
+        )
+        super().__init__(num_envs, seen, spaces.Discrete(action.n) if isinstance(action, spaces.Discrete) else action)
+
+    def reset(self):
+        seen, _ = self.env.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        return _map(_arranged, seen)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self):
+        seen, rewards, terminated, truncated, more = self.env.step(self._actions + self._first)
+        infos: list[dict] = [{} for _ in range(self.num_envs)]
+        for place in np.flatnonzero(terminated | truncated).tolist():
+            last = _map(lambda one: _arranged(one[None])[0], more["final_obs"][place])
+            cut = bool(truncated[place] and not terminated[place])
+            infos[place] = {"terminal_observation": last, "TimeLimit.truncated": cut}
+        return _map(_arranged, seen), rewards.astype(np.float32), terminated | truncated, infos
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return self.env.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices=None) -> list[Any]:
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
+        raise TerrellaError(
+            f"{self.env.world.spec.name} has no '{method_name}': its episodes are one batch of a World."
+        )
+
+    def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+def _map(change, seen):
+    return {name: change(array) for name, array in seen.items()} if isinstance(seen, dict) else change(seen)
+
+
+def _arranged(array: np.ndarray) -> np.ndarray:
+    """[B, H, W, 3] -> [B, 3, H, W] where it is pictures, [B] -> [B, 1]."""
+    if array.dtype == np.uint8 and array.ndim == 4:
+        return np.ascontiguousarray(array.transpose(0, 3, 1, 2))
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _space(space: spaces.Space) -> spaces.Space:
+    """The same of a space."""
+    if not isinstance(space, spaces.Box):
+        return space
+    low, high = (_arranged(limit[None])[0] for limit in (space.low, space.high))
+    return spaces.Box(low, high, dtype=space.dtype.type)  # pyright: ignore[reportArgumentType, reportOptionalMemberAccess]
