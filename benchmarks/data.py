@@ -24,7 +24,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from terrella.data import ClipCache, Layout, Recorder
+from terrella.data import ClipCache, Layout, Recorder, Sensor
+from terrella.data.channels import ACTION, DONE, REWARD, RGB
 from terrella.data.training.cache import finish, new_arrays
 from terrella.data.training.clips import Clips
 
@@ -186,7 +187,7 @@ def film(root: Path, height: int, width: int, frames: int) -> None:
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 255, (height // 16, width // 16, 3)).repeat(16, 0).repeat(16, 1)
     scene = (0.8 * coarse + rng.integers(0, 50, (height, width, 3))).astype(np.uint8)
-    with Recorder(root, Layout.of_channels(FPS, ("go",) * 6, rgb=(height, width))) as recorder:
+    with Recorder(root, _layout(6, Sensor(RGB, "image", (height, width, 3), "uint8"))) as recorder:
         for i in range(frames):
             recorder.add({"rgb": np.roll(scene, (i // 3, 2 * i), (0, 1))}, [float(i % 2)] * 6)
             if i % 500 == 499:
@@ -202,9 +203,14 @@ def opening(folder: Path) -> list[dict]:
     return found
 
 
+def _layout(actions: int, *seen: Sensor) -> Layout:
+    follow = Sensor(ACTION, "vector", (actions,)), Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")
+    return Layout(FPS, {sensor.name: sensor for sensor in (*seen, *follow)})
+
+
 def synthesised(root: Path, rows: int, of_episode: int = 1000) -> None:
     """A recording of actions alone, as LeRobot packs one: all episodes in one file."""
-    layout = Layout.of_channels(FPS, ("a", "b"))
+    layout = _layout(2)
     features = {key: value for key, value in layout.features().items() if key.split(".")[0] in ("action", "index")}
     episodes = np.arange(rows // of_episode)
     info = {

@@ -17,13 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
-from terrella.data import Dataset, Layout, Recorder
+from terrella.data import Dataset, Layout, Recorder, Sensor
+from terrella.data.channels import ACTION, DEPTH, DONE, POSE_NAMES, REWARD, RGB, STATE
 from terrella.data.storage.films import reel
+
+
+def _layout(fps: float, actions: int, *seen: Sensor) -> Layout:
+    pose = Sensor(STATE, "vector", (7,), names=POSE_NAMES)
+    follow = Sensor(ACTION, "vector", (actions,)), Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")
+    return Layout(fps, {sensor.name: sensor for sensor in (*seen, pose, *follow)})
 
 
 def camera(root: Path, seconds: float, facts: dict) -> None:
     """A camera with a pose, paced by the clock; late frames are counted."""
-    layout = Layout.of_channels(30, ("x", "y"), rgb=(480, 640), pose=True)
+    layout = _layout(30, 2, Sensor(RGB, "image", (480, 640, 3), "uint8"))
     scene, late = pictures(480, 640), []
     began = time.perf_counter()
     with Recorder(root, layout) as recorder:
@@ -42,7 +49,7 @@ def camera(root: Path, seconds: float, facts: dict) -> None:
 
 def world(root: Path, seconds: float, rate: float, facts: dict) -> None:
     """A world of 128 pixels with depth and pose, as fast as the recorder takes it (or at `rate` steps a second)."""
-    layout = Layout.of_channels(35, ("go",) * 6, rgb=(128, 128), depth=(64, 64), pose=True)
+    layout = _layout(35, 6, Sensor(RGB, "image", (128, 128, 3), "uint8"), Sensor(DEPTH, "depth", (64, 64)))
     scene, depth, count = pictures(128, 128), np.full((64, 64), 3.0, np.float32), 0
     began = time.perf_counter()
     with Recorder(root, layout) as recorder:

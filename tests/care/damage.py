@@ -20,12 +20,21 @@ from terrella.care.doctor import examine
 from terrella.care.repair import repair
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
+from terrella.data.channels import ACTION, DEPTH, DONE, POSE_NAMES, REWARD, RGB, STATE
 from terrella.data.source import Sensor
 
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"
+SENSORS = (
+    Sensor(RGB, "image", (32, 48, 3), "uint8"),
+    Sensor(DEPTH, "depth", (3, 4)),
+    Sensor(STATE, "vector", (7,), names=POSE_NAMES),
+    Sensor(ACTION, "vector", (2,), names=("go", "turn")),
+    Sensor(REWARD, "vector", (1,)),
+    Sensor(DONE, "vector", (1,), "bool"),
+)
 LAYOUT = Layout(
     20,
-    Layout.of_channels(20, ("go", "turn"), rgb=(32, 48), depth=(3, 4), pose=True).sensors,
+    {sensor.name: sensor for sensor in SENSORS},
     streams={LIDAR: Sensor(LIDAR, "points", (0, 3)), SIDE: Sensor(SIDE, "image", (16, 16, 3), "uint8", rate_hz=5)},
     clock=True,
 )

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from corridor import BUTTONS, Corridor, keys
+from layouts import layout_of
 
 from terrella.care import doctor
 from terrella.care.alignment import Run, judge
 from terrella.core import make_rng
-from terrella.data import Layout, Recorder
+from terrella.data import Recorder
 
 FPS, ROWS = 20, 140
 Body = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
@@ -121,7 +122,7 @@ def test_too_little_tells_nothing():
 def _walked(root, shift: int, pose: bool) -> None:
     """A recording of walks through the corridor, its actions `shift` rows late."""
     world, rng = Corridor(), make_rng(1)
-    with Recorder(root, Layout.of_channels(35, BUTTONS, rgb=(48, 64), pose=pose)) as recorder:
+    with Recorder(root, layout_of(35, BUTTONS, rgb=(48, 64), pose=pose)) as recorder:
         for _ in range(6):
             state, memory, seen, done = world.start(1, rng), keys.begin(1, rng), [], []
             for _ in range(60):

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from layouts import layout_of
 
 from terrella.care import doctor
 from terrella.care.doctor import being_written, examine
@@ -201,7 +202,7 @@ def test_each_fault_is_named_with_its_place_and_mend(recording, name):
 
 
 def test_actions_that_never_change_are_named(tmp_path):
-    with Recorder(tmp_path, Layout.of_channels(10, ("go",))) as recorder:
+    with Recorder(tmp_path, layout_of(10, ("go",))) as recorder:
         for _ in range(40):
             recorder.add({}, [1.0])
     assert [fault.what for fault in doctor(tmp_path)] == ["the action is [1.0] in all 39 rows"]
@@ -213,7 +214,7 @@ def test_there_must_be_a_dataset_to_examine(tmp_path):
 
 
 def test_a_recording_in_progress_is_no_fault(tmp_path):
-    layout = Layout.of_channels(10, ("go",), pose=True)
+    layout = layout_of(10, ("go",), pose=True)
     with Recorder(tmp_path, layout) as recorder:
         for _ in range(3):
             recorder.add({"pose": np.arange(7)}, [1.0])
@@ -233,7 +234,7 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
     info = json.loads((recording / "meta/info.json").read_text())
     about = json.loads((recording / "meta/terrella.json").read_text())
     named = {name: feature["names"] or () for name, feature in info["features"].items()}
-    layout = Layout.of_channels(info["fps"], tuple(named["action"]), (48, 64), (12, 16), True, world=about["world"])
+    layout = layout_of(info["fps"], tuple(named["action"]), (48, 64), (12, 16), True, world=about["world"])
 
     class Killed(BaseException):
         pass
@@ -267,7 +268,7 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
 
 
 def test_one_number_that_never_changes_is_worth_a_note(tmp_path):
-    layout = Layout.of_channels(10, ("go", "turn"), vectors={"wheel": 2, "lamp": 1})
+    layout = layout_of(10, ("go", "turn"), vectors={"wheel": 2, "lamp": 1})
     rng = np.random.default_rng(0)
     with Recorder(tmp_path, layout) as recorder:
         for _ in range(40):
@@ -283,7 +284,7 @@ def test_one_number_that_never_changes_is_worth_a_note(tmp_path):
 def test_the_same_pictures_twice_are_named(tmp_path):
     rng = np.random.default_rng(0)
     pictures = np.kron(rng.integers(0, 255, (20, 4, 4, 3)), np.ones((1, 8, 8, 1))).astype(np.uint8)
-    with Recorder(tmp_path, Layout.of_channels(10, ("go",), rgb=(32, 32))) as recorder:
+    with Recorder(tmp_path, layout_of(10, ("go",), rgb=(32, 32))) as recorder:
         for episode in range(3):
             for i in range(20):
                 recorder.add({"rgb": pictures[i] if episode != 1 else np.zeros((32, 32, 3), np.uint8)}, [rng.normal()])
@@ -345,7 +346,7 @@ STREAMS = {
 @pytest.mark.parametrize("name", STREAMS)
 def test_faults_of_streams_are_named(tmp_path, name):
     streams = {LIDAR: Sensor(LIDAR, "points", (0, 3)), SIDE: Sensor(SIDE, "image", (16, 16, 3), "uint8", rate_hz=5)}
-    layout = Layout(10, Layout.of_channels(10, ("go",), pose=True).sensors, streams=streams)
+    layout = Layout(10, layout_of(10, ("go",), pose=True).sensors, streams=streams)
     with Recorder(tmp_path, layout) as recorder:
         for _ in range(3):
             for i in range(6):
@@ -365,11 +366,11 @@ def test_faults_of_streams_are_named(tmp_path, name):
 def test_a_file_of_many_episodes_is_read_once(recording, monkeypatch):
     from strangers import shared
 
-    from terrella.care import tables
+    from terrella.care import pieces
 
     root = shared(recording, recording.parent / "shared")
     opened: list[Path] = []
-    real = tables.open_parquet
-    monkeypatch.setattr(tables, "open_parquet", lambda path: opened.append(path) or real(path))
+    real = pieces.open_parquet
+    monkeypatch.setattr(pieces, "open_parquet", lambda path: opened.append(path) or real(path))
     assert doctor(root) == []
     assert sum("data" in str(path.relative_to(root)) for path in opened) <= 2

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from layouts import layout_of
 from PIL import Image
 from test_doctor import DATA
 
@@ -41,7 +42,7 @@ def column(path: Path, name: str, values) -> None:
 def _thirteen(tmp_path_factory) -> Path:
     """Eight episodes at 13 frames a second: a picture that brightens, a state that moves, actions at random."""
     root, rng = tmp_path_factory.mktemp("thirteen") / "set", np.random.default_rng(0)
-    layout = Layout.of_channels(13, ("go", "turn"), rgb=(32, 48), pose=True)
+    layout = layout_of(13, ("go", "turn"), rgb=(32, 48), pose=True)
     y, x = np.mgrid[:32, :48]
     with Recorder(root, layout) as recorder:
         for number, length in enumerate(LENGTHS):
@@ -217,7 +218,7 @@ def test_films_that_are_all_black_are_named(thirteen):
 @pytest.mark.parametrize("frozen_from", [0, 5])
 def test_a_frozen_state_is_named(tmp_path, frozen_from):
     rng = np.random.default_rng(1)
-    with Recorder(tmp_path / "set", Layout.of_channels(13, ("go",), pose=True)) as recorder:
+    with Recorder(tmp_path / "set", layout_of(13, ("go",), pose=True)) as recorder:
         for number in range(3):
             for i in range(60):
                 still = number == 1 and i >= frozen_from
@@ -232,7 +233,7 @@ def test_a_frozen_state_is_named(tmp_path, frozen_from):
 def test_a_body_at_rest_is_not_frozen(tmp_path):
     """Nothing is done, or it holds still for a while: that is no fault."""
     rng = np.random.default_rng(1)
-    with Recorder(tmp_path / "set", Layout.of_channels(13, ("go",), pose=True)) as recorder:
+    with Recorder(tmp_path / "set", layout_of(13, ("go",), pose=True)) as recorder:
         for number in range(3):
             for i in range(60):
                 rest = number == 1 or i < 25
@@ -257,7 +258,7 @@ def test_a_wrong_length_in_the_table_of_episodes_is_named(thirteen, tmp_path, le
 
 @pytest.fixture
 def pictured(tmp_path) -> Path:
-    layout = Layout(10, Layout.of_channels(10, ("go",), rgb=(8, 8), pose=True).sensors, pictures="png")
+    layout = Layout(10, layout_of(10, ("go",), rgb=(8, 8), pose=True).sensors, pictures="png")
     rng = np.random.default_rng(0)
     with Recorder(tmp_path / "set", layout) as recorder:
         for length in (30, 31, 10):
@@ -331,7 +332,7 @@ def test_the_report_has_the_verdict_first_and_groups_what_is_alike(thirteen):
     found = examine(thirteen)
     lines = found.report("SET").splitlines()
     assert lines[0] == "SET: 16 faults of 2 kinds" and lines[1].startswith("likeliest cause: ")
-    assert len(found.groups) == 2 and sum(len(group.faults) for group in found.groups) == len(found.faults) == 16
+    assert len(found.groups) == 2 and sum(map(len, found.groups)) == len(found.faults) == 16
     assert len(lines) < 10 and any("8 of this kind" in line and "5 more" in line for line in lines)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from layouts import layout_of
 
 from terrella.care import doctor, thrift
 from terrella.core.errors import DatasetError
@@ -373,7 +374,7 @@ def test_a_hugging_face_cache_is_read_through_its_links(recording, tmp_path):
 
 @pytest.fixture
 def pictured(tmp_path) -> Path:
-    layout = Layout(10, Layout.of_channels(10, ("go",), rgb=(8, 8), pose=True).sensors, pictures="png")
+    layout = Layout(10, layout_of(10, ("go",), rgb=(8, 8), pose=True).sensors, pictures="png")
     rng = np.random.default_rng(0)
     with Recorder(tmp_path / "recording", layout) as recorder:
         for length in (30, 30, 10):
@@ -480,9 +481,7 @@ def test_a_video_of_enormous_black_pictures(recording):
 @pytest.mark.parametrize("damage", ["sizes", "nulls", "times", "columns", "many"])
 def test_streams_whose_readings_are_not_what_was_promised(tmp_path, damage):
     name = "observation.points.lidar"
-    layout = Layout(
-        10, Layout.of_channels(10, ("go",), pose=True).sensors, streams={name: Sensor(name, "points", (0, 3))}
-    )
+    layout = Layout(10, layout_of(10, ("go",), pose=True).sensors, streams={name: Sensor(name, "points", (0, 3))})
     with Recorder(tmp_path / "recording", layout) as recorder:
         for length in (30, 30, 10):
             for i in range(length):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from layouts import layout_of
 
 from terrella.care import repair
 from terrella.core.errors import DatasetError
@@ -23,14 +24,14 @@ from terrella.data.source import Sensor
 LIDAR, SIDE = "observation.points.lidar", "observation.images.side"
 LAYOUT = Layout(
     20,
-    Layout.of_channels(20, ("go",), rgb=(32, 48), pose=True).sensors,
+    layout_of(20, ("go",), rgb=(32, 48), pose=True).sensors,
     streams={LIDAR: Sensor(LIDAR, "points", (0, 3)), SIDE: Sensor(SIDE, "image", (16, 16, 3), "uint8", rate_hz=5)},
     clock=True,
 )
 
 SCRIPT = """
 import sys
-sys.path.insert(0, {folder!r})
+sys.path[:0] = {folders!r}
 from test_interrupted import drive
 from terrella.data import Recorder
 from test_interrupted import LAYOUT
@@ -74,7 +75,9 @@ def check(root: Path, number: int, least: int) -> int:
 @pytest.mark.parametrize("rows", [90, 300])
 def test_kill_9_keeps_every_whole_frame_of_the_episode_in_flight(tmp_path, rows):
     root = tmp_path / "killed"
-    script = SCRIPT.format(folder=str(Path(__file__).parent), root=str(root))
+    script = SCRIPT.format(
+        folders=[str(Path(__file__).parents[i]) + end for i, end in ((0, ""), (1, "/data"))], root=str(root)
+    )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         while int(process.stdout.readline()) < rows:

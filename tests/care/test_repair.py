@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from layouts import layout_of
 from strangers import killed, shared
 from test_doctor import DATA, VIDEO, change, cut, put, small_video, twin
 from test_interrupted import LAYOUT, LIDAR, SIDE, drive
@@ -22,7 +23,7 @@ from test_interrupted import LAYOUT, LIDAR, SIDE, drive
 from terrella.care import doctor, repair
 from terrella.cli import main
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder
+from terrella.data import Dataset, Recorder
 from terrella.data.storage.films import reel
 
 COUNTERS = ("index", "frame_index", "episode_index", "timestamp", "task_index")
@@ -189,7 +190,7 @@ def test_every_good_row_is_kept_once_and_no_other(data):
     counter = data.draw(st.sampled_from(["index", "frame_index", "timestamp", None]), label="counter")
     with tempfile.TemporaryDirectory() as folder:
         root, out = Path(folder) / "root", Path(folder) / "out"
-        with Recorder(root, Layout.of_channels(10, ("number",), vectors={"wheel": 1})) as recorder:
+        with Recorder(root, layout_of(10, ("number",), vectors={"wheel": 1})) as recorder:
             at = 0
             for length in lengths:
                 for _ in range(length):

@@ -17,6 +17,8 @@ from terrella.core.policy import Random
 from terrella.data import Layout, Recorder, record
 from terrella.sim.gymnasium import GymnasiumWorld
 
+from ..data.layouts import layout_of
+
 
 class Still:
     """Shows for ever what it observed last."""
@@ -43,7 +45,7 @@ class Still:
 @pytest.fixture
 def recording(tmp_path):
     """Three episodes of a bar that moves across the picture."""
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
         for episode in range(3):
             for step in range(40):
                 picture = np.full((48, 64, 3), 40, np.uint8)
@@ -107,7 +109,7 @@ def test_a_recording_made_afterwards_is_used_whole(recording, tmp_path, monkeypa
 
 def test_score_of_a_recording_without_held_out_episodes_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, ("left", "right"), rgb=(48, 64))) as recorder:
         for step in range(10):
             recorder.add({"rgb": np.zeros((48, 64, 3), np.uint8)}, np.zeros(2) if step < 9 else None)
     assert main(arguments(tmp_path / "set", tmp_path / "out")) == 2
@@ -120,7 +122,7 @@ def test_score_of_a_recording_without_held_out_episodes_is_refused(tmp_path, mon
 @pytest.mark.parametrize("names", (("a", "b", "c", "d", "e", "f"), ("fire",)))
 def test_a_recording_of_another_game_is_refused_in_one_sentence(names, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
-    with Recorder(tmp_path / "set", Layout.of_channels(10.0, names, rgb=(48, 64))) as recorder:
+    with Recorder(tmp_path / "set", layout_of(10.0, names, rgb=(48, 64))) as recorder:
         for step in range(60):
             recorder.add({"rgb": np.zeros((48, 64, 3), np.uint8)}, np.zeros(len(names)) if step < 59 else None)
             if step == 29:

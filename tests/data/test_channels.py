@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from layouts import layout_of
 from two_cameras import MOUNT, WRIST, TwoCameras
 
 from terrella.care import doctor
@@ -54,7 +55,7 @@ def test_names_are_kept_for_the_main_camera_and_go_back_to_their_channels(tmp_pa
     assert "observation" in dataset.features and "observation.observation" not in dataset.features
     assert dataset.features["observation.pose"]["shape"] == [7]  # since `state` is a channel of its own
     assert set(TwoCameras().spec.channels) | {"action"} == set(dataset.channels)
-    assert Layout.of_channels(10, ("go",), rgb=(8, 8), depth=(4, 4), pose=True).sensors.keys() >= {
+    assert layout_of(10, ("go",), rgb=(8, 8), depth=(4, 4), pose=True).sensors.keys() >= {
         "observation.images.rgb",
         "observation.depth",
         "observation.state",
@@ -101,7 +102,7 @@ def test_an_old_recording_of_one_camera_still_has_it(recording):
 
 
 def test_old_recordings_of_objects_are_read_by_their_name_of_now(tmp_path):
-    layout = Layout.of_channels(10, ("go",), rgb=(8, 8), pose=True, arrays={"cast": ((2, 4), "float32")})
+    layout = layout_of(10, ("go",), rgb=(8, 8), pose=True, arrays={"cast": ((2, 4), "float32")})
     with Recorder(tmp_path / "recording", layout) as recorder:
         for i in range(6):
             seen = {"rgb": np.zeros((8, 8, 3), np.uint8), "pose": np.arange(7), "cast": np.full((2, 4), i)}
@@ -136,7 +137,7 @@ def test_what_cannot_be_recorded_is_refused_by_its_name(name, space, words):
 
 
 def test_a_channel_without_a_place_is_an_error_and_not_left_out(tmp_path):
-    layout = Layout.of_channels(10, ("go",), pose=True)
+    layout = layout_of(10, ("go",), pose=True)
     with Recorder(tmp_path / "recording", layout) as recorder:
         with pytest.raises(DatasetError, match=r"no place for 'observation\.heat'"):
             recorder.add({"pose": np.arange(7), "heat": np.ones(1)}, [0.0])

@@ -14,14 +14,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from corridor import Corridor, keys
+from layouts import layout_of
 
 from terrella.care import doctor
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Dataset, Layout, Recorder, record
+from terrella.data import ClipCache, Dataset, Recorder, record
 from terrella.data.storage import durable
 
-LAYOUT = Layout.of_channels(10, ("go",), rgb=(16, 16), pose=True)
+LAYOUT = layout_of(10, ("go",), rgb=(16, 16), pose=True)
 
 
 def _episode(recorder: Recorder, rows: int, value: float = 0.0) -> None:
@@ -188,10 +189,12 @@ def test_a_file_that_the_system_refuses_to_grow_ends_the_encoder_clearly(tmp_pat
     """A limit on file size is a full disk to the encoder's thread and to parquet, without a full disk."""
     script = f"""
 import resource, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
+from layouts import layout_of
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder
-layout = Layout.of_channels(10, ("go",), rgb=(64, 64))
+from terrella.data import Dataset, Recorder
+layout = layout_of(10, ("go",), rgb=(64, 64))
 recorder = Recorder({str(tmp_path / "set")!r}, layout)
 rng = np.random.default_rng(0)
 def episode(rows):
@@ -274,7 +277,7 @@ def test_truncated_episode_table_is_named(recording):
 
 def test_a_recorder_that_nobody_closed_lets_go_and_loses_no_row(tmp_path):
     """A closed tab, or an exception that was swallowed, leaves a recorder behind."""
-    layout = Layout.of_channels(10, ("go",), rgb=(16, 16))
+    layout = layout_of(10, ("go",), rgb=(16, 16))
 
     def left_behind() -> None:
         recorder = Recorder(tmp_path / "recording", layout)
@@ -287,7 +290,7 @@ def test_a_recorder_that_nobody_closed_lets_go_and_loses_no_row(tmp_path):
 
 
 def test_a_recorder_that_fails_on_closing_lets_go(tmp_path, monkeypatch):
-    layout = Layout.of_channels(10, ("go",), pose=True)
+    layout = layout_of(10, ("go",), pose=True)
     recorder = Recorder(tmp_path / "recording", layout)
     for i in range(9):
         recorder.add({"pose": np.arange(7) + i}, [i])

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from layouts import layout_of
 
 from terrella.core.instruction import INSTRUCTION_SIZE, embed, embed_all
-from terrella.data import ClipCache, Clips, Dataset, Layout, Recorder
+from terrella.data import ClipCache, Clips, Dataset, Recorder
 
 
 @given(st.text(max_size=40))
@@ -27,7 +28,7 @@ def test_texts_that_share_words_are_near_and_order_counts():
 
 def test_every_row_of_a_batch_says_what_it_is_about(tmp_path):
     said = ["lift the cup", "turn left", "lift the cup"]
-    with Recorder(tmp_path / "recording", Layout.of_channels(10, ("go",), pose=True)) as recorder:
+    with Recorder(tmp_path / "recording", layout_of(10, ("go",), pose=True)) as recorder:
         for task in said:
             recorder.task = task
             for i in range(8):
@@ -48,7 +49,7 @@ def test_every_row_of_a_batch_says_what_it_is_about(tmp_path):
 
 
 def test_what_is_said_before_the_first_row_is_what_the_episode_is_about(tmp_path):
-    with Recorder(tmp_path / "recording", Layout.of_channels(10, ("go",), pose=True)) as recorder:
+    with Recorder(tmp_path / "recording", layout_of(10, ("go",), pose=True)) as recorder:
         recorder.task = "none"
         for said in ("lift the cup", None):
             if said:

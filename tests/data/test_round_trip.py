@@ -10,16 +10,17 @@ import pytest
 from corridor import BUTTONS, Corridor, keys, picture
 from hypothesis import given
 from hypothesis import strategies as st
+from layouts import layout_of
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import Dataset, Layout, Recorder, record
+from terrella.data import Dataset, Recorder, record
 from terrella.data.format import DEPTH_BEYOND, schema, to_arrow, to_numpy
 
 
 def test_every_lossless_array_comes_back_bit_for_bit(tmp_path):
     rng = np.random.default_rng(0)
-    layout = Layout.of_channels(30, ("gas", "wheel"), depth=(5, 7), pose=True, vectors={"lidar": 3, "fuel": 1})
+    layout = layout_of(30, ("gas", "wheel"), depth=(5, 7), pose=True, vectors={"lidar": 3, "fuel": 1})
     truth = {
         "depth": (rng.integers(0, 60_000, (600, 5, 7)) / 1000).astype(np.float32),
         "pose": rng.normal(size=(600, 7)).astype(np.float32),
@@ -53,7 +54,7 @@ def test_every_lossless_array_comes_back_bit_for_bit(tmp_path):
 
 def test_depth_keeps_millimetres_and_says_what_is_beyond(tmp_path):
     given_m = np.array([[0.0, 0.0004, 0.0016], [-1.0, 65.534, 70.0], [np.inf, np.nan, 12.3456]], np.float32)
-    with Recorder(tmp_path, Layout.of_channels(10, ("go",), depth=(3, 3))) as recorder:
+    with Recorder(tmp_path, layout_of(10, ("go",), depth=(3, 3))) as recorder:
         recorder.add({"depth": given_m}, [1.0])
         recorder.add({"depth": given_m})
     want = [[0, 0, 2], [0, 65534, DEPTH_BEYOND], [DEPTH_BEYOND, DEPTH_BEYOND, 12346]]
@@ -127,7 +128,7 @@ def test_record_stops_at_done_and_counts_the_frames_of_an_earlier_run(tmp_path):
 
 
 def test_what_does_not_fit_is_refused_and_leaves_the_recording_whole(tmp_path):
-    recorder = Recorder(tmp_path, Layout.of_channels(10, ("go",), pose=True))
+    recorder = Recorder(tmp_path, layout_of(10, ("go",), pose=True))
     recorder.add({"pose": np.zeros(7)}, [1.0])
     with pytest.raises(DatasetError, match="lacks"):
         recorder.add({}, [1.0])
@@ -141,14 +142,14 @@ def test_what_does_not_fit_is_refused_and_leaves_the_recording_whole(tmp_path):
     recorder.close()
     assert Dataset(tmp_path).episode(0)["pose"].tolist() == [[0.0] * 7, [1.0] * 7]
     with pytest.raises(DatasetError, match="rows a second"):
-        Recorder(tmp_path / "slow", Layout.of_channels(3e-5, ("go",), pose=True))
+        Recorder(tmp_path / "slow", layout_of(3e-5, ("go",), pose=True))
     with pytest.raises(DatasetError, match="even"):
-        Recorder(tmp_path / "odd", Layout.of_channels(10, ("go",), rgb=(15, 16)))
+        Recorder(tmp_path / "odd", layout_of(10, ("go",), rgb=(15, 16)))
 
 
 def test_an_observation_that_the_caller_changes_later_is_recorded_as_it_was(tmp_path):
     frame, pose = np.zeros((16, 16, 3), np.uint8), np.zeros(7, np.float32)
-    with Recorder(tmp_path, Layout.of_channels(10, ("go",), rgb=(16, 16), pose=True)) as recorder:
+    with Recorder(tmp_path, layout_of(10, ("go",), rgb=(16, 16), pose=True)) as recorder:
         for value in (10, 200):
             frame[:], pose[:] = value, value
             recorder.add({"rgb": frame, "pose": pose}, [0.0])

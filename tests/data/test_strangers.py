@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from layouts import layout_of
 from PIL import Image
 
 from terrella.core.errors import DatasetError
@@ -25,7 +26,7 @@ MILLIMETRES = (np.arange(ROWS * HEIGHT * WIDTH).reshape(ROWS, HEIGHT, WIDTH) * 1
 
 @pytest.fixture
 def plain(tmp_path) -> Path:
-    with Recorder(tmp_path / "plain", Layout.of_channels(10, ("go",), pose=True)) as recorder:
+    with Recorder(tmp_path / "plain", layout_of(10, ("go",), pose=True)) as recorder:
         for i in range(ROWS):
             recorder.add({"pose": np.arange(7) + i}, [i])
     return tmp_path / "plain"
@@ -154,7 +155,7 @@ def test_texts_are_read_as_texts_and_block_nothing(plain, tmp_path):
 def test_sensors_that_share_the_times_of_the_rows_are_read_after_a_conversion(tmp_path):
     """A converted recording declares them as streams too, but keeps them in the rows alone."""
     imu = "observation.imu"
-    sensors = {**Layout.of_channels(10, ("go",), pose=True).sensors, imu: Sensor(imu, "vector", (2,))}
+    sensors = {**layout_of(10, ("go",), pose=True).sensors, imu: Sensor(imu, "vector", (2,))}
     with Recorder(tmp_path / "recording", Layout(10, sensors, {imu: sensors[imu]}, clock=True)) as recorder:
         for i in range(ROWS):
             row = {"observation.state": np.arange(7) + i, imu: np.array([i, -i]), "action": [1.0]}

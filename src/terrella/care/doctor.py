@@ -10,35 +10,18 @@ from pathlib import Path
 
 from ..core.errors import DatasetError
 from ..data.format import INFO, STATS
-from ..data.storage import boxes, journal
+from ..data.storage import journal, mp4
 from .film_checks import Shown, examine_films, same
 from .motion_checks import misaligned
-from .row_checks import Rows, examine_rows
+from .row_checks import Rows, constants, examine_rows, frozen, statistics
 from .streams import examine_streams
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey, survey
-from .value_checks import constants, frozen, statistics
 
-__all__ = ["Fault", "Findings", "Group", "doctor", "examine"]
+__all__ = ["Fault", "Findings", "doctor", "examine"]
 
 _STAGING = ".staging/rows.log"
 _TWINS = "leave one of them out of training: --repair keeps both"
 _EXAMPLES = 3  # places of a kind of fault that a report names
-
-
-@dataclass(frozen=True)
-class Group:
-    """Faults of one kind: what they say but for the numbers is the same."""
-
-    faults: tuple[Fault, ...]
-
-    def __str__(self) -> str:
-        first, more = self.faults[0], self.faults[1:_EXAMPLES]
-        lines = [f"{_place(first)}: {first.what}."]
-        if len(self.faults) > 1:
-            others = len(self.faults) - 1 - len(more)
-            places = "; ".join([*map(_place, more), *([f"{others} more"] if others else [])])
-            lines.append(f"    {len(self.faults)} of this kind, the others: {places}.")
-        return "\n".join([*lines, f"    mend: {first.mend}."])
 
 
 @dataclass(frozen=True)
@@ -53,16 +36,16 @@ class Findings:
     notes: list[str]
 
     @property
-    def groups(self) -> list[Group]:
-        """The faults by kind, likely causes first."""
+    def groups(self) -> list[list[Fault]]:
+        """The faults by kind, likely causes first: of one kind is what says the same but for the numbers."""
         kinds: dict[tuple[str, str], list[Fault]] = {}
         for fault in self.faults:
             kinds.setdefault((_kind(fault.what), _kind(fault.mend)), []).append(fault)
-        return [Group(tuple(faults)) for faults in kinds.values()]
+        return list(kinds.values())
 
     def facts(self) -> dict[str, object]:
         """All of it as JSON values; `kinds` are the groups of faults, likely causes first."""
-        kinds = [{**asdict(group.faults[0]), "count": len(group.faults)} for group in self.groups]
+        kinds = [{**asdict(faults[0]), "count": len(faults)} for faults in self.groups]
         return {"faults": [asdict(fault) for fault in self.faults], "kinds": kinds, "notes": self.notes}
 
     def report(self, name: str) -> str:
@@ -70,7 +53,9 @@ class Findings:
         groups, count = self.groups, len(self.faults)
         kinds = f" of {len(groups)} kinds" if 1 < len(groups) < count else ""
         lines = [f"{name}: {f'{count} fault' if count else 'sound, no fault'}{'s' * (count > 1)}{kinds}"]
-        lines += [f"{'likeliest cause: ' * (at == 0 and len(groups) > 1)}{group}" for at, group in enumerate(groups)]
+        lines += [
+            f"{'likeliest cause: ' * (at == 0 and len(groups) > 1)}{_told(group)}" for at, group in enumerate(groups)
+        ]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
@@ -111,6 +96,14 @@ def _rank(fault: Fault) -> int:
     if fault.file == STATS or fault.mend in (LEFTOVER, _TWINS):
         return 7
     return 4 if fault.mend == RESTORE else 6
+
+
+def _told(faults: list[Fault]) -> str:
+    """What is said of faults of one kind."""
+    first, more, others = faults[0], faults[1:_EXAMPLES], len(faults) - _EXAMPLES
+    places = "; ".join([*map(_place, more), *([f"{others} more"] if others > 0 else [])])
+    of_kind = f"\n    {len(faults)} of this kind, the others: {places}." if more else ""
+    return f"{_place(first)}: {first.what}.{of_kind}\n    mend: {first.mend}."
 
 
 def _kind(sentence: str) -> str:
@@ -219,7 +212,7 @@ def _interrupted(found: Survey) -> Iterator[Fault]:
     try:
         about = journal.about(found.path(_STAGING))
         rows = sum(1 for number, _, _ in journal.readings(found.path(_STAGING)) if number == 0)
-        frames = {name: boxes.whole(found.path(f".staging/{name}.growing.mp4"))[1] for name in found.cameras}
+        frames = {name: mp4.whole_fragments(found.path(f".staging/{name}.growing.mp4"))[1] for name in found.cameras}
     except (OSError, ValueError, RecursionError, DatasetError):
         rows = 0
     if about and about.get("episode") != found.info.get("total_episodes") and found.info:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.episodes import Episode
+from ..data.meta import Episode
 from ..data.staged import SAMPLE_EVERY, look
 from ..data.storage import mp4
 from ..data.storage.films import Reel, reel

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..data.episodes import Film
 from ..data.format import fill, where
+from ..data.meta import Film
 from ..data.storage.films import Reel, reel, whole_frames
 from .features import BROKEN
 from .film_checks import Shown, examine_films

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,7 +20,60 @@ import pyarrow.parquet as pq
 from ..core.errors import DatasetError
 from ..data.storage.tables import open_parquet
 from . import thrift
-from .pages import DATA, DATA_V2, DICTIONARY, Page, page_at
+
+DATA, INDEX, DICTIONARY, DATA_V2 = range(4)
+_FIELD = {DATA: 5, DICTIONARY: 7, DATA_V2: 8}  # where a page header keeps what is special to its type
+_HEADER = 1 << 10  # bytes looked at for a header; more where it does not end there
+_LONGEST_HEADER = 1 << 24
+
+
+@dataclass(frozen=True)
+class Page:
+    """kind: DATA, DICTIONARY or DATA_V2; at: first byte of its header; values, packed and unpacked bytes as it claims."""
+
+    kind: int
+    at: int
+    header: int
+    packed: int
+    unpacked: int
+    values: int
+    encoding: int
+
+    @property
+    def end(self) -> int:
+        return self.at + self.header + self.packed
+
+
+def page_at(file: BinaryIO, at: int) -> Page:
+    """The page whose header begins at byte `at`; ValueError where none does."""
+    size = _HEADER
+    while True:
+        file.seek(at)
+        data = file.read(size)
+        try:
+            stated, length = thrift.read_struct(data)
+            break
+        except IndexError:
+            if len(data) < size or size > _LONGEST_HEADER:
+                raise ValueError(f"no page begins at byte {at}") from None
+            size *= 16
+    kind = _number(stated, 1)
+    if kind not in (DATA, INDEX, DICTIONARY, DATA_V2):
+        raise ValueError(f"no page begins at byte {at}")
+    about = stated.get(_FIELD.get(kind, 0), (thrift.STRUCT, {}))[1]
+    values, encoding = (_number(about, 1), _number(about, 4 if kind == DATA_V2 else 2)) if about else (0, 0)
+    page = Page(kind, at, length, _number(stated, 3), _number(stated, 2), values, encoding)
+    if min(page.packed, page.unpacked, page.values) < 0:
+        raise ValueError(f"the page at byte {at} claims less than nothing")
+    return page
+
+
+def _number(stated: object, field: int) -> int:
+    kind, value = stated.get(field, (0, None)) if isinstance(stated, dict) else (0, None)
+    if kind != thrift.I32 or not isinstance(value, int):
+        raise ValueError(f"a page header lacks its field {field}")
+    return value
+
 
 _MAGIC = b"PAR1"
 _TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")  # by number

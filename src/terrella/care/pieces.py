@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,48 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data.features import decoded
 from ..data.format import AUTOMATIC, to_numpy
-from ..data.storage.tables import open_parquet
+from ..data.storage.tables import BROKEN, damaged, open_parquet
 from .survey import Survey
-from .tables import batches
+
+_BATCH = 64 << 20  # bytes that one piece of numbers may take
+_TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
+_LARGEST, _REPEATED = 4 << 30, 256 << 20  # bytes that a row group may unpack to, and where texts may repeat one another
+_A_BYTE = 4  # of such texts and pictures, for each byte of a larger file
+
+
+def batches(
+    path: Path, features: Mapping[str, dict], columns: Sequence[str]
+) -> Iterator[tuple[int, int, pa.Table | DatasetError]]:
+    """(first row, rows, table) of a data file piece after piece, the largest of some megabytes; DatasetError where it is broken.
+
+    A piece that cannot be read is given as the error itself, and reading goes on with the next row group.
+    """
+    texts = any(features[name]["dtype"] in ("image", "string") for name in columns)
+    wide = 8 + sum(16 * math.prod(features[name]["shape"]) for name in columns if features[name]["dtype"] != "image")
+    try:
+        file = open_parquet(path)
+        few = max(_REPEATED, _A_BYTE * path.stat().st_size)
+        step, most = (_TEXTS, few) if texts else (max(1, _BATCH // wide), _LARGEST)
+    except BROKEN as error:
+        raise damaged(path, error) from error
+    with file:
+        at = 0
+        for number in range(file.num_row_groups):
+            rows, done, size = file.metadata.row_group(number).num_rows, 0, 0
+            try:
+                for batch in file.iter_batches(step, row_groups=[number], columns=list(columns)):
+                    size += batch.nbytes
+                    if size > most:
+                        raise ValueError(f"it unpacks to more than {most:,} bytes")
+                    if batch.num_rows:
+                        yield at + done, batch.num_rows, pa.Table.from_batches([batch])
+                    done += batch.num_rows
+                if done < rows:
+                    raise ValueError(f"{rows - done} rows are missing")
+            except BROKEN as error:
+                yield at + done, max(0, rows - done), damaged(path, error)
+            at += rows
+
 
 _MOST_LOST = 10_000_000  # rows that cannot be read at a stretch; more is damage
 
@@ -55,49 +95,48 @@ class Table:
     path: Path
     columns: dict[str, np.ndarray]
     good: np.ndarray
-    missing: dict[str, np.ndarray] = field(default_factory=dict)  # column -> rows in which it is no finite number
+    missing: dict[str, np.ndarray]  # column -> rows in which it is no finite number
 
 
 def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dict]) -> Table:
     """Reads all columns of a data file, keeps the counters; DatasetError where the file as a whole cannot be read."""
+    stored = [name for name, feature in features.items() if feature["dtype"] != "video"]
+    floats = [name for name in stored if features[name]["dtype"].startswith("float") and name != "timestamp"]
     with open_parquet(path) as opened:
         names = opened.schema_arrow.names
-    columns = [name for name, feature in features.items() if name in names and feature["dtype"] != "video"]
-    lacks = sorted(
-        name for name, f in features.items() if name not in names and f["dtype"] != "video" and name not in AUTOMATIC
-    )
-    if lacks:
-        raise DatasetError(f"{file} lacks the column '{lacks[0]}' that other rows have.")
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in AUTOMATIC}
-    missing: dict[str, list[np.ndarray]] = {}
-    good: list[np.ndarray] = []
-    for _, count, table in batches(path, features, columns):
+    for name in sorted(set(stored) - set(names) - set(AUTOMATIC)):
+        raise DatasetError(f"{file} lacks the column '{name}' that other rows have.")
+    parts: dict[str, list[np.ndarray]] = {name: [np.zeros(0)] for name in AUTOMATIC}
+    missing: dict[str, list[np.ndarray]] = {name: [np.zeros(0, bool)] for name in floats}
+    good = [np.zeros(0, bool)]
+    for _, count, table in batches(path, features, [name for name in stored if name in names]):
         if isinstance(table, DatasetError) and count > _MOST_LOST:
             raise table  # who claims so many rows has none
-        whole = np.ones(count, bool)
-        found: dict[str, np.ndarray] = {}
-        if isinstance(table, DatasetError):
-            whole[:] = False
-        else:
-            for name in columns:
-                try:
-                    if features[name]["dtype"] == "image":
-                        whole &= whole_pictures(table[name], tuple(features[name]["shape"]))
-                    else:
-                        found[name] = to_numpy(table[name], tuple(features[name]["shape"]))
-                except (ValueError, TypeError, NotImplementedError):
-                    whole[:] = False
-        for name in AUTOMATIC:
-            there = found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan)
-            parts[name].append(there)
-        for name, feature in features.items():
-            if feature["dtype"].startswith("float") and name != "timestamp":
-                bad = ~np.isfinite(found[name].reshape(count, -1)).all(1) if name in found else np.zeros(count, bool)
-                missing.setdefault(name, []).append(np.asarray(bad))
+        found, whole = ({}, np.zeros(count, bool)) if isinstance(table, DatasetError) else _numbers_of(table, features)
         good.append(whole)
-    joined = {name: np.concatenate(some) if some else np.zeros(0) for name, some in parts.items()}
-    bad = {name: np.concatenate(some) for name, some in missing.items()}
-    return Table(file, path, joined, np.concatenate(good) if good else np.zeros(0, bool), bad)
+        for name, some in parts.items():
+            some.append(found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan))
+        for name, some in missing.items():
+            some.append(np.zeros(count, bool))
+            if name in found:
+                some[-1] |= ~np.isfinite(found[name].reshape(count, -1)).all(1)
+    joined, bad = ({name: np.concatenate(some) for name, some in kind.items()} for kind in (parts, missing))
+    return Table(file, path, joined, np.concatenate(good), bad)
+
+
+def _numbers_of(table: pa.Table, features: Mapping[str, dict]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """(columns of numbers, bool [n]: the rows of which all columns can be read)."""
+    found, whole = {}, np.ones(len(table), bool)
+    for name in table.column_names:
+        shape = tuple(features[name]["shape"])
+        try:
+            if features[name]["dtype"] == "image":
+                whole &= whole_pictures(table[name], shape)
+            else:
+                found[name] = to_numpy(table[name], shape)
+        except (ValueError, TypeError, NotImplementedError):
+            whole[:] = False
+    return found, whole
 
 
 def whole_pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import DatasetError
-from ..data.episodes import Episode
 from ..data.format import TIME, stream_path
+from ..data.meta import Episode
 from ..data.source import Sensor
 from ..data.storage import mp4
 from ..data.storage.films import cut, reel, whole_frames
@@ -78,18 +79,15 @@ def _stream(survey: Survey, sensor: Sensor, episode: Episode, has_film: bool) ->
         yield Fault(film, episode.start, "frames of the film cannot be decoded", "let --repair keep those before them")
 
 
+@dataclass(frozen=True)
 class StreamMender:
     """Cuts streams to pieces of rows; films go to the folder `staging`, what was left out is added to `said`."""
 
-    def __init__(
-        self,
-        survey: Survey,
-        features: Mapping[str, dict],
-        streams: Mapping[str, Sensor],
-        staging: Path,
-        said: list[str],
-    ):
-        self.survey, self.features, self.streams, self.staging, self.said = survey, features, streams, staging, said
+    survey: Survey
+    features: Mapping[str, dict]
+    streams: Mapping[str, Sensor]
+    staging: Path
+    said: list[str]
 
     def cut(self, piece: Piece) -> tuple[dict, dict, float]:
         """(readings by stream, films by stream, seconds from the episode's time 0 to the piece's own)."""

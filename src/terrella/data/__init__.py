@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from .channels import check_game
 from .dataset import Dataset
-from .episodes import Episode
 from .format import Layout
+from .meta import Episode
 from .recorder import Recorder
 from .source import Readings, Sensor, Source, Take
 from .training.cache import ClipCache, split

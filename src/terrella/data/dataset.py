@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,10 +14,9 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..core.spec import Camera, kind_of
 from .channels import ACTION, DONE, REWARD, RGB, cameras_of, channel_of
-from .episodes import Episode, EpisodeTable, read_episodes
-from .features import as_depth, checked_features, is_deep, metres, sensors_of, shown, unit_of
+from .features import checked_features, decoded, metres, sensors_of, shown, unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, INFO, TIME, names_of, stream_path, to_numpy
-from .meta import read_about, read_info, read_sensors, read_tasks
+from .meta import Episode, EpisodeTable, read_about, read_episodes, read_info, read_sensors, read_tasks
 from .source import Lazy, Readings, Sensor, Source, Take, follows, is_action
 from .storage import mp4
 from .storage.remote import Files, LocalFiles, open_files
@@ -292,17 +293,12 @@ class Dataset:
         """Makes depth of image features of one channel that prove to have 16 bits, though nothing says that they are depth."""
         for name, sensor in self.sensors.items():
             feature = self.features[name]
-            if (
-                sensor.kind == "image"
-                and feature["dtype"] == "image"
-                and feature["shape"][2] == 1
-                and len(self.episodes)
-            ):
-                try:
+            grey = feature["dtype"] == "image" and feature["shape"][2] == 1
+            if sensor.kind == "image" and grey and len(self.episodes):
+                with suppress(DatasetError):  # whoever reads it gets an error
                     first = self._table(self.episodes[0], [name])[name]
-                    self.sensors[name] = as_depth(sensor) if len(first) and is_deep(first[0].as_py()) else sensor
-                except DatasetError:
-                    pass  # whoever reads it gets an error
+                    if len(first) and decoded(first[0].as_py(), sensor.shape, name).ndim == 2:
+                        self.sensors[name] = replace(sensor, kind="depth", shape=sensor.shape[:2], dtype="float32")
 
     def _table(self, episode: Episode, columns: list[str]):
         return read_rows(self.files.local(episode.data), columns, episode.start, episode.stop, self.features)

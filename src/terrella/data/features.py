@@ -68,20 +68,6 @@ def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dic
     return found
 
 
-def as_depth(sensor: Sensor) -> Sensor:
-    """The sensor of an image feature whose pictures turned out to have one channel of 16 bits."""
-    return replace(sensor, kind="depth", shape=sensor.shape[:2], dtype="float32")
-
-
-def is_deep(picture: Mapping | None) -> bool:
-    """Whether a picture kept as bytes has one channel of more than 8 bits; False where it cannot be opened."""
-    try:
-        with Image.open(io.BytesIO((picture or {})["bytes"]), formats=_PICTURES) as image:
-            return image.mode in _DEEP
-    except (OSError, ValueError, KeyError, TypeError, SyntaxError, *_BOMBS):
-        return False
-
-
 def decoded(picture: Mapping | None, shape: tuple[int, ...], camera: str) -> np.ndarray:
     """A picture kept as bytes: uint8 [H, W, 3], or [H, W] as it is stored where it has one channel of more than 8 bits."""
     try:

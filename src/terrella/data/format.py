@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..core.spec import Spec, shape_of
-from .channels import ACTION, DEPTH, DONE, POSE_NAMES, REWARD, RGB, STATE, facts_of, sensors_of_channels
+from .channels import ACTION, DONE, REWARD, facts_of, sensors_of_channels
 from .source import Sensor, is_action
 
 VERSION = "v3.0"
@@ -57,30 +57,6 @@ class Layout:
     world: Mapping[str, object] = field(default_factory=dict)
     facts: Mapping[str, object] = field(default_factory=dict)
     channels: Mapping[str, str] = field(default_factory=dict)
-
-    @staticmethod
-    def of_channels(
-        fps: float,
-        action: tuple[str, ...],
-        rgb: tuple[int, int] | None = None,
-        depth: tuple[int, int] | None = None,
-        pose: bool = False,
-        vectors: Mapping[str, int] | None = None,
-        world: Mapping[str, object] | None = None,
-        arrays: Mapping[str, tuple[tuple[int, ...], str]] | None = None,
-    ) -> Layout:
-        """Of a World's channels: rgb (H, W), depth (h, w), the camera's pose, vectors by length, a name per number of an
-        action, arrays (masks, lists) by shape and type."""
-        made = [Sensor(RGB, "image", (*rgb, 3), "uint8")] if rgb else []
-        made += [Sensor(DEPTH, "depth", depth)] if depth else []
-        made += [Sensor(STATE, "vector", (7,), names=POSE_NAMES)] if pose else []
-        for name, length in (vectors or {}).items():
-            names = tuple(f"{name}_{i}" for i in range(length))
-            made.append(Sensor(f"observation.{name}", "vector", (length,), names=names))
-        made += [Sensor(f"observation.{name}", "vector", *kind) for name, kind in (arrays or {}).items()]
-        made.append(Sensor(ACTION, "vector", (len(action),), names=tuple(action)))
-        made += [Sensor(REWARD, "vector", (1,)), Sensor(DONE, "vector", (1,), "bool")]
-        return Layout(fps, {sensor.name: sensor for sensor in made}, world=dict(world or {}))
 
     @staticmethod
     def of(spec: Spec, fps: float | None = None) -> Layout:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -22,12 +20,12 @@ from .channels import ACTION, DONE, REWARD, feature_of
 from .features import unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even
 from .source import Sensor, follows, is_action
-from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Staged, about, growing, growing_stream, pack_row
+from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Staged, about, growing, pack_row
+from .storage.durable import FULL
 from .storage.journal import Journal
-from .storage.mp4 import Mp4Writer
+from .storage.mp4 import Mp4Writer, Pressure
 from .writer import Writer, fresh
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
 
 
@@ -37,14 +35,6 @@ class Watch(Protocol):
     start_ns: int
 
     def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None: ...
-
-
-@dataclass(frozen=True)
-class Pressure:
-    """How far behind the encoders were. waited_s: time that `add` stood still; most_waiting: frames that queued at worst."""
-
-    waited_s: float = 0.0
-    most_waiting: int = 0
 
 
 class Recorder:
@@ -62,6 +52,7 @@ class Recorder:
     task:      what the episodes from now on are about.
     live:      where each row and reading is logged too, for somebody to watch; it never holds the recording up.
     recovered: rows of interrupted episodes that were kept.
+    pressure:  how far behind the encoders were, of all episodes so far.
     """
 
     def __init__(
@@ -83,7 +74,7 @@ class Recorder:
         self._running: list[Callable[[], object]] = []  # ends the files in flight
         self._journal: Journal | None = None
         weakref.finalize(self, _abandon, self._running, self._writer.close).atexit = False
-        self._pressure = Pressure()
+        self.pressure = Pressure()
         self._closed = False
         self._forget()
         try:
@@ -101,15 +92,6 @@ class Recorder:
     def episodes(self) -> int:
         """Episodes that are safe."""
         return self._writer.episodes
-
-    @property
-    def pressure(self) -> Pressure:
-        """Of all episodes so far."""
-        now = [*self._videos.values(), *self._films.values()]
-        return Pressure(
-            self._pressure.waited_s + sum(video.waited_s for video in now),
-            max([self._pressure.most_waiting, *(video.most_waiting for video in now)]),
-        )
 
     def add(
         self,
@@ -298,11 +280,11 @@ class Recorder:
                 if sensor.kind == "image":
                     self._pictures[name] = []
                 if self._is_video(sensor):
-                    self._videos[name] = Mp4Writer(growing(folder, name), even(sensor), layout.fps)
+                    self._videos[name] = Mp4Writer(growing(folder, name), even(sensor), layout.fps, self.pressure)
             for name, sensor in layout.streams.items():
                 if sensor.kind == "image":
                     rate = sensor.rate_hz or layout.fps
-                    self._films[name] = Mp4Writer(growing_stream(folder, name), even(sensor), rate)
+                    self._films[name] = Mp4Writer(growing(folder, f"stream-{name}"), even(sensor), rate, self.pressure)
             videos = [*self._videos.values(), *self._films.values()]
             self._running += [self._journal.close, *(video.abandon for video in videos)]
         return self._journal
@@ -346,14 +328,13 @@ class Recorder:
             self._forget()
             self._left = True
             self._writer.remove_unfinished()
-            why = "the disk is full" if getattr(error, "errno", None) in _FULL else f"writing failed ({error})"
+            why = "the disk is full" if getattr(error, "errno", None) in FULL else f"writing failed ({error})"
             safe = f"{self.episodes} episodes ({self.rows} frames) are safe there"
             safe += f", the {rows} rows in flight are kept as far as they were written" if rows else ""
             raise DatasetError(f"{why} at {self.root}; {safe}: free some space and record again to go on.") from error
 
     def _stop(self, quietly: bool = False) -> None:
         """Ends the files in flight."""
-        self._pressure = self.pressure
         videos, self._videos, self._films = [*self._videos.values(), *self._films.values()], {}, {}
         self._running.clear()
         if self._journal:

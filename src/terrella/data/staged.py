@@ -42,13 +42,8 @@ def pack_row(values: Mapping[str, np.ndarray], given: Sequence[bool], sensors: S
 
 
 def growing(folder: Path, camera: str) -> Path:
-    """The film of a camera that has a frame in each row."""
+    """The film of a camera; of one with a clock of its own, "stream-" stands before its name."""
     return folder / f"{camera}.growing.mp4"
-
-
-def growing_stream(folder: Path, camera: str) -> Path:
-    """The film of a camera with a clock of its own."""
-    return folder / f"stream-{camera}.growing.mp4"
 
 
 class Staged:
@@ -87,7 +82,7 @@ class Staged:
         films, streams = {}, {}
         for name, sensor in self.streams.items():
             if sensor.kind == "image":
-                film, rate = growing_stream(self.folder, name), sensor.rate_hz or self.fps
+                film, rate = growing(self.folder, f"stream-{name}"), sensor.rate_hz or self.fps
                 times = [time_s for time_s, _ in self._readings(name)]
                 count = _good(film, self.folder / "tried.mp4", len(times), rate) if pictures is None else len(times)
                 if not count:
@@ -134,6 +129,7 @@ class Staged:
 
     def _finished(self, film: Path, name: str, length: int) -> Path:
         target = self.folder / f"{name}.mp4"
+        mp4.trim(film)
         kept = mp4.finish(film, target, length)
         if kept != length:
             raise DatasetError(f"the film {film} has {kept} of the {length} frames that are needed.")
@@ -168,6 +164,7 @@ def _good(film: Path, target: Path, most: int, fps: float) -> int:
     if not most:
         return 0
     try:
+        mp4.trim(film)
         count = mp4.finish(film, target, most)
         good = whole_frames(target, 0, count, fps)
         return int(count if good.all() else good.argmin())

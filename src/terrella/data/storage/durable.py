@@ -12,6 +12,8 @@ from pathlib import Path
 
 from ...core.errors import DatasetError
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what the system says of a full disk
+
 
 def sync_file(path: Path) -> None:
     """Blocks until the file's bytes are on the disk."""
@@ -81,7 +83,7 @@ def in_whole(path: str | Path) -> Iterator[Path]:
 
 def unwritten(path: Path, error: OSError) -> DatasetError:
     """What to raise where writing failed on the disk: nothing of it is kept."""
-    why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+    why = "the disk is full" if error.errno in FULL else error.strerror or str(error)
     return DatasetError(f"{path} was not written: {why}; free some space, or choose another place, and try again.")
 
 

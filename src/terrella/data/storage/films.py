@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import shutil
 from contextlib import suppress
@@ -14,9 +13,9 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from . import durable, mp4
+from .durable import FULL
 from .mp4 import Mp4Writer
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MOST = 50_000_000  # frames of one file; more is damage
 _PACKED, _ZEROS = ("h264", "hevc", "av1", "libdav1d", "vp9"), bytes(24)  # entropy coding leaves no such run of zeros
 
@@ -65,58 +64,31 @@ def reel(path: Path, fps: float) -> Reel:
     return Reel(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
 
 
-def cut(path: Path, first: int, count: int, fps: float, target: Path, reel: Reel) -> bool:
+def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Reel) -> bool:
     """Frames `first` .. `first + count - 1` of a video as one of its own.
 
     True where its packets were copied; False where they had to be decoded and encoded again. DatasetError where a frame
     cannot be had.
     """
-    begin = np.flatnonzero(reel.frames == first)
-    if len(begin) == 1 and reel.keys[begin[0]]:
+    begin = np.flatnonzero(packed.frames == first)
+    if len(begin) == 1 and packed.keys[begin[0]]:
         at = int(begin[0])
-        packets = reel.frames[at : at + count]
+        packets = packed.frames[at : at + count]
         if len(packets) == count and np.array_equal(np.sort(packets), first + np.arange(count)):
-            if first == 0 and len(reel.frames) == count:
+            if first == 0 and len(packed.frames) == count:
                 shutil.copyfile(path, target)
             else:
-                with suppress(DatasetError):  # what this mp4 writer cannot hold may still be decoded
-                    _copy(path, at, count, target)
-            if np.array_equal(np.sort(mp4_frames(target, fps)), np.arange(count)):
-                durable.sync_file(target)
-                return True
+                try:
+                    mp4.finish(path, target, count, at)
+                except (DatasetError, *mp4.BROKEN) as error:  # what this mp4 writer cannot hold may still be decoded
+                    if getattr(error, "errno", None) in FULL:
+                        raise
+            with suppress(DatasetError):
+                if np.array_equal(np.sort(reel(target, fps).frames), np.arange(count)):
+                    durable.sync_file(target)
+                    return True
     _encode(path, first, count, fps, target)
     return False
-
-
-def mp4_frames(path: Path, fps: float) -> np.ndarray:
-    """Which frames a video holds; none where it is broken."""
-    try:
-        return reel(path, fps).frames
-    except DatasetError:
-        return np.zeros(0, np.int64)
-
-
-def _copy(path: Path, at: int, count: int, target: Path) -> None:
-    """Packets number `at` .. `at + count - 1` of the file."""
-    try:
-        options = mp4.FINISHED
-        with mp4.opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
-            out = copy.add_stream_from_template(stream, opaque=True)
-            begin = None
-            for number, packet in enumerate(source.demux(stream)):
-                if number < at:
-                    continue
-                if number == at + count or packet.pts is None:
-                    break
-                begin = packet.pts if begin is None else begin
-                packet.pts -= begin
-                packet.dts = None if packet.dts is None else packet.dts - begin
-                packet.stream = out
-                copy.mux(packet)
-    except mp4.BROKEN as error:
-        if getattr(error, "errno", None) in _FULL:
-            raise
-        raise mp4.broken(path, str(error)) from error
 
 
 def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:

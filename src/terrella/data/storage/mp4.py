@@ -1,14 +1,23 @@
-"""H.264 video files: an encoder that runs in parallel with the world, and exact frame reading (PyAV)."""
+"""H.264 video files: an encoder that runs in parallel with the world, and exact frame reading (PyAV).
+
+The boxes of a file are walked before FFmpeg makes room for the frames that they claim, and up to the last whole one.
+"""
 
 from __future__ import annotations
 
+import os
 import queue
+import struct
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import av
 import numpy as np
@@ -18,7 +27,88 @@ from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
 from ..source import Lazy
-from . import boxes, durable
+from . import durable
+
+_RUN = struct.Struct(">II")  # flags and frames of a fragment's run
+_FIELDS = (0x100, 0x200, 0x400, 0x800)  # what a run may keep for each frame, four bytes each
+_LARGEST = 1 << 24  # bytes of one fragment's table
+
+
+def _check_boxes(path: Path) -> None:
+    """ValueError where a fragment claims more frames than it has bytes; OSError where there is no file."""
+    about = os.stat(path)
+    _checked(str(path), about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(1024)
+def _checked(path: str, size: int, _changed_ns: int) -> None:
+    with open(path, "rb") as file:
+        for at, length, kind in _walk(file, size):
+            if kind == b"moof":
+                if length > _LARGEST:
+                    raise ValueError(f"a fragment's table claims {length:,} bytes")
+                _fragment(file, at, min(at + length, size), size)
+
+
+def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
+    """(place, bytes, kind) of the boxes of a file; the last may be cut, or claim what no box can have."""
+    at = 0
+    while at + 8 <= size:
+        file.seek(at)
+        length, kind = struct.unpack(">I4s", file.read(8))
+        if length == 1:
+            length = int.from_bytes(file.read(8), "big")
+        yield at, length, kind
+        if length < 8:  # 0: up to the end of the file
+            return
+        at += length
+
+
+def _fragment(file: BinaryIO, start: int, end: int, size: int) -> None:
+    file.seek(start)
+    data = file.read(end - start)
+    at = 8
+    while at + 16 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if kind == b"traf":
+            at += 8  # its boxes follow
+            continue
+        if kind == b"trun":
+            flags, frames = _RUN.unpack_from(data, at + 8)
+            each = 4 * sum(bool(flags & field) for field in _FIELDS)
+            if frames > (max(0, length - 16) // each if each else size):
+                raise ValueError(f"a fragment claims {frames:,} frames")
+        if length < 8:
+            return
+        at += length
+
+
+def whole_fragments(path: Path) -> tuple[int, int]:
+    """(bytes, fragments) of a growing file up to the end of its last fragment (moof and mdat) that is whole.
+
+    All bytes of a file that has no fragments, or is damaged: whoever reads it will tell.
+    """
+    with open(path, "rb") as file:
+        end = file.seek(0, 2)
+        kept, fragments, begun = end, 0, False
+        for at, length, kind in _walk(file, end):
+            if not begun and (length < 8 or (at + length > end and kind != b"moof")):
+                return end, 0
+            if length < 8 or at + length > end or (begun and kind not in (b"moof", b"mdat")):
+                break  # cut; after a power cut what follows may be zeros
+            if kind == b"moof":
+                kept, begun = kept if begun else at, True
+            else:
+                kept, fragments = at + length, fragments + begun
+    return kept, fragments
+
+
+def trim(path: Path) -> None:
+    """Cuts a growing file after its last whole fragment; a half-written one would spoil the rest."""
+    size = whole_fragments(path)[0]
+    if size < os.stat(path).st_size:
+        os.truncate(path, size)
+
 
 BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
 KEYFRAME_EVERY = 8
@@ -38,16 +128,22 @@ _WAITING = 64  # frames that may wait for the encoder; then `add` waits, no fram
 _LARGEST = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
 
 
-class Mp4Writer:
-    """Encodes uint8 [H, W, 3] frames in a thread of its own; errors of that thread surface in `add` or `finish`.
+@dataclass
+class Pressure:
+    """How far behind encoders were. waited_s: time that `add` stood still; most_waiting: frames that queued at worst."""
 
-    The file at `path` grows frame by frame. waited_s: seconds that `add` waited for the encoder; most_waiting: the most
-    frames that ever waited.
+    waited_s: float = 0.0
+    most_waiting: int = 0
+
+
+class Mp4Writer:
+    """Encodes uint8 [H, W, 3] frames in a thread of its own; errors of that thread surface in `add` or `close`.
+
+    The file at `path` grows frame by frame; `pressure` is told where the encoder is behind.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], fps: float):
-        self.path, self.waited_s, self.most_waiting = path, 0.0, 0
-        self._size = size
+    def __init__(self, path: Path, size: tuple[int, int], fps: float, pressure: Pressure | None = None):
+        self.path, self._size, self._pressure = path, size, pressure or Pressure()
         self._rate = Fraction(fps).limit_denominator(10_000)
         self._frames: queue.Queue[np.ndarray | None] = queue.Queue(_WAITING)
         self._error: BaseException | None = None
@@ -63,8 +159,8 @@ class Mp4Writer:
         except queue.Full:
             began = time.perf_counter()
             self._frames.put(frame)
-            self.waited_s += time.perf_counter() - began
-        self.most_waiting = max(self.most_waiting, self._frames.qsize())
+            self._pressure.waited_s += time.perf_counter() - began
+        self._pressure.most_waiting = max(self._pressure.most_waiting, self._frames.qsize())
 
     def close(self) -> None:
         """Ends the growing file; raises what went wrong in the encoder."""
@@ -106,7 +202,7 @@ class Mp4Writer:
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """A video's container and its first stream; one of BROKEN where it is none."""
-    boxes.check(path)
+    _check_boxes(path)
     with av.open(str(path), "r") as container:
         yield container, container.streams.video[0]
 
@@ -116,19 +212,22 @@ def ticks(stream: VideoStream, fps: float) -> Fraction:
     return (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
 
 
-def finish(growing: Path, target: Path, frames: int | None = None) -> int:
-    """Copies a grown file, which is cut after its last whole frame, to `target` with its index in front.
+def finish(path: Path, target: Path, frames: int | None = None, first: int = 0) -> int:
+    """Copies frames to a file of their own with its index in front; returns how many it holds.
 
-    At most `frames` are taken; returns how many it holds. Nothing is encoded anew. DatasetError where not one is whole.
+    At most `frames` are taken, from packet number `first` on, which begins at time 0. Nothing is encoded anew. DatasetError
+    where not one is whole.
     """
-    count, options = 0, FINISHED
+    count, begin, options = 0, 0, FINISHED
     try:
-        boxes.trim(growing)
-        with opened(growing) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
-            out = copy.add_stream_from_template(stream)
-            for packet in source.demux(stream):
-                if packet.size == 0 or packet.is_corrupt or count == frames:
+        with opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
+            out = copy.add_stream_from_template(stream, opaque=True)
+            for packet in islice(source.demux(stream), first, None):
+                if packet.size == 0 or packet.is_corrupt or packet.pts is None or count == frames:
                     break
+                begin = begin if count else packet.pts
+                packet.pts -= begin
+                packet.dts = None if packet.dts is None else packet.dts - begin
                 packet.stream = out
                 copy.mux(packet)
                 count += 1
@@ -136,9 +235,9 @@ def finish(growing: Path, target: Path, frames: int | None = None) -> int:
         if isinstance(error, OSError) and error.errno and not isinstance(error, av.InvalidDataError):
             raise
         if not count:
-            raise broken(growing, str(error)) from error
+            raise broken(path, str(error)) from error
     if not count:
-        raise broken(growing, "it holds no frame")
+        raise broken(path, "it holds no frame")
     durable.sync_file(target)
     return count
 

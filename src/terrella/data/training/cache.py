@@ -18,6 +18,7 @@ from ...core.errors import DatasetError
 from ..channels import ESTIMATES, channel_of, feature_of, renamed
 from ..dataset import Dataset
 from ..format import INFO
+from ..source import Lazy
 from ..storage import durable
 from ..storage.remote import BUDGET_BYTES, LocalFiles
 
@@ -41,29 +42,12 @@ _NUMBERS = {"float64": "float32"} | {
 }
 
 
-class Ranges(Sequence[tuple[int, int]]):
-    """(first row, row after the last) of each episode, read from an int64 array [E, 2] that may lie on the disk."""
-
-    def __init__(self, pairs: np.ndarray):
-        self.pairs = pairs
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: int) -> tuple[int, int]:  # type: ignore[override]
-        start, stop = self.pairs[index].tolist()
-        return start, stop
-
-    def __eq__(self, other) -> bool:
-        return isinstance(other, Sequence) and len(self) == len(other) and all(a == b for a, b in zip(self, other))
-
-
 class ClipCache:
     """Read-only arrays over all N rows of a dataset; what the recording lacks is None.
 
     rgb uint8 [N, H, W, 3]; depth float16 [N, h, w] metres (>= 65.5: beyond range); pose float32 [N, 7]; action float32
     [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; task int64 [N], the place in `tasks` of the text that
-    the row is about; episodes: (start, stop) row ranges.
+    the row is about; episodes: (start, stop) row ranges, `ranges` the same as int64 [E, 2].
     `arrays` has those that there are by name, and the recording's other vectors ("observation.state", …) by their key;
     `keys` names the array of each channel. All are memory-mapped: opening reads nothing of them, and takes no longer for a
     longer recording.
@@ -83,7 +67,8 @@ class ClipCache:
         try:
             about = json.loads((path / "about.json").read_text(encoding="utf-8"))
             self.arrays = {name: np.load(path / f"{name}.npy", mmap_mode="r") for name in about["arrays"]}
-            self.episodes = Ranges(np.load(path / "episodes.npy", mmap_mode="r"))
+            self.ranges = ranges = np.load(path / "episodes.npy", mmap_mode="r")
+            self.episodes = Lazy(len(ranges), lambda i: tuple(ranges[i].tolist()))
             self.length = self.episodes[-1][1]
             self.fps, self.action_names, self.world = about["fps"], tuple(about["action_names"]), about["world"]
             self.tasks: tuple[str, ...] = tuple(about["tasks"])

@@ -218,7 +218,7 @@ class _Whole:
         self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
         self.keys, self.tasks = cache.keys, cache.tasks
         self._episodes = chosen(episodes, len(cache.episodes))
-        first, stop = cache.episodes.pairs[slice(None) if episodes is None else self._episodes].T
+        first, stop = cache.ranges[slice(None) if episodes is None else self._episodes].T
         self._counts = np.maximum(stop - first - plan.span + 1, 0)
         self._starts = Starts.of(first, self._counts)
 
