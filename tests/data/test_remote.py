@@ -338,7 +338,11 @@ def test_a_clip_cache_of_a_recording_far_away(recording, tmp_path, monkeypatch, 
                 memory.pipe(f"/far/recording/{path.relative_to(recording)}", path.read_bytes())
     dataset = Dataset(Files(root, tmp_path / "files", budget_bytes=1 << 20))
     far = ClipCache.open(dataset, (12, 16))
-    assert far.path.is_relative_to(tmp_path / "home") and list(far.episodes) == list(near.episodes) and far.tasks == near.tasks
+    assert (
+        far.path.is_relative_to(tmp_path / "home")
+        and list(far.episodes) == list(near.episodes)
+        and far.tasks == near.tasks
+    )
     assert all(np.array_equal(near.arrays[name], far.arrays[name]) for name in near.arrays)
     assert ClipCache.open(dataset, (12, 16)).path == far.path  # built once
     with pytest.raises(DatasetError, match="may be kept here.*smaller pictures"):
