@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from terrella.space.camera import planar_pose, rays, rotation, unproject
+from terrella.space.camera import FAR_M, planar_pose, rays, rotation, unproject
+from terrella.space.kernels_numba.surfaces import cast_one
+from terrella.space.views import arrays, each_view
 
 CAMERA = (0.5, 0.8, 0.5, 0.5)
 SIZE = (48, 64)
@@ -27,3 +29,11 @@ def painted(pose: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     """Smooth colours of the surfaces seen, uint8 [B, 3, H, W]."""
     points = unproject(depth, pose, CAMERA)
     return (127 + 120 * torch.sin(1.3 * points)).round().to(torch.uint8).permute(0, 3, 1, 2)
+
+
+def cast(patch: torch.Tensor, pose: torch.Tensor, camera, size) -> torch.Tensor:
+    """Depth [B, H, W] that the views from `pose` [B, 7] see of `patch` [B, N, 9], by the kernel."""
+    depth = torch.full((len(pose), *size), FAR_M)
+    kernel = lambda patch, turn, at, depth: cast_one(patch, turn, at, camera, depth)  # noqa: E731
+    each_view(kernel, arrays(patch, rotation(pose), pose, depth))
+    return depth

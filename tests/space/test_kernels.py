@@ -11,8 +11,9 @@ from terrella.core import make_rng
 from terrella.space.billboards import PICTURE, painted
 from terrella.space.camera import FAR_M, planar_pose, rotation
 from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
-from terrella.space.keyframes import Keyframes, pick, pick_slowly
-from terrella.space.patches import cast, cast_slowly, patches
+from terrella.space.kernels_numba.recall import pick as pick_kernel
+from terrella.space.keyframes import ANYWAY, Keyframes, pick_slowly
+from terrella.space.patches import cast_slowly, patches
 from terrella.space.reproject import (
     carry_things,
     carry_things_slowly,
@@ -21,7 +22,9 @@ from terrella.space.reproject import (
     fill_holes,
     fill_holes_slowly,
 )
-from terrella.space.views import over_views
+from terrella.space.views import arrays, each_view, over_views
+
+from .rooms import cast
 
 CAMERA = (0.5, 0.667, 0.5, 0.5)
 
@@ -58,6 +61,12 @@ def test_patches_at_the_rim_are_not_lost(camera):
         assert (slow < FAR_M).float().mean() > 0.3
         close = torch.isclose(quick, slow, rtol=1e-3, atol=1e-3)
         assert float(close.float().mean()) > 0.995, "but for pixels on the very edge of a patch"
+
+
+def pick(votes: torch.Tensor, count: int) -> torch.Tensor:
+    picks = torch.full((len(votes), count), -1)
+    each_view(lambda votes, picks: pick_kernel(votes, ANYWAY, picks), arrays(votes, picks))
+    return picks
 
 
 def test_the_picks_are_those_of_the_slow_twin():

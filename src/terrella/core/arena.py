@@ -25,9 +25,8 @@ class Arena:
         self.device = torch.device(device)
         self._lock = threading.RLock()
         self._pointers: dict[int, weakref.ref[torch.Tensor]] = {}
-        self._newest = (
-            threading.local()
-        )  # the rows that each thread kept last, which it may still be building a state of
+        # the rows that each thread kept last, which it may still be building a state of
+        self._newest = threading.local()
         self._crowd = 1000  # pointers noted, above which the dead ones are dropped
         with torch.inference_mode(False):
             self._rows = {name: self._blank(name, room) for name in self.parts}
@@ -129,9 +128,7 @@ class Arena:
 
     def _blank(self, name: str, rows: int) -> torch.Tensor:
         dtype, shape = self.parts[name]
-        blank = torch.empty(
-            (rows, *shape), dtype=dtype, device=self.device
-        )  # the system gives memory when it is written
+        blank = torch.empty((rows, *shape), dtype=dtype, device=self.device)  # it takes memory when it is written
         blank[:1] = 0
         return blank
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from ..space.keyframes import Glimpse, Keyframes, gathered, look, retrieve
+from ..space.reproject import carry_unknown
 from ..worlds.config import THUMBNAIL, VideoConfig
 from ..worlds.generator import Conditioning, Generator, context_thumbnail, decode_depth, encode_depth, generate, pixels
-from ..worlds.places import carry
 from .recording import Recording
 from .trainer import Now
 
@@ -97,7 +97,7 @@ class Views:
     def carried(self, rgb, depth, from_rows: np.ndarray, to_rows: np.ndarray, glimpse: Glimpse) -> torch.Tensor:
         """The frame at `from_rows` (given, dreamt or true) carried into the views at `to_rows`."""
         poses = self.recording.pose(from_rows), self.recording.pose(to_rows)
-        return carry(rgb, depth, poses[0], glimpse, poses[1], self.config.camera)
+        return carry_unknown(rgb, depth, poses[0], glimpse.known, glimpse.depth, poses[1], self.config.camera)
 
 
 def _retrieved(memory: Keyframes, pose: torch.Tensor, config: VideoConfig) -> list[int]:

@@ -25,25 +25,17 @@ def align(
     """
     grey = [picture.float().mean(1, keepdim=True) for picture in (before, after)]
     starts = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], device=depth.device) * 0.7 * pace
-    motion = torch.zeros(len(before), 3, device=depth.device)
+    motions = [start.expand(len(before), 3) for start in starts]
     levels = [level for level in _ROUNDS if min(before.shape[-2:]) >= 6 * level] or [1]
     for level in levels:
         first, second = (F.avg_pool2d(picture, level) for picture in grey)
         near = 1 / F.avg_pool2d(1 / depth[:, None].clamp_min(0.05), level)[:, 0]
-        if level == levels[0]:
-            tried, best = [], []
-            for start in starts:
-                guess = start.expand(len(before), 3)
-                for _ in range(_ROUNDS[level]):
-                    guess, _ = _round(first, second, near, camera, guess, pace)
-                tried.append(guess)
-                best.append(_round(first, second, near, camera, guess, pace)[1])
-            choice = torch.stack(best).argmin(0)
-            motion = torch.stack(tried)[choice, torch.arange(len(before))]
-        else:
-            for _ in range(_ROUNDS[level]):
-                motion, _ = _round(first, second, near, camera, motion, pace)
-    return motion
+        for _ in range(_ROUNDS[level]):
+            motions = [_round(first, second, near, camera, motion, pace)[0] for motion in motions]
+        if len(motions) > 1:
+            best = torch.stack([_round(first, second, near, camera, motion, pace)[1] for motion in motions]).argmin(0)
+            motions = [torch.stack(motions)[best, torch.arange(len(before))]]
+    return motions[0]
 
 
 def _round(

@@ -121,9 +121,8 @@ def painted_slowly(rgb, depth, billboards, there, pose, camera) -> tuple[torch.T
     pictures = billboards[1]
     hides, instances = depth + BEHIND_M, torch.zeros_like(depth, dtype=torch.uint8)
     quarters = torch.tensor([0.25, 0.75], device=rgb.device)
-    u = (
-        torch.arange(width, device=rgb.device)[:, None] + quarters
-    ).flatten()  # two places along either side of a pixel
+    # two places along either side of a pixel
+    u = (torch.arange(width, device=rgb.device)[:, None] + quarters).flatten()
     v = (torch.arange(height, device=rgb.device)[:, None] + quarters).flatten()
     for rank in order.unbind(1):
         view = torch.arange(len(rgb), device=rgb.device)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +19,7 @@ from ..core.errors import CheckpointError
 from .align import align
 from .camera import Intrinsics
 
+Network = TypeVar("Network", bound=nn.Module)
 _USUAL = 0.99  # the share of pictures like those that it learned from whose strangeness is below 1
 
 
@@ -87,8 +89,7 @@ class Estimator(nn.Module):
 
     def depth_code(self, plain: torch.Tensor) -> torch.Tensor:
         """A normalised picture -> depth as a share of the way from near to far, logarithmic: [B, h, w] in 0..1."""
-        x = self.enter(torch.cat([F.pixel_unshuffle(plain, 2), self._where(len(plain))], 1))
-        kept, x = self._encode(x)
+        kept, x = self._encode(plain)
         x = x + self.whole(x.mean((2, 3)))[:, :, None, None]
         for level in reversed(range(len(self.after))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
@@ -99,9 +100,7 @@ class Estimator(nn.Module):
         """Of pictures, uint8 [B, 3, H, W], how much their two finest maps vary, the mean and contrast of each colour and the
         logarithm of its differences along either axis: [B, D]."""
         picture = self._seen(rgb)
-        plain = normalised(picture)
-        x = self.enter(torch.cat([F.pixel_unshuffle(plain, 2), self._where(len(plain))], 1))
-        kept, _ = self._encode(x)
+        kept, _ = self._encode(normalised(picture))
         steps = [picture.diff(dim=axis).abs().mean((2, 3)).clamp_min(1e-3).log() for axis in (2, 3)]
         light = [part.flatten(1) for part in _light(picture)]
         return torch.cat([kept[0].std((2, 3)), kept[1].std((2, 3)), *light, *steps], 1)
@@ -128,8 +127,9 @@ class Estimator(nn.Module):
         near, far = self.config.near_m, self.config.far_m
         return (near * (far / near) ** code).clamp(near, far)
 
-    def _encode(self, x: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
-        kept = []
+    def _encode(self, plain: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+        """The maps of a normalised picture, but for the smallest, and that."""
+        kept, x = [], self.enter(torch.cat([F.pixel_unshuffle(plain, 2), self._where(len(plain))], 1))
         for level, block in enumerate(self.before):
             x = block(x)
             if level < len(self.down):
@@ -176,25 +176,25 @@ def _light(picture: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return picture.mean((2, 3), keepdim=True), picture.std((2, 3), keepdim=True) + 0.02
 
 
-def estimator_weights(estimator: Estimator) -> dict[str, torch.Tensor]:
-    """What was learned by descent in half precision, the statistics as they are."""
-    learned = dict(estimator.named_parameters())
-    kept = {name: value.detach().cpu().contiguous() for name, value in estimator.state_dict().items()}
-    return {name: value.half() if name in learned else value for name, value in kept.items()}
+def half_weights(network: nn.Module) -> dict[str, torch.Tensor]:
+    """The tensors of a network for a file: what was learned by descent in half precision, the statistics as they are."""
+    learned = dict(network.named_parameters())
+    return {name: value.half() if name in learned else value for name, value in network.state_dict().items()}
 
 
-def estimator_of(config: Mapping, weights: Mapping[str, torch.Tensor]) -> Estimator:
-    """The estimator that `asdict(estimator.config)` and `estimator_weights` describe."""
-    size, camera = tuple(config["size"]), tuple(config["camera"])
-    estimator = Estimator(EstimatorConfig(size, config["near_m"], config["far_m"], tuple(config["channels"]), camera))
-    estimator.load_state_dict({name: value.float() for name, value in weights.items()})
-    return estimator.eval().requires_grad_(False)
+def restored(network: Network, weights: Mapping[str, torch.Tensor]) -> Network:
+    """`network` with weights of a file."""
+    network.load_state_dict(
+        {name: part.float() if part.dtype == torch.half else part for name, part in weights.items()}
+    )
+    return network.eval().requires_grad_(False)
 
 
 def save_estimator(estimator: Estimator, path: str | Path) -> None:
     """Writes one safetensors file."""
     about = {"kind": "estimator", "config": asdict(estimator.config)}
-    save_file(estimator_weights(estimator), str(path), metadata={"terrella": json.dumps(about)})
+    weights = {name: value.cpu().contiguous() for name, value in half_weights(estimator).items()}
+    save_file(weights, str(path), metadata={"terrella": json.dumps(about)})
 
 
 def load_estimator(path: str | Path) -> Estimator:
@@ -204,7 +204,8 @@ def load_estimator(path: str | Path) -> Estimator:
             about = json.loads((file.metadata() or {}).get("terrella", "{}"))
         if about.get("kind") not in ("estimator", "eye"):  # as it was called at first
             raise CheckpointError(f"{path} holds no estimator; make one with `terrella train estimator`.")
-        return estimator_of(about["config"], load_file(str(path)))
+        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in about["config"].items()}
+        return restored(Estimator(EstimatorConfig(**settings)), load_file(str(path)))
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         first = str(error).splitlines()[0]
         raise CheckpointError(f"{path} is no estimator that can be read ({first}); train it again.") from error

@@ -9,9 +9,10 @@ import torch
 import torch.nn.functional as F
 
 from .camera import Intrinsics, unproject, yaw
-from .kernels_numba.walls import WITHIN_M, straight_runs_of
+from .kernels_numba.walls import WITHIN_M
 from .kernels_numba.walls import slide as slide_kernel
-from .views import arrays, over_views
+from .kernels_numba.walls import straight_runs as straight_runs_kernel
+from .views import arrays, each_view, over_views
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 on the map
 
@@ -58,8 +59,7 @@ def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
     if inverse.device.type != "cpu":
         return straight_runs_slowly(inverse, left)
     found = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
-    parts = [*arrays(inverse, left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M, found.numpy()]
-    over_views(len(inverse), lambda first, last: straight_runs_of(first, last, *parts))
+    each_view(straight_runs_kernel, arrays(inverse, found), *arrays(left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
     return found
 
 
@@ -197,11 +197,8 @@ def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor,
     """The same as `slide`, in plain tensor algebra; the way on a GPU."""
     whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1).double()
     whole = F.pad(whole, (0, 0, 0, 1), value=NOWHERE)
-    place, rest, free = (
-        places.double(),
-        wish.double(),
-        torch.ones(len(places), 1, dtype=torch.bool, device=places.device),
-    )
+    place, rest = places.double(), wish.double()
+    free = torch.ones(len(places), 1, dtype=torch.bool, device=places.device)
     for bump in range(3):
         share, along = _first_touch(whole - place.repeat(1, 2)[:, None], rest, half_m)
         open_way, share = share[:, None] > 1, share[:, None]
@@ -223,11 +220,8 @@ def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[
     )
     one, other = (unit @ a[..., None])[..., 0], (unit @ b[..., None])[..., 0]  # [B, S, 3 axes]
     reach = half * unit.abs().sum(-1)
-    low, high, speed = (
-        torch.minimum(one, other) - reach,
-        torch.maximum(one, other) + reach,
-        (unit @ move[:, None, :, None])[..., 0],
-    )
+    low, high = torch.minimum(one, other) - reach, torch.maximum(one, other) + reach
+    speed = (unit @ move[:, None, :, None])[..., 0]
     moves = speed.abs() >= 1e-12
     ends = torch.stack([low, high]) / torch.where(moves, speed, 1.0)
     enter, face = torch.where(moves, ends.amin(0), -1e9).max(-1)
@@ -237,14 +231,8 @@ def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[
     deep = torch.minimum(enter[..., None] * speed - low, high - enter[..., None] * speed)
     crossing = (unit[..., 0] * faced[..., None, 1] - unit[..., 1] * faced[..., None, 0]).abs()
     grazes = ((crossing > 0.02) & (deep < WITHIN_M)).any(-1)
-    meets = (
-        (enter < leave)
-        & (enter <= 1)
-        & (enter > -1e9)
-        & (enter * pace > -WITHIN_M)
-        & ~grazes
-        & (length[..., 0] >= 1e-9)
-    )
+    meets = (enter < leave) & (enter <= 1) & (enter > -1e9) & (enter * pace > -WITHIN_M)
+    meets &= ~grazes & (length[..., 0] >= 1e-9)
     share, which = torch.where(meets, enter, 2.0).min(1)
     met = faced.gather(1, which[:, None, None].expand(-1, 1, 2))[:, 0]
     return share, torch.stack([-met[:, 1], met[:, 0]], 1)

@@ -74,8 +74,7 @@ class Keyframes:
 
     def at(self, index) -> Keyframes:
         if isinstance(index, list):
-            rows = torch.tensor(index, dtype=torch.int64, device=self.pose.device)
-            return Keyframes(*(getattr(self, field.name).index_select(0, rows) for field in fields(self)))
+            index = torch.tensor(index, dtype=torch.int64, device=self.pose.device)
         return Keyframes(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
@@ -178,18 +177,8 @@ def vote_slowly(depth, pose, points, distance, camera) -> torch.Tensor:
     return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
 
 
-def pick(votes: torch.Tensor, count: int) -> torch.Tensor:
-    """Of votes [B, K, P], the keyframes of which each adds most to what those before it cover: int64 [B, count], -1: no more."""
-    if votes.device.type != "cpu":
-        return pick_slowly(votes, count)
-    picks = torch.full((len(votes), count), -1)
-    parts = [*arrays(votes), ANYWAY, picks.numpy()]
-    over_views(len(votes), lambda first, last: kernels.pick_views(first, last, *parts))
-    return picks
-
-
 def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
-    """The same as `pick`, in plain tensor algebra; the way on a GPU."""
+    """Of votes [B, K, P], the keyframes of which each adds most to what those before it cover: int64 [B, count], -1: no more."""
     picks = torch.full((len(votes), count), -1, device=votes.device)
     if not votes.shape[1]:
         return picks

@@ -8,16 +8,13 @@ evidence alone), and of equals a dreamt one before an observed one, the oldest f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
-from gymnasium import spaces
 
 from ..core.arena import Arena
 from ..core.errors import ContractError
-from ..core.spec import Spec
 from ..core.state import State
 from .camera import Intrinsics, yaw
 from .floorplan import NOWHERE, WALLS
@@ -159,20 +156,17 @@ class Memory:
         apart, nearest, pose = apart[views], nearest[views], pose[views]
         new = Keyframes.of(rgb[views], depth[views], pose, self.camera, fine=False)
         arena = self._arena_of(held)
-        kept, kinds, born = held[ROWS], held["memory_kind"], held["memory_born"]
         slot = torch.where(apart <= 1, nearest, self._room(held, views, apart > 1))
         rows = arena.keep({name: vars(new)[name] for name in arena.parts})
         fresh = {
             "memory_pose": pose, "memory_kind": torch.full_like(slot, kind, dtype=torch.uint8),
-            "memory_born": born[views].amax(1) + 1, ROWS: rows,
+            "memory_born": held["memory_born"][views].amax(1) + 1, ROWS: rows,
         }  # fmt: skip
-        before = {"memory_pose": held["memory_pose"], "memory_kind": kinds, "memory_born": born, ROWS: kept}
         flags = which[views]
         changed = {}
         for name, value in fresh.items():
-            old = before[name][views, slot]
-            value = torch.where(flags.view(-1, *[1] * (value.ndim - 1)), value, old)
-            changed[name] = before[name].index_put((views, slot), value)
+            value = torch.where(flags.view(-1, *[1] * (value.ndim - 1)), value, held[name][views, slot])
+            changed[name] = held[name].index_put((views, slot), value)
         arena.hold(changed[ROWS])
         return changed
 
@@ -239,9 +233,8 @@ class Memory:
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)
         picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
-        turn = torch.where(
-            picks < 0, 2, (picks >= len(shared)).long()
-        )  # of equally trusted ones a recorded one comes first
+        # of equally trusted ones a recorded one comes first
+        turn = torch.where(picks < 0, 2, (picks >= len(shared)).long())
         picks = picks.gather(1, turn.argsort(dim=1, stable=True))
         return look(shared, picks, pose, self.camera, self.size, slots, own)
 
@@ -259,15 +252,3 @@ def keyframe_table(pose: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
     """Poses [..., 7] and kinds [...] as float32 [..., 4] = x, y in metres, heading in radians, kind; zeros where empty."""
     row = torch.cat([pose[..., :2], yaw(pose)[..., None], kind[..., None].float()], -1)
     return torch.where((kind > EMPTY)[..., None], row, 0.0)
-
-
-def remembering_spec(spec: Spec, size: tuple[int, int], keyframes: int) -> Spec:
-    """The spec of a world that remembers, with the channels of that: `known` [H, W], 1 where memory reconstructs what is
-    shown and 0 where it is invented, and `keyframes` [N, 4] (keyframe_table), in which memory can be inspected."""
-    shown: dict[str, spaces.Space] = {"known": spaces.Box(0, 1, size, np.float32)}
-    if keyframes:
-        shown["keyframes"] = spaces.Box(-np.inf, np.inf, (keyframes, 4), np.float32)
-    channels = {name: space for name, space in spec.channels.items() if name != "keyframes"}
-    units = {name: unit for name, unit in spec.units.items() if name != "keyframes"}
-    units |= {"keyframes": "x and y in m, heading in rad, kind"} if keyframes else {}
-    return replace(spec, channels={**channels, **shown}, units=units)

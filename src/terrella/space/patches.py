@@ -2,8 +2,8 @@
 
 Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
 the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
-`patches` and `cast` run compiled kernels on a CPU (kernels_numba/surfaces.py); `patches_slowly` and `cast_slowly` are their
-obvious twins, and the way on a GPU.
+Compiled kernels do both on a CPU (kernels_numba/surfaces.py); `patches_slowly` and `cast_slowly` are their obvious twins, and
+the way on a GPU.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import torch
 
 from .camera import FAR_M, NEAR_M, Intrinsics, rays, rotation, unproject
-from .kernels_numba.surfaces import cast_views, lift_views
-from .views import arrays, over_views
+from .kernels_numba.surfaces import lift
+from .views import arrays, each_view
 
 SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall seen head-on is no surface
 
@@ -32,8 +32,7 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
         depth.float().reshape(-1, height, width), rotation(pose).reshape(-1, 3, 3), pose[..., :3].reshape(-1, 3)
     )
     found = torch.empty(len(images), patch_count((height, width), stride), 9)
-    parts = [images, turns, positions, camera, stride, SLANT, found.numpy()]
-    over_views(len(images), lambda first, last: lift_views(first, last, *parts))
+    each_view(lift, [images, turns, positions, found.numpy()], camera, stride, SLANT)
     return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
 
 
@@ -79,18 +78,11 @@ def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
     return (bend < 0.05 * images).view(depth.shape)
 
 
-def cast(patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
-    """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9]; FAR_M where it sees none."""
-    if patch.device.type != "cpu":
-        return cast_slowly(patch, pose, camera, size)
-    depth = torch.full((len(pose), *size), FAR_M)
-    parts = [*arrays(patch, rotation(pose), pose[:, :3]), camera, depth.numpy()]
-    over_views(len(pose), lambda first, last: cast_views(first, last, *parts))
-    return depth
-
-
-def cast_slowly(patch, pose, camera, size, chunk: int = 512) -> torch.Tensor:
-    """The same as `cast`, by trying every patch on every pixel."""
+def cast_slowly(
+    patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], chunk: int = 512
+) -> torch.Tensor:
+    """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9], FAR_M where it sees none, by trying every patch
+    on every pixel; the way on a GPU."""
     turn = rotation(pose)
     centre = torch.einsum("bji,bnj->bni", turn, patch[..., :3] - pose[:, None, :3])
     across, down = (torch.einsum("bji,bnj->bni", turn, patch[..., k : k + 3]) for k in (3, 6))

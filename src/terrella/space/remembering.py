@@ -17,13 +17,13 @@ import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core.errors import ContractError, ObservationError
-from ..core.spec import Camera, Spec, shape_of
+from ..core.spec import POSE, POSE_UNIT, Camera, Spec, shape_of
 from ..core.state import State
 from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
 from .estimator import Estimator
 from .keyframes import Glimpse, merge
-from .memory import ROWS, Memory, remembering_spec
+from .memory import ROWS, Memory
 from .reproject import least_around
 
 SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
@@ -71,9 +71,7 @@ class Remembering:
         if not self.memory.capacity:
             least = math.ceil(100 * self.memory.keyframe_bytes / 2**20) / 100
             raise ContractError(f"a budget of {memory_mb} MiB has no room for a keyframe; give {least:.2f} or more.")
-        self.spec = remembering_spec(
-            _posed_spec(spec, (height, width), estimator, camera), (height, width), self.memory.capacity
-        )
+        self.spec = _spec(spec, self.memory, camera, estimator is not None)
         self._shown = tuple(name for name in _OWN_CHANNELS if name in spec.channels)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
@@ -193,15 +191,16 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
     return (mixed * 255).round().clamp(0, 255).to(torch.uint8), share[:, 0]
 
 
-def _posed_spec(spec: Spec, size: tuple[int, int], estimator: Estimator | None, camera: Intrinsics) -> Spec:
-    """With the pose and the depth that memory goes by."""
-    channels, units = dict(spec.channels), dict(spec.units)
-    if "pose" not in channels:
-        channels["pose"] = spaces.Box(-np.inf, np.inf, (7,), np.float32)
-        units["pose"] = "m, quaternion wxyz of T_world_cam"
-    if "depth" in channels or estimator is not None:  # of the pictures' size
-        channels["depth"], units["depth"] = spaces.Box(0, np.inf, size, np.float32), "m"
-    return replace(spec, channels=channels, units=units, cameras={**spec.cameras, "rgb": Camera(camera, size)})
+def _spec(spec: Spec, memory: Memory, camera: Intrinsics, estimates: bool) -> Spec:
+    """The spec of a world that remembers: with the pose and the depth that memory goes by; `known` [H, W], 1 where memory
+    reconstructs what is shown and 0 where it is invented; and `keyframes` [N, 4] (keyframe_table), in which it can be inspected."""
+    channels, units = {"pose": POSE, **spec.channels}, {"pose": POSE_UNIT, **spec.units}
+    if "depth" in channels or estimates:  # of the pictures' size
+        channels["depth"], units["depth"] = spaces.Box(0, np.inf, memory.size, np.float32), "m"
+    channels["known"] = spaces.Box(0, 1, memory.size, np.float32)
+    channels["keyframes"] = spaces.Box(-np.inf, np.inf, (memory.capacity, 4), np.float32)
+    units["keyframes"] = "x and y in m, heading in rad, kind"
+    return replace(spec, channels=channels, units=units, cameras={**spec.cameras, "rgb": Camera(camera, memory.size)})
 
 
 def _inner(state: State) -> State:

@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 
 from .camera import FAR_M, SAME, Intrinsics, project, rotation, unproject
-from .kernels_numba.carried import carry_views, fetch_views, splat_views
-from .kernels_numba.planes import fill_views
-from .views import arrays, over_views
+from .kernels_numba.carried import carry, fetch, splat
+from .kernels_numba.planes import fill
+from .views import arrays, each_view
 
 
 def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
@@ -43,8 +43,7 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
     filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
-    parts = [*arrays(depth, least_around(depth)), FAR_M, levels, filled.numpy()]
-    over_views(len(depth), lambda first, last: fill_views(first, last, *parts))
+    each_view(fill, arrays(depth, least_around(depth), filled), FAR_M, levels)
     return filled
 
 
@@ -91,10 +90,15 @@ def warp(
     held = F.grid_sample(depth.flatten(0, 1)[:, None], grid, mode="nearest", padding_mode="border", align_corners=False)
     held = held.view(batch, keys, height, width)
     inside = (grid.abs().amax(-1) <= 1).view(batch, keys, height, width) & (seen_depth > 0.05)
-    error = (held - seen_depth).abs() / seen_depth.clamp_min(0.05)
-    agreement = torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
+    agreement = _agreement(held, seen_depth, inside)
     closeness = target_depth[:, None] / seen_depth.clamp_min(0.05)
     return colour.view(batch, keys, -1, height, width), agreement, closeness
+
+
+def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
+    """How far a depth that is `held` is that of a surface `ahead`, 0..1, where that is `inside` the picture."""
+    error = (held - ahead).abs() / ahead.clamp_min(0.05)
+    return torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
 
 
 def carry_unknown(
@@ -108,8 +112,7 @@ def carry_unknown(
         return carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera)
     carried = torch.zeros(len(rgb), 4, *target_depth.shape[-2:])
     given = rgb, depth, rotation(pose), pose, known, target_depth, rotation(target_pose), target_pose
-    parts = [*arrays(*given), camera, carried.numpy()]
-    over_views(len(rgb), lambda first, last: carry_views(first, last, *parts))
+    each_view(carry, arrays(*given, carried), camera)
     return carried
 
 
@@ -132,15 +135,11 @@ def carry_things(
     given = rgb, depth, things, covered, pose, target_pose
     if not _kernels_do(*given):
         return carry_things_slowly(*given, camera)
-    pixels = arrays(rgb, depth, things, covered)
-    turns, poses, new_turns, new_poses = arrays(rotation(pose), pose, rotation(target_pose), target_pose)
+    source, target = (rotation(pose), pose), (rotation(target_pose), target_pose)
     flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
-    splat = [*pixels[1:3], turns, poses, new_turns, new_poses, camera, flat.numpy(), canvas.numpy()]
-    over_views(len(rgb), lambda first, last: splat_views(first, last, *splat))
-    (seen,) = arrays(_closed(canvas))
+    each_view(splat, arrays(depth, things, *source, *target, flat, canvas), camera)
     found = torch.zeros(len(rgb), 6, *depth.shape[1:])
-    fetch = [pixels[0], flat.numpy(), *pixels[2:], turns, poses, seen, new_turns, new_poses, camera, found.numpy()]
-    over_views(len(rgb), lambda first, last: fetch_views(first, last, *fetch))
+    each_view(fetch, arrays(rgb, flat, things, covered, *source, _closed(canvas), *target, found), camera)
     return found
 
 
@@ -155,16 +154,15 @@ def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) 
     planes = torch.cat([rgb.float() / 255, torch.stack([things, flat, covered.float()], 1)], 1)
     found = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
     inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (found[:, 5] < 0.5)
-    error = (found[:, 4] - ahead).abs() / ahead.clamp_min(0.05)
-    trust = torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)[:, None]
+    trust = _agreement(found[:, 4], ahead, inside)[:, None]
     found = found * (trust > 0)
     return torch.cat([found[:, :3], trust, seen[:, None], found[:, 3:4]], 1)
 
 
 def _closed(depth: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] with FAR_M in holes -> the same without."""
-    for fill in (least_around, fill_holes):  # the first closes the gaps of a surface that comes nearer
-        depth = torch.where(depth < FAR_M, depth, fill(depth))
+    for way in (least_around, fill_holes):  # the first closes the gaps of a surface that comes nearer
+        depth = torch.where(depth < FAR_M, depth, way(depth))
     return depth
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -21,6 +21,16 @@ def over_views(batch: int, work: Callable[[int, int], object]) -> None:
         work(0, bounds[1])
     for other in others:
         other.result()
+
+
+def each_view(kernel: Callable[..., object], views: Sequence[Any], *shared: Any) -> None:
+    """Calls kernel(*view, *shared) for each view of arrays [B, ...], as `over_views` does."""
+
+    def work(first: int, last: int) -> None:
+        for view in range(first, last):
+            kernel(*(part[view] for part in views), *shared)
+
+    over_views(len(views[0]), work)
 
 
 def arrays(*parts: torch.Tensor) -> list[Any]:

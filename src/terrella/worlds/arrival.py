@@ -11,22 +11,15 @@ from ..space.camera import Intrinsics
 from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes, look, retrieve
 from ..space.recognise import recognise
+from .parts import Absent
 
 AWAY_M = 1000.0  # from the recordings, of a picture of elsewhere: nothing that they hold is seen from there
 ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # a picture is of a remembered place from there up (see docs/log.md)
 
 
 @final
-class NoEstimator:
+class NoEstimator(Absent):
     """Of a world that cannot see depth in a lone picture."""
-
-    kind, config = "none", None
-
-    def __bool__(self) -> bool:
-        return False
-
-    def to(self, device) -> NoEstimator:
-        return self
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ..core.state import State
 from ..space.camera import planar_pose, yaw
 from ..space.floorplan import slide
 from .config import MotionConfig
-from .parts import Channels, Walls
+from .parts import Absent, Channels, Walls
 
 FASTEST_M = 1.0  # a step; what evidence moves by more has been put there, and has no speed
 
@@ -106,28 +106,11 @@ class MotionBody:
 
 
 @final
-class NoBody:
+class NoBody(Absent):
     """Of a frames-only world: nobody knows where its pictures were taken."""
 
-    kind, config, history = "none", None, 0
-
-    def __bool__(self) -> bool:
-        return False
-
-    def to(self, device) -> NoBody:
-        return self
-
-    def channels(self) -> Channels:
-        return Channels()
-
-    def blank(self, batch: int, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        return {}
-
-    def observed(self, prior: State, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        return {}
-
-    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {}
+    history = 0
+    blank = observed = step = Absent.nothing
 
     def ends(self, after: Mapping[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
         return torch.zeros(len(action), dtype=torch.bool, device=action.device)

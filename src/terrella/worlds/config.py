@@ -80,9 +80,8 @@ class VideoConfig:
     steps: int = 1  # flow-matching steps a frame
     vitals: tuple[float, ...] = ()  # with which episodes begin (names are its outcome's)
     residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise
-    objects: bool = (
-        False  # things are billboards (worlds/objects.py): the generator neither sees nor draws what they cover
-    )
+    # things are billboards (worlds/objects.py): the generator neither sees nor draws what they cover
+    objects: bool = False
     moving: bool = False  # things move: the last two frames are shown everywhere, and memory keeps what stands still
 
     @property

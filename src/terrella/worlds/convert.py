@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from safetensors.torch import load_file
 
 from ..core.errors import CheckpointError
 from .config import VideoConfig
-from .folder import KIND, MEMORY_FILE, VERSION, WEIGHTS_FILE, _plain, load_world, read_about, write_folder
+from .controls import Controls
+from .folder import KIND, MEMORY_FILE, VERSION, WEIGHTS_FILE, first_line, load_world, read_about, write_folder
+from .parts import Absent
 
 OLD_KIND, OLD_VERSION = "video", 2
 PARTS = {"motion": "body", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}  # the others keep their names
@@ -40,43 +43,30 @@ def convert_world(old: str | Path, new: str | Path) -> None:
         told = _described(about, starts)
         write_folder(new, told, {_renamed(name): value for name, value in weights.items()}, remembered)
     except (OSError, SafetensorError, LookupError, TypeError, ValueError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{old} cannot be converted ({first}); copy or train it again.") from error
+        raise CheckpointError(f"{old} cannot be converted ({first_line(error)}); copy or train it again.") from error
     load_world(new)
 
 
 def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
     """What world.json of version 3 says of such a world."""
     config = _config(about["config"])
-    usual, ending = about["rewards"]
-    outcome: dict[str, Any] = {
-        "kind": "constant",
-        "config": {"usual": usual, "ending": ending if config.geometry else 0.0},
-    }
+    posed, (usual, ending) = config.geometry, about["rewards"]
+    outcome = _part("constant", {"usual": usual, "ending": ending if posed else 0.0})
     if about.get("outcome"):
         begins = list(config.vitals)
-        if (
-            not config.geometry and "starts.vitals" in starts
-        ):  # such worlds took those that recordings usually begin with
+        if not posed and "starts.vitals" in starts:  # such worlds took those that recordings usually begin with
             begins = starts["starts.vitals"].median(0).values.tolist()
-        outcome = {"kind": "frames", "config": {**about["outcome"], "begins": begins}}
-    posed = config.geometry
+        outcome = _part("frames", {**about["outcome"], "begins": begins})
     parts = {
-        "body": {"kind": "motion", "config": _plain(config.motion)} if posed else _absent(),
-        "scene": {"kind": "keyframes", "config": _plain(config.keyframes)}
-        if posed
-        else {"kind": "history", "config": _plain(config.frames)},
-        "generator": {"kind": "unet", "config": _plain(config.generator)},
-        "objects": {"kind": "billboards", "config": about["cast"]} if about.get("cast") else _absent(),
+        "body": _part("motion", asdict(config.motion) if posed else None),
+        "scene": _part("keyframes", asdict(config.keyframes)) if posed else _part("history", asdict(config.frames)),
+        "generator": _part("unet", asdict(config.generator)),
+        "objects": _part("billboards", about.get("cast")),
         "outcome": outcome,
-        "uncertainty": {"kind": "network", "config": about["doubt"]} if about.get("doubt") else _absent(),
-        "estimator": {"kind": "network", "config": about["eye"]} if about.get("eye") else _absent(),
+        "uncertainty": _part("network", about.get("doubt")),
+        "estimator": _part("network", about.get("eye")),
     }
-    controls = about.get("controls") or {
-        "kind": "buttons",
-        "low": [0.0] * config.actions,
-        "high": [1.0] * config.actions,
-    }
+    controls = about.get("controls") or asdict(Controls.buttons(config.actions))
     said = {name: about[name] for name in ("dt_s", "action_names", "keys")}
     card = {
         {"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()
@@ -99,8 +89,9 @@ def _config(told: dict) -> VideoConfig:
     return VideoConfig(**settings)
 
 
-def _absent() -> dict:
-    return {"kind": "none", "config": None}
+def _part(kind: str, config: dict | None) -> dict:
+    """A part of this kind, or none without its settings."""
+    return {"kind": kind, "config": config} if config else {"kind": Absent.kind, "config": None}
 
 
 def _renamed(name: str) -> str:

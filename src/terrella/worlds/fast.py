@@ -65,23 +65,20 @@ def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
         slow, quick = in_turns([lambda: eager(*inputs), lambda: other(*inputs)])
     wins = quick < slow
     if wins:
-        vars(generator)["forward"] = _Way(eager, other)
+        vars(generator)["forward"] = _either(eager, other)
     way = EAGER if not wins else ONNX if on_cpu else COMPILED
     choice = Choice(way, slow, quick, prepared)
     return world.replaced(generator=generator, card={"fast": str(choice)}), choice
 
 
-@dataclass(frozen=True)
-class _Way:
+def _either(eager: Forward, quick: Forward) -> Forward:
     """A generator's way of drawing: `quick`, but where a gradient is needed `eager`."""
 
-    eager: Forward
-    quick: Forward
-
-    def __call__(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
-        given = noisy, time, conditioning
+    def forward(*given) -> torch.Tensor:
         learns = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in _flat(given))
-        return self.eager(*given) if learns else self.quick(*given)
+        return eager(*given) if learns else quick(*given)
+
+    return forward
 
 
 def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioning]:
@@ -96,10 +93,8 @@ def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioni
 
 def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
     """The generator as ONNX Runtime runs it on the CPU, for any batch; it keeps to torch's number of threads."""
-    missing = [
-        package for package in ("onnxruntime", "onnx") if not find_spec(package)
-    ]  # torch writes graphs with onnx
-    if missing:
+    # torch writes graphs with onnx
+    if missing := [package for package in ("onnxruntime", "onnx") if not find_spec(package)]:
         raise TerrellaError(
             f"Fast play needs {' and '.join(missing)}: pip install 'terrella[fast]', or leave --fast out."
         )
@@ -172,16 +167,10 @@ def _exported(generator: nn.Module, inputs: tuple) -> bytes:
     with warnings.catch_warnings(), torch.no_grad(), TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")  # of torch about its own exporter
         free = {name: {0: "batch"} for name in [*names, "clean"]}
-        torch.onnx.export(
-            Flat(),
-            tuple(tensors),
-            str(Path(folder, "graph.onnx")),
-            input_names=names,
-            output_names=["clean"],
-            dynamic_axes=free,
-            dynamo=False,
-        )
-        return Path(folder, "graph.onnx").read_bytes()
+        file = Path(folder, "graph.onnx")
+        named = {"input_names": names, "output_names": ["clean"], "dynamic_axes": free}
+        torch.onnx.export(Flat(), tuple(tensors), str(file), **named, dynamo=False)
+        return file.read_bytes()
 
 
 def _flat(inputs: tuple) -> list[torch.Tensor]:

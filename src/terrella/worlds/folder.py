@@ -6,7 +6,6 @@ stored as JPEG (colour) and zlib-packed uint16 millimetres (depth); nothing is e
 
 from __future__ import annotations
 
-import io
 import json
 import zlib
 from collections.abc import Callable, Mapping
@@ -22,56 +21,27 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ..core.errors import CheckpointError
-from ..space.estimator import Estimator, EstimatorConfig
+from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
 from ..space.keyframes import Keyframes
-from .arrival import NoEstimator
-from .body import Motion, MotionBody, NoBody
+from .body import Motion, MotionBody
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
 from .generator import Generator
 from .history import FrameHistory, Starts
 from .learned import About, LearnedWorld
-from .objects import NoObjects, Objects, ObjectsConfig
+from .objects import Objects, ObjectsConfig
 from .outcome import Constant, ConstantConfig, Outcome, OutcomeConfig
+from .parts import Absent
 from .places import KeyframeScene
-from .uncertainty import NoUncertainty, Uncertainty, UncertaintyConfig
+from .uncertainty import Uncertainty, UncertaintyConfig
 
 KIND, VERSION = "learned", 3
 WORLD_FILE, WEIGHTS_FILE, MEMORY_FILE = "world.json", "weights.safetensors", "memory.safetensors"
 Tensors = Mapping[str, torch.Tensor]
+Make = Callable[[Any, Tensors, Tensors], Any]
+# Of files that are not what they should be.
+DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
-# By part and kind: how one is made of its settings, its weights and what is remembered.
-KINDS: dict[str, dict[str, Callable[[dict, Tensors, Tensors], Any]]] = {
-    "body": {
-        "none": lambda config, weights, remembered: NoBody(),
-        "motion": lambda config, weights, remembered: _body(_settings(MotionConfig, config), weights),
-    },
-    "scene": {
-        "keyframes": lambda config, weights, remembered: _places(_settings(KeyframesConfig, config), remembered),
-        "history": lambda config, weights, remembered: _frames(_settings(HistoryConfig, config), remembered),
-    },
-    "generator": {
-        "unet": lambda config, weights, remembered: _network(Generator, _settings(GeneratorConfig, config), weights)
-    },
-    "objects": {
-        "none": lambda config, weights, remembered: NoObjects(),
-        "billboards": lambda config, weights, remembered: _network(Objects, _settings(ObjectsConfig, config), weights),
-    },
-    "outcome": {
-        "constant": lambda config, weights, remembered: Constant(_settings(ConstantConfig, config)),
-        "frames": lambda config, weights, remembered: _network(Outcome, _settings(OutcomeConfig, config), weights),
-    },
-    "uncertainty": {
-        "none": lambda config, weights, remembered: NoUncertainty(),
-        "network": lambda config, weights, remembered: _network(
-            Uncertainty, _settings(UncertaintyConfig, config), weights
-        ),
-    },
-    "estimator": {
-        "none": lambda config, weights, remembered: NoEstimator(),
-        "network": lambda config, weights, remembered: _network(Estimator, _settings(EstimatorConfig, config), weights),
-    },
-}
 HALVED = ("uncertainty", "estimator")  # what these learned by descent is stored in half precision
 
 
@@ -137,23 +107,17 @@ def load_world(
         weights, remembered = load_file(path / WEIGHTS_FILE), load_file(path / MEMORY_FILE)
         made = {}
         for name, part in about["parts"].items():
-            made[name] = KINDS[name][part["kind"]](part["config"] or {}, _below(weights, name), remembered)
+            if part["kind"] != Absent.kind:
+                config, make = KINDS[name][part["kind"]]
+                made[name] = make(_settings(config, part["config"] or {}), _below(weights, name), remembered)
         told = about["about"]
         controls = _settings(Controls, told["controls"])
         names = tuple(told["action_names"]), told["keys"], about["card"], tuple(told["ignored"])
         world = LearnedWorld(About(about["name"], controls, told["dt_s"], *names), **made)
-    except (
-        OSError,
-        SafetensorError,
-        RuntimeError,
-        LookupError,
-        AttributeError,
-        TypeError,
-        ValueError,
-        zlib.error,
-    ) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{path} is damaged or incomplete ({first}); copy or train it again.") from error
+    except DAMAGE as error:
+        raise CheckpointError(
+            f"{path} is damaged or incomplete ({first_line(error)}); copy or train it again."
+        ) from error
     if memory_mb is not None:
         world = world.with_memory_of(memory_mb)
     world = world if memory else world.without_memory()
@@ -171,6 +135,10 @@ def read_about(path: Path) -> dict:
     if not isinstance(about, dict):
         raise CheckpointError(f"{path}/world.json describes no world; copy it again.")
     return about
+
+
+def first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _foreign(path: Path, about: dict) -> str:
@@ -198,12 +166,8 @@ def _plain(config: Any) -> dict | None:
     return None if config is None else asdict(config)
 
 
-def _network(kind: type, config: Any, weights: Tensors) -> nn.Module:
-    network = kind(config)
-    network.load_state_dict(
-        {name: value.float() if value.dtype == torch.half else value for name, value in weights.items()}
-    )
-    return network
+def _network(kind: type) -> Make:
+    return lambda config, weights, remembered: restored(kind(config), weights)
 
 
 def _weights(name: str, part: Any) -> Tensors:
@@ -211,26 +175,34 @@ def _weights(name: str, part: Any) -> Tensors:
     network = part.motion if name == "body" and part else part
     if not isinstance(network, nn.Module):
         return {}
-    learned = dict(network.named_parameters()) if name in HALVED else {}
-    return {key: value.half() if key in learned else value for key, value in network.state_dict().items()}
+    return half_weights(network) if name in HALVED else network.state_dict()
 
 
-def _body(config: MotionConfig, weights: Tensors) -> MotionBody:
-    motion = Motion(config)
-    motion.load_state_dict(dict(weights))
-    return MotionBody(motion, config)
-
-
-def _places(config: KeyframesConfig, remembered: Tensors) -> KeyframeScene:
+def _places(config: KeyframesConfig, weights: Tensors, remembered: Tensors) -> KeyframeScene:
     return KeyframeScene(config, *(_unpack(_below(remembered, name), config) for name in ("memory", "starts")))
 
 
-def _frames(config: HistoryConfig, remembered: Tensors) -> FrameHistory:
+def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> FrameHistory:
     starts = _below(remembered, "starts")
     begun = Starts.of(_unpack_frames(starts).unflatten(0, (-1, config.slots)), config.actions)
     if "actions" in starts:
         begun = replace(begun, actions=starts["actions"], vitals=starts["vitals"])
     return FrameHistory(config, begun)
+
+
+# By part and kind: its settings, and how it is made of them, its weights and what is remembered.
+KINDS: dict[str, dict[str, tuple[type, Make]]] = {
+    "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(restored(Motion(config), weights)))},
+    "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
+    "generator": {"unet": (GeneratorConfig, _network(Generator))},
+    "objects": {"billboards": (ObjectsConfig, _network(Objects))},
+    "outcome": {
+        "constant": (ConstantConfig, lambda config, weights, _: Constant(config)),
+        "frames": (OutcomeConfig, _network(Outcome)),
+    },
+    "uncertainty": {"network": (UncertaintyConfig, _network(Uncertainty))},
+    "estimator": {"network": (EstimatorConfig, _network(Estimator))},
+}
 
 
 def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, torch.Tensor]:
@@ -297,8 +269,7 @@ def _replace(path: Path, write) -> None:
 
 
 def _readme(about: dict) -> str:
-    out = io.StringIO()
-    out.write(f"# {about['name']}\n\nA world of Terrella, kind `{about['kind']}`: `terrella play` this folder.\n\n")
+    text = f"# {about['name']}\n\nA world of Terrella, kind `{about['kind']}`: `terrella play` this folder.\n\n"
     for name, value in about["card"].items():
-        out.write(f"- **{name}**: {value if not isinstance(value, dict) else json.dumps(value)}\n")
-    return out.getvalue()
+        text += f"- **{name}**: {value if not isinstance(value, dict) else json.dumps(value)}\n"
+    return text

@@ -93,14 +93,8 @@ class Generator(nn.Module):
         merged = merge(glimpse) * 2 - 1
         depth = encode_depth(glimpse.depth)[:, None]
         last_rgb, last_trust = last[:, :3] * 2 - 1, last[:, 3:4]
-        parts = [
-            merged,
-            (colours * (trust > 0)[:, :, None]).flatten(1, 2),
-            trust,
-            last_rgb * (last_trust > 0),
-            last_trust,
-        ]
-        parts += [depth, glimpse.known[:, None], noisy[:, :4]]
+        shown = (colours * (trust > 0)[:, :, None]).flatten(1, 2), trust, last_rgb * (last_trust > 0), last_trust
+        parts = [merged, *shown, depth, glimpse.known[:, None], noisy[:, :4]]
         if self.moving:
             carried = encode_depth(last[:, 4:5])
             parts += [carried * (last_trust > 0), last[:, 5:]]

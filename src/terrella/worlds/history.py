@@ -54,12 +54,11 @@ class FrameHistory:
     def to(self, device) -> FrameHistory:
         return FrameHistory(self.config, Starts(*(part.to(device) for part in vars(self.starts).values())))
 
-    def with_memory(self, recorded: Keyframes) -> FrameHistory:
+    def with_memory(self, *given) -> FrameHistory:
         """It has no use for keyframes."""
         return self
 
-    def with_memory_of(self, budget_mb: float) -> FrameHistory:
-        return self
+    with_memory_of = with_memory
 
     @property
     def device(self) -> torch.device:
@@ -90,13 +89,11 @@ class FrameHistory:
         check_prior(prior.batch, len(frame))
         return Evidence(len(frame), self.device, None, {"frames": torch.cat([frame, prior["frames"][:, 1:]], 1)})
 
-    def adopted(self, state: State) -> State:
-        """`state`, which points at nothing."""
+    def adopted(self, state: State, *given) -> State:
+        """`state`, which points at nothing; nothing in it waits for a body, is kept beside it or grows old."""
         return state
 
-    def settled(self, state: State) -> State:
-        """`state`, in which nothing waits for a body."""
-        return state
+    settled = kept = aged = adopted
 
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
@@ -105,12 +102,6 @@ class FrameHistory:
     def pictured(self, state: State, evidence: Evidence) -> State:
         """`state` with the frames of the evidence, and the actions that led to them."""
         return state.replace(**{name: evidence.seen[name] for name in ("frames", "actions") if name in evidence.seen})
-
-    def kept(self, state: State, begins: bool) -> State:
-        return state
-
-    def aged(self, state: State, before: State) -> State:
-        return state
 
     def frame(self, state: State) -> torch.Tensor:
         """The newest frame, uint8 [B, 3, H, W]."""

@@ -22,7 +22,7 @@ from ..core.state import State
 from ..space.billboards import PICTURE, Cutout, cut_out, painted
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import NOWHERE
-from .parts import GOES, LOOKS, MOVES, Channels, Walls
+from .parts import GOES, LOOKS, MOVES, Absent, Channels, Walls
 
 # A billboard: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its
 # last move (x, y), steps since that, and its light, of its look's own.
@@ -130,9 +130,8 @@ class Objects(nn.Module):
                 f"objects is finite float [B, {self.config.rows}, 4] and instances uint8 [B, h, w]; got "
                 f"{tuple(listed.shape)} and {instances.dtype} {tuple(instances.shape)}."
             )
-        named = F.pad(
-            (listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows)
-        )  # a pixel of nobody is nobody's
+        # a pixel of nobody is nobody's
+        named = F.pad((listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows))
         instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
         cut = cut_out(seen["rgb"], instances, depth, listed[..., 1:], seen["pose"], camera)
@@ -221,9 +220,8 @@ class Objects(nn.Module):
         reach = self.solid[billboards[..., LOOK].long().clamp_min(0)]
         apart = (billboards[..., PLACE] - position).abs()
         level = apart[..., 2] < STOREY_M
-        stops = (
-            known & level & (reach > half_m) & (apart[..., :2].amax(-1) >= reach - 0.02)
-        )  # who stands in one may leave
+        outside = apart[..., :2].amax(-1) >= reach - 0.02  # who stands in one may leave
+        stops = known & level & (reach > half_m) & outside
         (x, y), half = billboards[..., PLACE][..., :2].unbind(-1), reach - half_m
         left, right, low, high = x - half, x + half, y - half, y + half
         sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
@@ -247,12 +245,9 @@ class Objects(nn.Module):
         was = torch.where(known, old[..., LOOK].long(), NONE)
         look = torch.where(whole, likest(off, was), NONE)
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
-        look = torch.where(
-            look == NONE, guess, look
-        )  # seen in part, or like none, it looks as it did, or else as it may
-        now = torch.where(
-            known[..., None], noted(old, listed[..., 1:], look.float()), fresh(number, listed[..., 1:], look)
-        )
+        # seen in part, or like none, it looks as it did, or else as it may
+        look, place = torch.where(look == NONE, guess, look), listed[..., 1:]
+        now = torch.where(known[..., None], noted(old, place, look.float()), fresh(number, place, look))
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
         lit = (look != NONE) & (~known | whole)
         now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)
@@ -265,40 +260,18 @@ class Objects(nn.Module):
 
 
 @final
-class NoObjects:
+class NoObjects(Absent):
     """Of a world whose things, if it has any, are drawn as the rest."""
 
-    kind, config = "none", None
+    blank = observed = moved = show = Absent.nothing
 
-    def __bool__(self) -> bool:
-        return False
-
-    def to(self, device) -> NoObjects:
-        return self
-
-    def channels(self, size: tuple[int, int]) -> Channels:
-        return Channels()
-
-    def blank(self, batch: int) -> dict[str, torch.Tensor]:
-        return {}
-
-    def begin(self, state: State, pick: torch.Tensor, draw: Callable[[State], State]) -> State:
+    def begin(self, state: State, *given) -> State:
         return state
 
-    def observed(self, seen: State, observation: Mapping, camera: Intrinsics | None) -> dict[str, torch.Tensor]:
-        return {}
-
-    def moved(self, before: State, after: State, seeds: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {}
-
-    def painted(self, state: State, camera: Intrinsics | None) -> State:
-        return state
-
-    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
+    def among(self, walls: Walls, *given) -> Walls:
         return walls
 
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        return {}
+    painted = begin
 
 
 def in_sight(state: State) -> torch.Tensor:
@@ -320,12 +293,8 @@ def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor 
     """Billboards [..., COLUMNS] that are seen for the first time: number and look [...], place [..., 3]."""
     billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
     billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
-    billboards[..., BEFORE], billboards[..., AGE], billboards[..., RESTED], billboards[..., LIGHT] = (
-        NONE,
-        AGES,
-        AGES,
-        1.0,
-    )
+    billboards[..., BEFORE], billboards[..., LIGHT] = NONE, 1.0
+    billboards[..., AGE], billboards[..., RESTED] = AGES, AGES
     return billboards
 
 

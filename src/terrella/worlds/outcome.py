@@ -171,19 +171,8 @@ class Outcome(nn.Module):
 
     # -- the network --------------------------------------------------------------------------------------------------
 
-    def logits(
-        self,
-        before: torch.Tensor,
-        after: torch.Tensor,
-        action: torch.Tensor,
-        vitals: torch.Tensor,
-        hidden: torch.Tensor,
-    ) -> Logits:
-        """before and after uint8 [B, 3, H, W]; action [B, actions]; vitals [B, V] before the step; hidden [B, hidden]."""
-        return self.judge(self.seen(before, after), action, vitals, hidden)
-
     def seen(self, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-        """What the two frames say, without memory: [B, 128]."""
+        """What two frames, uint8 [B, 3, H, W], say without memory: [B, 128]."""
         small = [_shrunk(frame, self.config.side) for frame in (before, after)]
         x = F.pixel_unshuffle(torch.cat([small[1], small[1] - small[0]], 1), 2)
         for layer in self.look:
@@ -191,7 +180,7 @@ class Outcome(nn.Module):
         return F.silu(self.sum_up(F.adaptive_avg_pool2d(x, 4).flatten(1)))
 
     def judge(self, seen: torch.Tensor, action: torch.Tensor, vitals: torch.Tensor, hidden: torch.Tensor) -> Logits:
-        """The same from `seen` [B, 128]."""
+        """From `seen` [B, 128]; action [B, actions]; vitals [B, V] before the step; hidden [B, hidden]."""
         spans = torch.tensor(self.config.spans, device=seen.device)
         hidden = self.remember(torch.cat([seen, action, vitals / spans], 1), hidden)
         known = torch.cat([seen, hidden], 1)
@@ -212,9 +201,9 @@ class Outcome(nn.Module):
         hidden: torch.Tensor,
         seeds: torch.Tensor | None = None,
     ) -> Happened:
-        """The outcome of a step; arguments as for `logits`. With `seeds` [B] (core/chance.py) each vital changes by chance, as
-        likely as it should; without, by the likeliest."""
-        found = self.logits(before, after, action, vitals, hidden)
+        """The outcome of a step; arguments as for `seen` and `judge`. With `seeds` [B] (core/chance.py) each vital changes by
+        chance, as likely as it should; without, by the likeliest."""
+        found = self.judge(self.seen(before, after), action, vitals, hidden)
         reward = (found.reward.float().softmax(1) * self.rewards).sum(1)
         moved = []
         for column, (logits, values) in enumerate(zip(found.changes, self.config.changes)):

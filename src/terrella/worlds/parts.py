@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from gymnasium import spaces
 
 from ..core.errors import ObservationError
 
-NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = (
-    1,
-    2,
-    11,
-    12,
-    13,
-    20,
-)  # streams of chance (core/chance.py); CHANGES one a vital
+# Streams of chance (core/chance.py); CHANGES one a vital.
+NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = 1, 2, 11, 12, 13, 20
 
 
 @dataclass(frozen=True)
@@ -30,6 +24,24 @@ class Channels:
     units: Mapping[str, str] = field(default_factory=dict)
     observes: tuple[str, ...] = ()
     may_observe: tuple[str, ...] = ()
+
+
+class Absent:
+    """What all null objects are: parts that show nothing and add nothing to a state."""
+
+    kind, config = "none", None
+
+    def __bool__(self) -> bool:
+        return False
+
+    def to(self, device) -> Self:
+        return self
+
+    def channels(self, *given) -> Channels:
+        return Channels()
+
+    def nothing(self, *given) -> dict[str, Any]:
+        return {}
 
 
 class Walls(NamedTuple):

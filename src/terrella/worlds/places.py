@@ -17,7 +17,7 @@ from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import floor_plan
-from ..space.keyframes import Glimpse, Keyframes
+from ..space.keyframes import Keyframes
 from ..space.memory import RECORDED, ROWS, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
@@ -28,15 +28,10 @@ from .generator import Conditioning, context_thumbnail, decode_depth, pixels
 from .moving import Frame, carry_frames, covering, still
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
 
-SEEN = (
-    "rgb",
-    "depth",
-    "things",
-    "pose",
-    "instances",
-)  # of a frame that is still needed two steps later, where things move
+SEEN = "rgb", "depth", "things", "pose", "instances"  # of a frame, needed still two steps later, where things move
 NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
 CELL_M = 0.25  # side of the cells of the map in which that is looked up
+BLIND = " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
 EXACTLY = "donot_use_mm_for_euclid_dist"
 
 
@@ -130,12 +125,7 @@ class KeyframeScene:
         if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and estimator:
             observation, lone = self._arrived(observation, prior, estimator)
         if "pose" not in observation:
-            alone = ", a picture alone" if estimator else ""
-            blind = (
-                ""
-                if estimator
-                else " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
-            )
+            alone, blind = (", a picture alone", "") if estimator else ("", BLIND)
             raise ObservationError(
                 f"it observes rgb, depth and pose{alone}, or a pose alone; got {list(observation)}.{blind}"
             )
@@ -159,9 +149,8 @@ class KeyframeScene:
             )
         if not (torch.isfinite(depth).all() and (depth > 0).all()):
             raise ObservationError("depth must be finite and above 0 metres.")
-        return Evidence(
-            batch, self.device, pose, {"rgb": rgb, "depth": depth, **self._things(observation, prior, depth)}, lone
-        )
+        seen = {"rgb": rgb, "depth": depth, **self._things(observation, prior, depth)}
+        return Evidence(batch, self.device, pose, seen, lone)
 
     def _things(self, observation: Mapping, prior: State | None, depth: torch.Tensor) -> dict[str, torch.Tensor]:
         """Where things are: as the evidence says, else where they were dreamt."""
@@ -267,7 +256,8 @@ class KeyframeScene:
         glimpse = self.own.look(state, pose, config.sources, config.slots, self.recorded)
         context = context_thumbnail(before["rgb"])
         if not config.moving:
-            last = carry(before["rgb"], before["depth"], before["pose"], glimpse, pose, config.camera)
+            frame = before["rgb"], before["depth"], before["pose"]
+            last = carry_unknown(*frame, glimpse.known, glimpse.depth, pose, config.camera)
             return Conditioning(glimpse, last, context)
         frames = []
         for age in ("", "earlier_"):
@@ -315,16 +305,3 @@ def own_memory(config: KeyframesConfig, device: str) -> Memory:
         return whole
     frame_mb = Memory(config.camera, config.size).keyframe_bytes / 2**20
     return Memory(config.camera, config.size, frame_mb, (1e-6, 1e-6), 2.0, device=device)
-
-
-def carry(
-    rgb: torch.Tensor,
-    depth: torch.Tensor,
-    pose: torch.Tensor,
-    glimpse: Glimpse,
-    target_pose: torch.Tensor,
-    camera: Intrinsics,
-) -> torch.Tensor:
-    """The last frame (rgb uint8 [B, 3, H, W]) warped into the new view where no keyframe knows it, and its trust:
-    [B, 4, H, W], 0 elsewhere. A frame that is warped again at every step blurs; a keyframe is warped once."""
-    return carry_unknown(rgb, depth, pose, glimpse.known, glimpse.depth, target_pose, camera)

@@ -20,14 +20,12 @@ from ..core.state import State
 from ..space.camera import yaw
 from ..space.keyframes import merge
 from .generator import Conditioning
-from .parts import Channels
+from .parts import Absent, Channels
 
 # Of an episode: steps since a picture was seen, the way and the turns since a pose was, whether it began with a lone picture
 # of elsewhere, and how strange that was (0..1).
 GONE = ("steps", "metres", "radians", "lone", "strange")
-SITUATION = (
-    len(GONE) - 1 + 2
-)  # these but the last, how far the next recorded keyframe is, and how many of its own it holds
+SITUATION = len(GONE) - 1 + 2  # the last is replaced by how far the next recorded keyframe is, and how many it holds
 CLUES = 15  # maps of `clues`
 CELLS = 4  # pixels a side of one of its cells; the error is expected in cells of twice that
 KNOTS = 17
@@ -61,9 +59,8 @@ class Uncertainty(nn.Module):
         self.wider = nn.Conv2d(second, second, 3, 1, 2, 2)
         self.output = nn.Conv2d(second, 1, 1)
         self.output.bias = nn.Parameter(torch.tensor([-3.0]))
-        line = torch.linspace(0, 1, KNOTS)
-        for name, value in (("found", line), ("meant", line)):
-            self.register_buffer(name, value.clone())
+        self.register_buffer("found", torch.linspace(0, 1, KNOTS))
+        self.register_buffer("meant", torch.linspace(0, 1, KNOTS))
         self.register_buffer("sure", torch.tensor(0.02))
         self.register_buffer("invents", torch.tensor(0.08))
 
@@ -98,38 +95,22 @@ class Uncertainty(nn.Module):
 
 
 @final
-class NoUncertainty:
+class NoUncertainty(Absent):
     """Of a world that does not say how wrong it expects to be."""
-
-    kind, config = "none", None
-
-    def __bool__(self) -> bool:
-        return False
-
-    def to(self, device) -> NoUncertainty:
-        return self
-
-    def channels(self) -> Channels:
-        return Channels()
 
     def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
         return torch.zeros_like(strange)
 
 
 @final
-class Asked:
+class Asked(Absent):
     """In the place of an uncertainty: notes what one would be asked, for those who teach it."""
-
-    kind, config = "asked", None
 
     def __init__(self, note: Callable[[Conditioning, torch.Tensor, torch.Tensor], None]):
         self.note = note
 
-    def to(self, device) -> Asked:
-        return self
-
-    def channels(self) -> Channels:
-        return Channels()
+    def __bool__(self) -> bool:
+        return True
 
     def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
         self.note(conditioning, clean, situation)

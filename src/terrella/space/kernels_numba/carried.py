@@ -26,7 +26,7 @@ def moved(u, v, depth, turn, position, new_turn, new_position, camera):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def carry(rgb, depth, turn, position, known, seen, target_turn, target_position, camera, carried):
+def carry(rgb, depth, turn, position, known, seen, target_turn, target_position, carried, camera):
     """The kernel of reproject.carry_unknown_slowly for one view: a frame's rgb uint8 [3, H, W] and depth [h, w] from its turn
     [3, 3] and position [3]; what the view knows [V, U] and sees [V, U] from its own; fills `carried` [4, V, U], which is 0."""
     _, height, width = rgb.shape
@@ -52,7 +52,7 @@ def carry(rgb, depth, turn, position, known, seen, target_turn, target_position,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def splat(depth, things, turn, position, target_turn, target_position, camera, flat, canvas):
+def splat(depth, things, turn, position, target_turn, target_position, flat, canvas, camera):
     """The first half of reproject.carry_things_slowly for one frame: depth and things [H, W] from its turn [3, 3] and position
     [3]; fills flat [H, W], the depth with that of things averaged over their surroundings, and lowers `canvas` [H, W] to what is
     seen of it from the target's."""
@@ -79,7 +79,7 @@ def splat(depth, things, turn, position, target_turn, target_position, camera, f
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_position, camera, found):
+def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_position, found, camera):
     """The second half of the same: what the frame shows (rgb uint8 [3, H, W], the others [H, W]) of what the target sees [H, W];
     fills found [6, H, W] = colour, trust, `seen`, things."""
     height, width = flat.shape
@@ -96,27 +96,3 @@ def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_
             for c in range(3):
                 found[c, v, u] = rgb[c, j, i] / 255
             found[3, v, u], found[5, v, u] = trust, things[j, i]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def carry_views(first, last, rgb, depth, turns, poses, known, seen, new_turns, new_poses, camera, carried):
-    """`carry` of B frames into carried [B, 4, V, U], which is 0; poses [B, 7]."""
-    for b in range(first, last):
-        frame = rgb[b], depth[b], turns[b], poses[b, :3]
-        carry(*frame, known[b], seen[b], new_turns[b], new_poses[b, :3], camera, carried[b])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def splat_views(first, last, depth, things, turns, poses, new_turns, new_poses, camera, flat, canvas):
-    """`splat` of B frames onto canvas [B, H, W]; poses [B, 7]."""
-    for b in range(first, last):
-        target = new_turns[b], new_poses[b, :3]
-        splat(depth[b], things[b], turns[b], poses[b, :3], *target, camera, flat[b], canvas[b])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def fetch_views(first, last, rgb, flat, things, covered, turns, poses, seen, new_turns, new_poses, camera, found):
-    """`fetch` of B frames into found [B, 6, H, W], which is 0; poses [B, 7]."""
-    for b in range(first, last):
-        frame = rgb[b], flat[b], things[b], covered[b], turns[b], poses[b, :3]
-        fetch(*frame, seen[b], new_turns[b], new_poses[b, :3], camera, found[b])

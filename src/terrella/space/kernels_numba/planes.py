@@ -15,7 +15,7 @@ def between(plane, i, j, a, b):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill(depth, near, far, levels, filled):
+def fill(depth, near, filled, far, levels):
     """The kernel of reproject.fill_holes_slowly for one view: depth [H, W], `far` in holes, and the least around each pixel, near
     [H, W]; fills `filled` [H, W]."""
     height, width = depth.shape
@@ -76,10 +76,3 @@ def halved(plane):
             above = plane[2 * v, 2 * u] + plane[2 * v, right]
             small[v, u] = np.float32(0.25) * (above + plane[below, 2 * u] + plane[below, right])
     return small
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill_views(first, last, depth, near, far, levels, filled):
-    """`fill` of depth and near [B, H, W] into filled [B, H, W]."""
-    for view in range(first, last):
-        fill(depth[view], near[view], far, levels, filled[view])

@@ -59,13 +59,6 @@ def pick(votes, anyway, picks):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def pick_views(first, last, votes, anyway, picks):
-    """`pick` of votes [B, K, P] into picks [B, n], which are -1 before."""
-    for view in range(first, last):
-        pick(votes[view], anyway, picks[view])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def choose(first, last, shared, own, rows, turns, positions, camera, size, step, anyway, picks):
     """The kernel of keyframes.retrieve_slowly: shared and own = coarse patches [K, N, 9], depth [K, h, w], turn [K, 3, 3] and
     pose [K, 7] of keyframes; rows [B, n], those of `own` that a view may use (0: none); fills picks [B, count], -1 before."""
@@ -148,30 +141,17 @@ def recall(first, last, picks, shared, own, seen, turns, positions, camera, colo
     _, slots, rows, columns = trust.shape
     fx, fy, cx, cy = np.float32(camera[0]), np.float32(camera[1]), np.float32(camera[2]), np.float32(camera[3])
     sure, across, down = np.zeros(most, np.float32), np.zeros(most, np.float32), np.zeros(most, np.float32)
-    beam, step, at = (
-        np.zeros((most, 3), np.float32),
-        np.zeros((most, 3, 3), np.float32),
-        np.zeros((most, 3), np.float32),
-    )
+    beam, at = np.zeros((most, 3), np.float32), np.zeros((most, 3), np.float32)
+    step = np.zeros((most, 3, 3), np.float32)
     which, mine = np.zeros(most, np.int64), np.zeros(most, np.bool_)
     for view in range(first, last):
         keys = 0
         for key in picks[view]:
             if key >= 0:
                 mine[keys], which[keys] = key >= known, key - known if key >= known else key
-                if mine[keys]:
-                    relative(
-                        own_turns[which[keys]],
-                        own_poses[which[keys]],
-                        turns[view],
-                        positions[view],
-                        step[keys],
-                        at[keys],
-                    )
-                else:
-                    relative(
-                        key_turns[which[keys]], poses[which[keys]], turns[view], positions[view], step[keys], at[keys]
-                    )
+                its_turns, its_poses = (own_turns, own_poses) if mine[keys] else (key_turns, poses)
+                frame = its_turns[which[keys]], its_poses[which[keys]]
+                relative(*frame, turns[view], positions[view], step[keys], at[keys])
                 keys += 1
         for v in range(rows):
             up = -((v + np.float32(0.5)) / np.float32(rows) - cy) / fy
@@ -198,11 +178,8 @@ def recall(first, last, picks, shared, own, seen, turns, positions, camera, colo
                             best = k
                     trust[view, slot, v, u] = sure[best]
                     sure[best] = -1.0
-                    shown = colours[view, slot, :, v, u]
-                    if mine[best]:
-                        between_twice(own_rgb[which[best]], across[best], down[best], shown)
-                    else:
-                        between_at(rgb[which[best]], across[best], down[best], shown)
+                    picture = own_rgb[which[best]] if mine[best] else rgb[which[best]]
+                    between_at(picture, int(mine[best]), across[best], down[best], colours[view, slot, :, v, u])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -223,30 +200,16 @@ def at_pixel(depth, key, a, b):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def between_at(planes, a, b, shown):
-    """Bytes [3, h, w] at image coordinates a, b, that lie in [0, 1] or are moved there, bilinear: fills shown [3] in [0, 1]."""
-    _, height, width = planes.shape
+def between_at(planes, twice, a, b, shown):
+    """Bytes [3, h, w], with `twice` = 1 every pixel taken four times (keyframes.doubled), at image coordinates a, b, that lie in
+    [0, 1] or are moved there, bilinear: fills shown [3] in [0, 1]."""
+    height, width = planes.shape[1] << twice, planes.shape[2] << twice
     half, one = np.float32(0.5), np.float32(1)
     a = min(max(a * np.float32(width) - half, np.float32(0)), np.float32(width - 1))
     b = min(max(b * np.float32(height) - half, np.float32(0)), np.float32(height - 1))
     i, j = min(int(a), width - 2), min(int(b), height - 2)
     a, b = a - np.float32(i), b - np.float32(j)
-    for c in range(3):
-        above = planes[c, j, i] * (one - a) + planes[c, j, i + 1] * a
-        below = planes[c, j + 1, i] * (one - a) + planes[c, j + 1, i + 1] * a
-        shown[c] = (above * (one - b) + below * b) / np.float32(255)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def between_twice(planes, a, b, shown):
-    """`between_at` of the planes with every pixel four times (keyframes.doubled)."""
-    height, width = 2 * planes.shape[1], 2 * planes.shape[2]
-    half, one = np.float32(0.5), np.float32(1)
-    a = min(max(a * np.float32(width) - half, np.float32(0)), np.float32(width - 1))
-    b = min(max(b * np.float32(height) - half, np.float32(0)), np.float32(height - 1))
-    i, j = min(int(a), width - 2), min(int(b), height - 2)
-    a, b = a - np.float32(i), b - np.float32(j)
-    left, right, top, bottom = i >> 1, (i + 1) >> 1, j >> 1, (j + 1) >> 1
+    left, right, top, bottom = i >> twice, (i + 1) >> twice, j >> twice, (j + 1) >> twice
     for c in range(3):
         above = planes[c, top, left] * (one - a) + planes[c, top, right] * a
         below = planes[c, bottom, left] * (one - a) + planes[c, bottom, right] * a

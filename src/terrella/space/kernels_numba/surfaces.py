@@ -11,7 +11,7 @@ from ..camera import NEAR_M
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def lift(depth, turn, position, camera, stride, slant, patch):
+def lift(depth, turn, position, patch, camera, stride, slant):
     """The kernel of patches.patches_slowly for one image: depth [H, W], turn [3, 3] and position [3] of T_world_cam;
     fills patch [N, 9]."""
     height, width = depth.shape
@@ -140,20 +140,6 @@ def cast_one(patch, turn, position, camera, depth):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def lift_views(first, last, depth, turns, positions, camera, stride, slant, patch):
-    """`lift` of images [B, H, W], each from its turn and position, into patch [B, N, 9]."""
-    for view in range(first, last):
-        lift(depth[view], turns[view], positions[view], camera, stride, slant, patch[view])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def cast_views(first, last, patch, turns, positions, camera, depth):
-    """`cast_one` of patch [B, N, 9], each into its view of depth [B, H, W]."""
-    for view in range(first, last):
-        cast_one(patch[view], turns[view], positions[view], camera, depth[view])
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def surfaces(first, last, picks, fine, own, own_turns, own_poses, turns, positions, camera, stride, slant, depth):
     """Lowers depth [B, H, W] to what the picked keyframes [B, S] (-1: none) show: those below K by their patches `fine`
     [K, N, 9], the others by the depth images own [A, h, w], from their turn [A, 3, 3] and pose [A, 7]."""
@@ -164,7 +150,7 @@ def surfaces(first, last, picks, fine, own, own_turns, own_poses, turns, positio
         for key in picks[view]:
             if key >= known:
                 row = key - known
-                lift(own[row], own_turns[row], own_poses[row, :3], camera, stride, slant, patch)
+                lift(own[row], own_turns[row], own_poses[row, :3], patch, camera, stride, slant)
                 cast_one(patch, turns[view], positions[view], camera, depth[view])
             elif key >= 0:
                 cast_one(fine[key], turns[view], positions[view], camera, depth[view])

@@ -11,7 +11,7 @@ WITHIN_M = 0.005  # as well as walls are known
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def straight_runs(inverse, left, fewest, straight, gap, least, found):
+def straight_runs(inverse, found, left, fewest, straight, gap, least):
     """The kernel of floorplan.straight_runs_slowly for one row: fills found [n, 4] = first, stop, slope, level of runs of columns
     on which the inverse depth [w] is a line of `left` [w], as far as neighbours are less than `gap` metres apart and no inverse
     depth is below `least`."""
@@ -40,13 +40,6 @@ def straight_runs(inverse, left, fewest, straight, gap, least, found):
         else:
             first += 1
     found[count:] = 0  # what was begun after the last
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def straight_runs_of(start, last, inverse, left, fewest, straight, gap, least, found):
-    """`straight_runs` of rows [K, w] into found [K, n, 4]."""
-    for key in range(start, last):
-        straight_runs(inverse[key], left, fewest, straight, gap, least, found[key])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
