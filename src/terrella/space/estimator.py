@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -204,7 +204,8 @@ def load_estimator(path: str | Path) -> Estimator:
             about = json.loads((file.metadata() or {}).get("terrella", "{}"))
         if about.get("kind") not in ("estimator", "eye"):  # as it was called at first
             raise CheckpointError(f"{path} holds no estimator; make one with `terrella train estimator`.")
-        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in about["config"].items()}
+        settings: dict[str, Any] = about["config"]
+        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
         return restored(Estimator(EstimatorConfig(**settings)), load_file(str(path)))
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         first = str(error).splitlines()[0]
