@@ -242,7 +242,7 @@ def test_a_score_that_was_stopped_goes_on_to_the_same_card(recording, tmp_path, 
     whole, count = json.loads(capsys.readouterr().out), len(calls)
     stop, calls = count * 3 // 4, []
     assert main([*arguments(recording, tmp_path / "broken"), *asked]) == 130
-    assert list((tmp_path / "broken" / "parts").glob("*.safetensors")), "what was measured is kept"
+    assert list((tmp_path / "broken" / "parts").rglob("*.safetensors")), "what was measured is kept"
     stop, calls = -1, []
     capsys.readouterr()
     assert main([*arguments(recording, tmp_path / "broken"), *asked]) == 0

@@ -51,7 +51,7 @@ def test_the_report_stands_alone(card, tmp_path):
 
 def test_a_report_that_cannot_be_written_is_one_sentence(card, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(TerrellaError, match="cannot write the report"):
+    with pytest.raises(TerrellaError, match="cannot write to"):
         write_report(card, tmp_path / "file" / "inside", "x")
 
 

@@ -94,7 +94,7 @@ def test_what_was_kept_of_another_exam_does_not_count(tmp_path):
     first, again = run(), run()
     assert again < first / 4, "nothing but the prices is measured twice"
     assert run(identity="other weights") == first and run(seed=1) == first
-    damaged = sorted((tmp_path / "parts").glob("*.safetensors"))[0]
+    damaged = sorted((tmp_path / "parts").rglob("*.safetensors"))[0]
     damaged.write_bytes(b"damaged")
     assert again <= run(seed=1) < first
 

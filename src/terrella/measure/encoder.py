@@ -84,13 +84,7 @@ def encoder_of(data: bytes, sha256: str) -> FrameEncoder:
 
 
 def frame_features(frames: torch.Tensor, encoder: nn.Module | None = None, batch: int = 32) -> torch.Tensor:
-    """Features of uint8 [..., H, W, 3] -> float64 [..., FEATURES]; ValueError for other types or smaller frames."""
-    if frames.dtype != torch.uint8 or frames.shape[-1] != 3:
-        raise ValueError(f"the encoder looks at uint8 [..., H, W, 3]; got {frames.dtype} {tuple(frames.shape)}.")
-    if min(frames.shape[-3:-1]) < MIN_SIDE:
-        raise ValueError(
-            f"the encoder needs frames of at least {MIN_SIDE}x{MIN_SIDE}; got {tuple(frames.shape[-3:-1])}."
-        )
+    """Features of uint8 [..., H, W, 3], both sides MIN_SIDE or more, -> float64 [..., FEATURES]."""
     encoder = encoder or shipped_encoder()
     flat = frames.cpu().reshape(-1, *frames.shape[-3:])
     found = torch.zeros(len(flat), FEATURES, dtype=torch.float64)

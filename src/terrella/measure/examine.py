@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from ..core.errors import TerrellaError
 from .clips import Clip, check_clips
 from .closure import MEMORY
 from .endurance import ENDURANCE
@@ -25,7 +24,7 @@ from .scorecard import Missing, Place, Scorecard, to_json
 from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
-from .work import Clock, Progress, Store, prices_of, run_all
+from .work import Clock, Progress, Store, prices_of, run_all, writing
 
 DRIFT = drift_probe((pixel_series, state_series, pose_series))
 PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, ENDURANCE, SPEED)
@@ -74,14 +73,12 @@ def examine(
 
 def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path, Path]:
     """Writes scorecard.json and scorecard.html (one self-contained page) into `folder`; returns both paths."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "scorecard.json").write_text(to_json(card) + "\n", encoding="utf-8")
-        (folder / "scorecard.html").write_text(page(card, title, PROBES), encoding="utf-8")
-    except OSError as error:
-        raise TerrellaError(f"cannot write the report to {folder} ({error}); choose another folder.") from error
-    return folder / "scorecard.json", folder / "scorecard.html"
+    data, shown = Path(folder) / "scorecard.json", Path(folder) / "scorecard.html"
+    with writing(Path(folder)):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        data.write_text(to_json(card) + "\n", encoding="utf-8")
+        shown.write_text(page(card, title, PROBES), encoding="utf-8")
+    return data, shown
 
 
 def _places(exam: Exam) -> list[Place]:

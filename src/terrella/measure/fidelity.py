@@ -16,20 +16,16 @@ def psnr(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
     Capped at PSNR_CAP_DB. A mean over frames is the mean of their dB, not the dB of their mean error.
     """
-    _check_alike(first, second)
     error = (first.double() - second.double()).square().mean((-3, -2, -1))
     floor = 255.0**2 / 10 ** (PSNR_CAP_DB / 10)
     return 10 * torch.log10(255.0**2 / error.clamp_min(floor))
 
 
 def ssim(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Structural similarity of the luma of uint8 frames [..., H, W, 3] -> float64 [...].
+    """Structural similarity of the luma of uint8 frames [..., H, W, 3], 11 pixels or more, -> float64 [...].
 
     Wang et al. 2004: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, L 255, only where the window fits.
     """
-    _check_alike(first, second)
-    if min(first.shape[-3:-1]) < 11:
-        raise ValueError(f"SSIM needs frames of at least 11x11 pixels; got {tuple(first.shape[-3:-1])}.")
     lead = first.shape[:-3]
     a, b = (luma(frame).reshape(-1, 1, *frame.shape[-3:-1]) for frame in (first, second))
     mean_a, mean_b, square_a, square_b, product = (_smoothed(part, 1.5, 5) for part in (a, b, a * a, b * b, a * b))
@@ -70,11 +66,3 @@ def _smoothed(image: torch.Tensor, sigma: float, reach: int) -> torch.Tensor:
     taps = torch.exp(-((torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device) / sigma) ** 2) / 2)
     taps = taps / taps.sum()
     return F.conv2d(F.conv2d(image, taps.view(1, 1, 1, -1)), taps.view(1, 1, -1, 1))
-
-
-def _check_alike(first: torch.Tensor, second: torch.Tensor) -> None:
-    if first.dtype != torch.uint8 or second.dtype != torch.uint8:
-        raise ValueError(f"frames are compared as uint8; got {first.dtype} and {second.dtype}.")
-    if first.shape[-3:] != second.shape[-3:] or first.shape[-1] != 3:
-        shapes = f"{tuple(first.shape)} and {tuple(second.shape)}"
-        raise ValueError(f"frames to compare must be [..., H, W, 3] of one size; got {shapes}.")

@@ -29,7 +29,6 @@ def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
 
     Unbiased covariances; no matrix is inverted, so sets smaller than D are allowed (but see the bias above).
     """
-    _check(real, dreamt)
     real, dreamt = real.double(), dreamt.double()
     return frechet_of_moments(*_moments(real), *_moments(dreamt))
 
@@ -53,9 +52,6 @@ def frechet_interval(real: torch.Tensor, dreamt: torch.Tensor) -> Figure:
     Each row is left out by itself; of more than 50, as many groups, joined at random, are. Figure.count is the number of
     frames. NaN of fewer than three rows; without an interval below eight.
     """
-    _check(real, dreamt)
-    if len(real) != len(dreamt):
-        raise ValueError(f"only equally many frames compare fairly; got {len(real)} real and {len(dreamt)} dreamt.")
     mine, count = torch.arange(len(real)), min(len(real), _MOST_GROUPS)
     if len(real) > count:
         mine = torch.randperm(len(real), generator=torch.Generator().manual_seed(0)) % count
@@ -81,11 +77,3 @@ def _root(matrix: torch.Tensor) -> torch.Tensor:
     rounding = values.amax(-1, keepdim=True) * matrix.shape[-1] * torch.finfo(matrix.dtype).eps
     values = values.where(values > rounding, 0)  # the root of what rounding left would be large
     return (vectors * values.sqrt()[..., None, :]) @ vectors.mT
-
-
-def _check(real: torch.Tensor, dreamt: torch.Tensor) -> None:
-    if real.shape[-1] != dreamt.shape[-1] or min(real.shape[-2], dreamt.shape[-2]) < 2:
-        shapes = f"{tuple(real.shape)} and {tuple(dreamt.shape)}"
-        raise ValueError(f"a distance needs features [n, D] of at least two frames on either side; got {shapes}.")
-    if not (real.isfinite().all() and dreamt.isfinite().all()):
-        raise ValueError("features hold numbers that are not finite; the frames' encoder is broken.")

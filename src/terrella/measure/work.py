@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -69,46 +67,37 @@ class Store:
     """Results of units in a folder, or nowhere. What was begun as something else (another `fingerprint`) is thrown away."""
 
     def __init__(self, folder: Path | None, fingerprint: str):
-        self.folder = folder
-        if folder is None:
+        self.folder = folder and folder / _digest(fingerprint)
+        if folder is None or self.folder is None:
             return
-        about = {"fingerprint": hashlib.sha256(fingerprint.encode()).hexdigest()}
-        try:
-            if json.loads((folder / "about.json").read_text(encoding="utf-8")) == about:
-                return
-        except (OSError, ValueError):
-            pass
-        self.clear()
-        with _writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / "about.json").write_text(json.dumps(about), encoding="utf-8")
+        with writing(folder):
+            for other in folder.glob("*"):
+                if other != self.folder:
+                    shutil.rmtree(other, ignore_errors=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
 
     def get(self, key: str) -> Results | None:
         """A result that was kept; None where there is none, or a damaged one."""
         try:
-            return load_file(self._path(key)) if self.folder else None
+            return load_file(self.folder / f"{_digest(key)}.safetensors") if self.folder else None
         except (OSError, SafetensorError):
             return None
 
     def put(self, key: str, result: Results) -> None:
         if self.folder is None:
             return
-        with _writing(self.folder):
-            part = self._path(key).with_suffix(".part")
+        with writing(self.folder):
+            part = self.folder / f"{_digest(key)}.part"
             save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, part)
-            os.replace(part, self._path(key))
+            part.replace(part.with_suffix(".safetensors"))
 
-    def clear(self) -> None:
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _path(self, key: str) -> Path:
-        assert self.folder is not None
-        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 @contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path) -> Iterator[None]:
     """Turns what a full or foreign disk says into one sentence."""
     try:
         yield
