@@ -137,6 +137,9 @@ def bars(card: Scorecard) -> Iterator[Bar]:
             yield Bar(f"back from {way}, {place} places", row("memory", way, place, "true"), least)
     for what in ("sharpness", "mean of green", "spread of green"):
         yield Bar(f"{what} over 1,000 steps, worst stretch", row("endurance", what, "recorded", "predicted"), 0.7, 1.3)
+    for what, within in (("sharpness", 0.1), ("mean of red", 0.03), ("mean of green", 0.03), ("mean of blue", 0.03)):
+        still = row("stillness", what, "recorded", "no action")
+        yield Bar(f"{what}, standing still for 1,000 steps", still, 1 - within, 1 + within)
 
 
 def main() -> None:

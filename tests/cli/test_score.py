@@ -69,7 +69,7 @@ def test_score_writes_json_and_a_page(recording, tmp_path, monkeypatch, capsys):
     likeness = [row for row in card["rows"] if row["what"] == "PSNR"]
     assert {row["horizon"] for row in likeness} == {1, 4}
     assert all(abs(row["gain"]["value"]) < 1e-6 for row in likeness), "it copies the last frame, no better"
-    assert "not better than copying the last frame" in card["verdict"][0]
+    assert "not clearly better than copying the last frame" in card["verdict"][0]
     assert json.loads((tmp_path / "out" / "scorecard.json").read_text())["worlds"] == card["worlds"]
     assert "<svg" in (tmp_path / "out" / "scorecard.html").read_text()
 
@@ -78,7 +78,9 @@ def test_score_says_first_whether_the_world_is_better_than_a_copy(recording, tmp
     monkeypatch.setattr(library, "load", lambda name, **options: Still())
     assert main(arguments(recording, tmp_path / "out")) == 0
     shown = capsys.readouterr().out
-    assert shown.startswith("still is not better than copying the last frame, after 1 and 4 steps.")
+    assert shown.startswith(
+        "still is not clearly better than copying the last frame at any step up to 4; it stays sharp."
+    )
     assert "scorecard.html" in shown and "copy last" in shown
     assert "not applicable: pose needs pose" in shown and not (tmp_path / "out" / "parts").exists()
 
@@ -189,7 +191,7 @@ def test_a_world_of_numbers_alone_gets_a_card(flaw, tmp_path, monkeypatch, capsy
     if flaw:
         assert row["RMSE"]["figure"]["value"] > 0.5
     else:
-        assert "cart is better than copying the last observation at every horizon" in card["verdict"][0]
+        assert "cart is better than copying the last observation at every step up to 16" in card["verdict"][0]
         assert row["RMSE"]["figure"]["value"] < 0.01 and row["R\u00b2"]["figure"]["value"] > 0.99
         assert row["RMSE"]["baselines"]["copy last"]["value"] > 10 * row["RMSE"]["figure"]["value"]
         assert row["steps better than copy-last"]["figure"]["value"] == 16
@@ -307,4 +309,4 @@ def test_two_cameras_axes_and_poses_are_scored_from_what_was_recorded(tmp_path, 
     assert found["rgb.wrist"]["baselines"]["copy last"]["value"] < 40
     assert any(row["probe"] == "pose" and row["what"] == "distance" for row in card["rows"])
     assert any(row["probe"] == "memory" and "yaw" in row["what"] for row in card["rows"]), "it takes poses"
-    assert "rig is better than copying the last frame at every horizon" in card["verdict"][0]
+    assert "rig is better than copying the last frame at every step up to 16; it obeys, remembers" in card["verdict"][0]

@@ -149,6 +149,7 @@ SHORT = {
     "closure_deg": (),
     "closure_walk": 0,
     "long_steps": 0,
+    "still_steps": 0,
     "speed_steps": 0,
 }
 

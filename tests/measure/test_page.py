@@ -23,7 +23,7 @@ def card():
     places = {"recorded": some_clips(5, 32), "new": some_clips(4, 32, seed=4)}
     config = ExamConfig(
         (1, 8, 32), batch=8, strips=1, drop=(8, 32), closure_deg=(90.0,), closure_step_deg=15, closure_clips=4,
-        closure_walk=0, long_steps=100, long_rollouts=2, speed_steps=20,
+        closure_walk=0, long_steps=100, still_steps=100, long_rollouts=2, speed_steps=20,
     )  # fmt: skip
     return card_of(arms, places, config, sets={LONG: {"recorded": some_clips(3, 110)}})
 
@@ -42,6 +42,7 @@ def test_the_report_stands_alone(card, tmp_path):
         "Position",
         "Does it remember?",
         "A long rollout",
+        "Does it fade while nobody plays?",
         "Speed",
     ):
         assert f"<h2>{heading}</h2>" in html

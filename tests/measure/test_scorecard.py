@@ -15,10 +15,12 @@ from terrella.core.errors import DatasetError, ObservationError
 from terrella.measure import Album, ExamConfig, as_dict, examine, to_json, verdict
 from terrella.measure.album import look
 from terrella.measure.closure import go, rows_of, turn_way, walk_way, walkers, yaw_way
-from terrella.measure.endurance import NAMES, long_rollout
+from terrella.measure.endurance import NAMES, long_rollout, still_rows
 from terrella.measure.endurance import rows_of as stretches
 from terrella.measure.fidelity import PSNR_CAP_DB
+from terrella.measure.scorecard import GAIN, Curve
 from terrella.measure.speed import speed
+from terrella.measure.statistics import Band
 
 ARMS = {flaw or "perfect": Panorama(flaw) for flaw in ("", "static", "deaf", "long", "fading", "shy")}
 
@@ -71,15 +73,51 @@ def test_every_figure_of_likeness_stands_beside_what_knows_nothing(card):
 
 def test_the_verdict_comes_first(card, clips):
     assert next(iter(as_dict(card))) == "verdict"
-    assert (
-        verdict(card)[0] == "panorama is better than copying the last frame at every horizon: after 1, 8 and 32 steps."
-    )
+    better = "better than copying the last frame at every step up to 32"
+    assert verdict(card)[0] == f"panorama is {better}; it obeys, stays sharp."
+    alike = "not clearly better than copying the last frame at any step up to 32"
     still = verdict(card_of({"still": Panorama("static")}, {"recorded": clips}))
-    assert still[0] == "panorama static is not better than copying the last frame, after 1, 8 and 32 steps."
-    faded = verdict(card_of({"fading": Panorama("blind")}, {"recorded": clips}))
-    assert "better than copying the last frame" in faded[0]
+    assert still[0].startswith(f"panorama static is {alike}; it does not clearly obey")
+    deaf = verdict(card_of({"deaf": Panorama("deaf")}, {"recorded": clips}))
+    assert "does not clearly obey" in deaf[0]
+    faded = verdict(card_of({"fading": Panorama("fading")}, {"recorded": clips}))
+    assert "blurs" in faded[0], faded
     alone = verdict(card_of({"one": Panorama()}, {"recorded": clips[:1]}))
-    assert "not better" in alone[0] and "no clear difference" in alone[1], "one clip cannot say"
+    assert "not clearly better" in alone[0] and "no clear difference" in alone[1], "one clip cannot say"
+
+
+def test_the_verdict_says_at_which_steps_copying_is_better(card):
+    def told(*gains: float, place: str = "recorded") -> Curve:
+        band = Band(list(gains), [gain - 0.1 for gain in gains], [gain + 0.1 for gain in gains], 9)
+        return Curve("pixels", "rgb", f"x{GAIN}", "dB", place, "perfect", "predicted", range(1, len(gains) + 1), band)
+
+    def said(*curves: Curve) -> str:
+        return verdict(replace(card, curves=list(curves)))[0].partition(" is ")[2].partition("; it ")[0]
+
+    assert said(told(1, 1, 0, -1, -1)) == "worse than copying the last frame beyond 3 steps, better up to 2 steps"
+    assert said(told(-1, 0, 1, 1)) == "worse than copying the last frame after 1 step, better beyond 2 steps"
+    assert said(told(-1, -1)) == "worse than copying the last frame at every step up to 2"
+    assert "worse than copying the last frame at 3 of 6 steps" in said(told(-1, 1, -1, 1, -1, 1))
+    two = said(told(1, 1), told(1, -1, place="new")).partition("; ")
+    assert two[0] == "better than copying the last frame at every step up to 2"
+    assert two[2] == "in new places worse after 2 steps, better after 1 step"
+
+
+def test_pooled_errors_do_not_flatter_copying_where_little_changes(clips):
+    half = [
+        replace(clip, channels=clip.channels | {"rgb": np.repeat(clip.channels["rgb"][:1], 35, 0)}) for clip in clips
+    ]
+    mixed = card_of({"fading": Panorama("fading")}, {"recorded": [*clips[:6], *half[6:]]})
+    still, pooled, frames, pixels = (
+        row(mixed, what, "fading", 1)
+        for what in ("PSNR", *(f"pooled PSNR{of}" for of in ("", ", frames that change", ", pixels that change")))
+    )
+    assert still.baselines["copy last"].value > pooled.baselines["copy last"].value + 3
+    assert (
+        pooled.baselines["copy last"].value > frames.baselines["copy last"].value > pixels.baselines["copy last"].value
+    )
+    errors = [10 ** (-figure.value / 10) for figure in (pooled.figure, frames.figure)]
+    assert errors[1] <= 2 * errors[0] * 1.01 and pooled.gain.low <= pooled.gain.value <= pooled.gain.high
 
 
 def test_a_static_world_gains_nothing(card):
@@ -242,7 +280,21 @@ def test_long_dreams_of_the_perfect_world_stay_and_fading_ones_do_not(clips):
     assert runs["fading"].rows[0].figure.value < 0.05
     curve = runs[""].curves[0]
     assert list(curve.x)[:3] == [30, 60, 90] and curve.x[-1] == 300
-    assert runs[""].pictures[0].rows["a"].shape == (11, 24, 32, 3)
+    assert runs[""].pictures[0].rows["a"].shape == (12, 24, 32, 3)
+
+
+def test_standing_still_must_not_fade(clips):
+    for flaw, most in (("", 1e-9), ("static", 1e-9), ("fading", 1.0)):
+        found = still_rows(
+            long_rollout(Panorama(flaw), clips, make_rng(0), 100, 4, idle=True), "a", "recorded", make_rng(0)
+        )
+        assert [one.what for one in found.rows] == list(NAMES[:4]) and found.curves[0].x[-1] == 100
+        strayed = abs(found.rows[0].figure.value - 1)
+        assert strayed <= most and (flaw != "fading" or strayed > 0.9)
+        assert found.pictures[0].columns[:2] == ["now", "1"] and found.rows[0].baselines["copy last"].value == 1
+    config = replace(exam_of({}).config, still_steps=100)
+    said = [verdict(card_of({"a": Panorama(flaw)}, {"recorded": clips}, config))[0] for flaw in ("", "fading")]
+    assert "holds still" in said[0] and "fades while nobody plays" in said[1]
 
 
 def test_a_fuller_album_matches_more_of_the_dream(clips):

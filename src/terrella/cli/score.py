@@ -32,6 +32,7 @@ from ..measure import (
     out_of_sight,
     passages,
     verdict,
+    words_of,
     write_report,
 )
 from .named import Device, Fast, device_of, load_named
@@ -72,7 +73,7 @@ def score(
         out: Folder for scorecard.json and scorecard.html.
         clips: Clips of each kind of place, 50 unless said; intervals want 50 or more.
         horizons: Steps after which figures are given, 1 8 32 64 unless said; a clip is as long as the largest.
-        long_steps: Length of the long rollouts, 1000 unless said; 0 leaves them out.
+        long_steps: Length of the long rollouts, played and standing still, 1000 unless said; 0 leaves them out.
         drift: Steps of the drift curves, on clips of their own (at most 24); 0 leaves them out. Unless said, 256 where the
             recordings have clips that long.
     """
@@ -84,7 +85,11 @@ def score(
         raise TerrellaError(
             "--horizons and --clips are whole numbers from 1 up, --drift from 0 up, --long-steps is 0 or at least 100."
         )
-    config = ExamConfig.quick(horizons) if quick else ExamConfig(horizons=horizons, long_steps=long_steps)
+    config = (
+        ExamConfig.quick(horizons)
+        if quick
+        else ExamConfig(horizons=horizons, long_steps=long_steps, still_steps=long_steps)
+    )
     arms, closing = _arms(name, device, fast, quick)
     exam, identity = _exam(arms, closing, data, new, fresh, clips, drift, config, seed)
     identity += _files_of(name) + f" fast={fast} device={device_of(device)}"
@@ -149,7 +154,7 @@ def _exam(
             if drift:
                 raise
             say(
-                f"No drift curve of {place} places: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
+                f"No drift curve of {words_of(place)}: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
         drawn = passages(
             source, world.spec, *asked[1:], max(config.horizons), min(clips, ENDING_CLIPS), make_rng(seed + 2), where
@@ -195,7 +200,7 @@ def _lines(card: Scorecard) -> list[str]:
     arm = next(iter(card.worlds))
     last: dict[tuple, Any] = {}
     for row in card.rows:
-        if row.arm == arm and row.motion == "predicted" and not row.void and math.isfinite(row.figure.value):
+        if row.arm == arm and row.motion != "true" and not row.void and math.isfinite(row.figure.value):
             last[row.probe, row.channel, row.what, row.place] = row
     lines = []
     for row in last.values():
@@ -203,5 +208,5 @@ def _lines(card: Scorecard) -> list[str]:
         baselines = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
         about = " ".join(part for part in (row.channel, row.what) if part)
         figure = f"{row.figure.value:.3g} {row.unit}".rstrip() + sure + baselines
-        lines.append(f"{row.probe:>12}  {about}, {row.place} places, {row.horizon} steps: {figure}")
+        lines.append(f"{row.probe:>12}  {about}, {words_of(row.place)}, {row.horizon} steps: {figure}")
     return [*lines, *(f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm)]

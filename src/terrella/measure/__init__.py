@@ -6,9 +6,10 @@ from .exam import CLIPS, ENDINGS, LONG, Exam, ExamConfig
 from .examine import PROBES, examine, write_report
 from .outcomes import passages
 from .page import page
-from .scorecard import Row, Scorecard, as_dict, to_json, verdict
+from .scorecard import Row, Scorecard, words_of
 from .strip import strip
+from .verdict import as_dict, to_json, verdict
 
 __all__ = ["CLIPS", "ENDINGS", "LONG", "PROBES", "Album", "Clip", "Exam", "ExamConfig", "Row", "Scorecard"]
 __all__ += ["as_dict", "check_recording", "clips_from_cache", "examine", "in_box", "out_of_sight", "page", "passages"]
-__all__ += ["strip", "to_json", "verdict", "write_report"]
+__all__ += ["strip", "to_json", "verdict", "words_of", "write_report"]

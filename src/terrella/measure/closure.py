@@ -17,7 +17,7 @@ from .clips import Clip
 from .exam import Exam, Found, Probe, batches
 from .fidelity import psnr
 from .roll import Results, Tick, fold_context, poses_at
-from .scorecard import PREDICTED, TRUE, Picture, Report, Row
+from .scorecard import PREDICTED, TRUE, Picture, Report, Row, words_of
 from .statistics import mean_interval
 from .turning import turns
 from .work import UNSEEN, Unit
@@ -141,7 +141,7 @@ def _units(exam: Exam) -> list[Unit]:
             calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * (steps + steps // 2)}
             run = partial(_go, exam, world, some, way, first)
             units.append(
-                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {place} places: {way.name}", calls, run)
+                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {words_of(place)}: {way.name}", calls, run)
             )
     return units
 
@@ -173,7 +173,7 @@ def _report(exam: Exam, found: Found) -> Report:
         if gone := found.of("memory", arm, place, str(which)):
             rows = rows_of((place, arm), way, gone, exam.rng)
             whole.rows += rows
-            strips.setdefault(f"{way.name}, {place} places", {})[_words(arm, rows)] = gone["frames"][0].numpy()
+            strips.setdefault(f"{way.name}, {words_of(place)}", {})[_words(arm, rows)] = gone["frames"][0].numpy()
     columns = ["first", "on the way", "far", "on the way back", "back", "far again"]
     whole.pictures = [Picture("memory", title, columns, rows) for title, rows in strips.items()]
     return whole

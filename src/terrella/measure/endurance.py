@@ -1,4 +1,4 @@
-"""Endurance: a thousand dreamt steps; do sharpness and colours stay those of the real game?"""
+"""Endurance: a thousand dreamt steps, played or standing still; do sharpness and colours stay those of the real game?"""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
-from ..core.policy import Replay
+from ..core.policy import Idle, Policy, Replay
 from ..core.world import World
 from .album import Album, look
 from .clips import Clip
 from .exam import Exam, Found, Probe
-from .roll import Results, Tick, fold_context
-from .scorecard import PREDICTED, Curve, Picture, Report, Row
-from .statistics import Band, Figure, ratio_interval
+from .roll import Results, Tick, can_idle, fold_context, rows_at
+from .scorecard import COPY_LAST, IDLE, PREDICTED, Curve, Picture, Report, Row
+from .statistics import Band, Figure, ratio_band, ratio_interval
 from .work import UNSEEN, Unit
 
 STRIDE = 5  # every fifth frame is looked at
@@ -28,6 +29,15 @@ LEAD = (
     "nearest to where the world says that it is, for a dull corner is dull in the game too; without poses against the mean of "
     "the recordings. The table gives the stretch that strays most from 1, and how far real stretches stray by themselves."
 )
+
+
+STILL_LEAD = (
+    "Nobody touches a key for as long: how far are sharpness and the mean of each colour from those of the last true frame, all "
+    "rollouts together, in the tenth that strays most? Copying the last frame stays at 1. Only what moves by itself, in the "
+    "game too, may change them: within 10% for sharpness and 3% for colours nothing fades."
+)
+SHARP_WITHIN, COLOUR_WITHIN = 0.1, 0.03
+LEAST = 0.5  # of 255: what is blacker, or flatter, is black
 
 
 @dataclass(frozen=True)
@@ -51,19 +61,22 @@ def long_rollout(
     steps: int = 1000,
     rollouts: int = 8,
     tick: Tick = lambda done: None,
+    idle: bool = False,
 ) -> Results:
-    """Goes on for `steps` steps from the contexts of `rollouts` clips, with the actions of recorded players on end.
+    """Goes on for `steps` steps from the contexts of `rollouts` clips, with the actions of recorded players on end, or `idle`.
 
-    looks [n, lanes, 7] of every fifth frame; poses [n, lanes, 7] where the world shows them; frames uint8 [K, H, W, 3] of the
-    first rollout at step 1 and at the ends of tenths.
+    looks [n, lanes, 7] of every fifth frame, first [lanes, 7] of the last true one; poses [n, lanes, 7] where the world shows
+    them; frames uint8 [K, H, W, 3] of the first rollout: the last true one, at step 1 and at the ends of tenths.
     """
     size = min(rollouts, len(clips), world.spec.max_batch or rollouts)
-    picked = torch.randperm(len(clips), generator=rng)[:size].tolist()
-    policy = Replay(recorded_actions(world, clips, size, steps, rng))
-    state = fold_context(world, [clips[pick] for pick in picked], rng)
+    order = _stillest(clips) if idle else [clips[pick] for pick in torch.randperm(len(clips), generator=rng).tolist()]
+    picked = order[:size]
+    policy: Policy = Idle(world.spec) if idle else Replay(recorded_actions(world, clips, size, steps, rng))
+    state, last = fold_context(world, picked, rng), rows_at(picked, "rgb", clips[0].context - 1)
     tick(size * clips[0].context)
     posed = "pose" in world.spec.channels and clips[0].pose is not None
-    memory, looks, poses, frames = policy.begin(size, rng), [], [], []
+    memory: Any = policy.begin(size, rng)
+    looks, poses, frames = [], [], [last[0]]
     for step in range(1, steps + 1):
         action, memory = policy.act({}, memory, rng)
         state = world.imagine(state, action, rng)
@@ -75,9 +88,18 @@ def long_rollout(
             if step == 1 or step % max(STRIDE, steps // 10 // STRIDE * STRIDE) == 0:
                 frames.append(seen["rgb"][0])
         tick(size)
-    return {"looks": torch.stack(looks), "frames": torch.stack(frames)} | (
-        {"poses": torch.stack(poses)} if posed else {}
-    )
+    found = {"looks": torch.stack(looks), "first": look(last), "frames": torch.stack(frames)}
+    return found | ({"poses": torch.stack(poses)} if posed else {})
+
+
+def _stillest(clips: Sequence[Clip]) -> list[Clip]:
+    """Those first whose last shown frames differ least: who runs when nobody acts any more comes to rest elsewhere."""
+
+    def moved(clip: Clip) -> float:
+        last, before = (np.asarray(clip.channels["rgb"][max(0, clip.context - back)], np.float32) for back in (1, 2))
+        return float(np.abs(last - before).mean())
+
+    return sorted(clips, key=moved)
 
 
 def recorded_actions(world: World, clips: Sequence[Clip], batch: int, steps: int, rng: torch.Generator) -> torch.Tensor:
@@ -125,31 +147,53 @@ def rows_of(
             value, low_, high_ = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
             band = Band(value, low_, high_, len(clips))
             found.curves.append(Curve(*where, x, band, guides=(0.7, 1.0, 1.3)))
-    columns = ["1", *(str(step) for step in x)][: len(gone["frames"])]
-    frames = gone["frames"].numpy()[: len(columns)]
-    found.pictures.append(Picture("endurance", f"{arm}: one rollout, by steps", columns, {arm: frames}))
+    found.pictures.append(_picture("endurance", arm, gone, x))
     return found
 
 
-def _units(exam: Exam) -> list[Unit]:
-    units, config = [], exam.config
-    place, clips = next(iter(exam.places.items()))
+def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> Report:
+    """By tenths of a rollout in which nobody acted: sharpness and the mean of each colour, against the last true frame."""
+    found, span, lanes = Report(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
+    parts = torch.stack([part.mean(0) for part in gone["looks"].split(span)], -1).clamp_min(LEAST)  # [lanes, 7, tenths]
+    first = gone["first"].clamp_min(LEAST)[..., None].expand_as(parts)
+    x = [min(stop, len(gone["looks"])) * STRIDE for stop in range(span, len(gone["looks"]) + span, span)]
+    for k, name in enumerate(NAMES[:4]):
+        band = ratio_band(parts[:, k], first[:, k], rng)
+        worst = max(range(len(x)), key=lambda tenth: abs(band.value[tenth] - 1))
+        where = "stillness", "rgb", name, "\u00d7", place, arm, IDLE
+        within = SHARP_WITHIN if name == "sharpness" else COLOUR_WITHIN
+        note, copied = f"after {x[worst]:,} steps", {COPY_LAST: Figure(1.0, 1.0, 1.0, lanes)}
+        found.rows.append(Row(*where, x[-1], band.at(worst), 0, copied, note=note))
+        found.curves += [Curve(*where, x, band, guides=(1 - within, 1.0, 1 + within))] if name in _DRAWN else []
+    found.pictures.append(_picture("stillness", arm, gone, x))
+    return found
+
+
+def _picture(probe: str, arm: str, gone: Results, x: Sequence[int]) -> Picture:
+    columns = ["now", "1", *(f"{step:,}" for step in x)][: len(gone["frames"])]
+    return Picture(probe, f"{arm}: one rollout, by steps", columns, {arm: gone["frames"].numpy()[: len(columns)]})
+
+
+def _units(kind: str, exam: Exam) -> list[Unit]:
+    units, config, idle = [], exam.config, kind == "stillness"
+    clips, steps = next(iter(exam.places.values())), config.still_steps if idle else config.long_steps
     for arm, world in exam.arms.items():
-        if config.long_steps and not _missing(exam, world):
+        if not (_still_missing if idle else _missing)(exam, world):
             lanes = min(config.long_rollouts, len(clips), world.spec.max_batch or config.long_rollouts)
-            calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * config.long_steps}
-            words = f"{arm}: {config.long_steps:,} steps on end"
-            run = partial(long_rollout, world, clips, exam.rng(4), config.long_steps, config.long_rollouts)
-            units.append(Unit(f"endurance|{arm}|0", words, calls, run))
+            calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * steps}
+            words = f"{arm}: {steps:,} steps {'standing still' if idle else 'on end'}"
+            run = partial(long_rollout, world, clips, exam.rng(4), steps, config.long_rollouts, idle=idle)
+            units.append(Unit(f"{kind}|{arm}|0", words, calls, run))
     return units
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(kind: str, exam: Exam, found: Found) -> Report:
     whole = Report()
     place, clips = next(iter(exam.places.items()))
     for arm in exam.arms:
-        if gone := found.of("endurance", arm):
-            one = rows_of(gone, clips, exam.album, arm, place, exam.rng())
+        if gone := found.of(kind, arm):
+            still = still_rows(gone, arm, place, exam.rng()) if kind == "stillness" else None
+            one = still or rows_of(gone, clips, exam.album, arm, place, exam.rng())
             whole.rows += one.rows
             whole.curves += one.curves
             whole.pictures += one.pictures
@@ -162,7 +206,20 @@ def _missing(exam: Exam, world: World) -> str:
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
-ENDURANCE = Probe("endurance", "A long rollout", LEAD, _missing, _report, units=_units)
+def _still_missing(exam: Exam, world: World) -> str:
+    if not exam.config.still_steps:
+        return "needs long rollouts, which were not asked for"
+    if not can_idle(world.spec):
+        return "needs an action that does nothing"
+    return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
+
+
+def _probe(name: str, question: str, lead: str, missing) -> Probe:
+    return Probe(name, question, lead, missing, partial(_report, name), units=partial(_units, name))
+
+
+ENDURANCE = _probe("endurance", "A long rollout", LEAD, _missing)
+STILLNESS = _probe("stillness", "Does it fade while nobody plays?", STILL_LEAD, _still_missing)
 
 
 def _matched(mine: torch.Tensor, poses: torch.Tensor, album: Album, not_episode: torch.Tensor | None = None) -> _Looks:

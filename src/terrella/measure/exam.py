@@ -17,7 +17,7 @@ from ..core.world import World, make_rng
 from .album import Album
 from .clips import Clip
 from .roll import Results, Watch, can_idle, dream, fold_context, poses_at
-from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report
+from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report, words_of
 from .work import Unit
 
 CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: of figures, of drift, those that may run into an end
@@ -28,8 +28,8 @@ class ExamConfig:
     """horizons: steps at which figures are given; control_horizons: where true actions are set against another player's and
     against none; batch: clips rolled together; strips: clips of each place whose pictures are kept; drop: PSNR at the
     first horizon less that at the second; true_motion: also along the true poses; closure_deg: how far the camera turns
-    before it comes back; closure_walk: steps of the walk there and back, 0 for none; long_steps: of the long rollouts, 0 for none;
-    speed_steps: 0 for none."""
+    before it comes back; closure_walk: steps of the walk there and back, 0 for none; long_steps: of the long rollouts,
+    still_steps: of those in which nobody acts, speed_steps: each 0 for none."""
 
     horizons: tuple[int, ...] = (1, 8, 32, 64, 128)
     control_horizons: tuple[int, ...] = (8, 32)
@@ -42,6 +42,7 @@ class ExamConfig:
     closure_walk: int = 100
     closure_clips: int = 24
     long_steps: int = 1000
+    still_steps: int = 1000
     long_rollouts: int = 8
     speed_steps: int = 400
 
@@ -50,7 +51,7 @@ class ExamConfig:
         """Of which doom-maze is through within a minute on two cores."""
         return ExamConfig(
             horizons=horizons, control_horizons=(min(8, horizons[-1]),), batch=8, strips=1, true_motion=False, closure_deg=(180.0,),
-            closure_step_deg=15.0, closure_walk=0, closure_clips=4, long_steps=0, speed_steps=50,
+            closure_step_deg=15.0, closure_walk=0, closure_clips=4, long_steps=0, still_steps=100, long_rollouts=4, speed_steps=50,
         )  # fmt: skip
 
 
@@ -208,7 +209,7 @@ def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Cl
     order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
     turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
     units, verb = [], "pose" if motion == TRUE else "imagine"
-    words = f"{arm}, {place} places, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
+    words = f"{arm}, {words_of(place)}, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
     for number, (first, some) in enumerate(batches(exam, world, clips)):
         watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
         others = [clips[turn[first + at]] for at in range(len(some))]

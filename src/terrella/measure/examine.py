@@ -10,7 +10,7 @@ import torch
 
 from .clips import Clip, check_clips
 from .closure import MEMORY
-from .endurance import ENDURANCE
+from .endurance import ENDURANCE, STILLNESS
 from .exam import CLIPS, LONG, Exam, Found, Probe, dreams
 from .likeness import drift_probe
 from .outcomes import OUTCOMES
@@ -20,14 +20,15 @@ from .pixels import series as pixel_series
 from .poses import POSES
 from .poses import series as pose_series
 from .risk import CALIBRATION
-from .scorecard import Missing, Place, Scorecard, to_json
+from .scorecard import Missing, Place, Scorecard
 from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
+from .verdict import to_json
 from .work import Clock, Progress, Store, prices_of, run_all, writing
 
 DRIFT = drift_probe((pixel_series, state_series, pose_series))
-PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, ENDURANCE, SPEED)
+PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, STILLNESS, ENDURANCE, SPEED)
 
 
 @torch.inference_mode()

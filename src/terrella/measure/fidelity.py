@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 
 PSNR_CAP_DB = 60.0  # identical 8-bit frames would be infinite and spoil every mean
+_FLOOR = 255.0**2 / 10 ** (PSNR_CAP_DB / 10)
+CHANGED = 8  # of 255: a pixel has changed where a channel differs by more; less is the noise of a video
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -16,9 +18,25 @@ def psnr(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
     Capped at PSNR_CAP_DB. A mean over frames is the mean of their dB, not the dB of their mean error.
     """
-    error = (first.double() - second.double()).square().mean((-3, -2, -1))
-    floor = 255.0**2 / 10 ** (PSNR_CAP_DB / 10)
-    return 10 * torch.log10(255.0**2 / error.clamp_min(floor))
+    return 10 * torch.log10(255.0**2 / squared_error(first, second).mean((-2, -1)).clamp_min(_FLOOR))
+
+
+def squared_error(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Mean over the channels of each pixel: uint8 [..., H, W, 3] -> float64 [..., H, W]."""
+    return (first.double() - second.double()).square().mean(-1)
+
+
+def pooled(error: torch.Tensor, changed: torch.Tensor) -> torch.Tensor:
+    """Sums of squared error [..., H, W] over all pixels, and over those that changed: [..., 2], no smaller than the cap of
+    `psnr` has it, so that nothing is infinitely better than anything."""
+    sums = torch.stack([error.sum((-2, -1)), (error * changed).sum((-2, -1))], -1)
+    counts = torch.stack([torch.ones_like(changed).sum((-2, -1)), changed.sum((-2, -1))], -1)
+    return torch.maximum(sums, _FLOOR * counts)
+
+
+def changes(last: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
+    """Which pixels of uint8 frames [..., H, W, 3] are no longer those of `last`: bool [..., H, W]."""
+    return ((frames.short() - last.short()).abs() > CHANGED).any(-1)
 
 
 def ssim(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:

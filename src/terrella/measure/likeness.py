@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,15 +12,16 @@ from ..core.spec import kind_of
 from .clips import Clip
 from .exam import CLIPS, LONG, Exam, Found, Probe
 from .roll import Results
-from .scorecard import COPY_LAST, IDLE, OTHERS, PREDICTED, TRUE, Curve, Report, Row
-from .statistics import last_step_above, mean_band, mean_interval
+from .scorecard import COPY_LAST, GAIN, IDLE, OTHERS, PREDICTED, TRUE, Curve, Report, Row
+from .statistics import Band, last_step_above, mean_band, mean_interval, ratio_band
 
 FALL_DB = 10 * math.log10(2)  # twice the squared error
 
 
 @dataclass(frozen=True)
 class Series:
-    """A measure of every step. values [n, T] of what was dreamt; copied [n, T]: the same of the last row shown."""
+    """A measure of every step. values [n, T] of what was dreamt; copied [n, T]: the same of the last row shown. counts [n, T]:
+    where given, both are squared errors summed over so many pixels, told as the PSNR of all clips' errors together."""
 
     channel: str
     what: str
@@ -28,11 +29,24 @@ class Series:
     better: int
     values: torch.Tensor
     copied: torch.Tensor
+    counts: torch.Tensor | None = None
 
     @property
     def gain(self) -> torch.Tensor:
         """[n, T]: by how much it is better than copying."""
         return self.better * (self.values - self.copied)
+
+    def band(self, exam: Exam, values: torch.Tensor) -> Band:
+        """What `values`, like its own, are told as at each step."""
+        if self.counts is None:
+            return mean_band(values, exam.rng())
+        return ratio_band(255.0**2 * self.counts[:, : values.shape[1]], values, exam.rng()).in_db()
+
+    def gains(self, exam: Exam) -> Band:
+        """By how much it is better than copying, clip by clip, at each step."""
+        if self.counts is None:
+            return mean_band(self.gain, exam.rng())
+        return ratio_band(self.copied, self.values, exam.rng()).in_db()
 
 
 Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
@@ -43,7 +57,7 @@ SeriesOf = Callable[
 
 def report(exam: Exam, found: Found, probe: str, series_of: SeriesOf) -> Report:
     """Rows at the horizons, curves at every step, of all arms and places; then those of the long clips."""
-    whole, config = Report(), exam.config
+    whole = Report()
     for place, clips in exam.places.items():
         copied: set[str] = set()
         for arm in exam.arms:
@@ -56,13 +70,15 @@ def report(exam: Exam, found: Found, probe: str, series_of: SeriesOf) -> Report:
                 for number, series in enumerate(made.get(motion, ())):
                     strangers = {name: made[name][number] for name in (OTHERS, IDLE) if name in made}
                     where = probe, series.channel, series.what, series.unit, place
-                    for step in config.horizons:
-                        whole.rows.append(_row(exam, where, arm, motion, step, series, strangers))
+                    whole.rows += _rows(exam, where, arm, motion, series, strangers)
+                    if series.counts is not None:
+                        continue
                     whole.curves.append(_curve(exam, where, arm, motion, series.values))
                     if (name := f"{series.channel} {series.what}") not in copied:
                         copied.add(name)
                         whole.curves.append(_curve(exam, where, COPY_LAST, "", series.copied))
             whole.rows += _control(exam, place, arm, made)
+            whole.curves += [_gain(exam, probe, place, arm, made[PREDICTED])] if made.get(PREDICTED) else []
     return whole
 
 
@@ -88,16 +104,25 @@ def _asked(motion: str, made: list[Series]) -> list[Series]:
     return [series for series in made if motion != TRUE or kind_of(series.channel) != "pose"]
 
 
-def _row(
-    exam: Exam, where: Where, arm: str, motion: str, step: int, series: Series, strangers: dict[str, Series]
-) -> Row:
-    at, rng = step - 1, exam.rng
-    baselines = {COPY_LAST: mean_interval(series.copied[:, at], rng())}
+def _rows(
+    exam: Exam, where: Where, arm: str, motion: str, series: Series, strangers: dict[str, Series]
+) -> Iterator[Row]:
+    """At each horizon; nothing where nothing was to be measured."""
+    mine, gains, others = series.band(exam, series.values), series.gains(exam), {COPY_LAST: series.copied}
     if motion == PREDICTED:
-        reach = {name: other.values for name, other in strangers.items() if at < other.values.shape[1]}
-        baselines |= {name: mean_interval(values[:, at], rng()) for name, values in reach.items()}
-    figure, gain = mean_interval(series.values[:, at], rng()), mean_interval(series.gain[:, at], rng())
-    return Row(*where, arm, motion, step, figure, series.better, baselines, gain)
+        others |= {name: other.values for name, other in strangers.items()}
+    bands = {name: series.band(exam, values) for name, values in others.items()}
+    for step in exam.config.horizons:
+        if math.isfinite(mine.value[step - 1]):
+            baselines = {name: band.at(step - 1) for name, band in bands.items() if step <= len(band.value)}
+            yield Row(*where, arm, motion, step, mine.at(step - 1), series.better, baselines, gains.at(step - 1))
+
+
+def _gain(exam: Exam, probe: str, place: str, arm: str, made: list[Series]) -> Curve:
+    """Of the measure that says most: of pictures their pooled errors."""
+    lead = next((series for series in made if series.counts is not None), made[0])
+    where = probe, lead.channel, f"{lead.what}{GAIN}", lead.unit, place, arm, PREDICTED
+    return Curve(*where, range(1, lead.values.shape[1] + 1), lead.gains(exam), guides=(0.0,))
 
 
 def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor) -> Curve:
@@ -109,7 +134,7 @@ def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) ->
     rows = []
     for name in (OTHERS, IDLE):
         for mine, theirs in zip(made.get(PREDICTED, ()), made.get(name, ())):
-            for step in exam.config.control_horizons:
+            for step in exam.config.control_horizons if mine.counts is None else ():
                 if step <= theirs.values.shape[1]:
                     values = mine.values[:, step - 1], theirs.values[:, step - 1]
                     better = mean_interval(mine.better * (values[0] - values[1]), exam.rng())

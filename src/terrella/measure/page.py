@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .page_parts import charts_of, figure_table, number, picture_of, section, steps_words, table_of
-from .scorecard import BETTER, WORSE, Row, Scorecard, compared, judged, verdict
+from .scorecard import COPY_LAST, Row, Scorecard, words_of
+from .verdict import BETTER, WORSE, compared, judged, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
@@ -26,7 +27,7 @@ def page(card: Scorecard, title: str, probes: Sequence[Probe]) -> str:
         _method(card),
     ]
     places = " &middot; ".join(
-        f"{place.clips} clips of {escape(place.name)} places ({place.moving_share:.0%} moving)" for place in card.places
+        f"{place.clips} {escape(words_of(place.name))} ({place.moving_share:.0%} moving)" for place in card.places
     )
     worlds = " &middot; ".join(f"{escape(arm)}: {escape(name)}" for arm, name in card.worlds.items())
     return (
@@ -43,7 +44,7 @@ def _verdict(card: Scorecard) -> str:
     steps = sorted({row.horizon for row in rows})
     for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
         mine = {row.horizon: row for row in rows if (row.channel, row.what, row.unit, row.place) == kind}
-        about = f"{escape(f'{kind[0]} {kind[1]}, {kind[2]}')}<small>{escape(kind[3])} places</small>"
+        about = f"{escape(f'{kind[0]} {kind[1]}, {kind[2]}')}<small>{escape(words_of(kind[3]))}</small>"
         lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
     inside = (
         table_of(["gain over copying the last frame", *(steps_words(step) for step in steps)], lines) if lines else ""
@@ -52,10 +53,12 @@ def _verdict(card: Scorecard) -> str:
 
 
 def _gain(row: Row) -> str:
-    kind = {BETTER: "met", WORSE: "missed"}.get(judged(row), "void")
+    said = judged(row.gain)
+    kind = {BETTER: "met", WORSE: "missed"}.get(said, "void")
     words = number(abs(row.gain.value)) if row.gain else ""
     sign = "" if row.gain is None else "\u2212" if row.gain.value < 0 else "+"
-    return f"<span class='status {kind}' title='{judged(row)}'>{sign}{words}</span>"
+    beside = f"<small>{number(row.figure.value)}; copied {number(row.baselines[COPY_LAST].value)}</small>"
+    return f"<span class='status {kind}' title='{said}'>{sign}{words}</span>{beside}"
 
 
 def _section(card: Scorecard, probe: Probe) -> str:
@@ -81,7 +84,13 @@ def _missing(card: Scorecard) -> str:
 
 
 def _method(card: Scorecard) -> str:
-    text = (_HERE / "method.html").read_text(encoding="utf-8")
+    asked = {f"<li class={row.probe}>" for row in card.rows} | {
+        "<ul>",
+        "</ul>",
+        "<li>",
+    }  # what was not measured is not explained
+    lines = (_HERE / "method.html").read_text(encoding="utf-8").splitlines()
+    text = "".join(line for line in lines if line[: line.index(">") + 1] in asked)
     context = card.places[0].context if card.places else 0
     filled = text.format(context=context, dt_ms=card.dt_s * 1e3, rate=1 / card.dt_s)
     return f"<section><h2>How this was measured</h2>{filled}</section>"

@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 
 from .plot import Line, line_chart, y_span
-from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard
+from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard, words_of
 from .statistics import Figure
 from .strip import join_row, jpeg
 
@@ -70,11 +70,11 @@ def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
             words = f"{escape(f'{what}, {unit}' if unit else what)}<small>{escape(', '.join(about))}</small>"
             lines.append([words, *(_cell(found[step]) if step in found else "" for step in steps)])
         heads = [
-            f"{escape(place)} places",
+            escape(words_of(place)),
             *(f"{steps_words(step)}<small>{step * dt_s:.2f} s</small>" for step in steps),
         ]
         inside = table_of(heads, lines)
-        folded = f"<details><summary>All figures, {escape(place)} places</summary>{inside}</details>"
+        folded = f"<details><summary>All figures, {escape(words_of(place))}</summary>{inside}</details>"
         tables += inside if open_ else folded
     return tables
 
@@ -100,7 +100,7 @@ def charts_of(card: Scorecard, probe: str) -> str:
             lines = [_line(card, curve) for curve in sorted(mine, key=lambda curve: curve.arm == COPY_LAST)]
             x_label, log = ("% kept, the surest first", False) if probe == "calibration" else ("steps", True)
             svg = line_chart(lines, _ticks(mine, log), x_label, f"{what}, {unit}" if unit else what, log, span, guides)
-            title = f"{place} places, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
+            title = f"{words_of(place)}, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
             boxes += _box(title, svg, lines)
         charts += f"<div class=charts>{boxes}</div>"
     return charts

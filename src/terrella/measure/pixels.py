@@ -12,29 +12,44 @@ from ..core.world import World
 from .clips import Clip
 from .encoder import MIN_SIDE, frame_features
 from .exam import CLIPS, ENDINGS, LONG, Exam, Found, Probe, batches
-from .fidelity import blurred, gradient_energy, psnr, ssim
+from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_error, ssim
 from .frechet import frechet_interval
 from .likeness import Series, report
 from .roll import Results, Tick, Watch, rows_at
-from .scorecard import COPY_LAST, PREDICTED, TRUE, Curve, Picture, Report, Row
+from .scorecard import COPY_LAST, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
 from .statistics import mean_interval, ratio_band, ratio_interval
 from .work import Unit
 
 LEAD = (
     "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
-    "are 95% intervals. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. The Frechet "
+    "are 95% intervals. A mean of PSNR flatters copying where many frames do not change at all, for an identical frame counts "
+    "as 60 dB: pooled PSNR is that of all clips' errors together, of all frames, of those that changed, and of the pixels that "
+    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. The Frechet "
     "distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
 )
+POOLED = "pooled PSNR"
 _LEAST_SSIM = 11  # pixels: the size of its window
 
 
 def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
-    """PSNR of every camera that was dreamt."""
+    """PSNR of every camera that was dreamt: the mean of the frames', and that of the pooled errors."""
     truth = found.of("truth", of, place)
     made = []
     for name in [key.removesuffix("/psnr") for key in dreamt if key.endswith("/psnr")]:
         values = dreamt[f"{name}/psnr"]
-        made.append(Series(name, "PSNR", "dB", 1, values, truth[f"{name}/copied"][:, : values.shape[1]]))
+        steps, (height, width) = values.shape[1], clips[0].channels[name].shape[1:3]
+        made.append(Series(name, "PSNR", "dB", 1, values, truth[f"{name}/copied"][:, :steps]))
+        if f"{name}/pooled" in dreamt:
+            changed = truth[f"{name}/changed"][:, :steps]
+            moving, whole = (changed > 0).double(), torch.full_like(changed, height * width)
+            mine, copied = dreamt[f"{name}/pooled"].unbind(-1), truth[f"{name}/copied_pooled"][:, :steps].unbind(-1)
+            made += [
+                Series(name, POOLED, "dB", 1, mine[0], copied[0], whole),
+                Series(
+                    name, f"{POOLED}, frames that change", "dB", 1, mine[0] * moving, copied[0] * moving, whole * moving
+                ),
+                Series(name, f"{POOLED}, pixels that change", "dB", 1, mine[1], copied[1], changed),
+            ]
     return made
 
 
@@ -48,6 +63,9 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip], row: int, step: int) -> Results:
     mine, truth = seen[name], rows_at(clips, name, row)
     kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
+    if horizons:
+        changed = changes(rows_at(clips, name, clips[0].context - 1), truth)
+        kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changed)
     if step in horizons:
         if min(mine.shape[1:3]) >= _LEAST_SSIM:
             kept[f"{name}/ssim"] = ssim(mine, truth)
@@ -67,7 +85,7 @@ def _units(exam: Exam) -> list[Unit]:
                 steps = clips[0].horizon if of == LONG else max(exam.config.horizons)
                 run = partial(_truth, exam, names, some, steps, exam.config.horizons if of == CLIPS else ())
                 calls = {("recording", "compare"): float(steps * len(some))}
-                units.append(Unit(f"truth|{of}|{place}|{number}", f"recordings of {place} places", calls, run))
+                units.append(Unit(f"truth|{of}|{place}|{number}", f"recordings, {words_of(place)}", calls, run))
     return units
 
 
@@ -81,6 +99,10 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
         for step in range(1, steps + 1):
             frames = rows_at(clips, name, context - 1 + step)
             here = {f"{name}/copied": psnr(last, frames), f"{name}/energy": gradient_energy(frames)}
+            if horizons:
+                changed = changes(last, frames)
+                here[f"{name}/changed"] = changed.sum((-2, -1)).double()
+                here[f"{name}/copied_pooled"] = pooled(squared_error(last, frames), changed)
             if step in horizons:
                 if min(last.shape[1:3]) >= _LEAST_SSIM:
                     here[f"{name}/copied_ssim"] = ssim(last, frames)
@@ -116,7 +138,7 @@ def _report(exam: Exam, found: Found) -> Report:
                             strip[f"{arm}, {motion} motion, {name}"] = np.concatenate([now, frames.numpy()])
         columns = ["now", *(f"{step} step{'s'[: step > 1]}, {step * exam.dt_s:.2f} s" for step in exam.config.horizons)]
         whole.pictures += [
-            Picture("pixels", f"{place} places, clip {number + 1}", columns, strip)
+            Picture("pixels", f"{words_of(place)}, clip {number + 1}", columns, strip)
             for number, strip in enumerate(strips)
             if strip
         ]
@@ -143,9 +165,10 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
             rows.append(Row(probe, name, "Frechet distance", "", place, arm, motion, step, figure, -1, baselines))
     first, last = config.drop
     if last <= max(config.horizons):
-        loss = mean_interval(dreamt[f"{name}/psnr"][:, first - 1] - dreamt[f"{name}/psnr"][:, last - 1], exam.rng())
+        falls = (some[:, first - 1] - some[:, last - 1] for some in (dreamt[f"{name}/psnr"], truth[f"{name}/copied"]))
+        loss, copied = (mean_interval(fall, exam.rng()) for fall in falls)
         what = f"PSNR lost from {first} to {last} steps"
-        rows.append(Row(probe, name, what, "dB", place, arm, motion, last, loss, -1))
+        rows.append(Row(probe, name, what, "dB", place, arm, motion, last, loss, -1, {COPY_LAST: copied}))
     return rows
 
 

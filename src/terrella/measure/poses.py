@@ -12,7 +12,7 @@ from .clips import Clip
 from .exam import CLIPS, ENDINGS, Exam, Found, Probe
 from .likeness import Series, report
 from .roll import Results, Watch, rows_at
-from .scorecard import PREDICTED, Report, Row
+from .scorecard import COPY_LAST, PREDICTED, Report, Row
 from .statistics import mean_interval, median_interval
 
 LEAD = (
@@ -53,10 +53,13 @@ def _report(exam: Exam, found: Found) -> Report:
             for step in exam.config.horizons if made.unit == "m" else ():
                 went = walked[:, step - 1] > WALKED_M
                 if went.any():
-                    share = 100 * made.values[went, step - 1] / walked[went, step - 1]
+                    shares = [
+                        100 * some[went, step - 1] / walked[went, step - 1] for some in (made.values, made.copied)
+                    ]
                     for what, figure in (("mean", mean_interval), ("median", median_interval)):
                         where = "pose", made.channel, f"distance over the way gone, {what}", "%", place, arm
-                        whole.rows.append(Row(*where, motion, step, figure(share, exam.rng()), -1))
+                        mine, copied = (figure(share, exam.rng()) for share in shares)
+                        whole.rows.append(Row(*where, motion, step, mine, -1, {COPY_LAST: copied}))
     return whole
 
 

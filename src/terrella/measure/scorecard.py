@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +12,7 @@ from .statistics import Band, Figure
 PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alone; or at each step the true pose
 OTHERS, IDLE = "other actions", "no action"  # actions of another clip; the action at rest, held
 COPY_LAST = "copy last"
-BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
+GAIN = ": gain over copy-last"  # of a measure: the curve by which it is compared at every step
 
 
 @dataclass(frozen=True)
@@ -122,82 +118,6 @@ class Scorecard:
         ]
 
 
-def to_json(card: Scorecard) -> str:
-    """The scorecard as one strict JSON document: no pictures, NaN as null, six digits."""
-    return json.dumps(as_dict(card), indent=1, allow_nan=False)
-
-
-def as_dict(card: Scorecard) -> dict:
-    """What `to_json` writes, as plain data; the verdict comes first."""
-    names = [part.name for part in dataclasses.fields(card) if part.name != "pictures"]
-    return {"verdict": verdict(card), **{name: _plain(getattr(card, name)) for name in names}}
-
-
-def verdict(card: Scorecard) -> list[str]:
-    """Sentences, the answer first: that of the first arm's main channel; then one for each figure and place."""
-    arm = next(iter(card.worlds))
-    rows, name = compared(card), card.worlds[arm]
-    if not rows:
-        needs = "; ".join(f"{gone.probe} {gone.why}" for gone in card.missing if gone.arm == arm)
-        return [f"{name} was not held against copying the last frame ({needs or 'no probe could be asked'})."]
-    main = [row for row in rows if (row.channel, row.what) == (rows[0].channel, rows[0].what)]
-    last = "frame" if rows[0].unit == "dB" else "observation"
-    good = {
-        place: [row.horizon for row in main if row.place == place and judged(row) == BETTER] for place in _places(main)
-    }
-    if all(judged(row) == BETTER for row in main):
-        first = f"{name} is better than copying the last {last} at every horizon: after {_steps(good[main[0].place])}."
-    elif not any(good.values()):
-        horizons = _steps([row.horizon for row in main if row.place == main[0].place])
-        first = f"{name} is not better than copying the last {last}, after {horizons}."
-    else:
-        where = [f"after {_steps(steps)} in {place} places" for place, steps in good.items() if steps]
-        first = f"{name} is better than copying the last {last} {' and '.join(where)}; not at the other horizons."
-    kinds = dict.fromkeys((row.channel, row.what, row.place) for row in rows)
-    return [first, *(_line([row for row in rows if (row.channel, row.what, row.place) == kind]) for kind in kinds)]
-
-
-def compared(card: Scorecard) -> list[Row]:
-    """The rows of the first arm, under actions alone, that are compared with copying the last frame."""
-    arm = next(iter(card.worlds))
-    mine = [row for row in card.rows if row.gain is not None and (row.arm, row.motion) == (arm, PREDICTED)]
-    return [row for row in mine if COPY_LAST in row.baselines]
-
-
-def judged(row: Row) -> str:
-    """Better or worse where the whole interval of the gain says so; one clip alone cannot say."""
-    if row.gain is None or not math.isfinite(row.gain.low):
-        return UNCLEAR
-    return BETTER if row.gain.low > 0 else WORSE if row.gain.high < 0 else UNCLEAR
-
-
-def _line(rows: Sequence[Row]) -> str:
-    parts = []
-    for row in rows:
-        gain, words = row.gain.value if row.gain else math.nan, judged(row)
-        parts.append(f"{gain:+.3g}" + ("" if words == BETTER else f" ({words})"))
-    steps = _steps([row.horizon for row in rows])
-    about = f"{rows[0].channel} {rows[0].what}, {rows[0].place} places"
-    return f"{about}: gain {', '.join(parts)} {rows[0].unit} after {steps}"
-
-
-def _places(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(row.place for row in rows))
-
-
-def _steps(horizons: Sequence[int]) -> str:
-    numbers = [str(step) for step in horizons]
-    whole = numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}"
-    return f"{whole} step{'s'[: horizons[-1] != 1]}"
-
-
-def _plain(value) -> Any:
-    if dataclasses.is_dataclass(value):
-        return {part.name: _plain(getattr(value, part.name)) for part in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple, range)):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    return value
+def words_of(place: str) -> str:
+    """As people are told of it: "recorded clips", "new places"."""
+    return f"{place} {'places' if place == 'new' else 'clips'}"

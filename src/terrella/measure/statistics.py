@@ -33,10 +33,21 @@ class Band:
     high: list[float]
     count: int
 
+    def at(self, place: int) -> Figure:
+        return Figure(self.value[place], self.low[place], self.high[place], self.count)
+
+    def in_db(self) -> Band:
+        """Ratios of powers as decibels."""
+
+        def told(ratios: list[float]) -> list[float]:
+            return [10 * math.log10(ratio) if ratio > 0 else math.nan for ratio in ratios]
+
+        return Band(told(self.value), told(self.low), told(self.high), self.count)
+
 
 def mean_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
     """Mean of values [n] with the percentile bootstrap interval (Efron 1979)."""
-    return _only(mean_band(values[:, None], rng))
+    return mean_band(values[:, None], rng).at(0)
 
 
 def mean_band(values: torch.Tensor, rng: torch.Generator) -> Band:
@@ -47,7 +58,7 @@ def mean_band(values: torch.Tensor, rng: torch.Generator) -> Band:
 
 def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
     """sum(top) / sum(bottom) over clips [n], both resampled together: no clip with a tiny denominator rules it."""
-    return _only(ratio_band(top[:, None], bottom[:, None], rng))
+    return ratio_band(top[:, None], bottom[:, None], rng).at(0)
 
 
 def ratio_band(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Band:
@@ -84,7 +95,7 @@ def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Gener
     if count < 2:
         nothing = [math.nan] * len(centre)
         return Band(centre.tolist() if count else nothing, nothing, nothing, count)
-    low, high = resample(_weights(count, rng)).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    low, high = resample(_weights(count, rng)).nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
     return Band(centre.tolist(), low.tolist(), high.tolist(), count)
 
 
@@ -101,7 +112,3 @@ def figure_of(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figu
         return Figure(float(centre), math.nan, math.nan, count)
     low, high = resampled.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
     return Figure(float(centre), low, high, count)
-
-
-def _only(band: Band) -> Figure:
-    return Figure(band.value[0], band.low[0], band.high[0], band.count)

@@ -1,0 +1,179 @@
+"""What a scorecard says: one sentence first, computed from figures and their intervals; then lines; and all of it as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+from .endurance import COLOUR_WITHIN, SHARP_WITHIN
+from .scorecard import COPY_LAST, GAIN, OTHERS, PREDICTED, Curve, Row, Scorecard, words_of
+from .statistics import Figure
+
+BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
+REMEMBERED_DB = 25.0  # back where it was, the picture is the first one to this or better
+SHARP = 0.7, 1.3  # sharpness over the recorded one
+BLUR_STEPS = 32
+
+
+def to_json(card: Scorecard) -> str:
+    """The scorecard as one strict JSON document: no pictures, NaN as null, six digits."""
+    return json.dumps(as_dict(card), indent=1, allow_nan=False)
+
+
+def as_dict(card: Scorecard) -> dict:
+    """What `to_json` writes, as plain data; the verdict comes first."""
+    names = [part.name for part in dataclasses.fields(card) if part.name != "pictures"]
+    return {"verdict": verdict(card), **{name: _plain(getattr(card, name)) for name in names}}
+
+
+def verdict(card: Scorecard) -> list[str]:
+    """Sentences, the answer first: that of the first arm; then one for each figure and place that was compared."""
+    arm = next(iter(card.worlds))
+    rows, name = compared(card), card.worlds[arm]
+    curves = [curve for curve in card.curves if curve.arm == arm and curve.what.endswith(GAIN)]
+    if not curves:
+        needs = "; ".join(f"{gone.probe} {gone.why}" for gone in card.missing if gone.arm == arm)
+        return [f"{name} was not held against copying the last frame ({needs or 'no probe could be asked'})."]
+    told = ", ".join(_traits(card, arm))
+    traits = f"; it {told}" if told else ""
+    kinds = dict.fromkeys((row.channel, row.what, row.place) for row in rows)
+    lines = (_line([row for row in rows if (row.channel, row.what, row.place) == kind]) for kind in kinds)
+    return [f"{name} is {_copying(curves, rows)}{traits}.", *lines]
+
+
+def compared(card: Scorecard) -> list[Row]:
+    """The rows of the first arm, under actions alone, that are compared with copying the last frame."""
+    arm = next(iter(card.worlds))
+    mine = [row for row in card.rows if row.gain is not None and (row.arm, row.motion) == (arm, PREDICTED)]
+    return [row for row in mine if COPY_LAST in row.baselines]
+
+
+def judged(gain: Figure | None) -> str:
+    """Better or worse where the whole interval of a gain says so; one clip alone cannot say."""
+    if gain is None or not math.isfinite(gain.low):
+        return UNCLEAR
+    return BETTER if gain.low > 0 else WORSE if gain.high < 0 else UNCLEAR
+
+
+def _copying(curves: Sequence[Curve], rows: Sequence[Row]) -> str:
+    """At which steps the world is worse, and better, than copying: of its main measure, by place; of pictures also where the
+    mean of the frames' PSNR says worse and their pooled errors do not."""
+    lead, last = curves[0], "frame" if curves[0].unit == "dB" else "observation"
+    than = {
+        curve.place: _spans(curve.x, [judged(curve.band.at(at)) for at in range(len(curve.x))])
+        for curve in curves
+        if (curve.channel, curve.what) == (lead.channel, lead.what)
+    }
+    (first, told), *others = than.items()
+    means = [row for row in rows if (row.channel, row.what, row.place) == (lead.channel, "PSNR", first)]
+    worse = [row.horizon for row in means if judged(row.gain) == WORSE and "worse" not in told]
+    told += f", though by mean PSNR worse after {_steps(worse)}" if worse else ""
+    told = told.replace("THAN", f"than copying the last {last}", 1)
+    parts = [told, *(f"in {words_of(place)} {words}" for place, words in others if words != than[first])]
+    return "; ".join(parts).replace(" THAN", "")
+
+
+def _spans(steps: Sequence[float], said: Sequence[str]) -> str:
+    """ "worse THAN beyond 4 steps, better THAN up to 2 steps": runs of steps that are judged alike; the unclear divide none."""
+    known, told = [(kind, at) for at, kind in enumerate(said) if kind != UNCLEAR], []
+    runs = [(kind, [at for _, at in some]) for kind, some in groupby(known, lambda one: one[0])]
+    for kind in (WORSE, BETTER):
+        spans = [(places[0], places[-1]) for found, places in runs if found == kind]
+        if len(spans) > 2:
+            told.append(f"{kind} THAN at {said.count(kind)} of {_steps(steps[-1:])}")
+        elif spans:
+            told.append(f"{kind} THAN {' and '.join(_span(steps, *span) for span in spans)}")
+    return ", ".join(told) or f"not clearly better THAN at any step up to {steps[-1]}"
+
+
+def _span(steps: Sequence[float], first: int, last: int) -> str:
+    if first == last:
+        return f"after {_steps([steps[first]])}"
+    if last == len(steps) - 1:
+        return f"beyond {_steps([steps[first - 1]])}" if first else f"at every step up to {steps[last]}"
+    return f"from {steps[first]} to {_steps([steps[last]])}" if first else f"up to {_steps([steps[last]])}"
+
+
+def _steps(numbers: Sequence[float]) -> str:
+    """ "1, 8 and 32 steps"."""
+    *most, last = map(str, numbers)
+    return f"{', '.join(most)}{' and ' if most else ''}{last} step{'s'[: numbers[-1] != 1]}"
+
+
+def _traits(card: Scorecard, arm: str) -> Iterable[str]:
+    """Does it obey, remember, stay sharp, stand still? What was not asked is not said."""
+    mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
+    sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
+    reach = max((row.horizon for row in sharp if row.horizon <= BLUR_STEPS), default=0)
+    control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
+    closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
+    stillness = [row for row in mine if row.probe == "stillness"]
+    asked = (
+        (_first(control), lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys")),
+        (closed, lambda row: _sure(row, REMEMBERED_DB, math.inf, "remembers", "does not surely remember", "forgets")),
+        (_first([row for row in sharp if row.horizon == reach]), _sharpness),
+        (stillness, _stands),
+    )
+    for rows, say in asked:
+        if rows:
+            places = dict.fromkeys(row.place for row in rows)
+            yield _by_place((place, max(say(row) for row in rows if row.place == place)[1]) for place in places)
+
+
+def _first(rows: Sequence[Row]) -> list[Row]:
+    """Those of the main channel at the first horizon."""
+    return [
+        row for row in rows if (row.channel, row.what, row.horizon) == (rows[0].channel, rows[0].what, rows[0].horizon)
+    ]
+
+
+def _sure(row: Row, low: float, high: float, *words: str) -> tuple[int, str]:
+    """Whether the whole interval lies between low and high (0), outside (2), or neither is sure (1), and which word says so."""
+    inside, outside = low < row.figure.low <= row.figure.high < high, row.figure.high < low or row.figure.low > high
+    rank = 0 if inside else 2 if outside else 1
+    return rank, words[rank]
+
+
+def _sharpness(row: Row) -> tuple[int, str]:
+    return _sure(
+        row, *SHARP, "stays sharp", *(("may blur", "blurs") if row.figure.value < 1 else ("may roughen", "roughens"))
+    )
+
+
+def _stands(row: Row) -> tuple[int, str]:
+    within = SHARP_WITHIN if row.what == "sharpness" else COLOUR_WITHIN
+    words = "holds still", "may fade while nobody plays", "fades while nobody plays"
+    return _sure(row, 1 - within, 1 + within, *words)
+
+
+def _by_place(told: Iterable[tuple[str, str]]) -> str:
+    """What is said of the first place, then of each of which something else is."""
+    (_, first), *others = told
+    return ", ".join([first, *(f"{words} in {words_of(place)}" for place, words in others if words != first)])
+
+
+def _line(rows: Sequence[Row]) -> str:
+    mine, copied = (
+        " / ".join(f"{figure.value:.3g}" for figure in figures)
+        for figures in ([row.figure for row in rows], [row.baselines[COPY_LAST] for row in rows])
+    )
+    said = [judged(row.gain) for row in rows]
+    about = f"{rows[0].channel} {rows[0].what}, {words_of(rows[0].place)}: {mine} {rows[0].unit}".rstrip()
+    unanimous = said[0] if len(set(said)) == 1 else ", ".join(said)
+    return f"{about} after {_steps([row.horizon for row in rows])}; copy-last {copied} ({unanimous})"
+
+
+def _plain(value) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {part.name: _plain(getattr(value, part.name)) for part in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple, range)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
