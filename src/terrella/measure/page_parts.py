@@ -91,7 +91,7 @@ def charts_of(card: Scorecard, probe: str) -> str:
     groups: dict[tuple, list[Curve]] = {}
     for curve in curves:
         groups.setdefault((curve.channel, curve.what, curve.unit), []).append(curve)
-    charts = ""
+    charts: list[str] = []
     for (channel, what, unit), some in groups.items():
         guides, boxes = some[0].guides, ""
         span = y_span([v for c in some for v in (*c.band.value, *c.band.low, *c.band.high)] + list(guides))
@@ -102,8 +102,9 @@ def charts_of(card: Scorecard, probe: str) -> str:
             svg = line_chart(lines, _ticks(mine, log), x_label, f"{what}, {unit}" if unit else what, log, span, guides)
             title = f"{words_of(place)}, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
             boxes += _box(title, svg, lines)
-        charts += f"<div class=charts>{boxes}</div>"
-    return charts
+        charts.append(boxes)
+    alone = len({curve.place for curve in curves}) == 1  # then all share one grid
+    return "".join(f"<div class=charts>{boxes}</div>" for boxes in (["".join(charts)] if alone else charts))
 
 
 def _ticks(curves: Sequence[Curve], log: bool) -> list[tuple[float, str]]:
