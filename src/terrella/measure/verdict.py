@@ -78,12 +78,14 @@ def _copying(curves: Sequence[Curve], rows: Sequence[Row]) -> str:
 
 
 def _spans(steps: Sequence[float], said: Sequence[str]) -> str:
-    """ "worse THAN beyond 4 steps, better THAN up to 2 steps": runs of steps that are judged alike; the unclear divide none."""
+    """ "worse THAN beyond 4 steps, better THAN up to 2 steps": runs of steps that are judged alike; the unclear divide
+    none, but then nothing is better, or worse at every step, that is not surely so."""
     known, told = [(kind, at) for at, kind in enumerate(said) if kind != UNCLEAR], []
     runs = [(kind, [at for _, at in some]) for kind, some in groupby(known, lambda one: one[0])]
     for kind in (WORSE, BETTER):
         spans = [(places[0], places[-1]) for found, places in runs if found == kind]
-        if len(spans) > 2:
+        gaps = said.count(kind) < sum(last + 1 - first for first, last in spans)
+        if len(spans) > 2 or gaps and (kind == BETTER or spans == [(0, len(said) - 1)]):
             told.append(f"{kind} THAN at {said.count(kind)} of {_steps(steps[-1:])}")
         elif spans:
             told.append(f"{kind} THAN {' and '.join(_span(steps, *span) for span in spans)}")
