@@ -73,7 +73,7 @@ def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
 
 
 def test_a_run_without_geometry_reads_clips_and_goes_on_exactly(recording, tmp_path):
-    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=3)
+    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=3, steps=36)
     stages = {"outcome": 1, "flow": 1}
     goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
 

@@ -13,6 +13,7 @@ from ..worlds.controls import Controls
 from .batches import Dream, place_batch
 from .history_batches import clip_length, history_batch
 from .moving_batches import moving_batch
+from .objectives import codec
 from .recording import Recording
 from .trainer import Feed, Now
 
@@ -56,11 +57,23 @@ def frames_feed(
     if memory is not None:
         of_place = moving_batch if config.moving else place_batch
         return Drawn(lambda now: of_place(recording, memory, config, size, now, dream))
+    clips = clips_of(recording, clip_length(config), size, config, seed)
+    controls = recording.controls or Controls.buttons(config.actions)
+    return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))
+
+
+def codec_feed(recording: Recording, config: VideoConfig, size: int, seed: int) -> Feed:
+    """Clips for a codec, `size` at a time: of thrice as many those in which more happens are the likelier."""
+    clips = clips_of(recording, codec.clip_length(config.slots), 3 * size, config, seed)
+    controls = recording.controls or Controls.buttons(config.actions)
+    return Streamed(clips, lambda found, now: codec.clip(found, controls, config.slots, size, now))
+
+
+def clips_of(recording: Recording, length: int, size: int, config: VideoConfig, seed: int) -> Clips:
+    """Clips of `length` rows, `size` at a time, of the episodes that training may see."""
     ranges = recording.cache.episodes  # of what is kept out, whole episodes are left out: clips know no rows
     whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
     channels = ("rgb", "action", *("instruction",) * ("task" in recording.cache.arrays))
-    clips = Clips(recording.cache, clip_length(config), channels, size, config.size, seed=seed, episodes=whole)
-    controls = recording.controls or Controls.buttons(config.actions)
-    return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))
+    return Clips(recording.cache, length, channels, size, config.size, seed=seed, episodes=whole)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from .trainer import Report
 THINGS = "observation.things"  # the channel that marks what may move or vanish
 OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
 FEWEST = 64  # frames that can be trained on
+MOST = 96 * 128  # pixels of a frame, unless more are asked for
 
 
 @dataclass(frozen=True)
@@ -41,16 +43,18 @@ class Recording:
     @staticmethod
     def open(
         data: str | Path,
-        size: tuple[int, int],
+        size: tuple[int, int] | None,
         report: Report,
         keep_out: Box | None = None,
         needs: tuple[str, ...] = ("rgb",),
         why: str = "a world of pictures is learned from them",
     ) -> Recording:
-        """The recording `data`, a folder or an address, with pictures at `size` (height, width); of what is far a clip cache
-        within its budget is kept here, for places are read in any order. Every 20th episode is held out, and so are the rows
-        from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or rows."""
+        """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitting`); of what is
+        far a clip cache within its budget is kept here, for places are read in any order. Every 20th episode is held out, and so
+        are the rows from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or
+        rows."""
         dataset = Dataset(data)
+        size = size or fitting(dataset)
         cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
         lacks = [name for name in needs if not there(cache, name)]
         if lacks:
@@ -185,6 +189,16 @@ def there(cache: ClipCache, name: str) -> bool:
     if name == "camera":
         return bool(cache.world.get("camera"))
     return getattr(cache, name, None) is not None or name in cache.arrays
+
+
+def fitting(dataset: Dataset) -> tuple[int, int]:
+    """Height and width in multiples of 8 at which a recording's pictures are learned: their own, or smaller ones of that shape
+    that have at most MOST pixels."""
+    if dataset.rgb_key is None:
+        return 96, 128
+    height, width = dataset.sensors[dataset.rgb_key].shape[:2]
+    scale = min(1.0, math.sqrt(MOST / (height * width)))
+    return max(16, 8 * round(scale * height / 8)), max(16, 8 * round(scale * width / 8))
 
 
 def controls_of(cache: ClipCache) -> Controls | None:

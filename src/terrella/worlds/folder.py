@@ -24,6 +24,7 @@ from ..core.errors import CheckpointError
 from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
 from ..space.keyframes import Keyframes
 from .body import Motion, MotionBody
+from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
 from .generator import Generator
@@ -194,7 +195,7 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
 KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(restored(Motion(config), weights)))},
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
-    "generator": {"unet": (GeneratorConfig, _network(Generator))},
+    "generator": {"unet": (GeneratorConfig, _network(Generator)), "codec": (CodecConfig, _network(Codec))},
     "objects": {"billboards": (ObjectsConfig, _network(Objects))},
     "outcome": {
         "constant": (ConstantConfig, lambda config, weights, _: Constant(config)),

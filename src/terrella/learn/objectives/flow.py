@@ -19,6 +19,8 @@ class Flow:
     """Where a frame is drawn in one step a critic judges it, from the step `critic_from` on, `critic_weight` times as hard
     as the loss itself. With more steps the whole flow from noise to frame is learned."""
 
+    strides = 1  # losses of a batch that the generator descends
+
     def __init__(
         self, generator: Generator, flow_steps: int, learning_rate: float, critic_from: int, critic_weight: float
     ):

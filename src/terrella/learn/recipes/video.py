@@ -12,6 +12,7 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...space.keyframes import Keyframes
 from ...worlds.body import Motion, MotionBody
+from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
 from ...worlds.folder import save_world
 from ...worlds.generator import Generator
@@ -20,7 +21,9 @@ from ...worlds.learned import About, LearnedWorld
 from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
 from ...worlds.outcome import Constant, ConstantConfig, Outcome
 from ...worlds.places import KeyframeScene
-from ..feeds import frames_feed
+from ..feeds import codec_feed, frames_feed
+from ..moves import frequent_moves, palette
+from ..objectives.codec import CodecObjective
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
@@ -28,8 +31,11 @@ from ..objectives.outcome import Happenings, Pieces, learn_outcome
 from ..objectives.uncertainty import forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..strips import draw_strip
-from ..trainer import Report, Run, Trainer, device_named
+from ..trainer import Feed, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
+
+WIDTHS = (32, 56, 88, 128)
+MOVES, COLOURS = 24, 64  # among which a codec chooses
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -42,9 +48,10 @@ class TrainConfig:
 
     Args:
         name: Name of the world.
-        size: Height and width of its frames in pixels.
+        size: Height and width of its frames in pixels. Default: those of the recording, if they are no more than 96 x 128 in all.
         geometry: Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
-        channels: Channels of the generator at 1/2, 1/4, 1/8, ... of the size.
+        channels: Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88
+            128, and without depth 64 96 128.
         frames: Last frames that a world without geometry sees.
         objects_steps: Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a
             recording that tells objects apart. 0 draws them like everything else.
@@ -70,9 +77,9 @@ class TrainConfig:
     """
 
     name: str = "world"
-    size: tuple[int, int] = (96, 128)
+    size: tuple[int, int] | None = None
     geometry: bool = True
-    channels: tuple[int, ...] = (32, 56, 88, 128)
+    channels: tuple[int, ...] = ()
     frames: int = 4
     outcome_steps: int = 1500
     objects_steps: int = 2500
@@ -97,7 +104,7 @@ class TrainConfig:
 
 def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> dict:
     """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
-    if any(length < 16 or length % 8 for length in config.size):
+    if config.size and any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
     recording = Recording.open(data, config.size, report, needs=("rgb", "action"), why=NEEDS)
@@ -117,11 +124,12 @@ def plan(recording: Recording, config: TrainConfig) -> VideoConfig:
             f"{recording.name} lists objects as {cache.arrays[OBJECTS].shape[1:]}, and {(ROWS, 4)} is read: number and place "
             f"of up to {ROWS}. Record it so, or train with --objects-steps 0."
         )
+    height, width = cache.rgb.shape[1:3]
     return VideoConfig(
         tuple(cache.world["camera"]) if posed else (1.0, 1.0, 0.5, 0.5),
         controls.numbers,
-        config.size,
-        config.channels,
+        (height, width),
+        config.channels or WIDTHS,
         slots=3 if posed else config.frames,
         geometry=posed,
         steps=config.flow_steps,
@@ -153,10 +161,38 @@ class _Learned:
             self.video = replace(self.video, vitals=begins)
             self.outcome = Outcome(replace(self.happened.config(), begins=begins)).to(run.device)
         self.memory = self._memory() if self.video.geometry else None
-        parts = config.flow_steps, config.learning_rate, config.critic_from, config.critic_weight
-        self.flow = Flow(Generator(self.video.generator), *parts)
+        fetches = self.memory is None and config.flow_steps == 1  # neither memory nor a flow draws frames
+        self.flow = self._codec() if fetches else self._flow()
         self.motion = Motion(self.video.motion)
         self.facts: dict = {}
+
+    def _flow(self) -> Flow:
+        config = self.config
+        parts = config.flow_steps, config.learning_rate, config.critic_from, config.critic_weight
+        return Flow(Generator(self.video.generator), *parts)
+
+    def _codec(self) -> CodecObjective:
+        """A codec that knows how pictures of the recording move, and their colours."""
+        recording, rng = self.recording, np.random.default_rng(self.config.seed)
+        rows = recording.within(1, 0)
+        rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
+        before, after = recording.rgb(rows - 1), recording.rgb(rows)
+        change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
+        some = rng.choice(len(rows), min(len(rows), 256), replace=False, p=change / change.sum())
+        moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
+        plain = self.video.generator
+        settings = CodecConfig(plain.size, plain.slots, plain.context, len(moves), len(colours))
+        levels = int(np.log2(min(plain.size) // COARSE)) + 1  # that so small a picture has room for
+        codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
+        codec.moves[1:], codec.palette[:] = moves, colours
+        return CodecObjective(codec, self.config.learning_rate)
+
+    def _feed(self, batch: int) -> Feed:
+        parts = self.video, batch, self.config.seed
+        if isinstance(self.flow, CodecObjective):
+            return codec_feed(self.recording, *parts)
+        dream = self.flow.dream if self.config.flow_steps == 1 else None  # a teacher sees recorded frames alone
+        return frames_feed(self.recording, self.memory, *parts, dream)
 
     def _memory(self) -> Keyframes:
         rows = np.flatnonzero(self.recording.usable)
@@ -166,10 +202,8 @@ class _Learned:
     def learn(self) -> dict:
         """All stages; each goes on where it was stopped."""
         config, run, recording = self.config, self.run, self.recording
-        batch = config.batch or (64 if run.device.type == "cuda" else 8)
-        dream = self.flow.dream if config.flow_steps == 1 else None  # a teacher sees recorded frames alone
-        feed = frames_feed(recording, self.memory, self.video, batch, config.seed, dream)
-        trainer = Trainer(run, "flow", feed, self.flow, config.steps, config.hours)
+        feed = self._feed(config.batch or (64 if run.device.type == "cuda" else 8))
+        trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides), config.hours)
         if self.memory is not None:
             self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
         if self.outcome is not None:
@@ -235,7 +269,7 @@ class _Learned:
         return {
             "what": f"Learned from {source.length:,} frames of {name}",
             "data": f"{recording.usable.sum():,} frames, {episodes} episodes",
-            "steps": trainer.facts["step"],
+            "steps": trainer.facts["step"] * self.flow.strides,
             "hours": round(trainer.facts["seconds"] / 3600, 2),
             "keep_out": self.config.keep_out,
             "keyframes": 0 if self.memory is None else len(self.memory),

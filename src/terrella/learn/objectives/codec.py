@@ -1,0 +1,100 @@
+"""Codec: where each pixel of the next frame comes from, learned on recorded frames and on the codec's own dreams of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ...worlds.codec import Codec
+from ...worlds.controls import Controls
+from ...worlds.generator import channels_last, context_thumbnail
+from ..moves import explained, scrolled
+from ..trainer import Average, Loss, Now, adamw, warmed
+
+DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
+RECORDED = 300  # training steps with recorded frames alone
+STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
+MOST = 4.0  # times that a pixel which changes may count more than one that stays
+STALE = (
+    0.15  # how much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it
+)
+CHANGED, OFF = 4, 20  # differences of 255
+
+
+@dataclass(frozen=True)
+class Clip:
+    """frames uint8 [B, slots + DREAM, 3, H, W] and actions [B, slots + DREAM, A] as networks take them, action t leading from
+    frame t to the next; the oldest first."""
+
+    frames: torch.Tensor
+    actions: torch.Tensor
+
+
+def clip_length(slots: int) -> int:
+    return slots + DREAM
+
+
+def clip(found: Mapping[str, np.ndarray], controls: Controls, slots: int, batch: int, now: Now) -> Clip:
+    """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
+    rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
+    differs = np.abs(rgb[:, slots:].astype(np.int16) - rgb[:, slots - 1 : -1]).max(-1) > 2 * CHANGED
+    weight = 0.3 + (differs.mean((2, 3)) > 0.005).mean(1)
+    picks = now.rng.choice(len(rgb), batch, replace=False, p=weight / weight.sum())
+    frames = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
+    actions = controls.encode(torch.from_numpy(action[picks]).flatten(0, 1)).unflatten(0, (batch, -1))
+    begins = torch.from_numpy(now.rng.random(batch) < STILL)[:, None]
+    first = torch.where(begins[..., None, None, None], frames[:, slots - 1 : slots], frames[:, :slots])
+    before = torch.where(begins[..., None], 0.0, actions[:, : slots - 1])
+    return Clip(torch.cat([first, frames[:, slots:]], 1), torch.cat([before, actions[:, slots - 1 :]], 1))
+
+
+class CodecObjective:
+    """The likelihood of each pixel under the mixture of its sources and of the palette."""
+
+    strides = DREAM  # losses of a batch, each of which is descended
+
+    def __init__(self, codec: Codec, learning_rate: float):
+        self.generator = channels_last(codec)
+        self.smooth = Average(self.generator, 0.998)
+        self.modules = {"generator": self.generator, "smooth": self.smooth}
+        self.learners = {"generator": adamw((self.generator,), warmed(learning_rate, 10, 0.02), average=self.smooth)}
+
+    def losses(self, batch: Clip, now: Now) -> Iterator[Loss]:
+        slots = self.generator.config.slots
+        recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
+        shown = recorded[:, :slots].flip(1)
+        for step in range(slots, recorded.shape[1]):
+            truth, before = recorded[:, step], recorded[:, step - 1]
+            context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
+            loss, drawn = self._loss(shown, context, truth, before)
+            yield loss
+            if now.step * DREAM < RECORDED:
+                drawn = truth
+            shown = torch.cat([drawn[:, None], shown[:, :-1]], 1)
+
+    def _loss(self, shown, context, truth, before) -> tuple[Loss, torch.Tensor]:
+        """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and what is drawn now."""
+        codec = self.generator
+        share, stays = explained(codec, shown, truth)
+        move = scrolled(codec, share, truth)
+        scroll = F.cross_entropy(codec.scroll(shown, context), move)
+        choices, features = codec.choices(shown, context, move)
+        changes = (truth.int() - before.int()).abs().amax(1) > CHANGED
+        some = changes | (stays > OFF)
+        some[:, ::7, ::7] = True
+        nearest = torch.cdist(truth.permute(0, 2, 3, 1)[some].float(), codec.palette.float()).argmin(1)
+        colour = F.cross_entropy(codec.colours(shown, features, some), nearest, reduction="none")
+        painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
+        each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
+        rare = changes.float().mean().clamp_min(1e-4)
+        weight = torch.where(changes, (0.4 * (1 - rare) / rare).clamp(1.0, MOST), 1.0)
+        weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
+        pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
+        with torch.no_grad():
+            drawn = codec.fetched(shown, choices, features)
+        loss = pixels + 0.1 * colour.mean() + 0.3 * scroll
+        return Loss("generator", loss, {"pixels": pixels, "colour": colour.mean(), "scroll": scroll}), drawn
