@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from ...core.errors import TrainingError
+from ...worlds.codec import Codec
 from ...worlds.folder import save_world
 from ...worlds.learned import LearnedWorld
 from ..feeds import Drawn
@@ -115,6 +116,10 @@ def train_dreams(
     """
     if min(config.steps, config.horizon, config.batch) < 1:
         raise TrainingError("--steps, --horizon and --batch are 1 or more.")
+    if isinstance(world.generator, Codec):
+        raise TrainingError(
+            f"{world.spec.name} has learned on its own dreams already, as worlds without depth do: nothing is left to do here."
+        )
     pair = paired(world, data, config.keep_out, report)
     beginnings(pair.recording, config.horizon)
     more = {} if teacher is None else {"teacher": fingerprint(like(world, teacher).generator)}
@@ -133,7 +138,7 @@ def train_dreams(
 def like(world: LearnedWorld, teacher: LearnedWorld) -> LearnedWorld:
     """The teacher; TrainingError unless its generator takes what that of `world` does."""
     made = (world.generator.config, teacher.generator.config)
-    taken = [(make.size, make.slots, make.context, make.moving) for make in made]
+    taken = [(make.size, make.slots, make.context, getattr(make, "moving", None)) for make in made]
     if taken[0] == taken[1] and teacher.config.steps > 1:
         return teacher
     raise TrainingError(
