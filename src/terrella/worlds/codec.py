@@ -58,11 +58,11 @@ class Codec(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.leave = nn.Conv2d(widths[0], COARSE**2 * PIXEL, 1)
         self.near = nn.Conv2d(seen, PIXEL, 3, padding=1)
-        self.choice = nn.Conv2d(2 * PIXEL, self.sources + 1, 1)
+        self.choice = nn.Conv2d(2 * PIXEL, self.sources + 2, 1)  # its last: goes as most of the picture does
         self.colour = nn.Sequential(nn.Linear(2 * PIXEL + 3, 64), nn.SiLU(), nn.Linear(64, config.colours))
         nn.init.zeros_(self.choice.weight)
-        bias = torch.full((self.sources + 1,), -1.0)
-        bias[0] = 4.0  # at first everything stays
+        bias = torch.full((self.sources + 2,), -1.0)
+        bias[0], bias[-1] = 4.0, 2.0  # at first everything stays
         self.choice.bias = nn.Parameter(bias)
         self.glance = nn.Sequential(
             nn.Conv2d(3 * config.slots, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 4, stride=4), nn.SiLU(), nn.Flatten(),
@@ -113,7 +113,9 @@ class Codec(nn.Module):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
             x = self.after[level](x, context)
         features = F.silu(torch.cat([F.pixel_shuffle(self.leave(x), COARSE), self.near(seen)], 1))
-        return self.choice(features), features
+        choices, scrolls = self.choice(features).split((self.sources + 1, 1), 1)
+        along = move[:, None, None, None].expand_as(scrolls)
+        return choices.scatter(1, along, torch.logaddexp(choices.gather(1, along), scrolls)), features
 
     def colours(self, frames: torch.Tensor, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
         """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
