@@ -68,7 +68,8 @@ class Codec(nn.Module):
             nn.Conv2d(3 * config.slots, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 4, stride=4), nn.SiLU(), nn.Flatten(),
             nn.Linear(48 * (height // 16) * (width // 16), 128), nn.SiLU(),
         )  # fmt: skip
-        self.scrolls = nn.Sequential(nn.Linear(128 + config.context, 128), nn.SiLU(), nn.Linear(128, config.moves + 1))
+        known = 128 + config.context + min(2, config.slots - 1) * (config.moves + 1)
+        self.scrolls = nn.Sequential(nn.Linear(known, 128), nn.SiLU(), nn.Linear(128, config.moves + 1))
 
     @property
     def sources(self) -> int:
@@ -79,7 +80,7 @@ class Codec(nn.Module):
         """The next frame [B, 4, H, W] in the generator's code, the likeliest one; noise and time say nothing to it."""
         frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
         context = conditioning.context
-        move = self.scroll(frames, context).argmax(1)
+        move = likeliest(self.scroll(frames, context))
         choices, features = self.choices(frames, context, move)
         drawn = self.fetched(frames, choices, features).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
@@ -88,7 +89,18 @@ class Codec(nn.Module):
         """By which of the moves most of the picture goes on: logits [B, moves + 1]. frames: uint8 [B, slots, 3, H, W], the newest
         first."""
         seen = self.glance(frames.flatten(1, 2).float() / 127.5 - 1)
-        return self.scrolls(torch.cat([seen, context], 1))
+        went = [self.fits(frames[:, age], frames[:, age + 1]) for age in range(min(2, self.config.slots - 1))]
+        return self.scrolls(torch.cat([seen, context, *went], 1))
+
+    def fits(self, after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+        """How well each of the moves leads from `before` to `after` (uint8 [B, 3, H, W]), 1 for the best: [B, moves + 1]."""
+        height, width = self.config.size
+        x = (torch.arange(1, width, 2, device=after.device) - self.moves[:, :1]).clamp(0, width - 1)
+        y = (torch.arange(1, height, 2, device=after.device) - self.moves[:, 1:]).clamp(0, height - 1)
+        place = (y[:, :, None] * width + x[:, None]).flatten()
+        there = before.flatten(2)[:, :, place].unflatten(2, (len(self.moves), -1))
+        error = (there.float() - after[..., 1::2, 1::2].flatten(2)[:, :, None].float()).abs().mean((1, 3))
+        return torch.exp(-(error - error.amin(1, keepdim=True)))
 
     def choices(
         self, frames: torch.Tensor, context: torch.Tensor, move: torch.Tensor
@@ -125,7 +137,7 @@ class Codec(nn.Module):
     def fetched(self, frames: torch.Tensor, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The likeliest next frames, uint8 [B, 3, H, W]: painted is what more likely is than is fetched from anywhere."""
         paints = choices.softmax(1)[:, -1] > 0.5
-        drawn = self.pixels(frames, choices[:, :-1].argmax(1))
+        drawn = self.pixels(frames, likeliest(choices[:, :-1]))
         if frames.device.type == "cpu" and not torch.onnx.is_in_onnx_export():  # few pixels are painted, in most frames
             drawn = drawn.permute(0, 2, 3, 1).contiguous()
             drawn[paints] = self.palette[self.colours(frames, features, paints).argmax(1)]
@@ -143,3 +155,8 @@ class Codec(nn.Module):
         place = ((slot * height + y) * width + x).flatten(1)
         flat = frames.transpose(1, 2).flatten(2)
         return flat.gather(2, place[:, None].expand(-1, 3, -1)).unflatten(2, (height, width))
+
+
+def likeliest(logits: torch.Tensor) -> torch.Tensor:
+    """Of choices [B, K, ...] the first, to stay, where it is likelier than all others together; else the likeliest of those."""
+    return torch.where(logits.softmax(1)[:, 0] > 0.5, 0, 1 + logits[:, 1:].argmax(1))

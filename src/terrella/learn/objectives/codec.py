@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ...worlds.codec import Codec
+from ...worlds.codec import Codec, likeliest
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
 from ..moves import explained, scrolled
@@ -18,7 +18,7 @@ from ..trainer import Average, Loss, Now, adamw, warmed
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
-MOST = 4.0  # times that a pixel which changes may count more than one that stays
+MOST = 16.0  # times that a pixel which changes may count more than one that stays
 STALE = (
     0.15  # how much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it
 )
@@ -70,18 +70,20 @@ class CodecObjective:
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
-            loss, drawn = self._loss(shown, context, truth, before)
+            loss, drawn = self._loss(shown, context, truth, before, now)
             yield loss
             if now.step * DREAM < RECORDED:
                 drawn = truth
             shown = torch.cat([drawn[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, context, truth, before) -> tuple[Loss, torch.Tensor]:
+    def _loss(self, shown, context, truth, before, now: Now) -> tuple[Loss, torch.Tensor]:
         """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and what is drawn now."""
         codec = self.generator
         share, stays = explained(codec, shown, truth)
         move = scrolled(codec, share, truth)
-        scroll = F.cross_entropy(codec.scroll(shown, context), move)
+        scrolls = codec.scroll(shown, context)
+        scroll, guessed = F.cross_entropy(scrolls, move), likeliest(scrolls)
+        move = torch.where(torch.from_numpy(now.rng.random(len(move)) < GUESSED).to(move.device), guessed, move)
         choices, features = codec.choices(shown, context, move)
         changes = (truth.int() - before.int()).abs().amax(1) > CHANGED
         some = changes | (stays > OFF)
