@@ -19,6 +19,7 @@ DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
 MOST = 16.0  # times that a pixel which changes may count more than one that stays
+GUESSED = 0.5  # the share of pictures that the network is shown displaced as it guesses, not as they go
 STALE = (
     0.15  # how much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it
 )
