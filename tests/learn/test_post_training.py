@@ -262,7 +262,7 @@ def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)
                 recorder.add({"rgb": picture}, np.array([step % 2]) if step < 59 else None, 0.5, False)
             recorder.end_episode()
-    with pytest.raises(DatasetError, match="the same game"):
+    with pytest.raises(DatasetError, match="the actions left, which are not those of .*its own game"):
         train_dreams(teacher, tmp_path / "other", tmp_path / "run", DREAMS, quiet)
     with pytest.raises(TrainingError, match="1 or more"):
         train_dreams(teacher, recording, tmp_path / "run", replace(DREAMS, horizon=0), quiet)

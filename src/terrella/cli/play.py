@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from .named import Device, Fast, load_named
-from .say import Host, Json, Port, Seed, Token, result
+from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
     from ..core.world import World
@@ -18,7 +18,7 @@ def play(
     name: Positional[str],
     image: Path | None = None,
     compare: bool = False,
-    truth: str = "doom:my_way_home",
+    truth: str | None = None,
     memory: bool = True,
     remember: bool = False,
     estimator: str | None = None,
@@ -39,7 +39,7 @@ def play(
         name: A name that `terrella list` shows, or the path of a checkpoint.
         image: Start from this picture (any image file). Pictures can also be dropped on the page.
         compare: Show the real game beside the learned world, under the same actions.
-        truth: The real game that --compare shows.
+        truth: The real game that --compare shows; default: the one that the world learned, else doom:my_way_home.
         memory: --no-memory plays a learned world without its keyframes.
         remember: Add a spatial memory to a world that has none.
         estimator: Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one.
@@ -90,10 +90,14 @@ def _first_picture(path: Path, world: World) -> Any:
     return picture
 
 
-def _game_like(learned: World, name: str) -> World:
-    """The real game, with pictures of the size that the learned world shows."""
+def _game_like(learned: World, name: str | None) -> World:
+    """The real game, with pictures of the size that the learned world shows; by default the one that it learned."""
     from .. import library
 
+    known = str(learned.spec.card.get("game"))
+    name = name or (known if library.is_truth(known) else library.GAME)
     shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
-    like: dict[str, Any] = {"size": shape[:2], "depth_size": shape[:2]} if shape and name.startswith("doom") else {}
-    return library.load(name, **like)
+    sizes = ("size", "depth_size") if name.startswith("doom") else ("size",)
+    if library.is_truth(known) and name != known:
+        say(f"{learned.spec.name} learned {known}, and is compared with {name}.")
+    return library.load(name, **(dict.fromkeys(sizes, shape[:2]) if shape and library.is_truth(name) else {}))

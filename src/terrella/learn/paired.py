@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from ..core.errors import DatasetError
+from ..data import Dataset, check_game
 from ..space.keyframes import Keyframes
 from ..worlds.generator import Generator
 from ..worlds.learned import LearnedWorld
@@ -56,7 +57,10 @@ def paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, report: 
     needs = ("rgb", *("depth", "pose") * config.geometry, *(THINGS,) * config.moving)
     needs += (OBJECTS, INSTANCES) * config.objects
     box = box_of(world.about.card.get("keep_out")) if keep_out is None else keep_out
-    recording = Recording.open(data, config.size, report, box, needs, f"{name} is shown that: record it as well")
+    dataset = Dataset(data)
+    if doubt := check_game(dataset, world.spec):
+        report(0, 1, doubt)
+    recording = Recording.open(dataset, config.size, report, box, needs, f"{name} is shown that: record it as well")
     found = recording.controls
     if found is None or (found.kind, found.numbers) != (controls.kind, controls.numbers):
         raise DatasetError(

@@ -42,7 +42,7 @@ class Recording:
 
     @staticmethod
     def open(
-        data: str | Path,
+        data: str | Path | Dataset,
         size: tuple[int, int] | None,
         report: Report,
         keep_out: Box | None = None,
@@ -53,14 +53,14 @@ class Recording:
         far a clip cache within its budget is kept here, for places are read in any order. Every 20th episode is held out, and so
         are the rows from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or
         rows."""
-        dataset = Dataset(data)
+        dataset = data if isinstance(data, Dataset) else Dataset(data)
         size = size or fitting(dataset)
         cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
         lacks = [name for name in needs if not there(cache, name)]
         if lacks:
-            raise DatasetError(f"{data} holds no {', '.join(lacks)}; {why}.")
+            raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
         if keep_out is not None and not there(cache, "pose"):
-            raise DatasetError(f"{data} has no poses, so no part of its map can be kept out; drop --keep-out.")
+            raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
         train, held_out = split(len(cache.episodes))
         found = Recording.of(cache, train, keep_out)
         return replace(found, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))

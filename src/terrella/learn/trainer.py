@@ -163,6 +163,17 @@ class Run:
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
         return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times)
 
+    def found(self, stage: str) -> dict | None:
+        """The facts of a stage that was begun; TrainingError where that had other settings, or was of another recording."""
+        found, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
+        old = (found or {}).get("recipe", {})
+        other = [f"{name} {old.get(name)}, not {recipe.get(name)}" for name in old if recipe.get(name) != old[name]]
+        if other:
+            raise TrainingError(
+                f"{self.out} holds a run with other settings ({'; '.join(other)}); repeat them, or give another --out."
+            )
+        return found
+
 
 class Trainer:
     """A stage of a run; it goes on where it was stopped, and ends after `steps` or `hours`, those of earlier runs counted in.
@@ -188,9 +199,7 @@ class Trainer:
         self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
         self.facts |= {"seconds": 0.0, "recent": []}
         self._file = resume_file(run.out, stage)
-        found = load_run(self._file, {}, {})
-        if found and found.get("recipe") != self.facts["recipe"]:
-            raise TrainingError(f"{run.out} holds a run with other settings; repeat them, or give another --out.")
+        found = run.found(stage)
         for module in objective.modules.values():
             module.to(self.device)
         if found:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ...core.errors import DatasetError, TrainingError
+from ...data import Dataset
 from ...space.keyframes import Keyframes
 from ...worlds.body import Motion, MotionBody
 from ...worlds.codec import COARSE, Codec, CodecConfig
@@ -107,8 +108,11 @@ def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: 
     if config.size and any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
-    recording = Recording.open(data, config.size, report, needs=("rgb", "action"), why=NEEDS)
-    run = Run.of(out, config, report, device, ("hours", "learning_rate"), frames=recording.cache.length)
+    dataset = Dataset(data)
+    facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
+    run = Run.of(out, config, report, device, ("hours", "learning_rate"), **facts)
+    run.found("flow")
+    recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=NEEDS)
     torch.manual_seed(config.seed)
     return _Learned(run, recording, config).learn()
 
@@ -268,6 +272,7 @@ class _Learned:
         name = recording.cache.world.get("name", source.root.name)
         return {
             "what": f"Learned from {source.length:,} frames of {name}",
+            "game": recording.cache.world.get("name"),
             "data": f"{recording.usable.sum():,} frames, {episodes} episodes",
             "steps": trainer.facts["step"] * self.flow.strides,
             "hours": round(trainer.facts["seconds"] / 3600, 2),
