@@ -15,6 +15,8 @@ from .space.estimator import Estimator
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+    from .sim.gymnasium import Adapter
+
 BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
 
@@ -85,6 +87,14 @@ def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:
     from .core.stable_baselines3 import WorldVecEnv
 
     return WorldVecEnv(world, num_envs, **options)
+
+
+def load_adapter(source: str) -> Adapter:
+    """The `adapter` of a Python file, or of "FILE.py:NAME" the object of that name: it says where an environment has depth, poses
+    and more (sim/gymnasium.py)."""
+    from .sim.opening import load_adapter
+
+    return load_adapter(source)
 
 
 def is_truth(name: str | Path) -> bool:

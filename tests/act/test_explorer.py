@@ -78,16 +78,3 @@ def test_it_fights_what_stands_in_sight_and_at_times_beside_the_mark():
     off = np.abs(off)
     assert len(off) > 200 and off.max() < 0.7  # in sight, always
     assert 0.4 < (off < 0.2).mean() < 0.8
-
-
-def test_a_world_without_depth_gets_held_random_actions():
-    spec = Spec("box", spaces.Box(-1, 1, (2,), np.float32), {"reward": spaces.Box(-1, 1, ())}, (), 0.1)
-    explorer, rng = Explorer(spec), make_rng(0)
-    memory, taken = explorer.begin(1, rng), []
-    for _ in range(300):
-        action, memory = explorer.act({}, memory, rng)
-        taken.append(action)
-    actions = torch.cat(taken)
-    spec.check_action(actions, 300)
-    runs = np.diff(np.flatnonzero((actions[1:] != actions[:-1]).any(1).numpy()))
-    assert runs.min() >= 3 and runs.max() <= 40 and len(runs) > 5

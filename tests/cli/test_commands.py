@@ -17,9 +17,10 @@ from terrella.core import make_rng
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
-    "record world": "--frames --human --json --live-mcap --out --pictures --port --seed --size",
-    "play": "--compare --device --estimator --fast --host --image --json --memory-mb --no-memory --policy --port --record "
-    "--remember --seed --token --truth",
+    "record world": "--action-names --adapter --fps --frames --human --idle --json --keys --live-mcap --out --pictures --port "
+    "--seed --size",
+    "play": "--action-names --compare --device --estimator --fast --host --idle --image --json --keys --memory-mb --no-memory "
+    "--policy --port --record --remember --seed --token --truth",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

@@ -10,7 +10,7 @@ from terrella.core import State, check_world, make_rng
 from terrella.core.errors import TerrellaError
 
 pytest.importorskip("ale_py", reason="Atari games need ale-py: pip install 'terrella[atari]'")
-from terrella.sim.atari import AtariWorld, keys_of
+from terrella.sim.atari import AtariWorld
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +70,6 @@ def test_with_sticky_actions_states_are_tickets():
     world = AtariWorld("ALE/Breakout-v5", sticky=0.25)
     assert not world.spec.forkable
     assert "stale_states_are_refused" in check_world(world, steps=4)
-
-
-def test_keys_reach_the_actions_of_the_game():
-    pong = ("NOOP", "FIRE", "RIGHT", "LEFT", "RIGHTFIRE", "LEFTFIRE")
-    keys = keys_of(pong)
-    assert keys["ArrowUp"] == keys["KeyW"] == [2.0] and keys["ArrowDown"] == [3.0] and keys["Space"] == [1.0]
-    four = keys_of(("NOOP", "UP", "RIGHT", "LEFT", "DOWN"))
-    assert [four[f"Arrow{way}"] for way in ("Up", "Right", "Left", "Down")] == [[1.0], [2.0], [3.0], [4.0]]
 
 
 def test_unknown_games_are_named():

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
-from ..core.policy import Random
 from ..core.spec import Spec
 from ..core.world import Observation
 from ..space.camera import yaw
+from .count_based import CountBased
 
 LEGS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
 _BODY_M = 0.55  # half the width that must be free to walk
@@ -66,21 +67,25 @@ class Explorer:
     In worlds with depth, pose and Doom's six movement buttons it goes where it has been least in this episode, by ways
     that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Where there is
     a channel `things` it walks up to them, and shoots at them with ATTACK; USE it tries on what is in its way. Elsewhere it
-    holds random actions for 3 to 40 steps. It knows nothing but the observations of its episode.
+    learns what its actions do and seeks what it has seldom seen (act/count_based.py; `log` and `recall` are its).
     """
 
-    def __init__(self, spec: Spec):
+    def __init__(self, spec: Spec, log: Path | None = None):
         self.spec = spec
         self._walks = set(LEGS) <= set(spec.action_names) and {"depth", "pose"} <= set(spec.channels)
-        self._random = Random(spec, (3, 40))
+        self._seeker = CountBased(spec, log)
+
+    def recall(self, steps: int) -> None:
+        """Goes on as after the first `steps` of the log."""
+        self._seeker.recall(steps)
 
     def begin(self, batch: int, rng: torch.Generator) -> list:
         """The memory of `batch` episodes: walks that have not begun, which `act` moves on in place."""
-        return [_Walk(rng, self.spec) for _ in range(batch)] if self._walks else self._random.begin(batch, rng)
+        return [_Walk(rng, self.spec) for _ in range(batch)] if self._walks else self._seeker.begin(batch, rng)
 
     def act(self, observation: Observation, memory: list, rng: torch.Generator) -> tuple[torch.Tensor, list]:
         if not self._walks:
-            return self._random.act(observation, memory, rng)
+            return self._seeker.act(observation, memory, rng)
         pressed = []
         for entry, walk in enumerate(memory):
             buttons = walk.next(_look(self.spec, {name: seen[entry : entry + 1] for name, seen in observation.items()}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
@@ -13,6 +14,29 @@ if TYPE_CHECKING:
 
 Device = Annotated[str, arg(help="cpu, cuda, mps, or auto: a GPU if there is one.")]
 Fast = Annotated[bool, arg(help="Draw with ONNX Runtime, or with a compiled graph on a GPU, if that is faster here.")]
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What a person says of a world's actions; the rest the world says, or it is chosen.
+
+    Args:
+        keys: Keys and their actions, by name or number: a=left d=right space=2, up+space=5 for both at once, w=0,1,0 of axes.
+        action_names: A name for every action, in order.
+        idle: The action that does nothing.
+    """
+
+    keys: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
+    idle: str | None = None
+
+    def of(self, world: World) -> World:
+        """The world, its spec with what was said."""
+        if self != Controls():
+            from ..core.keys import with_controls
+
+            world.spec = with_controls(world.spec, self.keys, self.action_names, self.idle)
+        return world
 
 
 def load_named(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:

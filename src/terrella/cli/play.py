@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from .named import Device, Fast, load_named
+from .named import Controls, Device, Fast, load_named
 from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 def play(
     name: Positional[str],
+    controls: Controls,
     image: Path | None = None,
     compare: bool = False,
     truth: str | None = None,
@@ -57,6 +58,7 @@ def play(
         raise TerrellaError("--image cannot be compared with a game, which cannot go on from it; leave --compare out.")
     if compare:
         worlds = [_game_like(learned, truth), learned]
+    worlds = [controls.of(world) for world in worlds]
     sink = None
     if record is not None:
         from ..data import Layout, Recorder

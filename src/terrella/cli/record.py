@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from .. import progress
+from ..core.spec import BUTTONS, CHOICE, Spec, can_idle, neutral_action
+from .named import Controls
 from .say import Json, Port, Seed, result, say
 
 if TYPE_CHECKING:
@@ -59,25 +61,40 @@ def record_doom(
 def record_world(
     name: Positional[str],
     recording: Recording,
+    controls: Controls,
     frames: int = 10_000,
     size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    adapter: str | None = None,
     pictures: Literal["auto", "png", "video"] = "auto",
 ) -> None:
-    """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5) or a learned world.
+    """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or a learned world.
 
     Args:
         name: A name that `terrella list` shows, or the path of a checkpoint.
         frames: Frames to record in all. With --human there is no limit.
         size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
+        fps: Steps a second of a Gymnasium environment; default: as it says, or 10.
+        adapter: A Python file (FILE.py or FILE.py:NAME) with an Adapter that says where depth, poses and more are found.
         pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above.
     """
     from .. import library
     from ..core.errors import TerrellaError
 
-    if size is not None and not name.startswith("gym:"):
-        raise TerrellaError("--size is for Gymnasium environments; other worlds show the size that they show.")
+    if fps is not None and not 0 < fps < 10_000:
+        raise TerrellaError(
+            f"--fps {fps:g} is no number of steps a second; say how many a person plays, as in --fps 15."
+        )
+    if name.startswith("gym:ALE/") and (fps or adapter):
+        raise TerrellaError("Atari games have a clock and names of their own; leave --fps and --adapter out.")
     options: dict[str, Any] = {"size": size} if size else {}
-    world = library.load(name, **options)
+    options |= {"dt_s": 1 / fps} if fps else {}
+    options |= {"adapter": library.load_adapter(adapter)} if adapter else {}
+    if options and not name.startswith("gym:"):
+        raise TerrellaError("--size, --fps and --adapter are for Gymnasium environments; other worlds are as they are.")
+    world = controls.of(library.load(name, **options))
+    for line in _described(world.spec):
+        say(line)
     if pictures == "auto":
         drawn = world.spec.channels.get("rgb")
         pictures = "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
@@ -88,7 +105,7 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
     from ..act.explorer import Explorer
     from ..core.errors import DatasetError
     from ..core.world import make_rng
-    from ..data import Dataset, Layout, Recorder, record
+    from ..data import Dataset, Layout, Recorder, coverage, record
 
     layout, out = replace(Layout.of(world.spec), pictures=pictures), recording.out
     facts: dict[str, object] = {"dataset": str(out)}
@@ -103,7 +120,11 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
             serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed)
         else:
             with progress.shown("recording") as report:
-                player, rng = Explorer(world.spec), make_rng(recording.seed)
+                player, rng = Explorer(world.spec, out / ".explorer"), make_rng(recording.seed)
+                kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
+                player.recall(
+                    kept.length - len(kept.episodes) if kept else 0
+                )  # each episode ends with a row without action
                 done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out) if out.exists() else None
@@ -119,7 +140,48 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
     facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
     if dataset.has("rgb"):
         facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
+        covered = coverage(dataset)
+        facts |= covered.facts()
+        for warning in covered.warnings():
+            say(f"Warning: {warning}")
     result(facts, recording.json)
+
+
+def _described(spec: Spec) -> list[str]:
+    """What is recorded, and of each choice that nobody made on the command line who made it."""
+    from ..data.recording import LONGEST
+
+    how = spec.card.get("how")
+    told = lambda what: f" ({how[what]})" if isinstance(how, dict) and what in how else ""  # noqa: E731
+    drawn, names = spec.channels.get("rgb"), spec.action_names
+    height, width = (drawn.shape or (0, 0))[:2] if drawn is not None else (0, 0)
+    limit = (
+        f"{spec.max_episode_steps:,} steps, its time limit"
+        if spec.max_episode_steps
+        else f"{LONGEST:,} steps, as it has no limit"
+    )
+    keys = ", ".join(f"{key} {_meant(spec, action)}" for key, action in spec.keys.items() if "+" not in key)
+    rest = _meant(spec, neutral_action(spec).reshape(-1).tolist())
+    return [
+        f"{spec.name}: pictures of {height}x{width} (--size)" if drawn is not None else
+        f"{spec.name} shows no pictures: the recording holds numbers alone, of which no world can be trained that is seen.",
+        f"{1 / spec.dt_s:g} steps a second{told('frame rate')}; episodes of up to {limit}.",
+        f"Actions: {', '.join(names) or spec.action}{told('action names')}; at rest: "
+        + (rest if can_idle(spec) else f"{rest}, as none is said to do nothing (--idle)"),
+        f"Keys: {keys or 'none (--keys)'}{told('keys')}",
+    ]  # fmt: skip
+
+
+def _meant(spec: Spec, action: list[float]) -> str:
+    """The name of a flat action, or its numbers."""
+    low, _ = spec.action_limits
+    if spec.action_mode == CHOICE and len(action) == 1:
+        at = int(action[0] - low)
+        return spec.action_names[at] if at < len(spec.action_names) else str(int(action[0]))
+    named = [name for name, value in zip(spec.action_names, action) if value]
+    if spec.action_mode == BUTTONS and spec.action_names:
+        return "+".join(named) or "none"
+    return ",".join(f"{value:g}" for value in action)
 
 
 @contextmanager

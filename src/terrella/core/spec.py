@@ -5,7 +5,7 @@ Importing this needs no torch, so that people who only convert and mend recordin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ NO_MOUNT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 BUTTONS, CHOICE = "buttons", "choice"
 AXES = ("axes", "position", "velocity", "torque", "pose_delta")  # what the numbers of a Box may mean
 MODES = (BUTTONS, CHOICE, *AXES)
+_IDLE = {"noop", "idle", "none", "stay", "nothing", "donothing", "noaction", "wait", "still", "pass", "noopaction"}
 
 
 def shape_of(space: spaces.Space) -> tuple[int, ...]:
@@ -99,6 +100,7 @@ class Spec:
     max_episode_steps: steps after which whoever trains in the world cuts an episode off (truncates it); None for no limit.
     differentiable: True where gradients flow from the channels through `imagine` to the action.
     card:         free facts for people: training data, hardware, scores.
+    idle:         the flat action that does nothing, where there is one and neither its name nor its mode says which.
     """
 
     name: str
@@ -119,6 +121,7 @@ class Spec:
     differentiable: bool = False
     card: Mapping[str, object] = field(default_factory=dict)
     may_observe: tuple[str, ...] = ()
+    idle: tuple[float, ...] = ()
 
     def __post_init__(self):
         if not self.action_mode:
@@ -197,14 +200,25 @@ class Spec:
         )
 
 
+def idle_name(names: Sequence[str]) -> int | None:
+    """Which of the names is called doing nothing; None where none is."""
+    plain = ["".join(filter(str.isalpha, name.lower())) for name in names]
+    return next((at for at, name in enumerate(plain) if name in _IDLE), None)
+
+
+def can_idle(spec: Spec) -> bool:
+    """Whether there is an action that does nothing; a choice must be named so, or told."""
+    return spec.action_mode != CHOICE or bool(spec.idle) or idle_name(spec.action_names) is not None
+
+
 def neutral_action(spec: Spec) -> np.ndarray:
-    """The action [*action.shape] that does least: no button, the first choice that is called a no-op or else the first,
-    axes at 0 or at the limit nearest to it."""
+    """The action [*action.shape] that does least: what the spec says, no button, the first choice that is called a no-op or
+    else the first, axes at 0 or at the limit nearest to it."""
     low, high = spec.action_limits
+    if spec.idle:
+        return np.asarray(spec.idle, dtype_of(spec.action)).reshape(shape_of(spec.action))
     if spec.action_mode == CHOICE and np.ndim(low) == 0:
-        names = [name.lower() for name in spec.action_names]
-        idle = next((at for at, name in enumerate(names) if name in ("noop", "no-op", "idle", "none", "stay")), 0)
-        return np.asarray(low + idle, dtype_of(spec.action))
+        return np.asarray(low + (idle_name(spec.action_names) or 0), dtype_of(spec.action))
     return np.clip(np.zeros(shape_of(spec.action)), low, high).astype(dtype_of(spec.action))
 
 

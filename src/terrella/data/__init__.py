@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from .channels import check_game
+from .coverage import Coverage, coverage
 from .dataset import Dataset
 from .format import Layout
 from .meta import Episode
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ClipCache",
     "Clips",
+    "Coverage",
     "Dataset",
     "Episode",
     "Layout",
@@ -32,6 +34,7 @@ __all__ = [
     "Source",
     "Take",
     "check_game",
+    "coverage",
     "record",
     "split",
 ]

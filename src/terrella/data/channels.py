@@ -140,6 +140,8 @@ def facts_of(spec: Spec) -> dict[str, object]:
         "action_mode": spec.action_mode,
         "action_frame": spec.action_frame,
         "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
+        "idle": [float(number) for number in spec.idle],
+        "max_episode_steps": spec.max_episode_steps,
         "units": dict(spec.units),
         "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
         **limits,

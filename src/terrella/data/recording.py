@@ -16,6 +16,8 @@ from ..core.world import Observation, World, make_rng
 from .format import Layout
 from .recorder import Recorder, Watch
 
+LONGEST = 1050  # steps of an episode in worlds that have no limit
+
 
 def record(
     world: World,
@@ -25,14 +27,15 @@ def record(
     rng: torch.Generator,
     progress: Callable[[int, int], None] | None = None,
     fps: float | None = None,
-    max_episode_steps: int = 1050,
+    max_episode_steps: int | None = None,
     task: str | None = None,
     live: Watch | None = None,
     pictures: Literal["video", "png"] = "video",
 ) -> Recorder:
     """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
 
-    An episode ends at `done` or after `max_episode_steps`. Each episode has a generator of its own, drawn from `rng`'s
+    An episode ends at `done` or after `max_episode_steps`, by default the world's own limit, or LONGEST.
+    Each episode has a generator of its own, drawn from `rng`'s
     seed and the episode's number, so that a run that was killed and started again with the same seed records the same
     as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to; `pictures` as in Layout.
     Returns the closed recorder (its rows and episodes can be read). DatasetError as Recorder raises it; what was
@@ -40,6 +43,8 @@ def record(
     """
     if frames < 2:
         raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
+    if max_episode_steps is None:
+        max_episode_steps = world.spec.max_episode_steps or LONGEST
     if max_episode_steps < 1:
         raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
     layout = replace(Layout.of(world.spec, fps), pictures=pictures)

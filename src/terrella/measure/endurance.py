@@ -12,11 +12,12 @@ import numpy as np
 import torch
 
 from ..core.policy import Idle, Policy, Replay
+from ..core.spec import can_idle
 from ..core.world import World
 from .album import Album, look
 from .clips import Clip
 from .exam import Exam, Found, Probe
-from .roll import Results, Tick, can_idle, fold_context, rows_at
+from .roll import Results, Tick, fold_context, rows_at
 from .scorecard import COPY_LAST, IDLE, PREDICTED, Curve, Picture, Report, Row
 from .statistics import Band, Figure, ratio_band, ratio_interval
 from .work import UNSEEN, Unit

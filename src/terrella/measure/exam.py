@@ -13,10 +13,11 @@ import numpy as np
 import torch
 
 from ..core.errors import ObservationError
+from ..core.spec import can_idle
 from ..core.world import World, make_rng
 from .album import Album
 from .clips import Clip
-from .roll import Results, Watch, can_idle, dream, fold_context, poses_at
+from .roll import Results, Watch, dream, fold_context, poses_at
 from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report, words_of
 from .work import Unit
 

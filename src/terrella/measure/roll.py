@@ -10,7 +10,6 @@ import torch
 
 from ..core.errors import DatasetError
 from ..core.policy import Idle, Policy, Replay, act
-from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
 from .clips import Clip, evidence
@@ -44,12 +43,6 @@ def actions_at(world: World, clips: Sequence[Clip], row: int) -> torch.Tensor:
     """The recorded action of row `row` of each clip: [B, *spec.action.shape]."""
     actions = torch.from_numpy(np.stack([np.asarray(clip.action[row]) for clip in clips]))
     return actions.reshape(len(clips), *(world.spec.action.shape or ()))
-
-
-def can_idle(spec: Spec) -> bool:
-    """Whether there is an action that does nothing; a choice must be named so."""
-    names = {name.lower() for name in spec.action_names}
-    return spec.action_mode != "choice" or bool(names & {"noop", "no-op", "idle", "none", "stay"})
 
 
 def policy_of(

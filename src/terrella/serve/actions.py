@@ -48,7 +48,7 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
     the neutral action. Keys that the world does not know count as nothing, values beyond its limits as the limit.
     """
     space = spec.action
-    rows = [np.asarray(spec.keys[code], np.float64) for code in held if code in spec.keys]
+    rows = [np.asarray(spec.keys[code], np.float64) for code in [*held, *_together(spec, held)] if code in spec.keys]
     flat = neutral_action(spec).ravel().astype(np.float64)
     if isinstance(space, spaces.Box):
         given = np.asarray(axes, np.float64)[: flat.size]
@@ -63,3 +63,12 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
     elif rows:
         flat = np.max(rows, axis=0) if isinstance(space, spaces.MultiBinary) else rows[-1]
     return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
+
+
+def _together(spec: Spec, held: Sequence[str]) -> list[str]:
+    """The combinations of keys ("ArrowUp+Space") that are held, those of most keys last; a key that does the same as another
+    counts as that."""
+    same = {tuple(action): code for code, action in reversed(list(spec.keys.items()))}
+    down = {*held, *(same[tuple(spec.keys[code])] for code in held if code in spec.keys)}
+    found = [code for code in spec.keys if "+" in code and down.issuperset(code.split("+"))]
+    return sorted(found, key=lambda code: code.count("+"))

@@ -11,12 +11,11 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
 from ..core.errors import TerrellaError
-from .gymnasium import Adapter, GymnasiumWorld, check_size, resized
+from .gymnasium import Adapter, GymnasiumWorld, check_size
+from .seeing import resized
 from .snapshot import NotCopyable
 
 FRAMES_PER_SECOND = 60
-_ARROWS = {"ArrowUp": "UP", "ArrowDown": "DOWN", "ArrowLeft": "LEFT", "ArrowRight": "RIGHT", "Space": "FIRE"}
-_LETTERS = {"KeyW": "ArrowUp", "KeyS": "ArrowDown", "KeyA": "ArrowLeft", "KeyD": "ArrowRight"}
 
 
 class AtariWorld(GymnasiumWorld):
@@ -60,18 +59,8 @@ class AtariWorld(GymnasiumWorld):
             snapshots=_Savestates,
             info_channels=("lives",),
             name=f"gym:{game}",
-            adapter=Adapter(action_names=names, keys=keys_of(names)),
+            adapter=Adapter(action_names=names),
         )
-
-
-def keys_of(names: Sequence[str]) -> dict[str, list[float]]:
-    """Arrow keys, WASD and the space bar for the actions of these names (NOOP, FIRE, UP, RIGHT, ...); a game that moves
-    along one axis listens to both pairs of arrows."""
-    found = {key: [float(names.index(name))] for key, name in _ARROWS.items() if name in names}
-    for key, other in (("ArrowUp", "RIGHT"), ("ArrowDown", "LEFT"), ("ArrowLeft", "DOWN"), ("ArrowRight", "UP")):
-        if key not in found and other in names:
-            found[key] = [float(names.index(other))]
-    return found | {letter: found[arrow] for letter, arrow in _LETTERS.items() if arrow in found}
 
 
 def _make(game: str, sticky: float) -> gymnasium.Env:

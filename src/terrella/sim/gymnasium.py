@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -14,25 +12,28 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from PIL import Image
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, REWARD, Camera, Spec
+from ..core.spec import DONE, REWARD, Camera, Spec, kind_of
 from ..core.state import State
 from ..core.world import make_rng
+from .opening import build, explained, picture_size
 from .processes import MOST, Processes
+from .seeing import check_space, followed, parts_of, resized, space_of
 from .snapshot import NotCopyable, Snapshots
+from .told import Told, told_by
 
-_KNOWN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 _TRIALS, _TRIAL_STEPS = 3, 40
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel that an environment can show: `read(env)` gives one value [*space.shape] of the environment as it now stands."""
+    """A channel that an environment can show: `read(env)` gives one value [*space.shape] of the environment as it now stands.
+    `read` may be the way to it: "info.depth" (a key of `info`), "camera.pose" (attributes, methods too). Without a space,
+    that of the first value."""
 
-    read: Callable[[gymnasium.Env], np.ndarray | float]
-    space: spaces.Space
+    read: Callable[[gymnasium.Env], np.ndarray | float] | str
+    space: spaces.Space | None = None
     unit: str = ""
 
 
@@ -52,7 +53,7 @@ class Adapter:
     channels: name -> Channel. depth: metres along the optical axis; pose: x, y, z in metres and quaternion w, x, y, z of
               T_world_cam, world z up, camera x forward, y left, z up; "rgb.wrist" and the like are further cameras.
     cameras:  picture channel -> Camera.
-    action_names, action_units, action_mode, action_frame, keys: as in Spec.
+    action_names, action_units, action_mode, action_frame, keys, idle: as in Spec; what is left out, the environment is asked.
     """
 
     channels: Mapping[str, Channel] = field(default_factory=dict)
@@ -62,6 +63,7 @@ class Adapter:
     action_mode: str = ""
     action_frame: str = ""
     keys: Mapping[str, list[float]] | None = None
+    idle: tuple[float, ...] = ()
 
 
 class GymnasiumWorld:
@@ -70,7 +72,8 @@ class GymnasiumWorld:
     env:      an id, which is made without its time limit (that is Spec.max_episode_steps, which `as_env` keeps),
               or a function that returns a new environment each time it is called.
     rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array". Where its observation is
-              a picture already (uint8 [H, W, 3]), that is `rgb`, and takes the place of `observation`.
+              a picture already (uint8 or floats up to 1, [H, W, 3], [3, H, W] or grey), that is `rgb`, and takes the place of
+              `observation`. Of a dictionary each entry that is an array is a channel.
     size:     (height, width) to which rgb is area-averaged; None leaves it as it is drawn.
     info_channels: numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
     forkable: None finds out: an environment whose Python state is plain numbers is copied between two instances on
@@ -80,13 +83,13 @@ class GymnasiumWorld:
     name:     for the spec, where the environment's own says too little.
     adapter:  further channels (depth, pose, more cameras) and what actions mean; by default the attribute `terrella` of
               the environment, where it has one.
-    dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second.
+    dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second, else 0.1.
     options:  handed to gymnasium.make.
 
     Channels: observation [B, *shape], reward float32 [B], done bool [B] (terminated, or truncated by the environment
     itself; then the state's `truncated` says so), rgb uint8 [B, H, W, 3]. After `done` the world stands still with reward 0.
-    Chance comes from `rng`: at `start`, and where states are values at each `imagine` too.
-    Raises TerrellaError for unknown ids and for Dict or Tuple spaces.
+    Chance comes from `rng`: at `start`, and where states are values at each `imagine` too. spec.card["how"] says what is known
+    from where. Raises TerrellaError, a sentence, for what cannot be found, made, reset or drawn, and for Tuple spaces.
     """
 
     def __init__(
@@ -104,25 +107,16 @@ class GymnasiumWorld:
         **options,
     ):
         self._lock = threading.Lock()  # one environment serves all episodes, so only one may move at a time
-        self._env, found = _build(env, rgb, options)
-        name, self._size, self._info = name or found, check_size(size), tuple(info_channels)
-        for space in (self._env.observation_space, self._env.action_space):
-            if not isinstance(space, _KNOWN_SPACES):
-                raise TerrellaError(
-                    f"{name} has the space {space}; wrap it so that it is one array (FlattenObservation)."
-                )
-        self._pictured = rgb and _is_picture(self._env.observation_space)
-        self._env.reset(seed=0)
+        self._env, found = build(env, rgb, options)
+        self._name, self._size, self._info = name or found, check_size(size), tuple(info_channels)
+        check_space(self._env.action_space, self._name)
+        drawn = rgb and self._env.render_mode == "rgb_array"
+        self._parts = parts_of(self._env.observation_space, self._name, rgb, drawn)
+        with explained(self._name, "reset"):
+            self._env.reset(seed=0)
         self._snapshots, self._viewer = None, self._env
         if forkable is not False:
-            twin, _ = _build(env, rgb, options)
-            self._snapshots, why = _try_copying(self._env, twin, snapshots or Snapshots)
-            if self._snapshots is not None:
-                self._viewer = twin
-            else:
-                twin.close()
-                if forkable:
-                    raise TerrellaError(f"{name} cannot be copied ({why}); leave out forkable=True.")
+            self._copied(build(env, rgb, options)[0], snapshots or Snapshots, bool(forkable))
         self._ticket = 0
         self._processes: Processes | None = None
         same = {
@@ -134,12 +128,27 @@ class GymnasiumWorld:
             "adapter": adapter,
         }
         self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
-        self._env.reset(seed=0)
-        self._adapter = adapter or getattr(self._env.unwrapped, "terrella", None) or Adapter()
+        seen, info = self._env.reset(seed=0)
+        adapter = adapter or getattr(self._env.unwrapped, "terrella", Adapter())
+        settled = {at: self._settled(at, channel, info) for at, channel in adapter.channels.items()}
+        self._adapter = replace(adapter, channels=settled)
+        self._kept = {at: one.read for at, one in settled.items() if str(one.read).startswith("info.")}
+        self._drawn = self._picture_size(seen, rgb)
+        self.spec = self._describe(told_by(self._env, adapter.action_names), dt_s)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
-        self.spec = self._describe(name, dt_s, rgb, limit)
+        self.spec = replace(self.spec, max_episode_steps=limit if limit and limit > 0 else None)
+
+    def _copied(self, twin: gymnasium.Env, copier: Callable, must: bool) -> None:
+        self._snapshots, why = _try_copying(self._env, twin, copier)
+        if self._snapshots is not None:
+            self._viewer = twin
+            twin.reset(seed=0)
+            return
+        twin.close()
+        if must:
+            raise TerrellaError(f"{self._name} cannot be copied ({why}); leave out forkable=True.")
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` resets of the environment, seeded from `rng`."""
@@ -204,14 +213,15 @@ class GymnasiumWorld:
             self._processes.close()
 
     def _row(self, observation, reward, terminated, truncated, info: Mapping) -> dict[str, np.ndarray]:
-        space = self._env.observation_space
-        seen = np.array(observation, dtype=space.dtype).reshape(space.shape)
-        row = {
-            **({"rgb": resized(seen, self._size)} if self._pictured else {"observation": seen}),
+        row: dict[str, Any] = {name: part.read(observation, self._name) for name, part in self._parts.items()}
+        if "rgb" in row:
+            row["rgb"] = self._sized(row["rgb"])
+        row |= {
             "reward": np.float32(reward),
             "done": np.bool_(terminated or truncated),
             "truncated": np.bool_(truncated and not terminated),
             **{name: np.float32(info[name]) for name in self._info},
+            **{name: self._fitting(name, followed(None, info, str(path))) for name, path in self._kept.items()},
         }
         if self._snapshots is not None:
             try:
@@ -255,59 +265,75 @@ class GymnasiumWorld:
 
     def look(self, name: str) -> np.ndarray:
         """One channel of the environment as it now stands."""
-        space, channel = self.spec.channels[name], self._adapter.channels.get(name)
-        drawn = np.asarray(self._viewer.render() if channel is None else channel.read(self._viewer.unwrapped))
-        seen = np.array(resized(drawn, self._size) if channel is None else drawn, space.dtype)
-        if seen.shape != space.shape:
-            raise TerrellaError(f"{self.spec.name} gave '{name}' of shape {seen.shape}; its space is {space}.")
-        return seen
+        channel, bare = self._adapter.channels.get(name), self._viewer.unwrapped
+        if channel is None:
+            return self._fitting(name, self._sized(np.asarray(self._viewer.render())))
+        return self._fitting(
+            name, followed(bare, {}, channel.read) if isinstance(channel.read, str) else channel.read(bare)
+        )
 
-    def _describe(self, name: str, dt_s: float | None, rgb: bool, limit: int | None) -> Spec:
-        channels = {} if self._pictured else {"observation": self._env.observation_space}
+    def _sized(self, picture: np.ndarray) -> np.ndarray:
+        if self._size is None and picture.shape[:2] != self._drawn:
+            now, before = ("x".join(map(str, (size or ())[:2])) for size in (picture.shape, self._drawn))
+            raise TerrellaError(
+                f"the pictures of {self._name} change their size, from {before} to {now}; give one for all (--size 64 64)."
+            )
+        return resized(picture, self._size)
+
+    def _fitting(self, name: str, value: Any) -> np.ndarray:
+        space = self.spec.channels[name]
+        array = np.array(value, space.dtype)
+        if array.shape != space.shape:
+            raise TerrellaError(f"{self.spec.name} gave '{name}' of shape {array.shape}; its space is {space}.")
+        return array
+
+    def _settled(self, name: str, channel: Channel, info: Mapping) -> Channel:
+        """The channel with a space, if need be that of its present value."""
+        if channel.space is not None:
+            return channel
+        try:
+            bare, read = self._env.unwrapped, channel.read
+            value = followed(bare, info, read) if isinstance(read, str) else read(bare)
+            return replace(channel, space=space_of(value, kind_of(name)))
+        except TerrellaError as error:
+            raise TerrellaError(f"the channel '{name}' of {self._name} cannot be read: {error}") from error
+
+    def _picture_size(self, observation: Any, rgb: bool) -> tuple[int, int] | None:
+        """(height, width) of the pictures as they come; None without any."""
+        if "rgb" in self._parts:
+            height, width = self._parts["rgb"].read(observation, self._name).shape[:2]
+            return height, width
+        return picture_size(self._viewer, self._name) if rgb else None
+
+    def _describe(self, told: Told, dt_s: float | None) -> Spec:
+        channels = {name: part.space for name, part in self._parts.items() if name != "rgb"}
         channels |= {"reward": REWARD, "done": DONE}
         channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}
-        drawn = (
-            self._env.observation_space.shape[:2] if self._pictured else _picture_size(self._viewer) if rgb else None
-        )
-        if drawn is not None:
-            channels["rgb"] = spaces.Box(0, 255, (*(self._size or drawn), 3), np.uint8)
+        if self._drawn is not None:
+            channels["rgb"] = spaces.Box(0, 255, (*(self._size or self._drawn), 3), np.uint8)
         if self._snapshots is not None:
             self._width = (len(self._snapshots.take(self._env)[0]),)
         more = self._adapter
-        channels |= {name: channel.space for name, channel in more.channels.items()}
+        channels |= {at: channel.space for at, channel in more.channels.items() if channel.space is not None}
+        what = f"the Gymnasium environment {self._name.removeprefix('gym:')}"
         return Spec(
-            name=name,
+            name=self._name,
             action=self._env.action_space,
             channels=channels,
             observes=(),
-            dt_s=dt_s or _step_seconds(self._env),
+            dt_s=dt_s or told.dt_s,
             units={name: channel.unit for name, channel in more.channels.items() if channel.unit},
             cameras=more.cameras,
-            action_names=more.action_names,
+            action_names=told.names,
             action_units=more.action_units,
             action_mode=more.action_mode,
             action_frame=more.action_frame,
-            keys=more.keys if more.keys is not None else _arrow_keys(self._env.action_space),
+            keys=more.keys if more.keys is not None else told.keys,
             forkable=self._snapshots is not None,
             max_batch=None if self._snapshots is not None else MOST,
-            max_episode_steps=limit,
-            card={"what": f"the Gymnasium environment {name.removeprefix('gym:')}", "kind": "simulator"},
+            card={"what": what, "kind": "simulator", "how": told.how},
+            idle=tuple(more.idle),
         )
-
-
-def _build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> tuple[gymnasium.Env, str]:
-    if callable(env):
-        built = env()
-        return built, f"gym:{built.spec.id if built.spec else type(built.unwrapped).__name__}"
-    options = {"max_episode_steps": -1, "disable_env_checker": True, **options}
-    try:
-        built = gymnasium.make(env, **options)
-        if rgb and "rgb_array" in (built.metadata.get("render_modes") or ()):
-            built.close()
-            built = gymnasium.make(env, render_mode="rgb_array", **options)
-        return built, f"gym:{env}"
-    except (gymnasium.error.Error, ImportError, TypeError) as error:
-        raise TerrellaError(f"Gymnasium cannot make '{env}': {error}") from error
 
 
 def _seeds(count: int, rng: torch.Generator) -> list[int]:
@@ -339,7 +365,7 @@ def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> t
                 for each in (env, twin):
                     _reseed(each, seed)
                     seen, reward, terminated, truncated, _ = each.step(action)
-                    lives.append((np.asarray(seen).tobytes(), reward, terminated, truncated, snapshots.take(each)))
+                    lives.append((_bytes(seen), reward, terminated, truncated, snapshots.take(each)))
                 if lives[0] != lives[1]:
                     return None, "a copy of it does not live the same life"
                 if terminated or truncated:
@@ -347,6 +373,13 @@ def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> t
     except NotCopyable as error:
         return None, str(error)
     return snapshots, ""
+
+
+def _bytes(seen: Any) -> Any:
+    """An observation as what can be compared."""
+    if isinstance(seen, Mapping):
+        return [(key, _bytes(value)) for key, value in seen.items()]
+    return np.asarray(seen).tobytes()
 
 
 def check_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
@@ -357,57 +390,3 @@ def check_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
     if not sound:
         raise TerrellaError(f"a picture of {tuple(size)} pixels cannot be: size is (height, width), 1 to 4096 each.")
     return int(size[0]), int(size[1])
-
-
-def _is_picture(space: gymnasium.Space) -> bool:
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3 and space.shape[2] == 3
-
-
-def resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """uint8 [H, W, 3] -> uint8 [*size, 3], each pixel the mean of the area that it covers."""
-    if size is None or picture.shape[:2] == tuple(size):
-        return picture
-    return np.asarray(Image.fromarray(picture).resize((size[1], size[0]), Image.Resampling.BOX))
-
-
-def _picture_size(env: gymnasium.Env) -> tuple[int, int] | None:
-    """(height, width) of the picture that a freshly reset environment draws, or None."""
-    if env.render_mode != "rgb_array":
-        return None
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would go to stdout, among our results
-    try:
-        picture = env.render()
-    except gymnasium.error.DependencyNotInstalled:
-        return None
-    if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
-        return None
-    return picture.shape[0], picture.shape[1]
-
-
-def _step_seconds(env: gymnasium.Env) -> float:
-    for name in ("dt", "tau"):
-        seconds = getattr(env.unwrapped, name, None)
-        if isinstance(seconds, float) and 0 < seconds < math.inf:
-            return seconds
-    return 1 / (env.metadata.get("render_fps") or 1)
-
-
-def _arrow_keys(action: gymnasium.Space) -> dict[str, list[float]]:
-    """Left and right as the first and the last choice, or as the ends of the first axis; of several axes, up and down are
-    the ends of the second, or, where that knows no backwards (a throttle), up is the second and down the third (a brake)."""
-    if isinstance(action, spaces.Discrete):
-        return {"ArrowLeft": [float(action.start)], "ArrowRight": [float(action.start + action.n - 1)]}
-    if not (isinstance(action, spaces.Box) and len(action.shape) == 1 and action.is_bounded()):
-        return {}
-
-    def only(axis: int, value: float) -> list[float]:
-        return [float(value) if place == axis else 0.0 for place in range(action.shape[0])]
-
-    keys = {"ArrowLeft": only(0, action.low[0]), "ArrowRight": only(0, action.high[0])}
-    if action.shape[0] > 1:
-        back = 1 if action.low[1] < 0 else 2
-        keys["ArrowUp"] = only(1, action.high[1])
-        if back < action.shape[0]:
-            keys["ArrowDown"] = only(back, action.low[1] if back == 1 else action.high[back])
-    rest = np.zeros(action.shape)
-    return keys if bool((action.low <= rest).all() and (rest <= action.high).all()) else {}

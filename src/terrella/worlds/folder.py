@@ -68,7 +68,8 @@ def save_world(
         "name": about.name,
         "about": {
             "controls": asdict(about.controls), "dt_s": about.dt_s, "action_names": list(about.action_names),
-            "keys": dict(about.keys), "ignored": list(about.ignored),
+            "keys": dict(about.keys), "ignored": list(about.ignored), "idle": list(about.idle),
+            "max_episode_steps": about.max_episode_steps,
         },
         "parts": {name: {"kind": part.kind, "config": _plain(part.config)} for name, part in world.parts.items()},
         "card": dict(about.card if card is None else card),
@@ -114,6 +115,7 @@ def load_world(
         told = about["about"]
         controls = _settings(Controls, told["controls"])
         names = tuple(told["action_names"]), told["keys"], about["card"], tuple(told["ignored"])
+        names = *names, tuple(told.get("idle", ())), told.get("max_episode_steps")
         world = LearnedWorld(About(about["name"], controls, told["dt_s"], *names), **made)
     except DAMAGE as error:
         raise CheckpointError(

@@ -51,6 +51,8 @@ class About:
     keys: Mapping[str, list[float]] = field(default_factory=dict)
     card: Mapping[str, object] = field(default_factory=dict)
     ignored: tuple[str, ...] = ()
+    idle: tuple[float, ...] = ()
+    max_episode_steps: int | None = None
 
 
 @final
@@ -170,6 +172,8 @@ class LearnedWorld:
             units={name: unit for part in said for name, unit in part.units.items()},
             action_names=tuple(about.action_names),
             keys=about.keys,
+            idle=about.idle,
+            max_episode_steps=about.max_episode_steps,
             cameras={"rgb": Camera(scene.camera, self.size)} if scene.camera else {},
             action_units=about.controls.units,
             action_mode=about.controls.mode,

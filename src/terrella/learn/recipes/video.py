@@ -244,7 +244,8 @@ class _Learned:
         names = about.get("action_names") or cache.action_names  # of a choice, the recording names each
         named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
         assert recording.controls is not None  # see NEEDS
-        what = About(self.config.name, recording.controls, *named, ignored=recording.ignored)
+        limits = {"idle": tuple(about.get("idle", ())), "max_episode_steps": about.get("max_episode_steps")}
+        what = About(self.config.name, recording.controls, *named, ignored=recording.ignored, **limits)
         generator = copy.deepcopy(self.flow.smooth.module).cpu().float()
         usual = float(np.median(self.happened.reward))
         if self.memory is None:

@@ -13,7 +13,7 @@ export function plan(keys) {
   const turn = turns ? { left: 'ArrowLeft', right: 'ArrowRight' } : null;
   const same = (a, b) => keys[a].every((value, index) => value === keys[b][index]);
   const used = [...Object.values(stick), ...Object.values(turn ?? {})].filter(Boolean);
-  const extra = Object.keys(keys).filter((code) => !used.some((other) => same(code, other)));
+  const extra = Object.keys(keys).filter((code) => !code.includes('+') && !used.some((other) => same(code, other)));
   return { stick, turn, extra };
 }
 

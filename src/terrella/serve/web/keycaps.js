@@ -25,6 +25,7 @@ export function drawKeycaps(root, world) {
   const groups = [0, 1, 2].map((number) => Object.assign(document.createElement('div'), { className: `cluster cluster-${number}` }));
   const caps = new Map();
   for (const code of Object.keys(world.keys)) {
+    if (code.includes('+')) continue; // several keys at once
     const cap = document.createElement('kbd');
     const letter = document.createElement('b'), meaning = document.createElement('i');
     letter.textContent = keyLabel(code);
