@@ -166,8 +166,11 @@ class Run:
     def found(self, stage: str) -> dict | None:
         """The facts of a stage that was begun; TrainingError where that had other settings, or was of another recording."""
         found, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
-        old = (found or {}).get("recipe", {})
-        other = [f"{name} {old.get(name)}, not {recipe.get(name)}" for name in old if recipe.get(name) != old[name]]
+        old = recipe if found is None else found.get("recipe", {})
+        both = {**old, **recipe}
+        other = [
+            f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)
+        ]
         if other:
             raise TrainingError(
                 f"{self.out} holds a run with other settings ({'; '.join(other)}); repeat them, or give another --out."

@@ -159,4 +159,6 @@ class Codec(nn.Module):
 
 def likeliest(logits: torch.Tensor) -> torch.Tensor:
     """Of choices [B, K, ...] the first, to stay, where it is likelier than all others together; else the likeliest of those."""
+    if logits.shape[1] == 1:  # nothing ever moves
+        return torch.zeros_like(logits[:, 0], dtype=torch.int64)
     return torch.where(logits.softmax(1)[:, 0] > 0.5, 0, 1 + logits[:, 1:].argmax(1))
