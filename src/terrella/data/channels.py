@@ -151,7 +151,9 @@ def facts_of(spec: Spec) -> dict[str, object]:
 def check_game(dataset: Dataset, spec: Spec) -> str:
     """DatasetError in one sentence where the recording cannot be of the world's game: it has no actions or others, or no pictures
     for a world that observes them. Gives a sentence where it fits but is said to be of another game, else ""."""
-    about, mine, named = dataset.world, facts_of(spec), set(map(str, dataset.world.get("action_names") or ()))
+    about: dict[str, Any] = dataset.world
+    mine: dict[str, Any] = facts_of(spec)
+    named = set(map(str, about.get("action_names") or ()))
     game, learned = about.get("name"), spec.card.get("game")
     limits = [name for name in ("action_low", "action_high", "discrete") if name in about and name in mine]
     theirs, ours, why = about.get("action_space") or ", ".join(dataset.action_names), spec.action, ""

@@ -129,12 +129,12 @@ class GymnasiumWorld:
         }
         self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
         seen, info = self._env.reset(seed=0)
-        adapter = adapter or getattr(self._env.unwrapped, "terrella", Adapter())
-        settled = {at: self._settled(at, channel, info) for at, channel in adapter.channels.items()}
-        self._adapter = replace(adapter, channels=settled)
+        chosen: Adapter = adapter or getattr(self._env.unwrapped, "terrella", Adapter())
+        settled = {at: self._settled(at, channel, info) for at, channel in chosen.channels.items()}
+        self._adapter = replace(chosen, channels=settled)
         self._kept = {at: one.read for at, one in settled.items() if str(one.read).startswith("info.")}
         self._drawn = self._picture_size(seen, rgb)
-        self.spec = self._describe(told_by(self._env, adapter.action_names), dt_s)
+        self.spec = self._describe(told_by(self._env, chosen.action_names), dt_s)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
