@@ -43,7 +43,7 @@ class Coverage:
             "frames_that_change": round(self.changed, 3),
             "frames_that_change_much": round(self.changed_much, 3),
             "places": f"{self.places:,} in {self.frames:,} frames",
-            "actions_with_an_effect": f"{len(shown)} of {len(self.shown) + len(self.rare)}: {', '.join(shown) or 'none'}",
+            "actions_with_a_clear_effect": f"{len(shown)} of {len(self.shown) + len(self.rare)}: {', '.join(shown) or 'none'}",
         }
 
     def warnings(self) -> list[str]:
