@@ -297,6 +297,16 @@ def test_standing_still_must_not_fade(clips):
     assert "holds still" in said[0] and "fades while nobody plays" in said[1]
 
 
+def test_who_still_glides_is_held_against_where_it_comes_to_rest():
+    looks, poses = torch.full((20, 2, 7), 100.0), torch.zeros(20, 2, 7)
+    poses[:6, 0, 0], looks[:6, 0] = torch.linspace(3, 0.5, 6), torch.linspace(20, 90, 6)[:, None]
+    gone = {"looks": looks, "first": looks[0], "poses": poses, "frames": torch.zeros(2, 8, 8, 3, dtype=torch.uint8)}
+    glided = still_rows(gone, "a", "recorded", make_rng(0)).rows[0].figure
+    assert glided.value == pytest.approx(1) == pytest.approx(glided.low)
+    looks[10:] = 60.0
+    assert still_rows(gone, "a", "recorded", make_rng(0)).rows[0].figure.value == pytest.approx(0.6)
+
+
 def test_a_fuller_album_matches_more_of_the_dream(clips):
     own, full = (long_report(Panorama(), clips, 100, album) for album in (None, Album.of_cache(recording())))
     share = [int(found.rows[0].note.partition("(")[2].partition("%")[0]) for found in (own, full)]

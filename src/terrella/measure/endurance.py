@@ -34,9 +34,11 @@ LEAD = (
 
 STILL_LEAD = (
     "Nobody touches a key for as long: how far are sharpness and the mean of each colour from those of the last true frame, all "
-    "rollouts together, in the tenth that strays most? Copying the last frame stays at 1. Only what moves by itself, in the "
-    "game too, may change them: within 10% for sharpness and 3% for colours nothing fades."
+    "rollouts together, in the tenth that strays most? With poses, from those of the frame in which the camera came to rest. "
+    "Copying the last frame stays at 1. Only what moves by itself, in the game too, may change them: within 10% for sharpness "
+    "and 3% for colours nothing fades."
 )
+GLIDES = 0.02  # metres, or of a quaternion, from where it comes to rest
 SHARP_WITHIN, COLOUR_WITHIN = 0.1, 0.03
 LEAST = 0.5  # of 255: what is blacker, or flatter, is black
 
@@ -155,8 +157,9 @@ def rows_of(
 def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> Report:
     """By tenths of a rollout in which nobody acted: sharpness and the mean of each colour, against the last true frame."""
     found, span, lanes = Report(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
-    parts = torch.stack([part.mean(0) for part in gone["looks"].split(span)], -1).clamp_min(LEAST)  # [lanes, 7, tenths]
-    first = gone["first"].clamp_min(LEAST)[..., None].expand_as(parts)
+    looks, first = _at_rest(gone)
+    parts = torch.stack([part.mean(0) for part in looks.split(span)], -1).clamp_min(LEAST)  # [lanes, 7, tenths]
+    first = first.clamp_min(LEAST)[..., None].expand_as(parts)
     x = [min(stop, len(gone["looks"])) * STRIDE for stop in range(span, len(gone["looks"]) + span, span)]
     for k, name in enumerate(NAMES[:4]):
         band = ratio_band(parts[:, k], first[:, k], rng)
@@ -168,6 +171,20 @@ def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> Rep
         found.curves += [Curve(*where, x, band, guides=(1 - within, 1.0, 1 + within))] if name in _DRAWN else []
     found.pictures.append(_picture("stillness", arm, gone, x))
     return found
+
+
+def _at_rest(gone: Results) -> tuple[torch.Tensor, torch.Tensor]:
+    """The looks [n, lanes, 7] of rollouts in which nobody acted, and those [lanes, 7] that they are held against: of the last
+    true frame. Where the world says where it stands, of the frame in which it came to rest, which stands for those before it:
+    who still glides sees something else."""
+    looks, first = gone["looks"], gone["first"]
+    if "poses" not in gone:
+        return looks, first
+    number = torch.arange(len(looks))[:, None]
+    glides = (gone["poses"] - gone["poses"][-1]).abs().amax(-1) > GLIDES
+    rest = ((number + 1) * glides).amax(0).clamp_max(len(looks) - 1)
+    first = torch.where((rest > 0)[:, None], looks[rest, torch.arange(len(rest))], first)
+    return torch.where((number < rest)[..., None], first, looks), first
 
 
 def _picture(probe: str, arm: str, gone: Results, x: Sequence[int]) -> Picture:

@@ -179,7 +179,7 @@ def _serve(pipe: Connection) -> None:
         while True:
             verb, given = pipe.recv()
             try:
-                if verb == "make":
+                if verb == "make":  # of the caller's own pipe, never of a file: read here, so that a fault is an answer
                     episode, answer = pickle.loads(given)(), None
                 else:
                     answer = getattr(episode, verb)(given)

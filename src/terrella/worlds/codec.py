@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from .generator import Block, Conditioning, encode_depth
+from .generator import Block, Conditioning, down_and_up, encode_depth
 
 COARSE = 4  # the network sees squares of so many pixels; what is chosen is chosen for each pixel
 PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
@@ -113,17 +113,7 @@ class Codec(nn.Module):
         down, across = (torch.linspace(-1, 1, length, device=frames.device) for length in (height, width))
         place = torch.stack([down[:, None].expand(height, width), across.expand(height, width)])
         x = F.pixel_unshuffle(torch.cat([seen, place.expand(batch, -1, -1, -1)], 1), COARSE)
-        x = F.silu(self.enter(x)).contiguous(memory_format=torch.channels_last)
-        kept = []
-        for level, block in enumerate(self.before):
-            x = block(x, context)
-            if level < len(self.down):
-                kept.append(x)
-                x = self.down[level](x)
-        x = self.after[-1](x, context)
-        for level in reversed(range(len(self.down))):
-            x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level](x, context)
+        x = down_and_up(self, F.silu(self.enter(x)), context)
         features = F.silu(torch.cat([F.pixel_shuffle(self.leave(x), COARSE), self.near(seen)], 1))
         choices, scrolls = self.choice(features).split((self.sources + 1, 1), 1)
         along = move[:, None, None, None].expand_as(scrolls)

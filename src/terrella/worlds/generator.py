@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar, final
+from typing import Any, TypeVar, final
 
 import torch
 import torch.nn.functional as F
@@ -49,6 +49,22 @@ class Block(nn.Module):
     def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
         inner = F.silu(self.first(x) + self.context(context)[:, :, None, None])
         return F.silu(x + self.second(inner))
+
+
+def down_and_up(net: Any, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
+    """Maps [B, C, h, w] through the levels of a U-Net, whose blocks `before` and `after` and steps `down` and `up` are those of
+    `net`; laid out as its weights are (channels_last)."""
+    x, kept = x.contiguous(memory_format=torch.channels_last), []
+    for level, block in enumerate(net.before):
+        x = block(x, context)
+        if level < len(net.down):
+            kept.append(x)
+            x = net.down[level](x)
+    x = net.after[-1](x, context)
+    for level in reversed(range(len(net.down))):
+        x = kept[level] + F.interpolate(net.up[level](x), kept[level].shape[-2:], mode="nearest")
+        x = net.after[level](x, context)
+    return x
 
 
 @final
@@ -101,17 +117,7 @@ class Generator(nn.Module):
             parts += [carried * (last_trust > 0), last[:, 5:]]
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
-        x = x.contiguous(memory_format=torch.channels_last)  # as the weights are
-        kept = []
-        for level, block in enumerate(self.before):
-            x = block(x, context)
-            if level < len(self.down):
-                kept.append(x)
-                x = self.down[level](x)
-        x = self.after[-1](x, context)
-        for level in reversed(range(len(self.down))):
-            x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level](x, context)
+        x = down_and_up(self, x, context)
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # a thing stays as it was unless the network knows better; what was not seen is not copied
