@@ -38,7 +38,7 @@ STILL_LEAD = (
     "Copying the last frame stays at 1. Only what moves by itself, in the game too, may change them: within 10% for sharpness "
     "and 3% for colours nothing fades."
 )
-GLIDES = 0.02  # metres, or of a quaternion, from where it comes to rest
+GLIDES = 0.005  # metres, or of a quaternion, from where it comes to rest
 SHARP_WITHIN, COLOUR_WITHIN = 0.1, 0.03
 LEAST = 0.5  # of 255: what is blacker, or flatter, is black
 

@@ -148,8 +148,9 @@ def _sharpness(row: Row) -> tuple[int, str]:
 
 def _stands(row: Row) -> tuple[int, str]:
     within = SHARP_WITHIN if row.what == "sharpness" else COLOUR_WITHIN
-    words = "holds still", "may fade while nobody plays", "fades while nobody plays"
-    return _sure(row, 1 - within, 1 + within, *words)
+    fading = row.what == "sharpness" and row.figure.value < 1  # else something moves, or takes another colour
+    words = ("may fade", "fades") if fading else ("may change", "changes")
+    return _sure(row, 1 - within, 1 + within, "holds still", *(f"{word} while nobody plays" for word in words))
 
 
 def _by_place(told: Iterable[tuple[str, str]]) -> str:
