@@ -73,8 +73,20 @@ def test_what_is_likelier_painted_has_a_colour_of_the_palette():
     assert torch.equal(drawn[0, :, 4:], there[0, :, 4:]) and torch.equal(drawn[1], there[1])
 
 
+def test_the_stress_on_what_changes_is_taken_back():
+    made, frames = codec(), pictures(1)
+    choices = torch.full((1, made.sources + 1, *SIZE), -9.0)
+    choices[:, 0], choices[:, 1] = 0.0, 2.0
+    features = torch.zeros(1, 32, *SIZE)
+    moved = made.pixels(frames, torch.ones(1, *SIZE, dtype=torch.int64))
+    assert torch.equal(made.fetched(frames, choices, features), moved)
+    made.stress.fill_(16.0)
+    assert torch.equal(made.fetched(frames, choices, features), frames[:, 0])
+
+
 def test_a_saved_one_draws_the_same(tmp_path):
     one, frames = world(codec()), pictures(2, seed=3)
+    one.generator.stress.fill_(3.0)
     save_world(one, tmp_path / "world")
     again = load_world(tmp_path / "world")
     context = torch.cat([context_thumbnail(frames[:, 0]), torch.zeros(2, 2 * SLOTS)], 1)
@@ -83,7 +95,11 @@ def test_a_saved_one_draws_the_same(tmp_path):
         one.generator.choices(frames, context, move), again.generator.choices(frames, context, move)
     ):
         assert torch.equal(mine, other)
-    assert torch.equal(again.generator.moves, MOVES) and again.generator.palette.dtype == torch.uint8
+    assert (
+        torch.equal(again.generator.moves, MOVES)
+        and again.generator.stress == 3
+        and again.generator.palette.dtype == torch.uint8
+    )
 
 
 @pytest.mark.parametrize("device", ["meta"])

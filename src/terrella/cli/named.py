@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,12 +32,14 @@ class Controls:
     idle: str | None = None
 
     def of(self, world: World) -> World:
-        """The world, its spec with what was said."""
-        if self != Controls():
-            from ..core.keys import with_controls
+        """The world with what was said in its spec; the one that was given stays as it is."""
+        if self == Controls():
+            return world
+        from ..core.keys import with_controls
 
-            world.spec = with_controls(world.spec, self.keys, self.action_names, self.idle)
-        return world
+        said = copy(world)
+        said.spec = with_controls(world.spec, self.keys, self.action_names, self.idle)
+        return said
 
 
 def load_named(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:

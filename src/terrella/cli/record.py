@@ -158,7 +158,7 @@ def _described(spec: Spec) -> list[str]:
     limit = (
         f"{spec.max_episode_steps:,} steps, its time limit"
         if spec.max_episode_steps
-        else f"{LONGEST:,} steps, as it has no limit"
+        else f"{LONGEST:,} steps, as none is declared"
     )
     keys = ", ".join(f"{key} {_meant(spec, action)}" for key, action in spec.keys.items() if "+" not in key)
     rest = _meant(spec, neutral_action(spec).reshape(-1).tolist())

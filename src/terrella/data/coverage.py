@@ -56,7 +56,7 @@ class Coverage:
         if self.places < 10:
             found.append(f"only {self.places} different places were seen")
         if self.shown and not any(self.shown.values()):
-            found.append("no action seems to do anything: what follows looks alike whichever is taken")
+            found.append("no action is clearly seen to do anything: what follows looks alike whichever is taken")
         more = "play it yourself (--human), record more --frames, and `terrella data merge` both"
         return [f"this recording teaches little: {'; '.join(found)}; {more}."] if found else []
 

@@ -38,11 +38,13 @@ class CodecConfig:
 
 @final
 class Codec(nn.Module):
-    """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]."""
+    """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]; `stress` [], how many times as
+    much a pixel counted that changed as one that stayed when it was learned: what is drawn takes that back."""
 
     kind = "codec"
     moves: torch.Tensor
     palette: torch.Tensor
+    stress: torch.Tensor
 
     def __init__(self, config: CodecConfig):
         super().__init__()
@@ -51,6 +53,7 @@ class Codec(nn.Module):
         widths, seen = config.channels, 3 * (config.slots + 1)
         self.register_buffer("moves", torch.zeros(config.moves + 1, 2, dtype=torch.int64))
         self.register_buffer("palette", torch.zeros(config.colours, 3, dtype=torch.uint8))
+        self.register_buffer("stress", torch.ones(()))
         self.enter = nn.Conv2d(COARSE**2 * (seen + 2), widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
         self.before = nn.ModuleList(Block(width, config.context) for width in widths)
@@ -126,6 +129,7 @@ class Codec(nn.Module):
 
     def fetched(self, frames: torch.Tensor, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The likeliest next frames, uint8 [B, 3, H, W]: painted is what more likely is than is fetched from anywhere."""
+        choices = torch.cat([choices[:, :1] + self.stress.log(), choices[:, 1:]], 1)
         paints = choices.softmax(1)[:, -1] > 0.5
         drawn = self.pixels(frames, likeliest(choices[:, :-1]))
         if frames.device.type == "cpu" and not torch.onnx.is_in_onnx_export():  # few pixels are painted, in most frames

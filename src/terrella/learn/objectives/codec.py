@@ -18,7 +18,6 @@ from ..trainer import Average, Loss, Now, adamw, warmed
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
-MOST = 16.0  # times that a pixel which changes may count more than one that stays
 GUESSED = 0.5  # the share of pictures that the network is shown displaced as it guesses, not as they go
 STALE = (
     0.15  # how much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it
@@ -93,8 +92,7 @@ class CodecObjective:
         colour = F.cross_entropy(codec.colours(shown, features, some), nearest, reduction="none")
         painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
         each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
-        rare = changes.float().mean().clamp_min(1e-4)
-        weight = torch.where(changes, (0.4 * (1 - rare) / rare).clamp(1.0, MOST), 1.0)
+        weight = torch.where(changes, codec.stress, 1.0)
         weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
         pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
         with torch.no_grad():

@@ -37,6 +37,7 @@ from .parts import SensesConfig, learn_senses
 
 WIDTHS = (32, 56, 88, 128)
 MOVES, COLOURS = 24, 64  # among which a codec chooses
+STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -189,6 +190,7 @@ class _Learned:
         levels = int(np.log2(min(plain.size) // COARSE)) + 1  # that so small a picture has room for
         codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
         codec.moves[1:], codec.palette[:] = moves, colours
+        codec.stress.fill_(float(np.clip(STRESSED / change.mean(), 1, STRESS)))
         return CodecObjective(codec, self.config.learning_rate)
 
     def _feed(self, batch: int) -> Feed:
