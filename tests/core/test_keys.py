@@ -77,3 +77,32 @@ def test_what_a_person_says_wins():
 def test_what_does_not_fit_is_refused_in_a_sentence(said, answer):
     with pytest.raises(TerrellaError, match=answer):
         with_controls(spec(spaces.Discrete(2), "left", "right"), **said)
+
+
+def test_each_of_several_choices_has_a_cluster_of_keys():
+    found = default_keys(spaces.MultiDiscrete([3, 3, 2]))
+    assert found["ArrowLeft"] == found["KeyA"] == [1, 0, 0] and found["ArrowRight"] == [2, 0, 0]
+    assert found["ArrowUp"] == [0, 1, 0] and found["ArrowDown"] == [0, 2, 0] and found["Space"] == [0, 0, 1]
+    pad = default_keys(spaces.MultiDiscrete([5, 2, 2]))
+    assert [pad[f"Arrow{way}"][0] for way in ("Up", "Right", "Down", "Left")] == [1, 2, 3, 4]
+    assert pad["Space"] == [0, 1, 0] and pad["KeyE"] == [0, 0, 1]
+    named = default_keys(spaces.MultiDiscrete([3, 3, 2, 2]), ("turn", "forward", "throw", "jump"))
+    assert named["ArrowUp"] == [0, 1, 0, 0] and named["KeyT"] == [0, 0, 1, 0] and named["Space"] == [0, 0, 0, 1]
+
+
+def test_choices_rest_where_they_are_told_to_and_very_many_are_two_ends():
+    found = default_keys(spaces.MultiDiscrete([3, 3, 25]), rest=(1, 1, 12))
+    assert found["ArrowLeft"] == [0, 1, 12] and found["ArrowUp"] == [1, 2, 12] and found["ArrowDown"] == [1, 0, 12]
+    assert found["KeyA"] == [1, 1, 0] and found["KeyD"] == [1, 1, 24]
+    many = default_keys(spaces.MultiDiscrete([9] * 8, start=[1] * 8))
+    assert all(len(action) == 8 and max(action) > 1 for action in many.values())
+
+
+def test_several_choices_are_told_by_name_and_value():
+    several = spec(spaces.MultiDiscrete([3, 2]), "move", "fire")
+    told = with_controls(several, ["w=move:1", "f=fire"])
+    assert told.keys == {"KeyW": [1, 0], "KeyF": [0, 1]}
+    centred = with_controls(with_controls(spec(spaces.MultiDiscrete([3, 3])), action_names=["a", "b"]), idle="1,1")
+    assert centred.keys["ArrowLeft"] == [0, 1] and neutral_action(centred).tolist() == [1, 1]
+    with pytest.raises(TerrellaError, match="is no action of toy"):
+        with_controls(several, ["w=move:7"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -60,6 +62,16 @@ def test_values_are_in_the_worlds_units_and_stay_within_its_limits(axes, action)
 def test_a_held_key_overrides_its_axis_alone():
     spec = Robot(keys={"KeyW": [2.0, 0.0, 0.0]}).spec
     assert action_of(spec, ("KeyW",), [0.5, 1.0, 0.0]).tolist() == [[2.0, 1.0, 0.0]]
+
+
+def test_of_several_choices_each_obeys_the_key_pressed_last():
+    spec = spec_of(spaces.MultiDiscrete([3, 3, 2]), idle=(0.0, 1.0, 0.0))
+    keys = {"KeyA": [1.0, 1, 0], "KeyD": [2.0, 1, 0], "KeyW": [0.0, 0, 0], "Space": [0.0, 1, 1]}
+    spec = replace(spec, keys=keys)
+    assert action_of(spec).tolist() == [[0, 1, 0]]
+    assert action_of(spec, ("KeyA", "KeyW", "Space")).tolist() == [[1, 0, 1]]
+    assert action_of(spec, ("KeyA", "KeyD")).tolist() == [[2, 1, 0]]
+    spec.check_action(action_of(spec, ("KeyD", "Space")), 1)
 
 
 def test_whole_axes_get_whole_numbers():

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .errors import TerrellaError
-from .spec import Spec, idle_name, shape_of
+from .spec import Spec, idle_name, neutral_action, shape_of
 
 _CODES = {
     **{name: f"Arrow{name.title()}" for name in ("up", "down", "left", "right")},
@@ -36,6 +36,20 @@ _WORDS = {
 }
 _SIDEWAYS = {"Up": "KeyW", "Down": "KeyS", "Left": "KeyA", "Right": "KeyD"}
 _STRAFES = {"strafe", "move", "step", "sidestep"}
+# Where the ways of one choice among several lie: by how many they are, the most usual place first.
+_CLUSTERS = {
+    1: (("Space",), ("KeyE",), ("KeyQ",), ("KeyX",), ("KeyZ",), ("KeyV",)),
+    2: (("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"), ("KeyA", "KeyD"), ("KeyW", "KeyS"), ("KeyJ", "KeyL"),
+        ("KeyI", "KeyK")),
+    4: tuple(tuple(one + way for way in ways) for one, ways in (
+        ("Arrow", ("Up", "Right", "Down", "Left")), ("Key", "WDSA"), ("Key", "ILKJ"))),
+}  # fmt: skip
+_MANY = 10  # of a choice among more than that, as of an axis, only the ends have keys
+_HINTS = (
+    {"turn", "steer", "steering", "yaw", "rotate", "pan", "horizontal", "x", "strafe", "sideways"},
+    {"move", "walk", "vertical", "y", "pitch", "tilt", "speed", "drive"},
+)
+_UPWARDS = {"ArrowUp", "KeyW", "KeyI"}
 _SPARE = (*(f"Digit{digit}" for digit in "1234567890"), *(f"Key{letter}" for letter in "QERTZUIOPFGHJKLXCVBNM"))
 
 
@@ -100,10 +114,13 @@ def _parts(name: str) -> tuple[list[str], set[str]]:
     return [way for way in ("Up", "Down", "Left", "Right", "Space") if way in known], words
 
 
-def default_keys(space: spaces.Space, names: Sequence[str] = ()) -> dict[str, list[float]]:
+def default_keys(space: spaces.Space, names: Sequence[str] = (), rest: Sequence[float] = ()) -> dict[str, list[float]]:
     """code -> flat action, for whoever says nothing of keys. Of choices and buttons by their names; two or three nameless
-    choices are on the left and right arrows, more on the digits and letters. Of axes: left and right are the ends of the first,
+    choices are on the left and right arrows, more on the digits and letters. Of several choices each has a cluster of keys
+    (`_clusters`), and `rest` is the action that does nothing. Of axes: left and right are the ends of the first,
     up and down those of the second, or, where that knows no backwards (a throttle), up is the second and down the third."""
+    if isinstance(space, spaces.MultiDiscrete):
+        return _clusters(space, names, rest)
     if isinstance(space, spaces.Discrete):
         start, count = int(space.start), int(space.n)
         if len(names) != count and count <= 3:
@@ -129,6 +146,48 @@ def default_keys(space: spaces.Space, names: Sequence[str] = ()) -> dict[str, li
     return keys if bool((space.low <= 0).all() and (space.high >= 0).all()) else {}
 
 
+def _clusters(space: spaces.MultiDiscrete, names: Sequence[str], rest: Sequence[float]) -> dict[str, list[float]]:
+    """Keys of several choices made at once; each is one value of one of them, while the others rest. A choice of two has a
+    key, of three a pair (left and right, up and down, then letters), of five the four arrows, others digits; of very many the
+    ends are a pair. Names such as "turn", "forward" or "fire" come first; W A S D double the arrows where they are free."""
+    low, count = (np.asarray(value, np.float64).ravel() for value in (space.start, space.nvec))
+    still = np.asarray(rest, np.float64) if len(rest) == len(low) else low
+    names = names if len(names) == len(low) else [""] * len(low)
+    hints = [_hint(name) for name in names]
+    found: dict[str, list[float]] = {}
+    for at in sorted(range(len(low)), key=lambda at: hints[at] is None):
+        values = [value for value in low[at] + np.arange(count[at]) if value != still[at]]
+        values = [values[0], values[-1]] if len(values) > _MANY else values
+        codes = _cluster(len(values), hints[at], names[at], found)
+        if len(values) == 2 and values[0] < still[at] < values[1] and _UPWARDS & set(codes):
+            values.reverse()
+        found |= {
+            code: np.where(np.arange(len(low)) == at, value, still).tolist() for code, value in zip(codes, values)
+        }
+    if not found.keys() & set(_SIDEWAYS.values()):
+        found |= {letter: found[f"Arrow{way}"] for way, letter in _SIDEWAYS.items() if f"Arrow{way}" in found}
+    return found
+
+
+def _hint(name: str) -> int | None:
+    """Which cluster of its size the name of a choice asks for: 0 across or to act, 1 along; None where it says nothing."""
+    known, words = _parts(name)
+    if known:
+        return 0 if {"Left", "Right", "Space"} & set(known) else 1
+    return next((at for at, hints in enumerate(_HINTS) if hints & words), None)
+
+
+def _cluster(size: int, hint: int | None, name: str, taken: Mapping[str, object]) -> list[str]:
+    """Keys that are free, as many as there are values."""
+    known = list(_CLUSTERS.get(size, ()))
+    if size == 1 and hint is None and name[:1].isascii() and name[:1].isalpha():
+        known.insert(0, (f"Key{name[0].upper()}",))
+    if hint:
+        known.insert(0, known[min(hint, len(known) - 1)])
+    free = [list(codes) for codes in known if not taken.keys() & set(codes)]
+    return free[0] if free else [code for code in _SPARE if code not in taken][:size]
+
+
 def told_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
     """The keys of Gymnasium's `get_keys_to_action`: {"w": 1, ("w", "a"): 5, (ord("d"),): 3, None: 0}; those without a key rest."""
     found = {}
@@ -148,15 +207,14 @@ def with_controls(
     spec: Spec, keys: Sequence[str] = (), action_names: Sequence[str] = (), idle: str | None = None
 ) -> Spec:
     """The spec with what a person said on the command line: keys as "a=left" or "w=0,1,0" (by a name or the numbers of an
-    action, "up+space=5" for two at once), names of all actions in order, and the action that rests. TerrellaError where
+    action, "up+space=5" for two at once, "w=move:2" for one of several choices), names of all actions in order, and the action that rests. TerrellaError where
     something does not fit."""
     if action_names:
         count = int(spec.action.n) if isinstance(spec.action, spaces.Discrete) else int(np.prod(shape_of(spec.action)))
         if len(action_names) != count:
             raise TerrellaError(f"{spec.name} has {count} actions; {len(action_names)} names were given.")
-        spec = replace(
-            spec, action_names=tuple(action_names), keys=default_keys(spec.action, action_names) or spec.keys
-        )
+        chosen = default_keys(spec.action, action_names, spec.idle)
+        spec = replace(spec, action_names=tuple(action_names), keys=chosen or spec.keys)
     told = {}
     for pair in keys:
         key, equals, action = pair.partition("=")
@@ -164,23 +222,31 @@ def with_controls(
             raise TerrellaError(f"a key is said as KEY=ACTION, as in --keys a=left d=right; got '{pair}'.")
         told["+".join(code_of(part) for part in key.split("+"))] = _action(spec, action)
     rests = tuple(_action(spec, idle)) if idle is not None else spec.idle
+    own = spec.keys
+    if rests != spec.idle and own == default_keys(spec.action, spec.action_names, spec.idle):
+        own = default_keys(spec.action, spec.action_names, rests)
     how = spec.card.get("how")
     card = (
         {**spec.card, "how": {**how, **({"keys": "as told"} if told else {})}} if isinstance(how, dict) else spec.card
     )
-    return replace(spec, keys=told or spec.keys, idle=rests, card=card)
+    return replace(spec, keys=told or own, idle=rests, card=card)
 
 
 def _action(spec: Spec, said: str) -> list[float]:
     """The flat action of a name, or of numbers."""
     low, high = (np.asarray(limit, np.float64).reshape(-1) for limit in spec.action_limits)
-    lower = [name.lower() for name in spec.action_names]
+    lower, (name, _, value) = [name.lower() for name in spec.action_names], said.lower().partition(":")
     if said.lower() in lower:
         at = lower.index(said.lower())
+        rest = neutral_action(spec).ravel() if isinstance(spec.action, spaces.MultiDiscrete) else 0
         return (
             [low[0] + at]
             if isinstance(spec.action, spaces.Discrete)
-            else np.where(np.arange(len(low)) == at, high, 0).tolist()
+            else np.where(np.arange(len(low)) == at, high, rest).astype(np.float64).tolist()
+        )
+    if isinstance(spec.action, spaces.MultiDiscrete) and name in lower and value:
+        said = ",".join(
+            value if at == lower.index(name) else str(n) for at, n in enumerate(neutral_action(spec).ravel())
         )
     try:
         found = [float(number) for number in said.split(",")]

@@ -88,13 +88,13 @@ class Spec:
     dt_s:         seconds of world time that one `imagine` advances.
     units:        channel -> unit, for the channels that have one ("m", "reward").
     cameras:      picture channel -> the camera that takes it.
-    action_names: one name per button (MultiBinary), choice (Discrete) or axis (Box).
+    action_names: one name per button (MultiBinary), choice (Discrete, of which a MultiDiscrete has several) or axis (Box).
     action_units: one unit per axis ("m", "rad/s", "N m"), or none.
     action_mode:  what the numbers mean: "buttons", "choice", "axes", "position", "velocity", "torque" or "pose_delta"; read off
                   the space where it is "".
     action_frame: the frame in which axes are meant ("world", "body", "tool"), where they have one.
     keys:         browser key (`KeyboardEvent.code`) -> the action that it stands for while held, as a
-                  flat list of floats; keys held together are combined by element-wise maximum.
+                  flat list of floats; buttons held together are combined by element-wise maximum, of one choice the last counts.
     forkable:     False where a state cannot be kept and returned to (an external game process).
     max_batch:    the largest batch that `start` accepts; None for no limit.
     max_episode_steps: steps after which whoever trains in the world cuts an episode off (truncates it); None for no limit.

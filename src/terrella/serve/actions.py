@@ -43,7 +43,8 @@ def axes_of(spec: Spec) -> list[dict]:
 def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) -> torch.Tensor:
     """The action [1, *spec.action.shape] of the keys held, oldest first, and of the values of the axes, in their units.
 
-    Buttons combine by element-wise maximum. A choice (Discrete) is the key pressed last. An axis (Box) has the value given,
+    Buttons combine by element-wise maximum. A choice (Discrete), and each of several (MultiDiscrete), is the key pressed last
+    that says anything of it. An axis (Box) has the value given,
     or that of the held key which is furthest from rest, so that a negative direction is not lost to a zero. Without any:
     the neutral action. Keys that the world does not know count as nothing, values beyond its limits as the limit.
     """
@@ -60,6 +61,10 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
             flat = np.where(pressed != 0, pressed, flat)
         flat = np.clip(flat, space.low.ravel(), space.high.ravel())
         flat = flat.round() if dtype_of(space).kind in "iu" else flat
+    elif isinstance(space, spaces.MultiDiscrete):
+        rest = flat
+        for row in rows:
+            flat = np.where(row != rest, row, flat)
     elif rows:
         flat = np.max(rows, axis=0) if isinstance(space, spaces.MultiBinary) else rows[-1]
     return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
