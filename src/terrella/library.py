@@ -123,6 +123,7 @@ def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
     entries = [Entry(name, "bundled", _read_card(BUNDLED / name)) for name in sorted(_bundled())]
     if find_spec("vizdoom"):
         entries.append(Entry(GAME, "game", {"what": "ViZDoom with Freedoom's art: the game that doom-maze learned"}))
+    entries.append(Entry("gym:Islet-v0", "game", {"what": "a walk over an island, a small game of our own"}))
     entries.append(Entry("gym:CartPole-v1", "game", {"what": "any Gymnasium environment, by its id"}))
     for folder in map(Path, folders):
         if not folder.is_dir():

@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 
 from ..core.errors import TerrellaError
+from . import islet  # noqa: F401  it registers Islet-v0
 
 _DISPLAY = re.compile(r"display|video device|gl context|\b(glfw|opengl|egl|osmesa|x11|glx|xlib)\b")
 
