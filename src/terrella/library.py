@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -116,6 +117,15 @@ def folder_of(name: str | Path) -> Path:
         f"There is no world '{text}'{likest} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
         "environment gym:CartPole-v1; or give the path of a checkpoint folder."
     )
+
+
+def folder_for_keys(name: str | Path) -> Path | None:
+    """The folder of a learned world that may keep other keys (worlds/folder.py); None for games, for bundled worlds, and
+    where it cannot be written."""
+    folder = None if is_truth(name) else folder_of(name)
+    if folder is None or folder.parent == BUNDLED:
+        return None
+    return folder if os.access(folder, os.W_OK) and os.access(folder / "world.json", os.W_OK) else None
 
 
 def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:

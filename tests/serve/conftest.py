@@ -47,7 +47,7 @@ class ListSink:
 
 
 @contextlib.contextmanager
-def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, policy=None):
+def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, policy=None, **kept):
     listener = open_port(host, 0)
     ready, addresses = threading.Event(), []
 
@@ -61,7 +61,7 @@ def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, po
         sinks.append(ListSink())
         return sinks[-1]
 
-    sessions = Sessions(worlds, 0, sink_factory if record else None, policy=policy, config=config)
+    sessions = Sessions(worlds, 0, sink_factory if record else None, policy=policy, config=config, **kept)
     server = make_server(build_app(sessions, host, token), listener, host, token, on_ready, websockets=True)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

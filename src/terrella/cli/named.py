@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
@@ -11,7 +12,9 @@ from tyro.conf import arg
 from .say import say
 
 if TYPE_CHECKING:
+    from ..core.spec import Spec
     from ..core.world import World
+    from ..data import Layout
 
 Device = Annotated[str, arg(help="cpu, cuda, mps, or auto: a GPU if there is one.")]
 Fast = Annotated[bool, arg(help="Draw with ONNX Runtime, or with a compiled graph on a GPU, if that is faster here.")]
@@ -40,6 +43,31 @@ class Controls:
         said = copy(world)
         said.spec = with_controls(world.spec, self.keys, self.action_names, self.idle)
         return said
+
+
+class Keeper:
+    """The spec with the keys and names that a person last set on the page; a folder that may keep them does (library.py)."""
+
+    def __init__(self, spec: Spec, folder: Path | None = None):
+        self.spec, self.folder = spec, folder
+
+    @property
+    def place(self) -> str:
+        """Where they are kept, for people; "" where only the browser keeps them."""
+        return f"in the world's folder, {self.folder}" if self.folder else ""
+
+    def noted(self, layout: Layout) -> Layout:
+        """The layout of a recording that says the keys of now."""
+        from ..data.channels import facts_of
+
+        return replace(layout, world=facts_of(self.spec))
+
+    def __call__(self, spec: Spec) -> None:
+        from ..worlds.folder import save_keys
+
+        self.spec = spec
+        if self.folder:
+            save_keys(self.folder, spec)
 
 
 def load_named(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:

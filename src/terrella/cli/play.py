@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from .named import Controls, Device, Fast, load_named
+from .named import Controls, Device, Fast, Keeper, load_named
 from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
@@ -48,8 +48,10 @@ def play(
         policy: Who acts while nobody touches the controls: a script that explores, or random actions.
         record: Folder of a dataset to which the page can record.
     """
+    from .. import library
     from ..core.errors import TerrellaError
     from ..serve import serve
+    from ..serve.guard import is_loopback
 
     learned = load_named(name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb)
     worlds = [learned]
@@ -59,12 +61,13 @@ def play(
     if compare:
         worlds = [_game_like(learned, truth), learned]
     worlds = [controls.of(world) for world in worlds]
-    sink = None
+    own = library.folder_for_keys(name) if is_loopback(host) and not compare else None
+    keeper, sink = Keeper(worlds[0].spec, own), None
     if record is not None:
         from ..data import Layout, Recorder
 
         layout, folder = Layout.of(worlds[0].spec), record
-        sink = lambda: Recorder(folder, layout, "play")  # noqa: E731
+        sink = lambda: Recorder(folder, keeper.noted(layout), "play")  # noqa: E731
     names, driver = [world.spec.name for world in worlds], None
     if policy is not None:
         from ..act.explorer import Explorer
@@ -75,7 +78,8 @@ def play(
     def ready(address: str) -> None:
         result({"address": address, "worlds": names}, json, f"{' and '.join(names)}: open {address}")
 
-    serve(worlds, host, port, token, sink, ready, seed, picture=picture, policy=driver)
+    keeping: dict[str, Any] = {"keep": keeper, "kept_in": keeper.place}
+    serve(worlds, host, port, token, sink, ready, seed, picture=picture, policy=driver, **keeping)
 
 
 def _first_picture(path: Path, world: World) -> Any:

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from .. import progress
 from ..core.spec import BUTTONS, CHOICE, Spec, can_idle, neutral_action
-from .named import Controls
+from .named import Controls, Keeper
 from .say import Json, Port, Seed, result, say
 
 if TYPE_CHECKING:
@@ -116,8 +116,9 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
             def ready(address: str) -> None:
                 say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
 
-            sink = lambda: Recorder(out, layout, "play", live=live)  # noqa: E731
-            serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed)
+            keeper = Keeper(world.spec)
+            sink = lambda: Recorder(out, keeper.noted(layout), "play", live=live)  # noqa: E731
+            serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed, keep=keeper)
         else:
             with progress.shown("recording") as report:
                 player, rng = Explorer(world.spec, out / ".explorer"), make_rng(recording.seed)

@@ -207,7 +207,8 @@ def with_controls(
     spec: Spec, keys: Sequence[str] = (), action_names: Sequence[str] = (), idle: str | None = None
 ) -> Spec:
     """The spec with what a person said on the command line: keys as "a=left" or "w=0,1,0" (by a name or the numbers of an
-    action, "up+space=5" for two at once, "w=move:2" for one of several choices), names of all actions in order, and the action that rests. TerrellaError where
+    action, "up+space=5" for two at once, "w=move:2" for one of several choices),
+    names of all actions in order, and the action that rests. TerrellaError where
     something does not fit."""
     if action_names:
         count = int(spec.action.n) if isinstance(spec.action, spaces.Discrete) else int(np.prod(shape_of(spec.action)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,11 +12,14 @@ from typing import Any
 from ..core.errors import ProtocolError
 from .actions import MAX_AXES
 from .history import Moment
+from .keys import Rebound
 
 VERSION = 3
 MAX_MESSAGE = 4096  # bytes of one message from a page
 MAX_PICTURE = 2**16 - 256  # bytes of a picture from a page, which are all that it sends as bytes
 MAX_HELD = 16  # keys held at once
+MAX_KEYS = 256  # of a world
+MAX_NAME = 40  # letters of an action's name
 MAX_CAMERAS = 16  # shown at once
 U32 = 2**32 - 1
 
@@ -100,12 +104,30 @@ def _controls(body: dict) -> Controls:
     return Controls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
 
 
+def _rebound(body: dict) -> Rebound:
+    keys, names = body.get("keys"), body.get("names", [])
+    if not isinstance(keys, dict) or len(keys) > MAX_KEYS or not all(re.fullmatch(_CODE, code) for code in keys):
+        raise ProtocolError(f"'keys' must be an object of at most {MAX_KEYS} key codes, and places of actions.")
+    if not isinstance(names, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in names):
+        raise ProtocolError("'names' must be a list of pairs, a place and a name.")
+    for _, name in names:
+        if not isinstance(name, str) or not name.isprintable() or not 0 < len(name.strip()) <= MAX_NAME:
+            raise ProtocolError(f"the name of an action has 1 to {MAX_NAME} letters.")
+    return Rebound(
+        {code: _integer(keys, code, 0, U32) for code in keys},
+        {_integer({"names": at}, "names", 0, U32): name.strip() for at, name in names},
+    )
+
+
+_CODE = r"[A-Z][A-Za-z0-9]{0,31}(\+[A-Z][A-Za-z0-9]{0,31}){0,3}"  # KeyboardEvent.code, or several held at once
+
 _READERS: dict[str, Callable[[dict], Any]] = {
     "pause": lambda body: None,
     "resume": lambda body: None,  # goes on; out of the past, back to the newest moment
     "branch": lambda body: None,  # goes on from the moment shown; what came after it is forgotten
     "sync": lambda body: None,  # the dream observes the game beside it
     "controls": _controls,
+    "keys": _rebound,  # the keys and names of the actions from now on
     "ack": lambda body: _integer(body, "seq", 0, U32),  # of a frame that has arrived
     "restart": lambda body: None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1),
     "rewind": lambda body: _integer(body, "steps", -U32, U32),  # back from the moment shown, and stand there

@@ -27,6 +27,7 @@ from .chart import knows_share, mapped
 from .clip import make_clip
 from .door import application, serve_page
 from .guard import RateLimit
+from .keys import Keep, KeyBook
 from .picture import uncertainty_levels
 from .recording import SinkFactory
 from .session import Session
@@ -61,12 +62,17 @@ class Sessions:
         picture: torch.Tensor | None = None,
         policy: Policy | None = None,
         config: ServeConfig | None = None,
+        keep: Keep | None = None,
+        kept_in: str = "",
     ):
         check_playable(worlds)
         self.worlds, self.config = tuple(worlds), config or ServeConfig()
         self._sink_factory, self._policy = sink_factory, policy
         kept = self.config.history_s, self.config.state_mb
-        self._make_timeline = lambda: Timeline(self.worlds, seed, sink_factory, picture, policy, *kept)
+        self._book = KeyBook(worlds[0].spec, keep, kept_in)
+        self._make_timeline = lambda: Timeline(
+            self.worlds, seed, sink_factory, picture, policy, *kept, keys=self._book.spec
+        )
         self._seats = self.config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
         self._open: dict[str, tuple[Session, asyncio.Task]] = {}
@@ -84,7 +90,7 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self._make_timeline, self._worker)
+        session = Session(self._make_timeline, self._worker, self._book)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -116,7 +122,10 @@ class Sessions:
             version=protocol.VERSION,
             session=session.id,
             resumed=resumed,
-            worlds=[_describe(world, label) for world, label in zip(self.worlds, labels, strict=True)],
+            worlds=[
+                _describe(world, label) | self._book.described()
+                for world, label in zip(self.worlds, labels, strict=True)
+            ],
             no_rewind=no_rewind(self.worlds),
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             driver=type(self._policy).__name__ if self._policy else "",
@@ -133,12 +142,9 @@ def _describe(world: World, label: str) -> dict:
             for name in spec.kinds("rgb")
         ],
         "dt_s": spec.dt_s,
-        "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
-        "action_names": list(spec.action_names),
         "action_mode": spec.action_mode,
         "action_frame": spec.action_frame,
         "axes": axes_of(spec),
-        "action_kind": type(spec.action).__name__,
         "scored": "reward" in spec.channels,
         "vitals": vitals(spec),
         "uncertainty": uncertainty_levels(spec),
@@ -242,15 +248,18 @@ def serve(
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
     policy: Policy | None = None,
+    keep: Keep | None = None,
+    kept_in: str = "",
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
     Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
-    touches the controls.
+    touches the controls. `keep` is called with the spec whenever a person has changed the keys on a page; `kept_in` says, in
+    words, where it keeps them for all pages, and is "" where each page keeps its own, in its browser.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
     """
-    sessions = Sessions(worlds, seed, sink_factory, picture, policy, config)
+    sessions = Sessions(worlds, seed, sink_factory, picture, policy, config, keep, kept_in)
     # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
     torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
     serve_page(lambda token: build_app(sessions, host, token), host, port, token, on_ready, websockets=True)

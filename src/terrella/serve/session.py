@@ -18,6 +18,7 @@ from starlette.websockets import WebSocket
 from ..core.errors import TerrellaError
 from . import protocol
 from .history import Moment
+from .keys import KeyBook
 from .protocol import Controls, Show
 from .timeline import Timeline
 
@@ -33,12 +34,12 @@ class Session:
     it was recording is closed then, for another page may want to record.
     """
 
-    def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor):
+    def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor, book: KeyBook | None = None):
         self.id = secrets.token_urlsafe(16)
         self.timeline: Timeline | None = None
         self.detached_at: float | None = time.monotonic()
         self.heard_at = time.monotonic()
-        self._make_timeline, self._worker = make_timeline, worker
+        self._make_timeline, self._worker, self._book = make_timeline, worker, book
         self._socket: WebSocket | None = None
         self._controls = Controls(0)
         self._commands: deque[tuple[str, Any]] = deque()
@@ -199,6 +200,9 @@ class Session:
                     self._unseen = await self._work(timeline.sync)
                 case "record":
                     await self._work(timeline.record, value)
+                case "keys" if self._book is not None:
+                    timeline.obeyed = self._book.changed(value)
+                    await self._work(self._book.keep, timeline.obeyed)
                 case "drive":
                     timeline.driving = value
                 case "show":

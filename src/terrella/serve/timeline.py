@@ -66,7 +66,7 @@ class Timeline:
 
     The first world is the one that is played; a dream beside it follows. `policy` drives while nobody touches the controls;
     without one, or with `driving` off, the person at the page does. history_s: seconds of pictures kept (for rewinding and
-    clips); state_mb: memory for the states among them.
+    clips); state_mb: memory for the states among them. keys: the spec with other keys than the world's own.
     """
 
     def __init__(
@@ -78,9 +78,11 @@ class Timeline:
         policy: Policy | None = None,
         history_s: float = 30.0,
         state_mb: int = 256,
+        keys: Spec | None = None,
     ):
         check_playable(worlds)
         self.worlds, self.spec = tuple(worlds), worlds[0].spec
+        self.obeyed = self.spec if keys is None else keys  # whose keys a person presses
         self.no_rewind = no_rewind(worlds)
         self.notice = ""  # something that a person should know, in one sentence
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
@@ -221,7 +223,7 @@ class Timeline:
 
     def _action(self, held: Sequence[str], axes: Sequence[float]) -> torch.Tensor:
         """[1, ...], the person's, or the policy's while it drives and nobody touches the controls."""
-        action = action_of(self.spec, held, axes)
+        action = action_of(self.obeyed, held, axes)
         if self._policy is None or not self.driving or not torch.equal(action, self._rest):
             return action
         seen = self.worlds[0].render(self._states[0], tuple(self.spec.channels))

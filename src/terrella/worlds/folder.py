@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ..core.errors import CheckpointError
+from ..core.spec import Spec
 from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
 from ..space.keyframes import Keyframes
 from .body import Motion, MotionBody
@@ -79,6 +80,19 @@ def save_world(
         write_folder(path, told, weights, kept if kept is not None else _remembered(world.scene, quality))
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
+
+
+def save_keys(path: str | Path, spec: Spec) -> None:
+    """Writes the keys and the names of the actions, and what rests, into a world's folder; nothing else of it changes.
+
+    CheckpointError where it is no world's folder, or cannot be written."""
+    about = read_about(Path(path))
+    said = {"keys": {code: list(value) for code, value in spec.keys.items()}, "action_names": list(spec.action_names)}
+    try:
+        about["about"] |= {**said, "idle": list(spec.idle)}
+        _replace(Path(path) / WORLD_FILE, lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
+    except (OSError, LookupError, TypeError) as error:
+        raise CheckpointError(f"the keys cannot be written to {path} ({error}).") from error
 
 
 def write_folder(path: Path, about: dict, weights: Tensors, remembered: Tensors | bytes) -> None:

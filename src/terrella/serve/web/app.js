@@ -2,7 +2,8 @@
 
 import { drawCard } from './card.js';
 import { Controls } from './controls.js';
-import { drawKeycaps, keyLabel, keyMeaning } from './keycaps.js';
+import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
+import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { MemoryMap } from './map.js';
 import { takePictures } from './picture.js';
@@ -33,6 +34,12 @@ const controls = new Controls((held, time) => {
   }
   sendControls(time);
 }, $('axes'));
+
+const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
+
+function sendKeys() {
+  link.send({ type: 'keys', keys: worlds[0].keys, names: panel.names });
+}
 
 function sendControls(time) {
   controlsId += 1;
@@ -87,6 +94,7 @@ function toggleTint() {
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
   ({ worlds, no_rewind: noRewind, no_record: noRecord, driver } = body);
+  if (panel.take(worlds[0])) sendKeys();
   if (!same) build();
   if (!body.resumed) map.clear();
   $('map-open').hidden = !worlds.some((world) => world.mapped);
@@ -162,9 +170,7 @@ function build() {
   $('what').textContent = worlds[worlds.length - 1].card.what ?? '';
   screens.setWorlds(worlds);
   drawCameras();
-  light = drawKeycaps($('keys'), worlds[0]);
-  controls.setWorld(worlds[0]);
-  drawTouch();
+  drawKeys();
   drawCard($('facts'), worlds);
   $('score-cell').hidden = !worlds[0].scored;
   document.querySelectorAll('.vital').forEach((cell) => cell.remove());
@@ -183,8 +189,15 @@ function build() {
   $('timeline').title = noRewind || '';
   able($('record'), noRecord, 'Record to a dataset');
   able($('sync'), '', 'Set the dream to what the game shows now');
+  $('keys-open').hidden = !worlds[0].actions.length;
   hint();
   screens.layout();
+}
+
+function drawKeys() {
+  light = drawKeycaps($('keys'), worlds[0], (code) => { showAside(panel); panel.ask(code); });
+  controls.setWorld(worlds[0]);
+  drawTouch();
 }
 
 function able(button, why, title) {
@@ -352,7 +365,17 @@ function drawTouch() {
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
 const drive = () => driver && link.send({ type: 'drive', on: !status.driving });
-const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyC: nextCamera, KeyG: drive, KeyP: togglePause, Escape: togglePause, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const escape = () => (panel.open ? showAside(null) : togglePause());
+const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyC: nextCamera, KeyG: drive, KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+
+/** What the page itself does with a key, here and now; '' where it does nothing. */
+function pageUse(code) {
+  const uses = {
+    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver && 'lets the policy act',
+    KeyC: screens.cameras.length > 1 && 'changes the camera', KeyP: 'pauses', KeyR: 'restarts', KeyF: 'fills the screen', Enter: 'goes on from the past',
+  };
+  return uses[code] || '';
+}
 
 function fullscreen() {
   return document.fullscreenElement ? document.exitFullscreen() : app.requestFullscreen?.();
@@ -388,8 +411,18 @@ $('banner-button').onclick = () => (state === 'failed' ? restart(status.seed ?? 
 $('rewind').onpointerdown = (event) => { event.target.closest('button').setPointerCapture(event.pointerId); startRewind(); };
 for (const name of ['pointerup', 'pointercancel', 'lostpointercapture']) $('rewind').addEventListener(name, stopRewind);
 $('rewind').oncontextmenu = (event) => event.preventDefault();
-const toggleCard = () => { $('card').hidden = !$('card').hidden; $('about').setAttribute('aria-expanded', !$('card').hidden); };
-$('about').onclick = $('card-close').onclick = toggleCard;
+const card = { get open() { return !$('card').hidden; }, toggle(open) { $('card').hidden = !open; } };
+function showAside(which) {
+  for (const [one, button] of [[card, $('about')], [panel, $('keys-open')]]) {
+    if (one.open !== (one === which)) one.toggle(one === which);
+    button.setAttribute('aria-expanded', one.open);
+  }
+}
+for (const [one, opens, closes] of [[card, 'about', 'card-close'], [panel, 'keys-open', 'keys-close']]) {
+  $(opens).onclick = () => { showAside(one.open ? null : one); $(opens).blur(); };
+  $(closes).onclick = () => showAside(null);
+}
+learnLayout(() => { if (worlds.length) drawKeys(); });
 
 let scrubbing = false, scrubbed = 0;
 const scrub = (event) => {

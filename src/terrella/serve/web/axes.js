@@ -42,8 +42,8 @@ export class Axes {
   setWorld(world, pick) {
     this.axes = world.axes;
     this.sweeps = world.action_mode === 'position';  // a stick moves the target, and lets go of it where it is
-    this.plan = stickPlan(world.axes, world.keys, pick);
-    this.keys = world.keys;
+    this.keys = Object.fromEntries(Object.entries(world.keys).map(([code, place]) => [code, world.actions[place].value]));
+    this.plan = stickPlan(world.axes, this.keys, pick);
     this.root.hidden = !world.axes.length;
     this.root.title = [world.action_mode, world.action_frame && `in the frame of the ${world.action_frame}`].filter(Boolean).join(', ');
     this.rows = world.axes.map((axis, at) => this.row(axis, at));

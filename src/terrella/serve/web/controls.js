@@ -5,15 +5,16 @@ import { Axes } from './axes.js';
 const UP = ['KeyW', 'ArrowUp'], DOWN = ['KeyS', 'ArrowDown'], LEFT = ['KeyA', 'ArrowLeft'], RIGHT = ['KeyD', 'ArrowRight'];
 const PRESSED = 0.35;  // deflection of a stick that counts as a key, in a world with buttons
 
-/** The keys that a stick, a turn pad and buttons stand for in this world. */
-export function plan(keys) {
-  const pick = (codes) => codes.find((code) => code in keys);
+/** The keys that a stick, a turn pad and buttons stand for in this world, by the keys that it had at first: code -> action. */
+export function plan(keys, first = keys) {
+  const own = Object.keys(first).length ? first : keys, single = Object.keys(keys).filter((code) => !code.includes('+'));
+  const now = (code) => single.find((other) => keys[other] === own[code]);
+  const at = (codes) => codes.find((code) => code in own), pick = (codes) => (at(codes) ? now(at(codes)) : undefined);
   const stick = { up: pick(UP), down: pick(DOWN), left: pick(LEFT), right: pick(RIGHT) };
-  const turns = stick.left === 'KeyA' && 'ArrowLeft' in keys && 'ArrowRight' in keys;
-  const turn = turns ? { left: 'ArrowLeft', right: 'ArrowRight' } : null;
-  const same = (a, b) => keys[a].every((value, index) => value === keys[b][index]);
-  const used = [...Object.values(stick), ...Object.values(turn ?? {})].filter(Boolean);
-  const extra = Object.keys(keys).filter((code) => !code.includes('+') && !used.some((other) => same(code, other)));
+  const turns = at(LEFT) === 'KeyA' && 'ArrowLeft' in own && 'ArrowRight' in own && own.KeyA !== own.ArrowLeft;
+  const turn = turns ? { left: now('ArrowLeft'), right: now('ArrowRight') } : null;
+  const used = [...Object.values(stick), ...Object.values(turn ?? {})].map((code) => keys[code]);
+  const extra = single.filter((code, index) => !used.includes(keys[code]) && single.findIndex((other) => keys[other] === keys[code]) === index);
   return { stick, turn, extra };
 }
 
@@ -32,7 +33,7 @@ export class Controls {
 
   setWorld(world) {
     this.keys = world.keys;
-    this.plan = plan(world.keys);
+    this.plan = plan(world.keys, world.first_keys);
     const { stick, turn } = this.plan;
     this.axes.setWorld(world, { ...stick, turnLeft: turn?.left, turnRight: turn?.right });
     this.release();

@@ -4,23 +4,34 @@ const PLACES = {
   KeyQ: [0, 1, 1], KeyW: [0, 1, 2], KeyE: [0, 1, 3], KeyA: [0, 2, 1], KeyS: [0, 2, 2], KeyD: [0, 2, 3],
   ArrowUp: [1, 1, 2], ArrowLeft: [1, 2, 1], ArrowDown: [1, 2, 2], ArrowRight: [1, 2, 3],
 };
-const GLYPHS = { ArrowUp: '↑', ArrowDown: '↓', ArrowLeft: '←', ArrowRight: '→', Space: 'Space', Enter: '⏎', ShiftLeft: 'Shift' };
+const GLYPHS = {
+  ArrowUp: '↑', ArrowDown: '↓', ArrowLeft: '←', ArrowRight: '→', Space: 'Space', Enter: '⏎', Backspace: '⌫', Minus: '-', Equal: '=',
+  BracketLeft: '[', BracketRight: ']', Semicolon: ';', Quote: "'", Backquote: '`', Comma: ',', Period: '.', Slash: '/', Backslash: '\\',
+};
+let layout = null;  // what is printed on the keys of this keyboard, where the browser tells
 
+/** Asks the browser what this keyboard's keys are called; then calls `redraw`. */
+export async function learnLayout(redraw) {
+  try {
+    layout = await navigator.keyboard.getLayoutMap();
+    redraw();
+  } catch { /* Firefox and Safari do not tell: keys are named as on an American keyboard */ }
+}
+
+/** What is printed on a key, or on several ("ArrowUp+Space"). */
 export function keyLabel(code) {
-  return GLYPHS[code] ?? code.replace(/^(Key|Digit)/, '').replace(/Left$|Right$/, '');
+  if (code.includes('+')) return code.split('+').map(keyLabel).join(' + ');
+  if (layout?.has(code)) return layout.get(code).toUpperCase();
+  return GLYPHS[code] ?? code.replace(/^(Key|Digit)/, '').replace(/^Numpad/, 'Num ').replace(/Left$|Right$/, '');
 }
 
-/** What a key does, in a word or two: MOVE_FORWARD is "forward", TURN_LEFT is "turn left". */
+/** What a key does, in the world's words. */
 export function keyMeaning(world, code) {
-  const value = world.keys[code], names = world.action_names;
-  const tidy = (name) => String(name).toLowerCase().replaceAll('_', ' ').replace(/^move /, '');
-  if (world.action_kind === 'Discrete') return tidy(names[value[0]] ?? value[0]);
-  const at = value.map((number, index) => [number, index]).filter(([number]) => number !== 0);
-  return at.map(([number, index]) => tidy(names[index] ?? `axis ${index + 1}`) + (world.action_kind === 'Box' ? (number > 0 ? ' +' : ' −') : '')).join(', ') || 'rest';
+  return world.actions[world.keys[code]].name;
 }
 
-/** Fills `root` with caps; gives a function that lights up the held ones. */
-export function drawKeycaps(root, world) {
+/** Fills `root` with caps; a click on one calls `chosen(code)`. Gives a function that lights up the held ones. */
+export function drawKeycaps(root, world, chosen) {
   root.replaceChildren();
   const groups = [0, 1, 2].map((number) => Object.assign(document.createElement('div'), { className: `cluster cluster-${number}` }));
   const caps = new Map();
@@ -30,12 +41,16 @@ export function drawKeycaps(root, world) {
     const letter = document.createElement('b'), meaning = document.createElement('i');
     letter.textContent = keyLabel(code);
     meaning.textContent = keyMeaning(world, code);
-    cap.title = meaning.textContent;
+    cap.title = `${meaning.textContent}: click to change`;
+    cap.onclick = () => chosen(code);
     cap.append(letter, meaning);
     const [group, row, column] = PLACES[code] ?? [2, 2, 0];
     if (column) { cap.style.gridRow = row; cap.style.gridColumn = column; }
     groups[group].append(cap);
     caps.set(code, cap);
+  }
+  for (const { children } of groups.slice(0, 2)) {  // left and right alone stand side by side
+    if (![...children].some((cap) => cap.style.gridColumn.startsWith('2'))) for (const cap of children) if (cap.style.gridColumn.startsWith('3')) cap.style.gridColumn = 2;
   }
   root.append(...groups.filter((group) => group.childElementCount));
   return (held) => caps.forEach((cap, code) => cap.classList.toggle('held', held.includes(code)));
