@@ -7,12 +7,16 @@ import re
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
+from tests.worlds.made import place
 
 import terrella
 from terrella.cli import COMMANDS, main
 from terrella.core import make_rng
+from terrella.worlds.controls import CHOICE, Controls
+from terrella.worlds.folder import load_world, save_world
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
@@ -141,6 +145,24 @@ def test_a_recording_of_nothing_is_refused(rows, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("terrella.serve.serve", serve)
     said = refusal(["record", "world", "gym:CartPole-v1", "--human", "--out", tmp_path / "set"], capsys)
     assert "nothing was recorded" in said
+
+
+@pytest.mark.parametrize(
+    "more, kept",
+    [([], True), (["--host", "0.0.0.0", "--token", "x"], False), (["--compare", "--truth", "gym:CartPole-v1"], False)],
+    ids=["own", "strangers", "beside its game"],
+)
+def test_keys_set_on_the_page_are_kept_in_the_worlds_folder_and_told_in_recordings(tmp_path, monkeypatch, more, kept):
+    def serve(worlds, host, port, token, sink, *_, keep, kept_in, **__):
+        keep(replace(worlds[0].spec, keys={"KeyX": [1.0]}))
+        assert (str(tmp_path / "one") in kept_in) == bool(kept_in) == kept
+        sink().close()
+
+    monkeypatch.setattr("terrella.serve.serve", serve)
+    save_world(place(Controls(CHOICE, (0.0,), (1.0,))), tmp_path / "one")
+    assert main(["play", str(tmp_path / "one"), "--record", str(tmp_path / "set"), "--device", "cpu", *more]) == 0
+    assert (load_world(tmp_path / "one").spec.keys == {"KeyX": [1.0]}) == kept
+    assert json.loads((tmp_path / "set" / "meta" / "terrella.json").read_text())["world"]["keys"] == {"KeyX": [1.0]}
 
 
 def test_help_imports_nothing_heavy():

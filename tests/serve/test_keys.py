@@ -29,15 +29,18 @@ def spec_of(space: spaces.Space, *names: str, **options) -> Spec:
 
 
 def listed(spec: Spec) -> dict[str, tuple[float, ...]]:
-    return {action.name: action.value for action in actions_of(spec)}
+    return {action.name + action.sign: action.value for action in actions_of(spec)}
 
 
 def test_everything_that_can_be_done_is_listed():
     assert listed(spec_of(spaces.Discrete(2, start=1))) == {"action 0": (1,), "action 1": (2,)}
     assert listed(Panorama().spec)["turn left"] == (0, 0, 0, 0, 1, 0)
     several = listed(spec_of(spaces.MultiDiscrete([3, 2]), "turn", "fire"))
-    assert several == {"turn 1": (1, 0), "turn 2": (2, 0), "fire": (0, 1)}
-    assert listed(spec_of(spaces.MultiDiscrete([3]), idle=(1.0,), keys={})) == {"choice 1 0": (0,), "choice 1 2": (2,)}
+    assert several == {"turn: 1": (1, 0), "turn: 2": (2, 0), "fire": (0, 1)}
+    assert listed(spec_of(spaces.MultiDiscrete([3]), idle=(1.0,), keys={})) == {
+        "choice 1: 0": (0,),
+        "choice 1: 2": (2,),
+    }
     car = spec_of(spaces.Box(np.float32([-1, 0]), np.float32([1, 1])), "steer", "gas", keys={"KeyW": [0.5, 1.0]})
     assert listed(car) == {"steer −": (-1, 0), "steer +": (1, 0), "gas": (0, 1), "steer 0.5, gas 1": (0.5, 1)}
 
@@ -241,16 +244,15 @@ def test_the_worlds_folder_is_named_and_axes_have_their_ends(serve_world, open_p
     page = open_page(serve_world([robot], keep=kept.append, kept_in="in the world's folder, runs/robot").url)
     page.click("#keys-open")
     assert "runs/robot" in page.locator("#keys-kept").text_content()
-    assert page.locator("#keys-panel li b").all_text_contents() == [
-        "forward −",
-        "forward +",
-        "turn −",
-        "turn +",
-        "gripper",
-    ]
+    names = page.locator("#keys-panel li input").evaluate_all("all => all.map((one) => one.ariaLabel)")
+    assert names == [f"Name of {name}" for name in ("forward −", "forward +", "turn −", "turn +", "gripper")]
+    row(page, "turn −").locator("input").fill("yaw")
+    page.keyboard.press("Enter")
+    assert row(page, "yaw +").count() == 1 and page.locator("#axes b").nth(1).text_content() == "yaw"
     page.locator("#keys-panel li").nth(4).locator(".add").click()
     page.keyboard.press("Space")
     page.keyboard.down("Space")
     until(page, "document.querySelectorAll('#axes output')[2].textContent === '1'")
     page.keyboard.up("Space")
-    assert kept[-1].keys["Space"] == [0.0, 0.0, 1.0] and page.evaluate("localStorage.length") == 0
+    assert kept[-1].keys["Space"] == [0.0, 0.0, 1.0] and kept[-1].action_names == ("forward", "yaw", "gripper")
+    assert page.evaluate("localStorage.length") == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,12 @@ from gymnasium import spaces
 
 import terrella
 from terrella.core import State, check_world, make_rng
-from terrella.core.errors import ContractError
+from terrella.core.errors import CheckpointError, ContractError
 from terrella.data.channels import facts_of
 from terrella.learn.recording import controls_of
 from terrella.worlds import learned
 from terrella.worlds.controls import AXES, CHOICE, Controls
-from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.folder import load_world, save_keys, save_world
 from terrella.worlds.generator import Generator
 from terrella.worlds.learned import LearnedWorld
 from terrella.worlds.uncertainty import Asked, Uncertainty, UncertaintyConfig
@@ -155,6 +156,18 @@ def test_a_saved_world_is_the_same(tmp_path, more):
     ways = [walk(one, look=True) for one in (first, again)]
     for name in world.spec.channels:
         assert torch.equal(*(one.render(state, (name,))[name] for one, state in zip((first, again), ways))), name
+
+
+def test_a_folder_keeps_other_keys_and_names_and_all_else_of_it(tmp_path):
+    world = place(KINDS["choice"])
+    save_world(world, tmp_path / "one")
+    before = (tmp_path / "one" / "weights.safetensors").read_bytes()
+    changed = replace(world.spec, keys={"KeyX": [3.0]}, action_names=("a", "b", "c", "d"), idle=(2.0,))
+    save_keys(tmp_path / "one", changed)
+    again = load_world(tmp_path / "one").spec
+    assert again == changed and (tmp_path / "one" / "weights.safetensors").read_bytes() == before
+    with pytest.raises(CheckpointError, match="no Terrella world"):
+        save_keys(tmp_path, changed)
 
 
 def test_channels_that_were_not_learned_are_named_in_the_card():

@@ -18,12 +18,13 @@ Keep = Callable[[Spec], None]  # what is done with the spec once its keys were c
 
 @dataclass(frozen=True)
 class Action:
-    """One thing to have a key for. value: the flat action; of: which of `Spec.action_names` is its name, None where its name is
-    made of several or of a number."""
+    """One thing to have a key for. value: the flat action; of: which of `Spec.action_names` is its name, None where that is made of
+    several; sign: what is said behind the name, as of the ends of an axis."""
 
     name: str
     value: tuple[float, ...]
     of: int | None = None
+    sign: str = ""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def actions_of(spec: Spec) -> list[Action]:
 
 def _single(spec: Spec) -> Iterator[Action]:
     space, rest = spec.action, neutral_action(spec).ravel().astype(np.float64)
-    names = [_tidy(name) for name in spec.action_names] or _unnamed(space)
+    names = _names(spec)
 
     def only(at: int, value: float, others: np.ndarray) -> tuple[float, ...]:
         return tuple(np.where(np.arange(len(others)) == at, float(value), others).tolist())
@@ -60,14 +61,13 @@ def _single(spec: Spec) -> Iterator[Action]:
         for at, (low, count) in enumerate(zip(space.start.ravel(), space.nvec.ravel(), strict=True)):
             values = [value for value in low + np.arange(count) if value != rest[at]]
             for value in values:
-                said = names[at] + ("" if len(values) == 1 else f" {value}")
-                yield Action(said, only(at, value, rest), at if len(values) == 1 else None)
+                yield Action(names[at], only(at, value, rest), at, "" if len(values) == 1 else f": {value}")
     else:
         for at, axis in enumerate(axes_of(spec)):
             ends = [end for end in (axis["low"], axis["high"]) if end]
             for end in ends:
                 sign = "" if len(ends) == 1 else " −" if end < 0 else " +"
-                yield Action(_tidy(axis["name"]) + sign, only(at, end, 0 * rest))
+                yield Action(names[at], only(at, end, 0 * rest), at, sign)
 
 
 def _unnamed(space: spaces.Space) -> list[str]:
@@ -76,6 +76,11 @@ def _unnamed(space: spaces.Space) -> list[str]:
         return [f"action {at}" for at in range(int(space.n))]
     what = {"MultiBinary": "button", "MultiDiscrete": "choice"}.get(type(space).__name__, "axis")
     return [f"{what} {at + 1}" for at in range(int(np.prod(space.shape or ())))]
+
+
+def _names(spec: Spec) -> list[str]:
+    said = [_tidy(name) for name in spec.action_names]
+    return [*said, *_unnamed(spec.action)[len(said) :]]
 
 
 def _tidy(name: str) -> str:
@@ -87,7 +92,7 @@ def _joined(spec: Spec, value: list[float]) -> str:
     """The words for an action of several parts."""
     rest = 0 * np.asarray(value) if isinstance(spec.action, spaces.Box) else neutral_action(spec).ravel()
     numbers = not isinstance(spec.action, spaces.MultiBinary)
-    names = [_tidy(name) for name in spec.action_names] or _unnamed(spec.action)
+    names = _names(spec)
     parts = [names[at] + (f" {number:g}" if numbers else "") for at, number in enumerate(value) if number != rest[at]]
     return ", ".join(parts) or "rest"
 
@@ -115,10 +120,11 @@ class KeyBook:
         return {
             "actions": [
                 {
-                    "name": each.name if each.of is None or not names else _tidy(names[each.of]),
+                    "name": each.name if each.of is None or each.of >= len(names) else _tidy(names[each.of]),
                     "first_name": each.name,
                     "value": list(each.value),
-                    "renamed": each.of is not None,
+                    "of": each.of,
+                    "sign": each.sign,
                 }
                 for each in self._actions
             ],
@@ -137,7 +143,7 @@ class KeyBook:
         keys = {code: list(self._actions[at].value) for code, at in asked.keys.items()}
         if not asked.names:
             return replace(spec, keys=keys)
-        names = list(spec.action_names) or _unnamed(spec.action)
+        names = [*spec.action_names, *_unnamed(spec.action)[len(spec.action_names) :]]
         for at, name in asked.names.items():
             place = self._actions[at].of
             if place is None:

@@ -195,7 +195,7 @@ function build() {
 }
 
 function drawKeys() {
-  light = drawKeycaps($('keys'), worlds[0], (code) => { showAside(panel); panel.ask(code); });
+  light = drawKeycaps($('keys'), worlds[0], (code) => { showAside(panel); if (code) panel.ask(code); });
   controls.setWorld(worlds[0]);
   drawTouch();
 }
@@ -208,7 +208,7 @@ function able(button, why, title) {
 function hint() {
   const caps = Object.keys(worlds[0].keys).filter((code) => !/^Arrow(Up|Down)/.test(code) || !('KeyW' in worlds[0].keys)).slice(0, 6);
   const parts = caps.flatMap((code) => [Object.assign(document.createElement('kbd'), { textContent: keyLabel(code) }), ' ']);
-  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : caps.length ? ['Press ', ...parts, 'to move'] : ['Move a slider, or click the picture and move the mouse']));
+  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : caps.length ? ['Press ', ...parts, worlds[0].axes.length ? 'or move a slider' : 'to move'] : ['Move a slider, or click the picture and move the mouse']));
   $('hint').classList.toggle('show', caps.length + worlds[0].axes.length > 0);
   setTimeout(() => $('hint').classList.remove('show'), 9000);
 }
@@ -355,6 +355,9 @@ function drawTouch() {
   const { plan } = controls.axes;
   $('stick').hidden = !Object.values(stick).some(Boolean) && !plan.lx && !plan.ly;
   $('turn').hidden = !turn && !plan.rx;
+  const { axes } = controls.axes;
+  $('stick').querySelector('em').textContent = axes.length ? controls.axes.movedBy('lx', 'ly') : 'move';
+  $('turn').querySelector('em').textContent = axes.length ? controls.axes.movedBy('rx') : 'turn';
   $('extra').replaceChildren(...(worlds[0].axes.length ? [] : extra).map((code) => {
     const button = Object.assign(document.createElement('button'), { textContent: keyMeaning(worlds[0], code) });
     controls.bindButton(button, code);

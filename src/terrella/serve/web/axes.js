@@ -6,6 +6,7 @@ const HINTS = [  // which stick moves an axis of that name, and the way that it 
   [/strafe|lateral|side|^v?y$|left/i, 'lx'],
 ];
 const STICKS = ['lx', 'ly', 'rx', 'ry'];
+const STICK_NAMES = { lx: 'left stick, sideways,', ly: 'left stick, up and down,', rx: 'right stick, sideways,', ry: 'right stick, up and down,' };
 
 /** What the sticks do: {lx: {plus: [...], minus: [...]}, ...}, the action at either end; from the world's keys where it has some. */
 export function stickPlan(axes, keys, pick) {
@@ -40,13 +41,13 @@ export class Axes {
   }
 
   setWorld(world, pick) {
-    this.axes = world.axes;
+    this.axes = world.axes.map((axis, at) => ({ ...axis, name: world.actions.find(({ of }) => of === at)?.name ?? axis.name }));
     this.sweeps = world.action_mode === 'position';  // a stick moves the target, and lets go of it where it is
     this.keys = Object.fromEntries(Object.entries(world.keys).map(([code, place]) => [code, world.actions[place].value]));
-    this.plan = stickPlan(world.axes, this.keys, pick);
+    this.plan = stickPlan(this.axes, this.keys, pick);
     this.root.hidden = !world.axes.length;
     this.root.title = [world.action_mode, world.action_frame && `in the frame of the ${world.action_frame}`].filter(Boolean).join(', ');
-    this.rows = world.axes.map((axis, at) => this.row(axis, at));
+    this.rows = this.axes.map((axis, at) => this.row(axis, at));
     this.root.replaceChildren(...this.rows.map((row) => row.label));
     this.rest();
   }
@@ -56,12 +57,24 @@ export class Axes {
     const label = make('label'), name = make('b', axis.name.replaceAll('_', ' ')), value = make('output'), ends = make('i');
     const slider = Object.assign(make('input'), { type: 'range', min: axis.low, max: axis.high, step: axis.whole ? 1 : 'any' });
     ends.append(make('span', digits(axis.low)), make('span', digits(axis.high)));
-    label.title = `${axis.name}: ${digits(axis.low)} to ${digits(axis.high)} ${axis.unit}; double click for ${digits(axis.neutral)}`;
+    const stick = STICKS.find((one) => this.moves(one, at)), by = stick ? `; the ${STICK_NAMES[stick]} moves it` : '';
+    label.title = `${axis.name}: ${digits(axis.low)} to ${digits(axis.high)} ${axis.unit}${by}; double click for ${digits(axis.neutral)}`;
     slider.oninput = (event) => { this.set[at] = Number(slider.value); this.merge(event.timeStamp); };
     slider.onchange = () => slider.blur();  // the keys are the world's again
     label.ondblclick = (event) => { this.set[at] = axis.neutral; this.merge(event.timeStamp); };
     label.append(name, value, slider, ends);
     return { label, slider, value };
+  }
+
+  /** Whether a stick moves an axis. */
+  moves(stick, at) {
+    const ends = this.plan[stick];
+    return !!ends && (ends.plus[at] !== this.axes[at].neutral || ends.minus[at] !== this.axes[at].neutral);
+  }
+
+  /** The names of the axes that these sticks move. */
+  movedBy(...sticks) {
+    return this.axes.filter((_, at) => sticks.some((stick) => this.moves(stick, at))).map(({ name }) => name).join(' · ');
   }
 
   get active() { return this.values.some((value, at) => value !== this.axes[at].neutral); }

@@ -27,10 +27,11 @@ export function keyLabel(code) {
 
 /** What a key does, in the world's words. */
 export function keyMeaning(world, code) {
-  return world.actions[world.keys[code]].name;
+  const { name, sign } = world.actions[world.keys[code]];
+  return name + sign;
 }
 
-/** Fills `root` with caps; a click on one calls `chosen(code)`. Gives a function that lights up the held ones. */
+/** Fills `root` with caps, as many as there is room for; a click on one calls `chosen(code)`, on the last, which is for all others, `chosen()`. Gives a function that lights up the held ones. */
 export function drawKeycaps(root, world, chosen) {
   root.replaceChildren();
   const groups = [0, 1, 2].map((number) => Object.assign(document.createElement('div'), { className: `cluster cluster-${number}` }));
@@ -51,6 +52,13 @@ export function drawKeycaps(root, world, chosen) {
   }
   for (const { children } of groups.slice(0, 2)) {  // left and right alone stand side by side
     if (![...children].some((cap) => cap.style.gridColumn.startsWith('2'))) for (const cap of children) if (cap.style.gridColumn.startsWith('3')) cap.style.gridColumn = 2;
+  }
+  const beside = groups.slice(0, 2).filter((group) => group.childElementCount).length, most = [18, 10, 6][beside], rest = groups[2];
+  if (rest.childElementCount > most) {
+    while (rest.childElementCount >= most) rest.lastChild.remove();
+    const more = Object.assign(document.createElement('kbd'), { className: 'more', title: 'All keys', innerHTML: '<b>⋯</b><i>all keys</i>' });
+    more.onclick = () => chosen();
+    rest.append(more);
   }
   root.append(...groups.filter((group) => group.childElementCount));
   return (held) => caps.forEach((cap, code) => cap.classList.toggle('held', held.includes(code)));

@@ -53,7 +53,7 @@ export class KeyPanel {
     const found = world.kept_in ? null : this.stored();
     if (found?.served === this.served) {
       world.keys = found.keys;
-      for (const [at, name] of found.names) world.actions[at].name = name;
+      for (const [at, name] of found.names) this.call(at, name);
     } else if (before && !world.kept_in && before.name === world.name && this.lostStore) {
       Object.assign(world, { keys: before.keys, actions: before.actions });  // a browser that keeps nothing, after a reconnection
     }
@@ -61,7 +61,11 @@ export class KeyPanel {
     return this.edited;
   }
 
-  get names() { return this.world.actions.flatMap(({ name, first_name }, at) => (name === first_name ? [] : [[at, name]])); }
+  /** The names that were changed, each with the place of one of its actions. */
+  get names() {
+    const { actions } = this.world, first = (at) => actions.findIndex(({ of }) => of === actions[at].of) === at;
+    return actions.flatMap(({ name, first_name }, at) => (name !== first_name && first(at) ? [[at, name]] : []));
+  }
 
   get edited() { return this.names.length > 0 || JSON.stringify(this.world.keys) !== JSON.stringify(this.world.first_keys); }
 
@@ -121,11 +125,16 @@ export class KeyPanel {
 
   bind() {
     const { code: gone, place, pressed } = this.asked, { keys, actions } = this.world;
-    const code = pressed.join('+'), other = keys[code], meant = actions[place].name;
+    const code = pressed.join('+'), other = keys[code], meant = this.words(place);
     this.asked = null;
     if (code === gone || other === place) return this.ask(null);
     this.world.keys = rebound(keys, gone, code, place);
     this.use(this.conflict(code, meant, other));
+  }
+
+  words(place) {
+    const { name, sign } = this.world.actions[place];
+    return name + sign;
   }
 
   /** What else a key did until now, in a sentence; '' where it did nothing. */
@@ -133,7 +142,7 @@ export class KeyPanel {
     const label = keyLabel(code), use = this.pageUse(code);
     if (other !== undefined) {
       const bare = !Object.values(this.world.keys).includes(other);
-      return `${label} was “${this.world.actions[other].name}” and is “${meant}” now${bare ? '; the former has no key any more' : ''}.`;
+      return `${label} was “${this.words(other)}” and is “${meant}” now${bare ? '; the former has no key any more' : ''}.`;
     }
     return use ? `${label} also ${use} on this page: that is left to its button, as the world’s keys come first.` : '';
   }
@@ -143,18 +152,24 @@ export class KeyPanel {
     this.asked = null;
     if (!code) return this.ask(null);
     this.world.keys = rebound(this.world.keys, code, null, place);
-    this.use(Object.values(this.world.keys).includes(place) ? '' : `“${this.world.actions[place].name}” has no key now.`);
+    this.use(Object.values(this.world.keys).includes(place) ? '' : `“${this.words(place)}” has no key now.`);
+  }
+
+  /** Names an action, and what else has that name: the other end of an axis. */
+  call(place, name) {
+    const { actions } = this.world;
+    for (const action of actions) if (action.of === actions[place].of) action.name = name;
   }
 
   rename(place, input) {
     const name = input.value.trim(), { actions } = this.world;
     if (name === actions[place].name) return;
-    const twice = actions.some((action, at) => at !== place && action.name.toLowerCase() === name.toLowerCase());
+    const twice = actions.some((action) => action.of !== actions[place].of && action.name.toLowerCase() === name.toLowerCase());
     if (!name || twice) {
       input.value = actions[place].name;
       return this.say(name ? `“${name}” is the name of another action.` : 'An action has a name of one letter or more.');
     }
-    actions[place].name = name;
+    this.call(place, name);
     this.use();
   }
 
@@ -171,25 +186,27 @@ export class KeyPanel {
     const { actions, keys, kept_in: kept } = this.world, make = (tag, fields) => Object.assign(document.createElement(tag), fields);
     this.root.querySelector('#keys-kept').textContent = kept ? `Kept ${kept}: they are the world’s from now on.` : this.lostStore ? 'This browser keeps nothing: they last until the page is closed.' : 'Kept in this browser, for this world.';
     this.reset.hidden = !this.edited;
-    this.list.replaceChildren(...actions.map(({ name, renamed }, place) => {
+    this.list.replaceChildren(...actions.map(({ name, of, sign }, place) => {
       const row = make('li'), caps = make('span', { className: 'caps' });
-      const title = renamed ? make('input', { value: name, maxLength: 40, spellcheck: false, title: 'Click to rename' }) : make('b', { textContent: name });
-      if (renamed) {
-        title.setAttribute('aria-label', `Name of ${name}`);
+      const title = of === null ? make('b', { textContent: name }) : make('input', { value: name, maxLength: 40, spellcheck: false, title: 'Click to rename' });
+      if (of !== null) {
+        title.setAttribute('aria-label', `Name of ${name + sign}`);
         title.onchange = () => this.rename(place, title);
         title.onkeydown = (event) => { if (event.code === 'Enter' || event.code === 'Escape') { if (event.code === 'Escape') title.value = name; title.blur(); } };
       }
       const cap = (code, text) => {
         const asking = this.asked?.place === place && this.asked.code === code;
         const button = make('button', { className: `cap${asking ? ' asking' : ''}${code ? '' : ' add'}`, textContent: asking ? 'press a key' : text });
-        button.setAttribute('aria-label', code ? `Change ${text}, ${name}` : `Add a key for ${name}`);
+        button.setAttribute('aria-label', code ? `Change ${text}, ${name + sign}` : `Add a key for ${name + sign}`);
         button.onclick = () => { this.ask(asking ? null : code, asking ? null : place); document.activeElement?.blur(); };
         return button;
       };
       const own = Object.keys(keys).filter((code) => keys[code] === place);
       if (place === this.world.resting) caps.append(make('em', { textContent: 'no key held' }));
       caps.append(...own.map((code) => cap(code, keyLabel(code))), cap(null, own.length || place === this.world.resting ? '+' : 'set a key'));
-      row.append(title, caps);
+      const fitted = make('span', { className: 'fitted' });  // as wide as the name, so that the sign stands right behind it
+      if (sign) { title.size = 1; fitted.append(make('span', { textContent: name }), title); }
+      row.append(...(sign ? [fitted, make('span', { className: 'sign', textContent: sign })] : [title]), caps);
       return row;
     }));
   }
