@@ -66,7 +66,7 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
 def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
     """Within the motion model, the generator, the estimator and the uncertainty; in the first step, too."""
     config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
-    stages = {"motion": 7, "flow": 0, "estimator": 1, "uncertainty": 3}
+    stages = {"motion": 7, "estimator": 1, "flow": 0, "uncertainty": 3}
     goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
     worlds = [load_file(tmp_path / run / "world" / "weights.safetensors") for run in ("a", "b")]
     assert all(torch.allclose(worlds[0][name].float(), worlds[1][name].float(), atol=1e-4) for name in worlds[0])

@@ -15,6 +15,7 @@ DESCRIPTION = "Learn a world from recordings, step inside it, and measure how fa
 
 # Each command: the function of this package that runs it, and what it does. Its module is imported when it runs.
 COMMANDS = {
+    "learn": ("learn:learn", "record, train and score a world of an environment, in one go"),
     "play": ("play:play", "play a world in the browser"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),

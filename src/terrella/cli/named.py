@@ -70,6 +70,41 @@ class Keeper:
             save_keys(self.folder, spec)
 
 
+@dataclass(frozen=True)
+class Environment:
+    """What a person says of a Gymnasium environment; the rest it says itself.
+
+    Args:
+        size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
+        fps: Steps a second of a Gymnasium environment; default: as it says, or 10.
+        adapter: A Python file (FILE.py or FILE.py:NAME) with an Adapter that says where depth, poses and more are found.
+    """
+
+    size: tuple[int, int] | None = None
+    fps: float | None = None
+    adapter: str | None = None
+
+    def open(self, name: str) -> World:
+        """The world of this name, as was said."""
+        from .. import library
+        from ..core.errors import TerrellaError
+
+        if self.fps is not None and not 0 < self.fps < 10_000:
+            raise TerrellaError(
+                f"--fps {self.fps:g} is no number of steps a second; say how many a person plays, as in --fps 15."
+            )
+        if name.startswith("gym:ALE/") and (self.fps or self.adapter):
+            raise TerrellaError("Atari games have a clock and names of their own; leave --fps and --adapter out.")
+        options: dict[str, Any] = {"size": self.size} if self.size else {}
+        options |= {"dt_s": 1 / self.fps} if self.fps else {}
+        options |= {"adapter": library.load_adapter(self.adapter)} if self.adapter else {}
+        if options and not name.startswith("gym:"):
+            raise TerrellaError(
+                "--size, --fps and --adapter are for Gymnasium environments; other worlds are as they are."
+            )
+        return library.load(name, **options)
+
+
 def load_named(name: str, device: str, memory: bool = True, fast: bool = False, **remembering: Any) -> World:
     """A world by name; only learned worlds have a device, a memory and a faster way of drawing."""
     from .. import library

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from tyro.conf import Positional
 
 from .. import progress
 from ..core.spec import BUTTONS, CHOICE, Spec, can_idle, neutral_action
-from .named import Controls, Keeper
+from .named import Controls, Environment, Keeper
 from .say import Json, Port, Seed, result, say
 
 if TYPE_CHECKING:
     from ..core.world import World
+    from ..data import Dataset, Recorder
 
 
 @dataclass(frozen=True)
@@ -62,10 +64,8 @@ def record_world(
     name: Positional[str],
     recording: Recording,
     controls: Controls,
+    environment: Environment,
     frames: int = 10_000,
-    size: tuple[int, int] | None = None,
-    fps: float | None = None,
-    adapter: str | None = None,
     pictures: Literal["auto", "png", "video"] = "auto",
 ) -> None:
     """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or a learned world.
@@ -73,39 +73,43 @@ def record_world(
     Args:
         name: A name that `terrella list` shows, or the path of a checkpoint.
         frames: Frames to record in all. With --human there is no limit.
-        size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
-        fps: Steps a second of a Gymnasium environment; default: as it says, or 10.
-        adapter: A Python file (FILE.py or FILE.py:NAME) with an Adapter that says where depth, poses and more are found.
         pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above.
     """
-    from .. import library
-    from ..core.errors import TerrellaError
-
-    if fps is not None and not 0 < fps < 10_000:
-        raise TerrellaError(
-            f"--fps {fps:g} is no number of steps a second; say how many a person plays, as in --fps 15."
-        )
-    if name.startswith("gym:ALE/") and (fps or adapter):
-        raise TerrellaError("Atari games have a clock and names of their own; leave --fps and --adapter out.")
-    options: dict[str, Any] = {"size": size} if size else {}
-    options |= {"dt_s": 1 / fps} if fps else {}
-    options |= {"adapter": library.load_adapter(adapter)} if adapter else {}
-    if options and not name.startswith("gym:"):
-        raise TerrellaError("--size, --fps and --adapter are for Gymnasium environments; other worlds are as they are.")
-    world = controls.of(library.load(name, **options))
-    for line in _described(world.spec):
+    world = controls.of(environment.open(name))
+    for line in described(world.spec):
         say(line)
-    if pictures == "auto":
-        drawn = world.spec.channels.get("rgb")
-        pictures = "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
-    _record(world, recording, frames, pictures)
+    _record(world, recording, frames, stored_as(world.spec) if pictures == "auto" else pictures)
+
+
+def stored_as(spec: Spec) -> Literal["video", "png"]:
+    """How pictures of such a world are kept, unless it is said."""
+    drawn = spec.channels.get("rgb")
+    return "png" if drawn is not None and max((drawn.shape or (0,))[:2]) <= 96 else "video"
+
+
+def explore(
+    world: World,
+    out: Path,
+    frames: int,
+    seed: int,
+    report: Callable[..., None],
+    pictures: Literal["video", "png"],
+    **more: Any,
+) -> Recorder:
+    """Lets a script play into the recording `out`, on from what lies there; `more` is what `record` takes."""
+    from ..act.explorer import Explorer
+    from ..core.world import make_rng
+    from ..data import Dataset, record
+
+    player = Explorer(world.spec, out / ".explorer")
+    kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
+    player.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
+    return record(world, player, out, frames, make_rng(seed), report, pictures=pictures, **more)
 
 
 def _record(world: World, recording: Recording, frames: int, pictures: Literal["video", "png"] = "video") -> None:
-    from ..act.explorer import Explorer
     from ..core.errors import DatasetError
-    from ..core.world import make_rng
-    from ..data import Dataset, Layout, Recorder, coverage, record
+    from ..data import Dataset, Layout, Recorder
 
     layout, out = replace(Layout.of(world.spec), pictures=pictures), recording.out
     facts: dict[str, object] = {"dataset": str(out)}
@@ -121,12 +125,7 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
             serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed, keep=keeper)
         else:
             with progress.shown("recording") as report:
-                player, rng = Explorer(world.spec, out / ".explorer"), make_rng(recording.seed)
-                kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
-                player.recall(
-                    kept.length - len(kept.episodes) if kept else 0
-                )  # each episode ends with a row without action
-                done = record(world, player, out, frames, rng, report, live=live, pictures=pictures)
+                done = explore(world, out, frames, recording.seed, report, pictures, live=live)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out) if out.exists() else None
     if dataset is None or not dataset.length:
@@ -138,17 +137,24 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
                 else "; ask for more --frames."
             )
         )
-    facts |= {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world.spec.name}
+    result(facts | looked_at(dataset, world.spec.name), recording.json)
+
+
+def looked_at(dataset: Dataset, world: str) -> dict[str, object]:
+    """What a recording of `world` holds, with a picture of it to look at; warns of one that teaches little."""
+    from ..data import coverage
+
+    facts: dict[str, object] = {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world}
     if dataset.has("rgb"):
-        facts["look"] = str(_contact_sheet(dataset, out / "look.jpg"))
+        facts["look"] = str(_contact_sheet(dataset, Path(dataset.root) / "look.jpg"))
         covered = coverage(dataset)
         facts |= covered.facts()
         for warning in covered.warnings():
             say(f"Warning: {warning}")
-    result(facts, recording.json)
+    return facts
 
 
-def _described(spec: Spec) -> list[str]:
+def described(spec: Spec) -> list[str]:
     """What is recorded, and of each choice that nobody made on the command line who made it."""
     from ..data.recording import LONGEST
 

@@ -6,7 +6,8 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -90,19 +91,26 @@ def score(
         if quick
         else ExamConfig(horizons=horizons, long_steps=long_steps, still_steps=long_steps)
     )
-    arms, closing = _arms(name, device, fast, quick)
-    exam, identity = _exam(arms, closing, data, new, fresh, clips, drift, config, seed)
-    identity += _files_of(name) + f" fast={fast} device={device_of(device)}"
+    arms, closing = arms_of(name, device, fast, quick)
+    exam, identity = exam_of(arms, closing, data, new, fresh, clips, drift, config, seed)
     with progress.shown("scoring") as report:
-        tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
-        card = examine(exam, out / "parts", identity, tell)
-    files = write_report(card, out, f"{next(iter(card.worlds.values()))}: the scorecard")
-    shutil.rmtree(out / "parts", ignore_errors=True)
+        card, files = carded(name, exam, identity + f" fast={fast} device={device_of(device)}", out, report)
     facts = {**as_dict(card), "files": [str(file) for file in files]}
     result(facts, json, "\n".join([*verdict(card), *_lines(card), f"the page: {files[1]}"]))
 
 
-def _arms(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
+def carded(
+    name: str, exam: Exam, identity: str, out: Path, report: Callable[..., None]
+) -> tuple[Scorecard, list[Path]]:
+    """The scorecard of the world `name`, and its files in the folder `out`, where what is measured is kept as it comes."""
+    tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
+    card = examine(exam, out / "parts", identity + _files_of(name), tell)
+    files = write_report(card, out, f"{next(iter(card.worlds.values()))}: the scorecard")
+    shutil.rmtree(out / "parts", ignore_errors=True)
+    return card, list(files)
+
+
+def arms_of(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
     """The world, with its memory and without where it has one; and more of which only memory is asked."""
     world = load_named(name, device, fast=fast)
     if library.is_truth(name) or "pose" not in world.spec.observes:
@@ -113,7 +121,7 @@ def _arms(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, Wo
     return {"memory": world, "no memory": load_named(name, device, memory=False, fast=fast)}, {"last frame only": bare}
 
 
-def _exam(
+def exam_of(
     arms: Mapping[str, World],
     closing: Mapping[str, World],
     data: Path,
@@ -123,10 +131,12 @@ def _exam(
     drift: int | None,
     config: ExamConfig,
     seed: int,
+    report: Callable[..., None] | None = None,
 ) -> tuple[Exam, str]:
-    """Clips of the recordings, of ground that training saw and of ground that it did not."""
+    """Clips of the recordings, of ground that training saw and of ground that it did not; without `report` it shows itself
+    what is read."""
     world = next(iter(arms.values()))
-    cache = _cache(data, world)
+    cache = _cache(data, world, report)
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
     every = range(len(cache.episodes))
     held_out = every if fresh else split(len(every))[1]
@@ -165,7 +175,7 @@ def _exam(
     return Exam(arms, sets, config, seed, going, album, closing), f"{__version__} {paths} "
 
 
-def _cache(data: Path, world: World) -> Any:
+def _cache(data: Path, world: World, report: Callable[..., None] | None = None) -> Any:
     """The recording's ClipCache at the size that the world shows, if it is of the world's game."""
     dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
     if doubt := check_game(dataset, world.spec):
@@ -174,9 +184,9 @@ def _cache(data: Path, world: World) -> Any:
         height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
         feature = dataset.channels.get(channel)
         sizes.setdefault((height, width), []).extend([feature] if feature and channel != "rgb" else [])
-    with progress.shown(f"reading {data}") as report:
+    with nullcontext(report) if report else progress.shown(f"reading {data}") as told:
         asked = (sizes or {(96, 128): []}).items()
-        caches = [ClipCache.open(dataset, size, report, cameras) for size, cameras in asked]
+        caches = [ClipCache.open(dataset, size, told, cameras) for size, cameras in asked]
     for cache, cameras in zip(caches, sizes.values()):  # cameras of another size have a cache of their own
         caches[0].arrays.update({feature: cache.arrays[feature] for feature in cameras})
     check_recording(caches[0], world.spec)

@@ -31,8 +31,9 @@ def record(
     task: str | None = None,
     live: Watch | None = None,
     pictures: Literal["video", "png"] = "video",
+    enough: Callable[[], bool] = lambda: False,
 ) -> Recorder:
-    """Records until `root` holds `frames` rows (those of an earlier run count), one world step a row.
+    """Records until `root` holds `frames` rows (those of an earlier run count), or until it is `enough`, one world step a row.
 
     An episode ends at `done` or after `max_episode_steps`, by default the world's own limit, or LONGEST.
     Each episode has a generator of its own, drawn from `rng`'s
@@ -51,15 +52,15 @@ def record(
     base = int(torch.randint(2**62, (1,), generator=rng).item())
     task = task or f"explore {world.spec.name}"
     with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again
-        while recorder.rows < frames - 1:  # an episode has 2 rows or more
+        while recorder.rows < frames - 1 and not enough():  # an episode has 2 rows or more
             seed = int(np.random.SeedSequence([base, recorder.episodes]).generate_state(1, np.uint64)[0] >> 2)
-            _episode(world, policy, recorder, frames, make_rng(seed), progress, max_episode_steps)
+            _episode(world, policy, recorder, frames, make_rng(seed), progress, max_episode_steps, enough)
             recorder.end_episode()
     return recorder
 
 
 @torch.no_grad()
-def _episode(world, policy, recorder, frames, rng, progress, max_steps) -> None:
+def _episode(world, policy, recorder, frames, rng, progress, max_steps, enough) -> None:
     channels = [name for name in world.spec.channels if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]
     state, left, done = world.start(1, rng), frames - recorder.rows, False
@@ -74,7 +75,7 @@ def _episode(world, policy, recorder, frames, rng, progress, max_steps) -> None:
         recorder.add(_first(seen), action[0].cpu().numpy(), reward, done)
         if progress:
             progress(recorder.rows + recorder.in_flight, frames)
-        if done:
+        if done or enough():
             break
     recorder.add(_first(world.render(state, channels)))
     if progress:

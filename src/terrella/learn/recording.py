@@ -194,9 +194,11 @@ def there(cache: ClipCache, name: str) -> bool:
 def fitting(dataset: Dataset) -> tuple[int, int]:
     """Height and width in multiples of 8 at which a recording's pictures are learned: their own, or smaller ones of that shape
     that have at most MOST pixels."""
-    if dataset.rgb_key is None:
-        return 96, 128
-    height, width = dataset.sensors[dataset.rgb_key].shape[:2]
+    return (96, 128) if dataset.rgb_key is None else learned_size(*dataset.sensors[dataset.rgb_key].shape[:2])
+
+
+def learned_size(height: int, width: int) -> tuple[int, int]:
+    """The size at which pictures of so many pixels are learned, see `fitting`."""
     scale = min(1.0, math.sqrt(MOST / (height * width)))
     return max(16, 8 * round(scale * height / 8)), max(16, 8 * round(scale * width / 8))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -65,6 +65,15 @@ def load_run(
         raise TrainingError(
             f"{path} is not a run of this recipe ({first}); give another --out, or delete it."
         ) from error
+
+
+def stages_of(folder: Path) -> Iterator[dict]:
+    """The facts of each stage of a run that can be read."""
+    for path in sorted(folder.glob("resume-*.safetensors")):
+        try:
+            yield _facts(path)
+        except (OSError, SafetensorError, KeyError, ValueError, TypeError):
+            continue
 
 
 def _facts(path: Path) -> dict:

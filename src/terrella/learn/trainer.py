@@ -24,6 +24,7 @@ from torch import nn
 
 from ..core.errors import TrainingError
 from ..core.world import make_rng
+from .budget import Budget
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 
 Report = Callable[[float, float, str], None]
@@ -34,7 +35,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Now:
-    """One step: its number, the share of the training before it, and its randomness, which (seed, step) alone decides."""
+    """One step: its number, the share of the training before it (of its steps or of its time, whichever is more), and its
+    randomness, which (seed, step) alone decides."""
 
     step: int
     share: float
@@ -142,6 +144,7 @@ class Run:
     """The folder of a training run, and what its stages share.
 
     recipe: JSON values that must not change within the run.
+    budget: the time that all stages share.
     """
 
     out: Path
@@ -151,17 +154,25 @@ class Run:
     device: torch.device = CPU
     save_every_s: float = 60.0
     strip_every_s: float = 300.0
+    budget: Budget = field(default_factory=Budget, compare=False)
 
     @staticmethod
     def of(
-        out: str | Path, config: Any, report: Report, device: torch.device = CPU, free: Sequence[str] = (), **facts: Any
+        out: str | Path,
+        config: Any,
+        report: Report,
+        device: torch.device = CPU,
+        free: Sequence[str] = (),
+        shares: Mapping[str, float] | None = None,
+        **facts: Any,
     ) -> Run:
         """The run of a recipe's settings, a dataclass, of which all but `free` and where and how often it is saved must not
-        change, nor may `facts`."""
+        change, nor may `facts`; `shares` of the settings' `hours`, if they have any, are the most that stages may take."""
         settings = asdict(config)
         times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
-        return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times)
+        budget = Budget(Path(out), settings.get("hours", math.inf), shares)
+        return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times, budget=budget)
 
     def found(self, stage: str) -> dict | None:
         """The facts of a stage that was begun; TrainingError where that had other settings, or was of another recording."""
@@ -179,12 +190,14 @@ class Run:
 
 
 class Trainer:
-    """A stage of a run; it goes on where it was stopped, and ends after `steps` or `hours`, those of earlier runs counted in.
+    """A stage of a run; it goes on where it was stopped, and ends after `steps` or when the share of the run's time is over that
+    it may take; what earlier runs did counts.
 
     TrainingError where the run's folder holds one with another recipe.
 
-    device: where it is to run, if not where the others do.
-    facts:  recipe, step, seconds, and what `once` added; saved with the rest.
+    device:  where it is to run, if not where the others do.
+    limit_s: seconds after which it ends.
+    facts:   recipe, step, seconds, and what `once` added; saved with the rest.
     """
 
     def __init__(
@@ -194,11 +207,10 @@ class Trainer:
         feed: Feed,
         objective: Objective,
         steps: int,
-        hours: float = math.inf,
         device: torch.device | None = None,
     ):
         self.run, self.stage, self.feed, self.objective = run, stage, feed, objective
-        self.steps, self.hours, self.device = steps, hours, device or run.device
+        self.steps, self.limit_s, self.device = steps, run.budget.most_s(stage), device or run.device
         self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
         self.facts |= {"seconds": 0.0, "recent": []}
         self._file = resume_file(run.out, stage)
@@ -217,11 +229,18 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """The facts that people read."""
-        return {name: fact for name, fact in self.facts.items() if name not in ("recipe", "recent", "feed")}
+        inner = ("recipe", "recent", "feed", "spent", "asked")
+        return {name: fact for name, fact in self.facts.items() if name not in inner}
 
     @property
     def finished(self) -> bool:
-        return self.facts["step"] >= self.steps or self.facts["seconds"] >= 3600 * self.hours
+        return self.share >= 1
+
+    @property
+    def share(self) -> float:
+        """How much of the training is done, of its steps or of its time, whichever is more."""
+        by_time = self.facts["seconds"] / self.limit_s if self.limit_s > 0 else 1.0
+        return max(self.facts["step"] / self.steps if self.steps > 0 else 1.0, by_time)
 
     def train(self, draw: Callable[[], None] | None = None) -> None:
         """Trains to the end; `draw()` now and then, which leaves what there is to look at."""
@@ -260,7 +279,7 @@ class Trainer:
         """One whole step: a batch, and down each of its losses in turn. Returns the means of their parts."""
         rng = np.random.default_rng([self.run.seed, step])
         noise = make_rng(int(rng.integers(2**62)))
-        now = Now(step, step / self.steps, self.device, rng, noise)
+        now = Now(step, self.share, self.device, rng, noise)
         for learner in self.objective.learners.values():
             if learner.rate is not None:
                 for group in learner.optimiser.param_groups:
@@ -291,7 +310,7 @@ class Trainer:
     def save(self) -> None:
         """The run as it is after its last whole step."""
         self.run.out.mkdir(parents=True, exist_ok=True)
-        self.facts["feed"] = self.feed.state()
+        self.facts |= {"feed": self.feed.state(), "spent": self.run.budget.spent_s}
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:
@@ -308,8 +327,7 @@ class Trainer:
         write_log(self.run.out, line)
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
-        by_steps, by_hours = facts["step"] / self.steps, facts["seconds"] / (3600 * self.hours)
-        self.run.report(max(by_steps, by_hours), 1.0, f"{self.stage}: {words}")
+        self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: {words}")
 
 
 def _not_a_number(what: str, step: int) -> str:

@@ -3,7 +3,7 @@
 from .album import Album
 from .clips import Clip, check_recording, clips_from_cache, in_box, out_of_sight
 from .exam import CLIPS, ENDINGS, LONG, Exam, ExamConfig
-from .examine import PROBES, examine, write_report
+from .examine import PROBES, examine, within, write_report
 from .outcomes import passages
 from .page import page
 from .scorecard import Row, Scorecard, words_of
@@ -12,4 +12,4 @@ from .verdict import as_dict, to_json, verdict
 
 __all__ = ["CLIPS", "ENDINGS", "LONG", "PROBES", "Album", "Clip", "Exam", "ExamConfig", "Row", "Scorecard"]
 __all__ += ["as_dict", "check_recording", "clips_from_cache", "examine", "in_box", "out_of_sight", "page", "passages"]
-__all__ += ["strip", "to_json", "verdict", "words_of", "write_report"]
+__all__ += ["strip", "to_json", "verdict", "within", "words_of", "write_report"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import product
 from typing import Any
@@ -78,6 +78,12 @@ class Exam:
     @property
     def dt_s(self) -> float:
         return next(iter(self.arms.values())).spec.dt_s
+
+    def of(self, clips: int) -> Exam:
+        """The same on no more than so many clips of each set and place."""
+        sets = {kind: {place: some[:clips] for place, some in places.items()} for kind, places in self.sets.items()}
+        going = {place: some[:clips] for place, some in self.going.items()}
+        return replace(self, sets=sets, going=going, _known={})
 
     def rng(self, number: int = 0) -> torch.Generator:
         """Chance for one purpose: always the same, whatever was drawn before."""

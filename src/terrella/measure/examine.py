@@ -25,7 +25,7 @@ from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
 from .verdict import to_json
-from .work import Clock, Progress, Store, prices_of, run_all, writing
+from .work import Calls, Clock, Forecast, Progress, Store, prices_of, run_all, writing
 
 DRIFT = drift_probe((pixel_series, state_series, pose_series))
 PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, STILLNESS, ENDURANCE, SPEED)
@@ -51,12 +51,8 @@ def examine(
     for place, clips in exam.sets.get(LONG, {}).items():
         check_clips(place, clips, 1)
     store = Store(folder, exam.fingerprint(identity))
-    some = next(iter(exam.places.values()))
-    prices = {}
     progress(0.0, "measuring how fast the worlds are", 0.0)
-    for arm, world in {**exam.arms, **exam.closing}.items():
-        prices |= prices_of(arm, world, some[: min(config.batch, world.spec.max_batch or config.batch)], clock)
-    prices["recording", "compare"] = 3e-3
+    prices = _prices(exam, clock)
     units = dreams(exam, probes) + [unit for probe in probes for unit in probe.units(exam)]
     found = Found(run_all(units, store, prices, clock, progress))
     card = Scorecard({arm: world.spec.name for arm, world in exam.arms.items()}, first.spec.dt_s, _places(exam))
@@ -70,6 +66,30 @@ def examine(
         card.curves.extend(report.curves)
         card.pictures.extend(report.pictures)
     return card
+
+
+@torch.inference_mode()
+def within(
+    exam: Exam, seconds: float, sizes: Sequence[int], clock: Clock = time.monotonic, probes: Sequence[Probe] = PROBES
+) -> int:
+    """The most clips, of `sizes`, on which the exam takes no more than so many seconds, as far as a trial of the worlds tells;
+    the fewest where all take longer."""
+    forecast = Forecast(_prices(exam, clock))
+    for size in sorted(sizes, reverse=True):
+        some = exam.of(size)
+        units = dreams(some, probes) + [unit for probe in probes for unit in probe.units(some)]
+        if sum(map(forecast.seconds, units)) <= seconds:
+            return size
+    return min(sizes)
+
+
+def _prices(exam: Exam, clock: Clock) -> Calls:
+    """Seconds of a call, by arm and verb."""
+    config, some = exam.config, next(iter(exam.places.values()))
+    prices: dict[tuple[str, str], float] = {("recording", "compare"): 3e-3}
+    for arm, world in {**exam.arms, **exam.closing}.items():
+        prices |= prices_of(arm, world, some[: min(config.batch, world.spec.max_batch or config.batch)], clock)
+    return prices
 
 
 def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path, Path]:

@@ -100,7 +100,7 @@ def learn_objects(
     trainer.train()
     objects.eval()
     facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
-    return {**facts, "objects_steps": steps}
+    return {**facts, "objects_steps": trainer.facts["step"]}
 
 
 def listed(cache: ClipCache) -> np.ndarray:

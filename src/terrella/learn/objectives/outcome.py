@@ -140,9 +140,10 @@ def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
     """Trains the objective's Outcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    Trainer(run, "outcome", Drawn(objective.picked), objective, steps).train()
+    trainer = Trainer(run, "outcome", Drawn(objective.picked), objective, steps)
+    trainer.train()
     objective.outcome.eval()
-    return {"outcome_steps": steps}
+    return {"outcome_steps": trainer.facts["step"]}
 
 
 def surprise(

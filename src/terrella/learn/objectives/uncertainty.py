@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyC
 from ..feeds import Drawn
 from ..recording import Recording
 from ..run_folder import resume_file
-from ..trainer import CPU, Loss, Now, Report, Run, Trainer, adamw, warmed
+from ..trainer import CPU, Loss, Now, Run, Trainer, adamw, warmed
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
@@ -71,15 +72,15 @@ class Rollout:
 def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frames: int) -> tuple[Uncertainty, dict]:
     """The uncertainty of `world` and what is known of it: its `sure` and `invents` levels, and of episodes that neither
     trained nor calibrated it the mean error and the mean that was expected."""
-    horizon = min(64, max(8, frames // 40), int(_ahead(recording).max()) - max(SHOWN))
+    horizon = _horizon(recording, frames)
     if horizon < 8:
         raise DatasetError(
             f"no {max(SHOWN) + 8} rows in a row can be dreamt again to learn uncertainty from; record longer episodes."
         )
-    seen = _kept(run.out / DREAMT, world, recording, Rollout(frames, horizon, seed=run.seed), run.report)
+    seen = _kept(run, world, recording, Rollout(frames, horizon, seed=run.seed))
     apart = seen.episode % _APART == 0
     learned, others = seen.at(~apart), seen.at(apart)
-    uncertainty = fit(run, learned, min(1500, max(20, frames // 6)))
+    uncertainty = fit(run, learned, _steps(frames))
     half = others.episode // _APART % 2 == 0
     if half.all() or not half.any():
         half = torch.arange(len(half)) % 2 == 0
@@ -93,25 +94,58 @@ def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frame
     return uncertainty, facts
 
 
+def expected_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
+    """Seconds that `learn_uncertainty` will take of such a world, by a few steps of dreaming and of learning."""
+    if _horizon(recording, frames) < 8:
+        return 0.0
+    trial = Rollout(frames, 4)
+    dream(world, recording, trial, 0)  # the first compiles
+    began = time.monotonic()
+    seen = dream(world, recording, trial, 0)
+    dreamt = time.monotonic()
+    with torch.random.fork_rng(devices=[]):
+        objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
+    for step in range(3):
+        now = Now(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
+        for loss in objective.losses(objective.picked(now), now):
+            loss.value.backward()
+    learned = time.monotonic()
+    return (dreamt - began) * frames / (trial.horizon * trial.batch) + (learned - dreamt) * _steps(frames) / 3
+
+
 def forget(out: Path) -> None:
     """Removes what a run has learned of its uncertainty so far."""
     shutil.rmtree(out / DREAMT, ignore_errors=True)
     resume_file(out, "uncertainty").unlink(missing_ok=True)
 
 
-def _kept(folder: Path, world: LearnedWorld, recording: Recording, rollout: Rollout, report: Report) -> Dreamt:
-    """All dreams, each batch kept in `folder` as soon as it is whole: a run that is stopped goes on with the next."""
+def _horizon(recording: Recording, frames: int) -> int:
+    """Steps of a dream."""
+    return min(64, max(8, frames // 40), int(_ahead(recording).max()) - max(SHOWN))
+
+
+def _steps(frames: int) -> int:
+    """Training steps on so many frames."""
+    return min(1500, max(20, frames // 6))
+
+
+def _kept(run: Run, world: LearnedWorld, recording: Recording, rollout: Rollout) -> Dreamt:
+    """All dreams for which there is time, two batches or more, each kept in the run's folder as soon as it is whole: a run that
+    is stopped goes on with the next."""
+    folder, began = run.out / DREAMT, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
-    parts = []
+    parts: list[Dreamt] = []
     for number in range(rollout.batches):
         path = folder / f"{number:05d}.safetensors"
         if not path.exists():
+            if len(parts) >= 2 and time.monotonic() - began > run.budget.most_s("dreams"):
+                break
             made = dream(world, recording, rollout, number)
             save_file({name: part.contiguous() for name, part in made._asdict().items()}, path.with_suffix(".partial"))
             path.with_suffix(".partial").replace(path)
         parts.append(Dreamt(**load_file(path)))
         frames = (number + 1) * rollout.batch * rollout.horizon
-        report(number + 1, rollout.batches, f"uncertainty: dreamt {frames:,} frames")
+        run.report(number + 1, rollout.batches, f"uncertainty: dreamt {frames:,} frames")
     return Dreamt.joined(parts)
 
 

@@ -25,11 +25,12 @@ from ...worlds.places import KeyframeScene
 from ..feeds import codec_feed, frames_feed
 from ..moves import frequent_moves, palette
 from ..objectives.codec import CodecObjective
+from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
 from ..objectives.outcome import Happenings, Pieces, learn_outcome
-from ..objectives.uncertainty import forget
+from ..objectives.uncertainty import expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..strips import draw_strip
 from ..trainer import Feed, Report, Run, Trainer, device_named
@@ -38,6 +39,9 @@ from .parts import SensesConfig, learn_senses
 WIDTHS = (32, 56, 88, 128)
 MOVES, COLOURS = 24, 64  # among which a codec chooses
 STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
+
+# of the hours, what each stage may take at most; the generator has the rest
+SHARES = {"motion": 0.08, "outcome": 0.08, "objects": 0.1, "estimator": 0.12, "dreams": 0.06, "uncertainty": 0.04}
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -62,7 +66,7 @@ class TrainConfig:
         flow_steps: Steps in which a frame is drawn. With more than one the whole flow from noise to frame is learned, so that
             a frame is a sample and not a mean: a teacher for `train distil`.
         steps: Training steps of the generator. Training ends after these or after `hours`.
-        hours: Hours of training, those of earlier runs included.
+        hours: Hours of training, of all parts together and of earlier runs too; the learning rate falls as they go by.
         batch: Frames per step. Default: 8 on a CPU, 64 on a GPU.
         learning_rate: Highest learning rate of the generator.
         motion_steps: Training steps of the motion model.
@@ -111,7 +115,7 @@ def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: 
     device = device_named(config.device)
     dataset = Dataset(data)
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
-    run = Run.of(out, config, report, device, ("hours", "learning_rate"), **facts)
+    run = Run.of(out, config, report, device, ("hours", "learning_rate"), SHARES, **facts)
     run.found("flow")
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=NEEDS)
     torch.manual_seed(config.seed)
@@ -209,7 +213,7 @@ class _Learned:
         """All stages; each goes on where it was stopped."""
         config, run, recording = self.config, self.run, self.recording
         feed = self._feed(config.batch or (64 if run.device.type == "cuda" else 8))
-        trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides), config.hours)
+        trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides))
         if self.memory is not None:
             self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
         if self.outcome is not None:
@@ -219,6 +223,7 @@ class _Learned:
             starts, rgb = recording.pose(self._beginnings()), recording.dataset.rgb_at
             parts = self.objects, recording, rgb, starts, self.video.camera, config.objects_steps
             self.facts |= learn_objects(run, *parts)
+        self._divide(trainer)
         done = (run.out / "world" / "world.json").exists() and "senses" in trainer.facts
         if not trainer.finished:
             forget(run.out)  # it knew the errors of an earlier generator
@@ -226,9 +231,26 @@ class _Learned:
             done = False
         trainer.train(lambda: self.draw_strip(trainer))
         if not done:
+            trainer.facts["asked"] = config.hours
+            trainer.save()
             self._finish(trainer)
         senses = trainer.facts.pop("senses")
         return {"world": str(run.out / "world"), **trainer.summary, **self.facts, **senses}
+
+    def _divide(self, trainer: Trainer) -> None:
+        """Gives the generator what is left of the hours when the other stages have had theirs: before it is trained those that
+        can be, and for the uncertainty, which comes after, as long as a trial says. A run that has had its hours keeps to them."""
+        config, budget, took_s = self.config, self.run.budget, trainer.facts["seconds"]
+        if config.hours <= trainer.facts.get("asked", 0.0):
+            trainer.limit_s = took_s
+            return
+        if self.memory is not None and config.estimator_steps:
+            learn_estimator(self.run, self.recording, config.estimator_steps)
+        after_s = 0.0
+        if config.uncertainty_frames:
+            most_s = budget.most_s("dreams") + budget.most_s("uncertainty")
+            after_s = min(most_s, 1.2 * expected_s(self.world(trainer), self.recording, config.uncertainty_frames))
+        trainer.limit_s = max(1e-6, took_s + budget.left_s - after_s)
 
     def _finish(self, trainer: Trainer) -> None:
         """The last strip, and the estimator and uncertainty of the finished world."""

@@ -1,0 +1,147 @@
+"""`terrella learn` from outside: one command to a world and its card, which goes on wherever it was stopped or killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from terrella.cli import main
+from terrella.cli.plan import RECORDING, SCORING, TRAINING, Plan, folder_for
+from terrella.core.errors import TerrellaError
+from terrella.data import Dataset
+from terrella.learn.trainer import Trainer
+
+from .tiny import NAME
+
+ROOT = Path(__file__).parents[2]
+FRAMES = 300
+
+
+def begun(folder: Path, asked: dict, minutes: float) -> Plan:
+    """A plan of which something is recorded."""
+    plan = Plan(folder, asked, minutes)
+    (folder / RECORDING / "meta").mkdir(parents=True)
+    (folder / RECORDING / "meta" / "info.json").write_text("{}")
+    plan.save()
+    return plan
+
+
+@pytest.mark.parametrize("minutes", [0.5, 3, 30, 600])
+def test_the_minutes_are_divided_and_none_is_left_over(minutes, tmp_path):
+    plan = Plan(tmp_path / "new", {}, minutes)
+    share = plan.share_s
+    assert sum(share.values()) == pytest.approx(60 * minutes, abs=6) and share[TRAINING] > 0.5 * 60 * minutes
+    plan.spent[RECORDING] = 2.0  # sooner than was planned: training has the rest
+    plan.note(RECORDING, {})
+    assert plan.share_s[TRAINING] > share[TRAINING]
+    plan.spent[TRAINING] = plan.seconds  # later than was planned
+    plan.note(TRAINING, {})
+    assert 0 < plan.left_s(SCORING) <= share[SCORING]
+
+
+def test_a_plan_goes_on_with_its_own_settings_alone(tmp_path):
+    begun(tmp_path / "a", {"environment": "gym:A-v1", "seed": 0}, 3).note(RECORDING, {"frames": 5})
+    assert Plan(tmp_path / "a", {"environment": "gym:A-v1", "seed": 0}, 3).facts == {RECORDING: {"frames": 5}}
+    with pytest.raises(TerrellaError, match="environment gym:A-v1, not gym:B-v1"):
+        Plan(tmp_path / "a", {"environment": "gym:B-v1", "seed": 0}, 3)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(TerrellaError, match="something else"):
+        Plan(tmp_path / "mine", {}, 3)
+    (tmp_path / "a" / "learn.json").write_text("{")
+    with pytest.raises(TerrellaError, match="damaged"):
+        Plan(tmp_path / "a", {}, 3)
+
+
+def test_more_minutes_train_a_finished_world_on(tmp_path):
+    plan = begun(tmp_path / "a", {}, 3)
+    for stage in (RECORDING, TRAINING, SCORING):
+        plan.note(stage, {})
+    assert set(Plan(tmp_path / "a", {}, 2).facts) == {RECORDING, TRAINING, SCORING}
+    assert set(Plan(tmp_path / "a", {}, 5).facts) == {RECORDING}
+
+
+def test_a_plan_of_which_nothing_was_recorded_binds_nobody(tmp_path):
+    Plan(tmp_path / "a", {"seed": 0}, 3).save()
+    assert Plan(tmp_path / "a", {"seed": 1}, 3).facts == {} and not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    "name, folder",
+    [
+        ("gym:CarRacing-v3", "CarRacing-v3"),
+        ("gym:ALE/Breakout-v5", "Breakout-v5"),
+        ("gym:my.game:Mine-v0", "Mine-v0"),
+        ("doom:my_way_home", "my_way_home"),
+        ("doom:freedoom2/MAP01,MAP02", "MAP01-MAP02"),
+    ],
+)
+def test_the_folder_is_named_after_the_environment(name, folder):
+    assert folder_for(name) == Path("learned") / folder
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        (["gym:CartPol-v1"], "CartPol-v1"),
+        ([NAME.replace("Tiny-", "Blind-")], "shows no pictures"),
+        ([NAME.replace("Tiny-", "Broken-")], "the emulator has crashed"),
+        ([NAME, "--minutes", "0"], "--minutes"),
+        ([NAME, "--minutes", "inf"], "--minutes"),
+        ([NAME, "--frames", "1"], "--frames"),
+        ([NAME, "--keys", "q=99"], "99"),
+    ],
+)
+def test_what_cannot_be_learned_is_said_and_leaves_nothing(given, said, tmp_path, capsys):
+    assert main(["learn", *given, "--out", str(tmp_path / "out")]) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("terrella: ")]
+    assert said in line and not (tmp_path / "out").exists()
+
+
+def command(out: Path) -> list[str]:
+    return ["learn", NAME, "--minutes", "0.3", "--frames", str(FRAMES), "--out", str(out)]
+
+
+def killed_while_recording(out: Path) -> None:
+    script = f"import sys; from terrella.cli import main; main({command(out)!r})"
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, env={**os.environ, "PYTHONPATH": paths}) as process:
+        while not (out / RECORDING / "meta" / "info.json").exists() and process.poll() is None:
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+
+
+def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "tiny"
+    killed_while_recording(out)
+    stepped = Trainer._step
+
+    def interrupting(self, number):
+        if self.stage == "flow" and number == 1:
+            signal.raise_signal(signal.SIGINT)
+        return stepped(self, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_step", interrupting)
+        assert main(command(out)) == 130
+    said = capsys.readouterr().err
+    assert "records for up to" in said and "the same command goes on from there" in said
+    assert Dataset(out / RECORDING).length == FRAMES
+    assert main([*command(out), "--json"]) == 0
+    told = capsys.readouterr()
+    facts = json.loads(told.out)
+    assert "Goes on in" in told.err and "trains for" in told.err and "records for" not in told.err
+    assert "copying the last" in facts["verdict"][0] and facts["play"].endswith("run")
+    assert (out / "run" / "world" / "world.json").exists() and Path(facts["card"]).stat().st_size > 0
+    assert main(command(out)) == 0
+    again = capsys.readouterr()
+    assert "is finished" in again.err and facts["verdict"][0] in again.out and "play it: terrella play" in again.out
+    assert main([*command(out), "--seed", "5"]) == 2
+    assert "seed 0, not 5" in capsys.readouterr().err
