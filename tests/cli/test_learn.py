@@ -92,7 +92,6 @@ def test_the_folder_is_named_after_the_environment(name, folder):
     [
         (["gym:CartPol-v1"], "CartPol-v1"),
         ([NAME.replace("Tiny-", "Blind-")], "shows no pictures"),
-        ([NAME.replace("Tiny-", "Broken-")], "the emulator has crashed"),
         ([NAME, "--minutes", "0"], "--minutes"),
         ([NAME, "--minutes", "inf"], "--minutes"),
         ([NAME, "--frames", "1"], "--frames"),
@@ -106,7 +105,7 @@ def test_what_cannot_be_learned_is_said_and_leaves_nothing(given, said, tmp_path
 
 
 def command(out: Path) -> list[str]:
-    return ["learn", NAME, "--minutes", "0.3", "--frames", str(FRAMES), "--out", str(out)]
+    return ["learn", NAME, "--minutes", "0.5", "--frames", str(FRAMES), "--out", str(out)]
 
 
 def killed_while_recording(out: Path) -> None:
@@ -124,7 +123,7 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     stepped = Trainer._step
 
     def interrupting(self, number):
-        if self.stage == "flow" and number == 1:
+        if self.stage == "flow" and number == 0:
             signal.raise_signal(signal.SIGINT)
         return stepped(self, number)
 

@@ -213,4 +213,4 @@ def _summary(facts: Mapping[str, object]) -> str:
 
 
 def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.1f} min"
+    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{max(seconds, 0.0):.0f} s"

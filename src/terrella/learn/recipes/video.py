@@ -38,6 +38,7 @@ from .parts import SensesConfig, learn_senses
 
 WIDTHS = (32, 56, 88, 128)
 MOVES, COLOURS = 24, 64  # among which a codec chooses
+MATCHED = 1 << 20  # pixels of the pairs of pictures in which its moves are found
 STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
 
 # of the hours, what each stage may take at most; the generator has the rest
@@ -187,7 +188,8 @@ class _Learned:
         rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
         before, after = recording.rgb(rows - 1), recording.rgb(rows)
         change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
-        some = rng.choice(len(rows), min(len(rows), 256), replace=False, p=change / change.sum())
+        most = max(32, MATCHED // (before.shape[-2] * before.shape[-1]))  # pairs: blocks are matched at 625 displacements
+        some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
         plain = self.video.generator
         settings = CodecConfig(plain.size, plain.slots, plain.context, len(moves), len(colours))
