@@ -188,7 +188,7 @@ class _Learned:
         rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
         before, after = recording.rgb(rows - 1), recording.rgb(rows)
         change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
-        most = max(32, MATCHED // (before.shape[-2] * before.shape[-1]))  # pairs: blocks are matched at 625 displacements
+        most = max(32, MATCHED // before[0, 0].numel())  # pairs: each is matched at 625 displacements
         some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
         plain = self.video.generator
