@@ -30,6 +30,7 @@ ENDLESS = 10**9  # steps: training ends with its time
 EPISODES = 12  # or more are recorded, if need be shorter ones: some are kept out of training, to score it
 SIZES, FEWEST = (50, 24, 12, 6, 3), 6  # numbers of clips, the most for which there is time; fewer are too few
 SAVE_EVERY_S = 30.0
+FEW_STEPS = 50  # after which a world has learned next to nothing
 
 
 def learn(
@@ -144,6 +145,10 @@ def _train(plan: Plan, name: str, controls: Controls, environment: Environment, 
         plan.folder.name, steps=ENDLESS, hours=hours, seed=plan.asked["seed"], save_every_s=SAVE_EVERY_S
     )
     facts = train_video(plan.folder / RECORDING, plan.folder / "run", config, report)
+    if facts["step"] < FEW_STEPS:
+        say(
+            f"Warning: there was time for {facts['step']} training steps alone; the same command with more --minutes trains it on."
+        )
     return {"world": facts["world"], "steps": facts["step"]}
 
 
