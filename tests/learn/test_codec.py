@@ -1,14 +1,13 @@
-"""What a codec learns: moves by block matching, a palette, which source explains a pixel; and a scroll that an action makes."""
+"""What a codec learns of a recording: moves by block matching, a palette, and the mosaics of clips."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from terrella.core import make_rng
-from terrella.learn.moves import explained, explained_slowly, frequent_moves, palette, scrolled
-from terrella.worlds.codec import Codec, CodecConfig
+from terrella.learn.moves import frequent_moves, mosaics, palette
+from terrella.space.mosaic import recalled
 
 SIZE = (32, 40)
 
@@ -19,12 +18,6 @@ def scrolling(x: int, y: int, count: int = 12) -> tuple[torch.Tensor, torch.Tens
     before, after = wide[..., 16:48, 20:60].clone(), wide[..., 16 - y : 48 - y, 20 - x : 60 - x].clone()
     after[..., :8, :] = before[..., :8, :]
     return before, after
-
-
-def codec(moves: torch.Tensor) -> Codec:
-    made = Codec(CodecConfig(SIZE, 2, 4, len(moves), 4, channels=(8, 8)))
-    made.moves[1:] = moves
-    return made
 
 
 def test_the_moves_of_most_blocks_are_found():
@@ -42,21 +35,11 @@ def test_a_palette_holds_the_colours_of_a_picture():
     assert all((found.int() - colour.int()).abs().amax(1).min() <= 4 for colour in colours)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_kernel_explains_as_its_slow_twin(seed):
+def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
     before, after = scrolling(3, 0, 2)
-    before[0, :, 9:20] = after[0, :, 9:20]
-    made = codec(torch.tensor([[3, 0], [0, -1]]))
-    noise = torch.randint(0, 9, after.shape, generator=make_rng(seed))
-    frames, truth = torch.stack([before, after.flip(0)], 1), (after.int() + noise).clamp(0, 255).to(torch.uint8)
-    fast, slow = explained(made, frames, truth), explained_slowly(made, frames, truth)
-    assert torch.allclose(fast[0], slow[0], atol=1e-4) and torch.equal(fast[1], slow[1])
-
-
-def test_the_scroll_is_what_most_texture_does():
-    before, after = scrolling(3, 0, 2)
-    made = codec(torch.tensor([[3, 0], [0, -1]]))
-    truth = torch.stack([after[0], before[1]])
-    share, stays = explained(made, torch.stack([before, before], 1), truth)
-    assert scrolled(made, share, truth).tolist() == [1, 0]
-    assert not stays[1].any() and stays[0, 8:].float().mean() > 20 and not stays[0, :8].any()
+    moves, real = torch.tensor([[0, 0], [3, 0]]), torch.tensor([[True, True], [False, False]])
+    made = mosaics(torch.stack([before, after], 1), moves, real)
+    known = recalled(made, SIZE, torch.tensor([[0, 0], [0, 0]]))
+    assert torch.equal(known[0, :3, 8:], after[0, :, 8:]) and not known[1].any()
+    gone = recalled(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
+    assert torch.equal(gone[0, :3, 8:], before[0, :, 8:])

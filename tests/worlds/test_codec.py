@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from terrella.core import check_world, make_rng
-from terrella.worlds.codec import Codec, CodecConfig
+from terrella.space.matching import SAME, fetched
+from terrella.space.mosaic import blank, remembered
+from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.folder import load_world, save_world
@@ -33,7 +35,7 @@ def pictures(batch: int, seed: int = 0) -> torch.Tensor:
 
 
 def world(generator: Codec) -> LearnedWorld:
-    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2), Starts.of(pictures(4), 2))
+    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2, tuple(map(tuple, MOVES.tolist()))), Starts.of(pictures(4), 2))
     return LearnedWorld(About("made", Controls.buttons(2), 0.1), scene=scene, generator=generator)
 
 
@@ -49,57 +51,85 @@ def test_an_untrained_one_stands_still_to_the_last_bit():
     assert torch.equal(still.render(state, ("rgb",))["rgb"], still.render(first, ("rgb",))["rgb"])
 
 
+def shown(made: Codec, batch: int = 1, seed: int = 0) -> Seen:
+    """Frames, and a mosaic that holds the newest of them but for its upper half."""
+    frames = pictures(batch, seed)
+    mosaic = remembered(blank(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64))
+    mosaic[:, :, : mosaic.shape[2] // 2] = 0
+    return made.seen(frames, mosaic, torch.arange(batch) % len(MOVES))
+
+
+def like(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """Whether no pixel is of another colour; near ones count as one."""
+    return bool((one.int() - other.int()).abs().max() <= SAME)
+
+
 def test_pixels_are_fetched_from_where_the_sources_say():
-    frames, made = pictures(1), codec()
+    made = codec()
+    seen = shown(made)
     height, width = SIZE
     for source in range(made.sources):
-        fetched = made.pixels(frames, torch.full((1, *SIZE), source))
+        found = fetched(seen.sources, torch.full((1, *SIZE), source), made.moves)
         for v, u in ((0, 0), (5, 7), (height - 1, width - 1)):
             slot = max(0, source - len(MOVES) + 1)
             x, y = MOVES[source].tolist() if slot == 0 else (0, 0)
             j, i = min(max(v - y, 0), height - 1), min(max(u - x, 0), width - 1)
-            assert torch.equal(fetched[0, :, v, u], frames[0, slot, :, j, i]), (source, v, u)
+            assert torch.equal(found[0, :, v, u], seen.sources[0, slot, :, j, i]), (source, v, u)
+
+
+def test_what_the_mosaic_does_not_know_is_not_fetched_from_it():
+    made = codec()
+    seen = shown(made)
+    choices, _ = made.choices(seen, torch.zeros(1, 36 + 2 * SLOTS))
+    memory = choices.softmax(1)[:, made.sources - 1]
+    assert not memory[:, : SIZE[0] // 2].any() and (memory[:, SIZE[0] // 2 :] > 0).all()
+    assert torch.equal(seen.sources[:, -1, :, SIZE[0] // 2 :], seen.sources[:, 0, :, SIZE[0] // 2 :])
+
+
+def test_what_went_on_is_carried_to_where_it_would_go_next():
+    made = codec()
+    went = torch.rand(1, len(MOVES), *SIZE, generator=make_rng(4))
+    carried = made._carried(went)
+    for number, (x, y) in enumerate(MOVES.tolist()):
+        assert carried[0, number, 8, 9] == went[0, number, 8 - y, 9 - x]
 
 
 def test_what_is_likelier_painted_has_a_colour_of_the_palette():
-    made, frames = codec(), pictures(2)
-    choices = torch.zeros(2, made.sources + 1, *SIZE)
+    made = codec()
+    seen = shown(made, 2)
+    choices = torch.full((2, made.sources + 1, *SIZE), -9.0)
     choices[:, 1] = 3.0
     choices[0, -1, :4] = 9.0
-    drawn = made.fetched(frames, choices, torch.randn(2, 32, *SIZE, generator=make_rng(1)))
+    drawn = made.drawn(seen, choices, torch.randn(2, HIDDEN, *SIZE, generator=make_rng(1)))
     colours = drawn[0, :, :4].flatten(1).T
-    assert (colours[:, None] == made.palette).all(-1).any(1).all()
-    there = made.pixels(frames, torch.ones(2, *SIZE, dtype=torch.int64))
-    assert torch.equal(drawn[0, :, 4:], there[0, :, 4:]) and torch.equal(drawn[1], there[1])
+    assert ((colours[:, None].int() - made.palette.int()).abs().amax(-1) <= SAME).any(1).all()
+    there = fetched(seen.sources, torch.ones(2, *SIZE, dtype=torch.int64), made.moves)
+    assert like(drawn[0, :, 4:], there[0, :, 4:]) and like(drawn[1], there[1])
 
 
 def test_the_stress_on_what_changes_is_taken_back():
-    made, frames = codec(), pictures(1)
-    choices = torch.full((1, made.sources + 1, *SIZE), -9.0)
+    made = codec()
+    seen = shown(made)
+    choices = torch.full((1, made.sources + 1, *SIZE), -20.0)
     choices[:, 0], choices[:, 1] = 0.0, 2.0
-    features = torch.zeros(1, 32, *SIZE)
-    moved = made.pixels(frames, torch.ones(1, *SIZE, dtype=torch.int64))
-    assert torch.equal(made.fetched(frames, choices, features), moved)
+    features = torch.zeros(1, HIDDEN, *SIZE)
+    moved = fetched(seen.sources, torch.ones(1, *SIZE, dtype=torch.int64), made.moves)
+    assert like(made.drawn(seen, choices, features), moved)
     made.stress.fill_(16.0)
-    assert torch.equal(made.fetched(frames, choices, features), frames[:, 0])
+    assert torch.equal(made.drawn(seen, choices, features), seen.sources[:, 0])
 
 
 def test_a_saved_one_draws_the_same(tmp_path):
-    one, frames = world(codec()), pictures(2, seed=3)
+    one, seen = world(codec()), shown(codec(), 2, seed=3)
     one.generator.stress.fill_(3.0)
     save_world(one, tmp_path / "world")
     again = load_world(tmp_path / "world")
-    context = torch.cat([context_thumbnail(frames[:, 0]), torch.zeros(2, 2 * SLOTS)], 1)
-    move = torch.tensor([1, 0])
-    for mine, other in zip(
-        one.generator.choices(frames, context, move), again.generator.choices(frames, context, move)
-    ):
+    context = torch.cat([context_thumbnail(seen.sources[:, 0]), torch.zeros(2, 2 * SLOTS)], 1)
+    for mine, other in zip(one.generator.choices(seen, context), again.generator.choices(seen, context)):
         assert torch.equal(mine, other)
-    assert (
-        torch.equal(again.generator.moves, MOVES)
-        and again.generator.stress == 3
-        and again.generator.palette.dtype == torch.uint8
-    )
+    made = again.generator
+    assert torch.equal(made.moves, MOVES) and made.stress == 3 and made.palette.dtype == torch.uint8
+    assert again.scene.config == one.scene.config
 
 
 @pytest.mark.parametrize("device", ["meta"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -24,7 +26,8 @@ def made(controls: Controls, vitals: tuple[str, ...] = ()) -> LearnedWorld:
     torch.manual_seed(0)
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), controls.numbers, SIZE, (8, 8), slots=4, geometry=False, residual=True)
     frames = torch.randint(0, 255, (3, 4, 3, *SIZE), dtype=torch.uint8)
-    starts = Starts(frames, torch.rand(3, 4, controls.numbers), torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)])
+    first = torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)]
+    starts = replace(Starts.of(frames, controls.numbers), actions=torch.rand(3, 4, controls.numbers), vitals=first)
     changes, spans, begins = ((-1.0, 0.0),) * len(vitals), (3.0,) * len(vitals), (2.0,) * len(vitals)
     outcome = Outcome(OutcomeConfig(controls.numbers, (0.0, 1.0), vitals, changes, spans, begins=begins))
     scene, generator = FrameHistory(config.frames, starts), Generator(config.generator)

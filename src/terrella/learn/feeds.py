@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
+import torch
+
 from ..core.errors import DatasetError
 from ..data import Clips
 from ..space.keyframes import Keyframes
@@ -62,11 +65,15 @@ def frames_feed(
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))
 
 
-def codec_feed(recording: Recording, config: VideoConfig, size: int, seed: int) -> Feed:
-    """Clips for a codec, `size` at a time: of thrice as many those in which more happens are the likelier."""
-    clips = clips_of(recording, codec.clip_length(config.slots), 3 * size, config, seed)
+def codec_feed(recording: Recording, config: VideoConfig, moves: torch.Tensor, size: int, seed: int) -> Feed:
+    """Clips for a codec of these `moves`, `size` at a time: of thrice as many those in which more happens are the likelier."""
+    lengths = np.array([stop - first for first, stop in recording.cache.episodes])
+    pasts = codec.PAST, codec.PAST // 2, 0
+    most = [lengths[lengths >= codec.clip_length(config.slots, past)].sum() for past in pasts]
+    past = next(past for past, rows in zip(pasts, most) if rows >= 0.9 * most[-1])  # else episodes are too short for it
+    clips = clips_of(recording, codec.clip_length(config.slots, past), 3 * size, config, seed)
     controls = recording.controls or Controls.buttons(config.actions)
-    return Streamed(clips, lambda found, now: codec.clip(found, controls, config.slots, size, now))
+    return Streamed(clips, lambda found, now: codec.clip(found, controls, moves, config.slots, size, now))
 
 
 def clips_of(recording: Recording, length: int, size: int, config: VideoConfig, seed: int) -> Clips:

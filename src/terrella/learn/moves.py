@@ -1,5 +1,4 @@
-"""How pictures of a recording go on: the moves that blocks make most often, the colours of most pixels, and which sources of a
-Codec explain a frame."""
+"""How pictures of a recording go on: the moves that blocks make most often, the colours of most pixels, and mosaics of clips."""
 
 from __future__ import annotations
 
@@ -7,18 +6,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..worlds.codec import Codec
-from .kernels_numba import explained as explained_kernel
+from ..space.matching import scrolled
+from ..space.mosaic import blank, remembered
 
 REACH = 12  # pixels that a block may move in a step
 BLOCK = 8  # pixels
 DIFFERENT = 4.0  # mean difference (of 255) of blocks above which a block has changed
 AWAY = 0.05  # by which each pixel of a move must improve the match
-SHARP, NEAR, NEVER = (
-    10.0,
-    3.0,
-    60.0,
-)  # differences (of 255): of a pixel, and around it, to which a source explains less by e
 
 
 def frequent_moves(before: torch.Tensor, after: torch.Tensor, most: int) -> torch.Tensor:
@@ -58,39 +52,14 @@ def palette(frames: torch.Tensor, colours: int, rng: np.random.Generator) -> tor
     return centres.round().clamp(0, 255).to(torch.uint8)
 
 
-def explained(codec: Codec, frames: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """How well each source of `codec` explains each pixel of the next frames `truth` (uint8 [B, 3, H, W]) by `frames` (uint8 [B,
-    slots, 3, H, W]): 0..1 [B, sources, H, W], the pixel's own difference and that of 5 x 5 around it counting; and the largest
-    difference [B, H, W], of 255, of what stays. Where that is exact, other sources count for half."""
-    if frames.device.type != "cpu":
-        return explained_slowly(codec, frames, truth)
-    share = torch.empty(len(frames), codec.sources, *truth.shape[-2:])
-    stays = torch.empty(len(frames), *truth.shape[-2:])
-    given = frames.contiguous().numpy(), truth.contiguous().numpy(), codec.moves.numpy()
-    explained_kernel(*given, (SHARP, NEAR, NEVER), share.numpy(), stays.numpy())
-    return share, stays
-
-
-def explained_slowly(codec: Codec, frames: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same as `explained`, in plain tensor algebra; the way on a GPU."""
-    size = truth.shape[-2:]
-    sources = torch.arange(codec.sources, device=truth.device)[:, None, None, None].expand(-1, len(truth), *size)
-    error = torch.stack([(codec.pixels(frames, one).int() - truth.int()).abs() for one in sources], 1).float()
-    own, around = error.amax(2), F.avg_pool2d(error.mean(2), 5, 1, 2, count_include_pad=False)
-    worse = around - around.amin(1, keepdim=True)
-    share = torch.exp(-worse / NEAR - (own - 4).clamp_min(0) / SHARP) * (own <= NEVER)
-    halved = torch.where(own[:, :1] == 0, 0.5, 1.0).expand(-1, codec.sources - 1, -1, -1)
-    return share * torch.cat([torch.ones_like(own[:, :1]), halved], 1), own[:, 0]
-
-
-def scrolled(codec: Codec, share: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """By which of the codec's moves most of what is not of one colour in `truth` goes on: int64 [B]; 0 unless another explains
-    clearly more. share: of `explained`."""
-    smooth = F.avg_pool2d(truth.float(), 5, 1, 2, count_include_pad=False)
-    textured = (truth.float() - smooth).abs().mean(1) > 3
-    explains = ((share[:, : len(codec.moves)] > 0.3) & textured[:, None]).float().mean((2, 3))
-    most, move = explains.max(1)
-    return torch.where(most > 1.25 * explains[:, 0] + 0.01, move, 0)
+def mosaics(frames: torch.Tensor, moves: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
+    """Mosaics [B, 4, H', W'] of frames uint8 [B, T, 3, H, W], the oldest first, those that are `real` bool [B, T] alone."""
+    mosaic = blank(len(frames), (frames.shape[-2], frames.shape[-1]), frames.device)
+    for step in range(frames.shape[1]):
+        before, now = frames[:, max(step - 1, 0)], frames[:, step]
+        joined = remembered(mosaic, now, moves[scrolled(before, now, moves)])
+        mosaic = torch.where(real[:, step, None, None, None], joined, mosaic)
+    return mosaic
 
 
 def _shifted(pictures: torch.Tensor, x: int, y: int) -> torch.Tensor:

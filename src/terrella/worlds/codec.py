@@ -1,23 +1,27 @@
 """Codec: a generator for worlds without depth, which fetches pixels before it paints any, as a video codec does.
 
-Each pixel of the next frame stays, comes from a displaced place of the last frame or from an older frame (a choice, never an
-average, so nothing fades), or is painted in a colour of the recording's palette where no source has it: a pointer-generator
-mixture (See et al. 2017) over the block moves of the recording (learn/moves.py finds them).
+Each pixel of the next frame stays, comes from a displaced place of the last frame, from an older frame or from the mosaic (a
+choice, never an average, so nothing fades), or is painted in a colour of the recording's palette where no source has it: a
+pointer-generator mixture (See et al. 2017) over the block moves of the recording (learn/moves.py finds them).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ..space.matching import FEW, clearest, explained, explains, fetched, preferred, voted
+from ..space.mosaic import recalled
 from .generator import Block, Conditioning, down_and_up, encode_depth
 
-COARSE = 4  # the network sees squares of so many pixels; what is chosen is chosen for each pixel
+COARSE = 4  # the trunk sees squares of so many pixels; what is chosen is chosen for each pixel
 PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
+HIDDEN = 32  # of each pixel, of which its choice is made
+UNKNOWN = -1e4  # the logit of what is not there
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,47 @@ class CodecConfig:
     context: int
     moves: int
     colours: int
-    channels: tuple[int, ...] = (64, 96, 128)
+    channels: tuple[int, ...] = (48, 64, 96)
     steps: int = 1  # a frame is drawn at once
     residual: bool = True
+
+
+class Seen(NamedTuple):
+    """What a frame is made from: `sources` uint8 [B, slots + 1, 3, H, W], the last frames, the newest first, and what the mosaic
+    knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by `move` [B]; `went`
+    [B, moves + 1, H, W], how well each of the moves, at what it leads to this pixel, explained the last step."""
+
+    sources: torch.Tensor
+    scrolled: torch.Tensor
+    known: torch.Tensor
+    went: torch.Tensor
+    move: torch.Tensor
+
+
+class Scroll(nn.Module):
+    """Which of the moves most of the picture goes on by."""
+
+    def __init__(self, config: CodecConfig):
+        super().__init__()
+        (height, width), moves = config.size, config.moves + 1
+        self.glance = nn.Sequential(
+            nn.AvgPool2d(2), nn.Conv2d(3, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 2, stride=2), nn.SiLU(), nn.Flatten(),
+            nn.Linear(48 * (height // 16) * (width // 16), 64), nn.SiLU(),
+        )  # fmt: skip
+        self.known = nn.Linear(64 + config.context + (config.slots - 1) * moves, 128)
+        self.votes = nn.Linear(128, moves)
+        nn.init.zeros_(self.votes.weight)
+        self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * config.moves))  # untrained, nothing scrolls
+
+    def glanced(self, frame: torch.Tensor) -> torch.Tensor:
+        """What is seen in the newest frame uint8 [B, 3, H, W]: [B, 64]."""
+        return self.glance(frame.float() / 127.5 - 1)
+
+    def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
+        """Logits [B, moves + 1] from what is `glanced`, and how well each of the moves explained each of the frames by the one
+        before, 0..1 [B, slots - 1, moves + 1]."""
+        went = went / went.amax(2, keepdim=True).clamp_min(0.01)
+        return self.votes(F.silu(self.known(torch.cat([seen, context, went.pow(4).flatten(1)], 1))))
 
 
 @final
@@ -50,105 +92,106 @@ class Codec(nn.Module):
         super().__init__()
         self.config = config
         height, width = config.size
-        widths, seen = config.channels, 3 * (config.slots + 1)
-        self.register_buffer("moves", torch.zeros(config.moves + 1, 2, dtype=torch.int64))
+        widths, seen, moves = config.channels, 3 * (config.slots + 2) + 1, config.moves + 1
+        self.register_buffer("moves", torch.zeros(moves, 2, dtype=torch.int64))
         self.register_buffer("palette", torch.zeros(config.colours, 3, dtype=torch.uint8))
         self.register_buffer("stress", torch.ones(()))
-        self.enter = nn.Conv2d(COARSE**2 * (seen + 2), widths[0], 1)
+        self.enter = nn.Conv2d(COARSE**2 * (seen + 2) + moves, widths[0], 1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:]))
         self.before = nn.ModuleList(Block(width, config.context) for width in widths)
         self.after = nn.ModuleList(Block(width, config.context) for width in widths)
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.leave = nn.Conv2d(widths[0], COARSE**2 * PIXEL, 1)
         self.near = nn.Conv2d(seen, PIXEL, 3, padding=1)
-        self.choice = nn.Conv2d(2 * PIXEL, self.sources + 2, 1)  # its last: goes as most of the picture does
-        self.colour = nn.Sequential(nn.Linear(2 * PIXEL + 3, 64), nn.SiLU(), nn.Linear(64, config.colours))
+        self.going = nn.Conv2d(moves, PIXEL, 1)
+        self.nearby = nn.Conv2d(PIXEL, PIXEL, 3, padding=3, dilation=3)
+        self.mixed = nn.Conv2d(2 * PIXEL, HIDDEN, 1)
+        self.choice = nn.Conv2d(
+            HIDDEN, self.sources + 3, 1
+        )  # its last two: goes as most of the picture does, and as before
+        self.colour = nn.Sequential(nn.Linear(HIDDEN + 6, 64), nn.SiLU(), nn.Linear(64, config.colours))
         nn.init.zeros_(self.choice.weight)
-        bias = torch.full((self.sources + 2,), -1.0)
-        bias[0], bias[-1] = 4.0, 2.0  # at first everything stays
+        bias = torch.full((self.sources + 3,), -1.0)
+        bias[0], bias[-2], bias[-1] = 3.0, 6.0, 2.0  # at first everything goes as most of the picture does
         self.choice.bias = nn.Parameter(bias)
-        self.glance = nn.Sequential(
-            nn.Conv2d(3 * config.slots, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 4, stride=4), nn.SiLU(), nn.Flatten(),
-            nn.Linear(48 * (height // 16) * (width // 16), 128), nn.SiLU(),
-        )  # fmt: skip
-        known = 128 + config.context + min(2, config.slots - 1) * (config.moves + 1)
-        self.scrolls = nn.Sequential(nn.Linear(known, 128), nn.SiLU(), nn.Linear(128, config.moves + 1))
+        self.scrolling = Scroll(config)
 
     @property
     def sources(self) -> int:
-        """Pixels that one may be fetched from: the moves of the last frame, then the older frames."""
-        return self.config.moves + self.config.slots
+        """Pixels that one may be fetched from: the moves of the last frame, then the older frames, then the mosaic."""
+        return self.config.moves + self.config.slots + 1
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """The next frame [B, 4, H, W] in the generator's code, the likeliest one; noise and time say nothing to it."""
         frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
-        context = conditioning.context
-        move = likeliest(self.scroll(frames, context))
-        choices, features = self.choices(frames, context, move)
-        drawn = self.fetched(frames, choices, features).float() / 127.5 - 1
+        context, mosaic = conditioning.context, conditioning.mosaic
+        assert mosaic is not None
+        seen = self.seen(frames, mosaic, self.scroll(frames, context))
+        drawn = self.drawn(seen, *self.choices(seen, context)).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def scroll(self, frames: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-        """By which of the moves most of the picture goes on: logits [B, moves + 1]. frames: uint8 [B, slots, 3, H, W], the newest
-        first."""
-        seen = self.glance(frames.flatten(1, 2).float() / 127.5 - 1)
-        went = [self.fits(frames[:, age], frames[:, age + 1]) for age in range(min(2, self.config.slots - 1))]
-        return self.scrolls(torch.cat([seen, context, *went], 1))
+        """By which of the moves most of the picture goes on: int64 [B]. frames: uint8 [B, slots, 3, H, W], the newest first."""
+        went = [explains(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
+        return likeliest(self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1)))
 
-    def fits(self, after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-        """How well each of the moves leads from `before` to `after` (uint8 [B, 3, H, W]), 1 for the best: [B, moves + 1]."""
-        height, width = self.config.size
-        x = (torch.arange(1, width, 2, device=after.device) - self.moves[:, :1]).clamp(0, width - 1)
-        y = (torch.arange(1, height, 2, device=after.device) - self.moves[:, 1:]).clamp(0, height - 1)
-        place = (y[:, :, None] * width + x[:, None]).flatten()
-        there = before.flatten(2)[:, :, place].unflatten(2, (len(self.moves), -1))
-        error = (there.float() - after[..., 1::2, 1::2].flatten(2)[:, :, None].float()).abs().mean((1, 3))
-        return torch.exp(-(error - error.amin(1, keepdim=True)))
+    def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, move: torch.Tensor) -> Seen:
+        """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]."""
+        memory = recalled(mosaic, self.config.size, self.moves[move])
+        known = memory[:, 3:] > 0
+        scrolled = fetched(frames, move[:, None, None].expand(-1, *self.config.size), self.moves)
+        sources = torch.cat([frames, torch.where(known, memory[:, :3], scrolled)[:, None]], 1)
+        went, _ = explained(frames[:, 1:2], frames[:, 0], self.moves)
+        last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
+        return Seen(sources, scrolled, known, self._carried(preferred(went, last)), move)
 
-    def choices(
-        self, frames: torch.Tensor, context: torch.Tensor, move: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted", where the picture scrolls by `move`
-        [B]; and the pixels' features [B, 2 PIXEL, H, W]."""
-        batch, (height, width) = len(frames), self.config.size
-        scrolled = self.pixels(frames, move[:, None, None].expand(-1, height, width))
-        seen = torch.cat([frames.flatten(1, 2), scrolled], 1).float() / 127.5 - 1
-        down, across = (torch.linspace(-1, 1, length, device=frames.device) for length in (height, width))
+    def choices(self, seen: Seen, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted"; and the pixels' features [B, HIDDEN,
+        H, W]."""
+        batch, (height, width), last = len(seen.move), self.config.size, torch.channels_last
+        shown = torch.cat([seen.sources.flatten(1, 2), seen.scrolled], 1).float() / 127.5 - 1
+        shown = torch.cat([shown, seen.known.float()], 1)
+        down, across = (torch.linspace(-1, 1, length, device=shown.device) for length in (height, width))
         place = torch.stack([down[:, None].expand(height, width), across.expand(height, width)])
-        x = F.pixel_unshuffle(torch.cat([seen, place.expand(batch, -1, -1, -1)], 1), COARSE)
-        x = down_and_up(self, F.silu(self.enter(x)), context)
-        features = F.silu(torch.cat([F.pixel_shuffle(self.leave(x), COARSE), self.near(seen)], 1))
-        choices, scrolls = self.choice(features).split((self.sources + 1, 1), 1)
-        along = move[:, None, None, None].expand_as(scrolls)
-        return choices.scatter(1, along, torch.logaddexp(choices.gather(1, along), scrolls)), features
+        squares = F.pixel_unshuffle(torch.cat([shown, place.expand(batch, -1, -1, -1)], 1), COARSE)
+        x = F.silu(self.enter(torch.cat([squares, F.avg_pool2d(seen.went, COARSE)], 1)))
+        x = down_and_up(self, x, context)
+        near = F.silu(self.near(shown.contiguous(memory_format=last)) + self.going(seen.went))
+        near = near + self.nearby(near)
+        features = torch.cat([F.pixel_shuffle(self.leave(x), COARSE), near], 1)
+        features = F.silu(self.mixed(F.silu(features).contiguous(memory_format=last)))
+        choices, scrolls, goes = self.choice(features).split((self.sources + 1, 1, 1), 1)
+        moved, others, memory, painted = choices.split((len(self.moves), self.config.slots - 1, 1, 1), 1)
+        moved = moved + goes * seen.went
+        along = seen.move[:, None, None, None].expand_as(scrolls)
+        moved = moved.scatter(1, along, torch.logaddexp(moved.gather(1, along), scrolls))
+        memory = torch.where(seen.known, memory, UNKNOWN)
+        return torch.cat([moved, others, memory, painted], 1), features
 
-    def colours(self, frames: torch.Tensor, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
+    def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
         """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
-        known = torch.cat([features, frames[:, 0].float() / 127.5 - 1], 1).permute(0, 2, 3, 1)
+        near = torch.cat([seen.sources[:, 0], seen.scrolled], 1).float() / 127.5 - 1
+        known = torch.cat([features, near], 1).permute(0, 2, 3, 1)
         return self.colour(known.flatten(0, 2) if where is None else known[where])
 
-    def fetched(self, frames: torch.Tensor, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """The likeliest next frames, uint8 [B, 3, H, W]: painted is what more likely is than is fetched from anywhere."""
-        choices = torch.cat([choices[:, :1] + self.stress.log(), choices[:, 1:]], 1)
-        paints = choices.softmax(1)[:, -1] > 0.5
-        drawn = self.pixels(frames, likeliest(choices[:, :-1]))
-        if frames.device.type == "cpu" and not torch.onnx.is_in_onnx_export():  # few pixels are painted, in most frames
-            drawn = drawn.permute(0, 2, 3, 1).contiguous()
-            drawn[paints] = self.palette[self.colours(frames, features, paints).argmax(1)]
-            return drawn.permute(0, 3, 1, 2).contiguous()
-        colour = self.palette[self.colours(frames, features).argmax(1)].view(*paints.shape, 3).permute(0, 3, 1, 2)
-        return torch.where(paints[:, None], colour, drawn)
+    def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
+        share = choices.softmax(1)
+        if share.device.type == "cpu":  # few pixels may be painted, in most frames
+            paints = share[:, -1] >= FEW
+            painted = torch.zeros(*paints.shape, 3, dtype=torch.uint8)
+            painted[paints] = self.palette[self.colours(seen, features, paints).argmax(1)]
+        else:
+            painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
+        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
-    def pixels(self, frames: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
-        """The pixels of `frames` that the sources [B, H, W] name: uint8 [B, 3, H, W]; beyond an edge lies its own pixel."""
+    def _carried(self, went: torch.Tensor) -> torch.Tensor:
+        """How well each of the moves explained the last step [B, moves + 1, H, W], at the pixel to which it would lead next."""
         height, width = self.config.size
-        slot = (source - self.config.moves).clamp_min(0)
-        moved = torch.where(slot > 0, 0, source)
-        x = (torch.arange(width, device=source.device) - self.moves[:, 0][moved]).clamp(0, width - 1)
-        y = (torch.arange(height, device=source.device)[:, None] - self.moves[:, 1][moved]).clamp(0, height - 1)
-        place = ((slot * height + y) * width + x).flatten(1)
-        flat = frames.transpose(1, 2).flatten(2)
-        return flat.gather(2, place[:, None].expand(-1, 3, -1)).unflatten(2, (height, width))
+        x = (torch.arange(width, device=went.device) - self.moves[:, :1]).clamp(0, width - 1)
+        y = (torch.arange(height, device=went.device) - self.moves[:, 1:]).clamp(0, height - 1)
+        place = (y[:, :, None] * width + x[:, None]).flatten(1)
+        return went.flatten(2).gather(2, place.expand(len(went), -1, -1)).unflatten(2, (height, width))
 
 
 def likeliest(logits: torch.Tensor) -> torch.Tensor:

@@ -53,11 +53,13 @@ class KeyframesConfig:
 
 @dataclass(frozen=True)
 class HistoryConfig:
-    """size: (height, width) of the frames; slots: last frames that are kept; actions: numbers in an action."""
+    """size: (height, width) of the frames; slots: last frames that are kept; actions: numbers in an action; moves: displacements
+    by which a picture may scroll, x and y in pixels, the first of them 0, 0; with none there is no mosaic."""
 
     size: tuple[int, int]
     slots: int
     actions: int
+    moves: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,9 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
     starts = _below(remembered, "starts")
     begun = Starts.of(_unpack_frames(starts).unflatten(0, (-1, config.slots)), config.actions)
     if "actions" in starts:
-        begun = replace(begun, actions=starts["actions"], vitals=starts["vitals"])
+        begun = replace(
+            begun, actions=starts["actions"], vitals=starts["vitals"], known=starts.get("known", begun.known)
+        )
     return FrameHistory(config, begun)
 
 
@@ -231,7 +233,7 @@ def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, 
     packed = {
         f"starts.{key}": value for key, value in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()
     }
-    return {**packed, "starts.actions": starts.actions, "starts.vitals": starts.vitals}
+    return {**packed, **{f"starts.{name}": getattr(starts, name) for name in ("actions", "vitals", "known")}}
 
 
 def _below(tensors: Tensors, name: str) -> dict[str, torch.Tensor]:

@@ -18,6 +18,8 @@ from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.keyframes import Glimpse, Keyframes
+from ..space.matching import scrolled
+from ..space.mosaic import blank, held_in, remembered
 from .config import HistoryConfig
 from .generator import Conditioning, context_thumbnail, pixels
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
@@ -28,26 +30,31 @@ TRUST = 0.03  # in a frame, against the one after it: what is merged from all of
 @dataclass(frozen=True)
 class Starts:
     """Where episodes begin, S pieces of recording, the newest first: frames uint8 [S, slots, 3, H, W]; the actions that led to
-    them as networks take them [S, slots, A]; vitals [S, V]."""
+    them as networks take them [S, slots, A]; vitals [S, V]; what a mosaic knew of the frame before the newest, uint8 [S, 4, H,
+    W] (colour and votes)."""
 
     frames: torch.Tensor
     actions: torch.Tensor
     vitals: torch.Tensor
+    known: torch.Tensor
 
     @staticmethod
     def of(frames: torch.Tensor, actions: int) -> Starts:
         """No button held, and no vitals."""
-        return Starts(frames, torch.zeros(*frames.shape[:2], actions), torch.zeros(len(frames), 0))
+        known = torch.zeros(len(frames), 4, *frames.shape[3:], dtype=torch.uint8)
+        return Starts(frames, torch.zeros(*frames.shape[:2], actions), torch.zeros(len(frames), 0), known)
 
 
 @final
 class FrameHistory:
     """`starts`: where episodes begin."""
 
-    kind, posed, camera, drawn_names = "history", False, None, ("frames",)
+    kind, posed, camera = "history", False, None
 
     def __init__(self, config: HistoryConfig, starts: Starts):
         self.config, self.starts = config, starts
+        self.moves = torch.tensor(config.moves, dtype=torch.int64, device=starts.frames.device).view(-1, 2)
+        self.drawn_names = ("frames", "mosaic") if config.moves else ("frames",)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
@@ -77,6 +84,8 @@ class FrameHistory:
         pick = (chance.uniform(seeds, (), stream=STARTS) * len(self.starts.frames)).long()
         found = Starts(*(part[pick] for part in vars(self.starts).values()))
         seen = {"frames": found.frames, "actions": found.actions.flip(1), "vitals": found.vitals}
+        if self.config.moves:
+            seen["mosaic"] = held_in(blank(len(pick), self.config.size, self.device), found.known)
         return Evidence(len(pick), self.device, None, seen), pick
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
@@ -97,11 +106,13 @@ class FrameHistory:
 
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
-        return State({"frames": evidence.seen["frames"]})
+        mosaic = {"mosaic": blank(evidence.batch, self.config.size, self.device)} if self.config.moves else {}
+        return State({"frames": evidence.seen["frames"], **mosaic})
 
     def pictured(self, state: State, evidence: Evidence) -> State:
-        """`state` with the frames of the evidence, and the actions that led to them."""
-        return state.replace(**{name: evidence.seen[name] for name in ("frames", "actions") if name in evidence.seen})
+        """`state` with the frames of the evidence, the actions that led to them, and the mosaic as of the frame before."""
+        names = ("frames", "actions", "mosaic")
+        return state.replace(**{name: evidence.seen[name] for name in names if name in evidence.seen})
 
     def frame(self, state: State) -> torch.Tensor:
         """The newest frame, uint8 [B, 3, H, W]."""
@@ -120,13 +131,19 @@ class FrameHistory:
         frames, actions = state["frames"], state["actions"].flip(1)
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
-        return Conditioning(past(frames), last, context)
+        return Conditioning(past(frames), last, context, self._joined(state) if self.config.moves else None)
 
     def drawn(
         self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
     ) -> State:
-        """`state` with the frame `clean` [B, 4, H, W] as its newest."""
-        return state.replace(frames=torch.cat([pixels(clean)[:, None], state["frames"][:, :-1]], 1))
+        """`state` with the frame `clean` [B, 4, H, W] as its newest, and the one before in its mosaic."""
+        mosaic = {} if conditioning.mosaic is None else {"mosaic": conditioning.mosaic}
+        return state.replace(frames=torch.cat([pixels(clean)[:, None], state["frames"][:, :-1]], 1), **mosaic)
+
+    def _joined(self, state: State) -> torch.Tensor:
+        """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it."""
+        frames = state["frames"]
+        return remembered(state["mosaic"], frames[:, 0], self.moves[scrolled(frames[:, 1], frames[:, 0], self.moves)])
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
         return {"rgb": lambda: state["frames"][:, 0].permute(0, 2, 3, 1).contiguous()}

@@ -111,6 +111,7 @@ class LearnedWorld:
         """The settings of all parts in one."""
         drawn, posed = self.generator.config, self.scene.posed
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
+        settings.pop("moves", None)  # those of a codec, found in its recording
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
         settings |= (
             {} if not self.body else {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}

@@ -9,12 +9,15 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ...worlds.codec import Codec, likeliest
+from ...space.matching import CLEAR, explained, preferred, scrolled
+from ...space.mosaic import remembered
+from ...worlds.codec import Codec, Scroll
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
-from ..moves import explained, scrolled
+from ..moves import mosaics
 from ..trainer import Average, Loss, Now, adamw, warmed
 
+PAST = 24  # steps of a clip before those that are shown, of which its mosaic is made; fewer where episodes are short
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
@@ -28,28 +31,36 @@ CHANGED, OFF = 4, 20  # differences of 255
 @dataclass(frozen=True)
 class Clip:
     """frames uint8 [B, slots + DREAM, 3, H, W] and actions [B, slots + DREAM, A] as networks take them, action t leading from
-    frame t to the next; the oldest first."""
+    frame t to the next; the oldest first. mosaic uint8 [B, 4, H', W']: as of the frame before the last of the slots."""
 
     frames: torch.Tensor
     actions: torch.Tensor
+    mosaic: torch.Tensor
 
 
-def clip_length(slots: int) -> int:
-    return slots + DREAM
+def clip_length(slots: int, past: int = PAST) -> int:
+    return past + slots + DREAM
 
 
-def clip(found: Mapping[str, np.ndarray], controls: Controls, slots: int, batch: int, now: Now) -> Clip:
+def clip(
+    found: Mapping[str, np.ndarray], controls: Controls, moves: torch.Tensor, slots: int, batch: int, now: Now
+) -> Clip:
     """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
     rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
-    differs = np.abs(rgb[:, slots:].astype(np.int16) - rgb[:, slots - 1 : -1]).max(-1) > 2 * CHANGED
+    past = rgb.shape[1] - slots - DREAM
+    differs = np.abs(rgb[:, past + slots :].astype(np.int16) - rgb[:, past + slots - 1 : -1]).max(-1) > 2 * CHANGED
     weight = 0.3 + (differs.mean((2, 3)) > 0.005).mean(1)
     picks = now.rng.choice(len(rgb), batch, replace=False, p=weight / weight.sum())
-    frames = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
-    actions = controls.encode(torch.from_numpy(action[picks]).flatten(0, 1)).unflatten(0, (batch, -1))
+    whole = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
+    actions = controls.encode(torch.from_numpy(action[picks][:, past:]).flatten(0, 1)).unflatten(0, (batch, -1))
     begins = torch.from_numpy(now.rng.random(batch) < STILL)[:, None]
-    first = torch.where(begins[..., None, None, None], frames[:, slots - 1 : slots], frames[:, :slots])
+    frames, lone = whole[:, past:], begins[..., None, None, None]
+    first = torch.where(lone, frames[:, slots - 1 : slots], frames[:, :slots])
     before = torch.where(begins[..., None], 0.0, actions[:, : slots - 1])
-    return Clip(torch.cat([first, frames[:, slots:]], 1), torch.cat([before, actions[:, slots - 1 :]], 1))
+    since = torch.from_numpy(now.rng.integers(0, past + slots, batch))[:, None]  # play has a longer or a shorter past
+    real = (torch.arange(past + slots - 1) >= since) & ~begins
+    mosaic = mosaics(whole[:, : past + slots - 1], moves, real)
+    return Clip(torch.cat([first, frames[:, slots:]], 1), torch.cat([before, actions[:, slots - 1 :]], 1), mosaic)
 
 
 class CodecObjective:
@@ -63,39 +74,55 @@ class CodecObjective:
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         self.learners = {"generator": adamw((self.generator,), warmed(learning_rate, 10, 0.02), average=self.smooth)}
 
+    @property
+    def scroll(self) -> Scroll:
+        """The codec's own, which is learned before it (see scroll.py)."""
+        return self.generator.scrolling
+
+    def knows_scroll(self) -> None:
+        """From now on the scroll learns no more."""
+        self.smooth.module.scrolling.load_state_dict(self.scroll.requires_grad_(False).state_dict())
+
     def losses(self, batch: Clip, now: Now) -> Iterator[Loss]:
         slots = self.generator.config.slots
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
-        shown = recorded[:, :slots].flip(1)
+        shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
-            loss, drawn = self._loss(shown, context, truth, before, now)
+            mosaic = remembered(mosaic, shown[:, 0], moves[scrolled(shown[:, 1], shown[:, 0], moves)])
+            loss, drawn = self._loss(shown, mosaic, context, truth, before, now)
             yield loss
             if now.step * DREAM < RECORDED:
                 drawn = truth
             shown = torch.cat([drawn[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, context, truth, before, now: Now) -> tuple[Loss, torch.Tensor]:
+    def _loss(self, shown, mosaic, context, truth, before, now: Now) -> tuple[Loss, torch.Tensor]:
         """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and what is drawn now."""
         codec = self.generator
-        share, stays = explained(codec, shown, truth)
-        move = scrolled(codec, share, truth)
-        scrolls = codec.scroll(shown, context)
-        scroll, guessed = F.cross_entropy(scrolls, move), likeliest(scrolls)
+        move = scrolled(shown[:, 0], truth, codec.moves)
+        with torch.no_grad():
+            guessed = codec.scroll(shown, context)
         move = torch.where(torch.from_numpy(now.rng.random(len(move)) < GUESSED).to(move.device), guessed, move)
-        choices, features = codec.choices(shown, context, move)
+        seen = codec.seen(shown, mosaic, move)
+        choices, features = codec.choices(seen, context)
+        share, stays = explained(shown, truth, codec.moves)
+        share, memory = preferred(share, move), explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known
+        within = share[:, : codec.config.moves + 1].amax(
+            1, keepdim=True
+        )  # what the last frame explains need not be recalled
+        share = torch.cat([share, memory * (1 - CLEAR * within)], 1)
         changes = (truth.int() - before.int()).abs().amax(1) > CHANGED
         some = changes | (stays > OFF)
         some[:, ::7, ::7] = True
         nearest = torch.cdist(truth.permute(0, 2, 3, 1)[some].float(), codec.palette.float()).argmin(1)
-        colour = F.cross_entropy(codec.colours(shown, features, some), nearest, reduction="none")
+        colour = F.cross_entropy(codec.colours(seen, features, some), nearest, reduction="none")
         painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
         each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
         weight = torch.where(changes, codec.stress, 1.0)
         weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
         pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
         with torch.no_grad():
-            drawn = codec.fetched(shown, choices, features)
-        loss = pixels + 0.1 * colour.mean() + 0.3 * scroll
-        return Loss("generator", loss, {"pixels": pixels, "colour": colour.mean(), "scroll": scroll}), drawn
+            drawn = codec.drawn(seen, choices, features)
+        found = {"pixels": pixels, "colour": colour.mean(), "scroll": (move == guessed).float().mean()}
+        return Loss("generator", pixels + 0.1 * colour.mean(), found), drawn

@@ -12,6 +12,7 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...data import Dataset
 from ...space.keyframes import Keyframes
+from ...space.mosaic import recalled
 from ...worlds.body import Motion, MotionBody
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
@@ -23,13 +24,14 @@ from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
 from ...worlds.outcome import Constant, ConstantConfig, Outcome
 from ...worlds.places import KeyframeScene
 from ..feeds import codec_feed, frames_feed
-from ..moves import frequent_moves, palette
+from ..moves import frequent_moves, mosaics, palette
 from ..objectives.codec import CodecObjective
 from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
 from ..objectives.outcome import Happenings, Pieces, learn_outcome
+from ..objectives.scroll import learn_scroll
 from ..objectives.uncertainty import expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..strips import draw_strip
@@ -39,6 +41,7 @@ from .parts import SensesConfig, learn_senses
 WIDTHS = (32, 56, 88, 128)
 MOVES, COLOURS = 24, 64  # among which a codec chooses
 MATCHED = 1 << 20  # pixels of the pairs of pictures in which its moves are found
+REMEMBERED = 64  # steps before it, of which what a start knows is made
 STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
 
 # of the hours, what each stage may take at most; the generator has the rest
@@ -202,7 +205,7 @@ class _Learned:
     def _feed(self, batch: int) -> Feed:
         parts = self.video, batch, self.config.seed
         if isinstance(self.flow, CodecObjective):
-            return codec_feed(self.recording, *parts)
+            return codec_feed(self.recording, self.video, self.flow.generator.moves, *parts[1:])
         dream = self.flow.dream if self.config.flow_steps == 1 else None  # a teacher sees recorded frames alone
         return frames_feed(self.recording, self.memory, *parts, dream)
 
@@ -215,6 +218,9 @@ class _Learned:
         """All stages; each goes on where it was stopped."""
         config, run, recording = self.config, self.run, self.recording
         feed = self._feed(config.batch or (64 if run.device.type == "cuda" else 8))
+        if isinstance(self.flow, CodecObjective):
+            learn_scroll(run, self.flow.scroll, recording, self.flow.generator.moves, self.video.slots)
+            self.flow.knows_scroll()
         trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides))
         if self.memory is not None:
             self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
@@ -276,7 +282,9 @@ class _Learned:
         usual = float(np.median(self.happened.reward))
         if self.memory is None:
             outcome = self._outcome(ConstantConfig(usual))
-            scene = FrameHistory(self.video.frames, self._starts())
+            moves = self.flow.generator.moves if isinstance(self.flow, CodecObjective) else torch.zeros(0, 2)
+            kept = replace(self.video.frames, moves=tuple((int(x), int(y)) for x, y in moves))
+            scene = FrameHistory(kept, self._starts(moves))
             return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
         ends = self.happened.done & np.array(cache.action_valid)
         outcome = self._outcome(ConstantConfig(usual, _ending_pays(self.happened.reward - usual, ends)))
@@ -314,7 +322,7 @@ class _Learned:
         first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
         return first[:: max(1, len(first) // STARTS)][:STARTS]
 
-    def _starts(self) -> Starts:
+    def _starts(self, moves: torch.Tensor) -> Starts:
         """Where episodes begin in a world without geometry: some 32 moments of the recording, evenly."""
         slots, recording = self.video.slots, self.recording
         since = np.arange(recording.cache.length) - recording.start
@@ -323,11 +331,22 @@ class _Learned:
             raise DatasetError(f"no episode is longer than the {slots} frames of history that one begins with.")
         rows = rows[:: max(1, len(rows) // 32)]
         frames = rows[:, None] - np.arange(slots)
-        return Starts(
-            recording.rgb(frames.ravel()).view(*frames.shape, 3, *self.video.size),
+        begun = Starts.of(recording.rgb(frames.ravel()).view(*frames.shape, 3, *self.video.size), self.video.actions)
+        acts, vitals = (
             recording.actions_before(rows, np.arange(1, slots + 1)),
             torch.from_numpy(self.happened.vitals[rows]),
         )
+        return replace(
+            begun, actions=acts, vitals=vitals, known=self._known(rows, moves) if len(moves) else begun.known
+        )
+
+    def _known(self, rows: np.ndarray, moves: torch.Tensor) -> torch.Tensor:
+        """What mosaics of their episodes know of the pictures before `rows`: uint8 [n, 4, H, W]."""
+        recording, past = self.recording, rows[:, None] - np.arange(REMEMBERED, 0, -1)
+        real = torch.from_numpy(past >= recording.start[rows][:, None])
+        pictures = recording.rgb(np.maximum(past, 0).ravel()).unflatten(0, past.shape)
+        nowhere = torch.zeros(len(rows), 2, dtype=torch.int64)
+        return recalled(mosaics(pictures, moves, real), self.video.size, nowhere)
 
     def draw_strip(self, trainer: Trainer) -> None:
         """Truth above dream, with the memory and without; and the world as it now is, so that it can be played while it

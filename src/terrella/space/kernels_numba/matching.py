@@ -1,0 +1,180 @@
+"""How pictures go on in pictures: pixels that a displacement explains, the scroll of most of a picture, and the mosaic."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def around(plane, rows, mean):
+    """Means [H, W] of the 5 x 5 pixels around each of a plane [H, W], as far as they lie in it; overwrites `rows` [H, W + 4]."""
+    height, width = plane.shape
+    for v in range(height):
+        first, stop = max(0, v - 2), min(height, v + 3)
+        rows[v] = 0
+        for j in range(first, stop):
+            for u in range(width):
+                rows[v, u + 2] += plane[j, u]
+        for u in range(width):
+            total = rows[v, u] + rows[v, u + 1] + rows[v, u + 2] + rows[v, u + 3] + rows[v, u + 4]
+            mean[v, u] = total / np.float32((min(width, u + 3) - max(0, u - 2)) * (stop - first))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def differences(frame, truth, x, y, most, mean):
+    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those of `frame` x, y away."""
+    _, height, width = truth.shape
+    first, stop = min(max(0, x), width), max(min(width, width + x), 0)
+    for v in range(height):
+        j = min(max(v - y, 0), height - 1)
+        most[v], mean[v] = 0, 0
+        for c in range(3):
+            there, here = frame[c, j], truth[c, v]
+            for u in range(first):
+                off = np.float32(abs(np.int32(there[0]) - np.int32(here[u])))
+                most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
+            for u in range(first, stop):
+                off = np.float32(abs(np.int32(there[u - x]) - np.int32(here[u])))
+                most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
+            for u in range(stop, width):
+                off = np.float32(abs(np.int32(there[width - 1]) - np.int32(here[u])))
+                most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
+        mean[v] *= np.float32(1 / 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def explained(frames, truth, share, stays, moves, scales):
+    """The kernel of matching.explained_slowly: frames uint8 [slots, 3, H, W], truth uint8 [3, H, W], moves [M, 2]; fills share
+    [sources, H, W] and stays [H, W]."""
+    sources, height, width = share.shape
+    sharp, near, never = np.float32(scales[0]), np.float32(scales[1]), np.float32(scales[2])
+    differs, rows = np.empty((height, width), np.float32), np.empty((height, width + 4), np.float32)
+    mean, least = np.empty((sources, height, width), np.float32), np.empty((height, width), np.float32)
+    least[:] = np.inf
+    for k in range(sources):
+        slot = max(0, k - len(moves) + 1)
+        x, y = (moves[k, 0], moves[k, 1]) if slot == 0 else (0, 0)
+        differences(frames[slot], truth, x, y, share[k], differs)
+        around(differs, rows, mean[k])
+        for v in range(height):
+            for u in range(width):
+                least[v, u] = min(least[v, u], mean[k, v, u])
+    stays[:] = share[0]
+    for k in range(sources):
+        for v in range(height):
+            for u in range(width):
+                own, worse = share[k, v, u], mean[k, v, u] - least[v, u]
+                if own > never or worse > 8 * near:
+                    share[k, v, u] = 0
+                    continue
+                share[k, v, u] = np.exp(-worse / near - max(own - np.float32(4), np.float32(0)) / sharp)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def explains(before, after, found, moves, same, textured):
+    """The kernel of matching.explains_slowly: before, after uint8 [3, H, W], moves [M, 2]; fills found [M]."""
+    _, height, width = after.shape
+    count = 0
+    found[:] = 0
+    for v in range(1, height, 2):
+        for u in range(1, width, 2):
+            edge = 0
+            for c in range(3):
+                own = np.int32(after[c, v, u])
+                edge = max(edge, abs(own - np.int32(after[c, v - 1, u])), abs(own - np.int32(after[c, v, u - 1])))
+            if edge <= textured:
+                continue
+            count += 1
+            for k in range(len(moves)):
+                j, i = v - moves[k, 1], u - moves[k, 0]
+                if j < 1 or i < 1 or j >= height or i >= width:
+                    continue
+                off = 0
+                for c in range(3):
+                    off = max(off, abs(np.int32(before[c, j, i]) - np.int32(after[c, v, u])))
+                    off = max(off, abs(np.int32(before[c, j - 1, i]) - np.int32(after[c, v - 1, u])))
+                    off = max(off, abs(np.int32(before[c, j, i - 1]) - np.int32(after[c, v, u - 1])))
+                if off <= same:
+                    found[k] += 1
+    for k in range(len(moves)):
+        found[k] /= max(count, 1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def voted(frames, share, painted, drawn, moves, limits):
+    """The kernel of matching.voted_slowly: frames uint8 [slots, 3, H, W], share [sources + 1, H, W], painted and drawn uint8 [3, H,
+    W]; fills drawn. Sources of one colour are counted as one."""
+    last, height, width = share.shape[0] - 1, share.shape[1], share.shape[2]
+    same, few, equal, stress = np.int32(limits[0]), np.float32(limits[1]), np.int32(limits[2]), np.float32(limits[3])
+    colour, worth = np.empty((last + 1, 3), np.int32), np.empty(last + 1, np.float32)
+    for v in range(height):
+        for u in range(width):
+            count = 0
+            for k in range(last + 1):
+                if share[k, v, u] < few and k:
+                    continue
+                slot = max(0, k - len(moves) + 1)
+                x, y = (moves[k, 0], moves[k, 1]) if slot == 0 else (0, 0)
+                j, i = min(max(v - y, 0), height - 1), min(max(u - x, 0), width - 1)
+                at = 0
+                for c in range(3):
+                    colour[count, c] = painted[c, v, u] if k == last else frames[slot, c, j, i]
+                while at < count and not (
+                    colour[at, 0] == colour[count, 0]
+                    and colour[at, 1] == colour[count, 1]
+                    and colour[at, 2] == colour[count, 2]
+                ):
+                    at += 1
+                worth[at] = share[k, v, u] + (worth[at] if at < count else np.float32(0))
+                count += at == count
+            best, most = 0, np.float32(-1)
+            for a in range(count):
+                total, stays = np.float32(0), False
+                for b in range(count):
+                    off = max(
+                        abs(colour[a, 0] - colour[b, 0]),
+                        abs(colour[a, 1] - colour[b, 1]),
+                        abs(colour[a, 2] - colour[b, 2]),
+                    )
+                    if off <= same:
+                        total += worth[b]
+                    if b == 0:
+                        stays = off <= equal
+                total *= stress if stays else np.float32(1)
+                if total > most * np.float32(1.001):
+                    best, most = a, total
+            for c in range(3):
+                drawn[c, v, u] = colour[best, c]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def remembered(mosaic, frame, move, after, same, most):
+    """The kernel of mosaic.remembered_slowly: mosaic and after uint8 [4, H', W'], frame uint8 [3, H, W], move [2]; fills after."""
+    _, tall, wide = mosaic.shape
+    _, height, width = frame.shape
+    x, y = move[0], move[1]
+    for c in range(4):
+        for v in range(tall):
+            j = v - y
+            if j < 0 or j >= tall:
+                after[c, v] = 0
+                continue
+            first, stop = max(0, x), min(wide, wide + x)
+            after[c, v, :first] = 0
+            after[c, v, first:stop] = mosaic[c, j, first - x : stop - x]
+            after[c, v, stop:] = 0
+    top, left = (tall - height) // 2, (wide - width) // 2
+    for v in range(height):
+        for u in range(width):
+            votes, off = after[3, top + v, left + u], 0
+            for c in range(3):
+                off = max(off, abs(np.int32(after[c, top + v, left + u]) - np.int32(frame[c, v, u])))
+            if votes > 0 and off <= same:
+                after[3, top + v, left + u] = min(votes + 1, most)
+            elif votes > 1:
+                after[3, top + v, left + u] = votes - 1
+            else:
+                for c in range(3):
+                    after[c, top + v, left + u] = frame[c, v, u]
+                after[3, top + v, left + u] = 1

@@ -1,0 +1,97 @@
+"""Matching and the mosaic: kernels against their slow twins, and what a camera saw over a made-up map."""
+
+from __future__ import annotations
+
+import torch
+
+from terrella.core import make_rng
+from terrella.space.matching import (
+    explained,
+    explained_slowly,
+    explains,
+    explains_slowly,
+    fetched,
+    scrolled,
+    voted,
+    voted_slowly,
+)
+from terrella.space.mosaic import MOST, blank, recalled, remembered, remembered_slowly
+
+MOVES = torch.tensor([[0, 0], [3, 0], [-3, 0], [0, 2], [0, -2], [1, 1]])
+
+
+def map_(seed: int = 0, size: tuple[int, int] = (60, 90)) -> torch.Tensor:
+    return torch.randint(0, 256, (3, *size), dtype=torch.uint8, generator=make_rng(seed))
+
+
+def view(whole: torch.Tensor, x: int, y: int, size: tuple[int, int] = (16, 24)) -> torch.Tensor:
+    return whole[None, :, y : y + size[0], x : x + size[1]]
+
+
+def test_kernels_are_as_their_slow_twins():
+    whole = map_()
+    frames = torch.stack([view(whole, 20, 20)[0], view(whole, 23, 20)[0], view(whole, 24, 21)[0]])[None]
+    truth = view(whole, 17, 20).clone()
+    truth[..., 4:8, 4:8] = 30
+    for fast, slow in zip(explained(frames, truth, MOVES), explained_slowly(frames, truth, MOVES)):
+        assert torch.allclose(fast, slow, atol=1e-5)
+    assert torch.allclose(explains(frames[:, 0], truth, MOVES), explains_slowly(frames[:, 0], truth, MOVES))
+    mosaic = blank(1, (16, 24))
+    for move in MOVES[:4]:
+        for frame in (frames[:, 0], truth, truth):
+            slow = remembered_slowly(mosaic, frame, move[None])
+            mosaic = remembered(mosaic, frame, move[None])
+            assert torch.equal(mosaic, slow)
+
+
+def test_a_scroll_is_found_and_a_still_picture_stands():
+    whole = map_()
+    one = view(whole, 30, 20)
+    for number, (x, y) in enumerate(MOVES.tolist()):
+        assert scrolled(one, view(whole, 30 - x, 20 - y), MOVES).item() == number
+    assert scrolled(one, torch.full_like(one, 9), MOVES).item() == 0, "nothing explains a plain picture"
+    assert torch.equal(fetched(one[:, None], torch.ones(1, 16, 24, dtype=torch.int64), MOVES)[..., 3:], one[..., :-3])
+
+
+def test_what_left_the_picture_is_recalled_where_it_comes_back():
+    whole, mosaic, x = map_(), blank(1, (16, 24)), 20
+    mosaic = remembered(mosaic, view(whole, x, 20), MOVES[:1])
+    for way, steps in ((2, 8), (1, 7)):  # the camera goes 24 pixels to the right, and 21 back
+        for _ in range(steps):
+            before, x = x, x - int(MOVES[way, 0])
+            found = scrolled(view(whole, before, 20), view(whole, x, 20), MOVES)
+            mosaic = remembered(mosaic, view(whole, x, 20), MOVES[found])
+    known = recalled(mosaic, (16, 24), MOVES[1:2])  # one step more, and it is where it was
+    assert torch.equal(known[:, :3], view(whole, 20, 20)) and (known[:, 3] > 0).all()
+    assert (recalled(mosaic, (16, 24), torch.tensor([[0, 16]]))[:, 3] == 0).all(), "above it nothing was seen"
+
+
+def test_what_passes_leaves_no_trace():
+    whole, mosaic = map_(), blank(1, (16, 24))
+    still = torch.zeros(1, 2, dtype=torch.int64)
+    for step in range(24):
+        frame = view(whole, 20, 20).clone()
+        if 6 <= step < 16:
+            frame[..., 5:9, step : step + 4] = 255
+        mosaic = remembered(mosaic, frame, still)
+    known = recalled(mosaic, (16, 24), still)
+    assert torch.equal(known[:, :3], view(whole, 20, 20)) and known[:, 3].max() == MOST
+
+
+def test_what_most_sources_are_like_is_drawn():
+    """Three sources of one background outvote a likelier one of a thing before it; and fast as slow, of random shares."""
+    frames = torch.full((1, 1, 3, 16, 24), 100, dtype=torch.uint8)
+    frames[..., 8, 12] = 255
+    share = torch.zeros(1, len(MOVES) + 1, 16, 24)
+    share[:, 0], share[:, 1], share[:, 2], share[:, 3] = 0.2, 0.4, 0.2, 0.2
+    painted = torch.zeros(1, 3, 16, 24, dtype=torch.uint8)
+    assert (voted(frames, share, painted, MOVES, 1.0) == 100).all()
+    share[:, 1] = 0.7
+    drawn = voted(frames, share, painted, MOVES, 1.0)
+    assert (drawn[..., 8, 15] == 255).all() and drawn.int().sum() == 100 * 3 * 16 * 24 + 155 * 3
+    assert torch.equal(voted(frames, share, painted, MOVES, 9.0), frames[:, 0]), "what stays counts for more"
+    frames = view(map_(), 20, 20)[:, None].expand(2, 2, 3, 16, 24) // 64 * 20
+    share = torch.rand(2, len(MOVES) + 2, 16, 24, generator=make_rng(1)).pow(3)
+    painted = map_(2, (16, 24)).expand(2, 3, 16, 24)
+    fast, slow = (how(frames, share / share.sum(1, keepdim=True), painted, MOVES, 2.0) for how in (voted, voted_slowly))
+    assert (fast == slow).all(1).float().mean() > 0.995
