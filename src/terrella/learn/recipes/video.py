@@ -45,7 +45,7 @@ REMEMBERED = 64  # steps before it, of which what a start knows is made
 STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
 
 # of the hours, what each stage may take at most; the generator has the rest
-SHARES = {"motion": 0.08, "outcome": 0.08, "objects": 0.1, "estimator": 0.12, "dreams": 0.06, "uncertainty": 0.04}
+SHARES = {"motion": 0.08, "scroll": 0.1, "outcome": 0.08, "objects": 0.1, "estimator": 0.12, "dreams": 0.06, "uncertainty": 0.04}
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -72,7 +72,7 @@ class TrainConfig:
         steps: Training steps of the generator. Training ends after these or after `hours`.
         hours: Hours of training, of all parts together and of earlier runs too; the learning rate falls as they go by.
         batch: Frames per step. Default: 8 on a CPU, 64 on a GPU.
-        learning_rate: Highest learning rate of the generator.
+        learning_rate: Highest learning rate of the generator. Default: 8e-4, and without depth 2e-3.
         motion_steps: Training steps of the motion model.
         keyframes: Number of recorded keyframes that the world remembers.
         keep_out: A box x0 y0 x1 y1 of the map, in metres, that training never sees, to score new places.
@@ -98,7 +98,7 @@ class TrainConfig:
     steps: int = 8000
     hours: float = 24.0
     batch: int | None = None
-    learning_rate: float = 8e-4
+    learning_rate: float | None = None
     motion_steps: int = 6000
     keyframes: int = 640
     keep_out: Box | None = None
@@ -181,7 +181,7 @@ class _Learned:
 
     def _flow(self) -> Flow:
         config = self.config
-        parts = config.flow_steps, config.learning_rate, config.critic_from, config.critic_weight
+        parts = config.flow_steps, config.learning_rate or 8e-4, config.critic_from, config.critic_weight
         return Flow(Generator(self.video.generator), *parts)
 
     def _codec(self) -> CodecObjective:
@@ -200,7 +200,7 @@ class _Learned:
         codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
         codec.moves[1:], codec.palette[:] = moves, colours
         codec.stress.fill_(float(np.clip(STRESSED / change.mean(), 1, STRESS)))
-        return CodecObjective(codec, self.config.learning_rate)
+        return CodecObjective(codec, self.config.learning_rate or 2e-3)
 
     def _feed(self, batch: int) -> Feed:
         parts = self.video, batch, self.config.seed
