@@ -17,6 +17,7 @@ from ..recording import Recording
 from ..trainer import Loss, Now, Run, Trainer, adamw, warmed
 
 STEPS, BATCH, LENGTH = 600, 24, 8  # pieces a step, and steps of each, which are guessed one after another
+DREAMT = 0.5  # the share of pieces that go on from what was guessed: there pictures go by whole pixels, as in dreams
 RARELY = 0.3  # as likely is a piece drawn in which the picture does not scroll, as one in which it always does
 ALIKE = 0.03  # how much less a displacement may explain to be less right by e: pictures scroll by parts of pixels
 _ROWS = 512  # that are read at a time
@@ -71,20 +72,21 @@ class Scrolling:
     def losses(self, batch: Piece, now: Now) -> Iterator[Loss]:
         frames, context, found = (part.to(now.device) for part in batch)
         seen = self.scroll.glanced(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        ages, total, right = self.slots - 1, 0.0, 0.0
-        clear = torch.from_numpy(now.rng.random(len(found)) < 0.5).to(now.device)  # dreams are moved by whole pixels
-        first = torch.where(clear[:, None, None], one_of(found[:, :ages]), found[:, :ages])
+        ages, losses, right = self.slots - 1, [], []
+        dreamt = torch.from_numpy(now.rng.random(len(found)) < DREAMT).to(now.device)[:, None]
+        first = torch.where(dreamt[..., None], one_of(found[:, :ages]), found[:, :ages])
         went = list(first.unbind(1))[::-1]  # the newest first
         for step in range(LENGTH):
             logits = self.scroll(seen[:, step], context[:, step], torch.stack(went[:ages], 1))
             wanted = found[:, ages + step]
             near = (wanted - wanted.amax(1, keepdim=True)) / ALIKE
             known = (wanted.amax(1) > 0.2).float()
-            total = total - ((logits.log_softmax(1) + near).logsumexp(1) * known).sum() / known.sum().clamp_min(1)
+            losses.append(-((logits.log_softmax(1) + near).logsumexp(1) * known).sum() / known.sum().clamp_min(1))
             guess = likeliest(logits.detach())
-            right = right + (wanted.gather(1, guess[:, None]) > wanted.amax(1, keepdim=True) - ALIKE).float().mean()
-            went.insert(0, F.one_hot(guess, wanted.shape[1]).float())
-        yield Loss("scroll", total / LENGTH, {"scroll": total / LENGTH, "right": right / LENGTH})
+            right.append((wanted.gather(1, guess[:, None]) > wanted.amax(1, keepdim=True) - ALIKE).float().mean())
+            went.insert(0, torch.where(dreamt, F.one_hot(guess, wanted.shape[1]).float(), wanted))
+        loss = torch.stack(losses).mean()
+        yield Loss("scroll", loss, {"scroll": loss, "right": torch.stack(right).mean()})
 
 
 def one_of(found: torch.Tensor) -> torch.Tensor:

@@ -45,7 +45,15 @@ REMEMBERED = 64  # steps before it, of which what a start knows is made
 STRESSED, STRESS = 0.4, 16.0  # pixels that change count as if they were so many, at most so many times more than others
 
 # of the hours, what each stage may take at most; the generator has the rest
-SHARES = {"motion": 0.08, "scroll": 0.1, "outcome": 0.08, "objects": 0.1, "estimator": 0.12, "dreams": 0.06, "uncertainty": 0.04}
+SHARES = {
+    "motion": 0.08,
+    "scroll": 0.1,
+    "outcome": 0.08,
+    "objects": 0.1,
+    "estimator": 0.12,
+    "dreams": 0.06,
+    "uncertainty": 0.04,
+}
 
 NEEDS = (
     "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
