@@ -194,6 +194,8 @@ class _Learned:
 
     def _codec(self) -> CodecObjective:
         """A codec that knows how pictures of the recording move, and their colours."""
+        if self.video.slots < 2:
+            raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
         recording, rng = self.recording, np.random.default_rng(self.config.seed)
         rows = recording.within(1, 0)
         rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
@@ -290,7 +292,7 @@ class _Learned:
         usual = float(np.median(self.happened.reward))
         if self.memory is None:
             outcome = self._outcome(ConstantConfig(usual))
-            moves = self.flow.generator.moves if isinstance(self.flow, CodecObjective) else torch.zeros(0, 2)
+            moves = self.flow.generator.moves.cpu() if isinstance(self.flow, CodecObjective) else torch.zeros(0, 2)
             kept = replace(self.video.frames, moves=tuple((int(x), int(y)) for x, y in moves))
             scene = FrameHistory(kept, self._starts(moves))
             return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
