@@ -106,3 +106,8 @@ def test_several_choices_are_told_by_name_and_value():
     assert centred.keys["ArrowLeft"] == [0, 1] and neutral_action(centred).tolist() == [1, 1]
     with pytest.raises(TerrellaError, match="is no action of toy"):
         with_controls(several, ["w=move:7"])
+
+
+def test_several_choices_of_any_number_of_values_and_any_name_have_keys():
+    for sizes, names in (([4, 2], ("speed", "fire")), ([1, 4, 6], ("turn", "move", "y")), ([3], ("forward",))):
+        assert default_keys(spaces.MultiDiscrete(sizes), names)

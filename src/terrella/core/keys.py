@@ -182,7 +182,7 @@ def _cluster(size: int, hint: int | None, name: str, taken: Mapping[str, object]
     known = list(_CLUSTERS.get(size, ()))
     if size == 1 and hint is None and name[:1].isascii() and name[:1].isalpha():
         known.insert(0, (f"Key{name[0].upper()}",))
-    if hint:
+    if hint and known:
         known.insert(0, known[min(hint, len(known) - 1)])
     free = [list(codes) for codes in known if not taken.keys() & set(codes)]
     return free[0] if free else [code for code in _SPARE if code not in taken][:size]

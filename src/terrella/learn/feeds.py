@@ -67,7 +67,11 @@ def frames_feed(
 
 def codec_feed(recording: Recording, config: VideoConfig, moves: torch.Tensor, size: int, seed: int) -> Feed:
     """Clips for a codec of these `moves`, `size` at a time: of thrice as many those in which more happens are the likelier."""
-    lengths = np.array([stop - first for first, stop in recording.cache.episodes])
+    lengths = np.array(
+        [stop - first for first, stop in (recording.cache.episodes[number] for number in recording.seen)]
+    )
+    if lengths.max(initial=0) < (least := codec.clip_length(config.slots, 0)):
+        raise DatasetError(f"no episode of {recording.name} has the {least} rows that a clip has; record longer ones.")
     pasts = codec.PAST, codec.PAST // 2, 0
     most = [lengths[lengths >= codec.clip_length(config.slots, past)].sum() for past in pasts]
     past = next(past for past, rows in zip(pasts, most) if rows >= 0.9 * most[-1])  # else episodes are too short for it

@@ -26,7 +26,7 @@ def remembered(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor) ->
     [B, 2] = x, y in pixels. What leaves the mosaic is forgotten."""
     if frame.device.type != "cpu":
         return remembered_slowly(mosaic, frame, move)
-    after = torch.empty_like(mosaic)
+    after = torch.empty(mosaic.shape, dtype=torch.uint8)
     each_view(remembered_kernel, arrays(mosaic, frame, move, after), SAME, MOST)
     return after
 

@@ -23,6 +23,7 @@ from ..core import chance
 from ..core.errors import TerrellaError
 from ..core.world import make_rng
 from ..space.keyframes import Glimpse
+from .codec import Codec
 from .generator import Conditioning
 from .learned import LearnedWorld
 
@@ -54,6 +55,10 @@ def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     TerrellaError where ONNX Runtime is not installed. Eager torch goes on drawing whatever needs a gradient.
     """
     generator: nn.Module = copy.deepcopy(world.generator)
+    if isinstance(generator, Codec):
+        raise TerrellaError(
+            "--fast is for worlds that a U-Net draws; this one fetches its pixels by compiled kernels already."
+        )
     inputs = example(world)
     on_cpu = world.device.type == "cpu"
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""train video: a recording into a playable world, in stages: motion, outcome, objects, generator, estimator, uncertainty."""
+"""train video: a recording into a playable world, by scroll, motion, outcome, objects, estimator, generator, uncertainty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...space.mosaic import recalled
 from ...worlds.body import Motion, MotionBody
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
-from ...worlds.folder import save_world
+from ...worlds.folder import WORLD_FILE, read_about, save_world
 from ...worlds.generator import Generator
 from ...worlds.history import FrameHistory, Starts
 from ...worlds.learned import About, LearnedWorld
@@ -34,6 +34,7 @@ from ..objectives.outcome import Happenings, Pieces, learn_outcome
 from ..objectives.scroll import learn_scroll
 from ..objectives.uncertainty import expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
+from ..run_folder import resume_file
 from ..strips import draw_strip
 from ..trainer import Feed, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
@@ -69,7 +70,7 @@ class TrainConfig:
         size: Height and width of its frames in pixels. Default: those of the recording, if they are no more than 96 x 128 in all.
         geometry: Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
         channels: Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88
-            128, and without depth 64 96 128.
+            128, and without depth 48 64 96.
         frames: Last frames that a world without geometry sees.
         objects_steps: Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a
             recording that tells objects apart. 0 draws them like everything else.
@@ -229,7 +230,8 @@ class _Learned:
         config, run, recording = self.config, self.run, self.recording
         feed = self._feed(config.batch or (64 if run.device.type == "cuda" else 8))
         if isinstance(self.flow, CodecObjective):
-            learn_scroll(run, self.flow.scroll, recording, self.flow.generator.moves, self.video.slots)
+            if not resume_file(run.out, "flow").exists():  # the codec has learned with the scroll that it knows
+                learn_scroll(run, self.flow.scroll, recording, self.flow.generator.moves, self.video.slots)
             self.flow.knows_scroll()
         trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides))
         if self.memory is not None:
@@ -283,6 +285,9 @@ class _Learned:
     def world(self, trainer: Trainer) -> LearnedWorld:
         """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""
         recording, cache, about = self.recording, self.recording.cache, self.recording.cache.world
+        if (self.run.out / "world" / WORLD_FILE).exists():  # keys and names may have been changed while it was played
+            kept = read_about(self.run.out / "world")["about"]
+            about = {**about, **{name: kept[name] for name in ("keys", "action_names", "idle") if kept.get(name)}}
         names = about.get("action_names") or cache.action_names  # of a choice, the recording names each
         named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
         assert recording.controls is not None  # see NEEDS
