@@ -28,7 +28,11 @@ def walked(world: World, action: str, steps: int, batch: int = 8) -> list[torch.
 def test_it_is_a_world_of_pictures_and_says_how_it_is_played(world):
     spec = world.spec
     assert "pose" not in spec.channels and spec.channels["rgb"].shape == (80, 96, 3)
-    assert spec.action_names == ("noop", "up", "down", "left", "right") and spec.keys and spec.card["game"] == "gym:Islet-v0"
+    assert (
+        spec.action_names == ("noop", "up", "down", "left", "right")
+        and spec.keys
+        and spec.card["game"] == "gym:Islet-v0"
+    )
 
 
 @pytest.mark.parametrize("action, way", [("right", (-2, 0)), ("left", (2, 0)), ("down", (0, -2)), ("up", (0, 2))])
