@@ -3,12 +3,12 @@
 # It is learned from pictures and actions alone, of our own small game (src/terrella/sim/islet.py).
 set -e
 PATH=.venv/bin:$PATH
-terrella record world gym:Islet-v0 --frames 30000 --seed 0 --out recordings/islet
-OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 1
+terrella record world gym:Islet-v0 --frames 20000 --seed 0 --out recordings/islet
+OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 0.38
 mkdir -p src/terrella/bundled
 rm -rf src/terrella/bundled/islet
 cp -r runs/islet/world src/terrella/bundled/islet
 # Scores come from a recording of its own, of which training saw nothing.
-terrella record world gym:Islet-v0 --frames 10000 --seed 1 --out recordings/islet-test
-terrella score islet recordings/islet-test --fresh --out scores/islet
+terrella record world gym:Islet-v0 --frames 3000 --seed 5 --out recordings/islet-test
+terrella score islet --data recordings/islet-test --fresh --clips 24 --horizons 1 8 32 --long-steps 0 --drift 0 --out scores/islet
 # To see both side by side: terrella play islet --compare
