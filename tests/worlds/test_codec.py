@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from terrella.core import check_world, make_rng
+from terrella.data import Layout
 from terrella.space.matching import SAME, fetched
 from terrella.space.mosaic import blank, remembered
 from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen
@@ -41,6 +44,24 @@ def world(generator: Codec) -> LearnedWorld:
 
 def test_it_keeps_the_contract():
     assert {"batches", "states_can_be_saved"} <= set(check_world(world(codec()), steps=3))
+
+
+def test_where_the_picture_scrolls_the_mosaic_is_shown_with_the_picture_in_its_middle():
+    made, rng = world(codec()), make_rng(0)
+    state = made.imagine(made.start(2, rng), torch.zeros(2, 2, dtype=torch.int8), rng)
+    seen, (height, width) = made.render(state, ("rgb", "mosaic")), SIZE
+    assert seen["mosaic"].shape == (2, *made.spec.channels["mosaic"].shape)
+    known = seen["mosaic"][..., 3] > 0
+    top, left = height, 3 * width // 2
+    assert known[:, top : top + height, left : left + width].all() and not known.all()
+    assert not seen["mosaic"][~known].any()
+    assert "mosaic" not in Layout.of(made.spec).channels, "recordings do without it"
+
+
+def test_where_nothing_scrolls_there_is_no_mosaic_to_show():
+    still = replace(world(codec()).scene.config, moves=((0, 0),) * len(MOVES))
+    scene = FrameHistory(still, Starts.of(pictures(4), 2))
+    assert "mosaic" not in scene.channels().shows
 
 
 def test_an_untrained_one_stands_still_to_the_last_bit():

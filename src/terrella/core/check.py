@@ -25,6 +25,7 @@ _WELL_KNOWN = {
     "done": (np.bool_, 0),
     "known": (np.float32, 2),
     "keyframes": (np.float32, 2),
+    "mosaic": (np.uint8, 3),
     "instruction": (np.float32, 1),
 }
 

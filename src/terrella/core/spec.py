@@ -137,6 +137,11 @@ class Spec:
         """The channels of one kind, the main one first: kinds("rgb") -> ("rgb", "rgb.wrist")."""
         return tuple(sorted((name for name in self.channels if kind_of(name) == kind), key=suffix_of))
 
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The channels that a recording holds, and a policy sees: all but a mosaic, which is made of the pictures before."""
+        return tuple(name for name in self.channels if kind_of(name) != "mosaic")
+
     def check_channels(self, channels) -> None:
         """Raises ChannelError naming the channels that exist."""
         for name in channels:

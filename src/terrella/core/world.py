@@ -14,8 +14,9 @@ from .state import State
 # [B, H, W, 3]; depth: float32 [B, h, w], metres along the optical axis; pose: float32 [B, 7] = x, y, z in metres and
 # quaternion w, x, y, z of T_world_cam, world z up, camera x forward, y left, z up; reward: float32 [B]; done: bool [B];
 # known: float32 [B, H, W] in 0..1, the share of memory in each pixel of rgb, the rest being invented; keyframes: float32
-# [B, N, 4] = x, y in metres, heading in radians, kind (0 empty, 1 recorded, 2 observed, 3 imagined); instruction: float32
-# [B, D], the embedding of a task's text. A goal is a mapping of channels, too.
+# [B, N, 4] = x, y in metres, heading in radians, kind (0 empty, 1 recorded, 2 observed, 3 imagined); mosaic: uint8 [B, H',
+# W', 4] = red, green, blue and 255 (0 where nothing was seen), the pictures joined by how they scrolled, rgb in the middle;
+# instruction: float32 [B, D], the embedding of a task's text. A goal is a mapping of channels, too.
 Observation = Mapping[str, torch.Tensor]
 
 

@@ -80,9 +80,9 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
 
 
 def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
-    """channel -> Sensor of everything that a world shows; DatasetError names what no recording can hold."""
-    features = features_of(spec.channels)
-    return {name: _sensor(spec, name, space, features[name]) for name, space in spec.channels.items()}
+    """channel -> Sensor of all that is recorded of a world; DatasetError names what no recording can hold."""
+    features = features_of(spec.recorded)
+    return {name: _sensor(spec, name, spec.channels[name], features[name]) for name in spec.recorded}
 
 
 def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sensor:

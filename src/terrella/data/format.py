@@ -60,7 +60,7 @@ class Layout:
 
     @staticmethod
     def of(spec: Spec, fps: float | None = None) -> Layout:
-        """The layout that records every channel of a world; DatasetError names what no recording can hold."""
+        """The layout that records a world (see Spec.recorded); DatasetError names what no recording can hold."""
         channels = sensors_of_channels(spec)
         width = int(np.prod(shape_of(spec.action)))
         names = spec.action_names if len(spec.action_names) == width else tuple(f"action_{i}" for i in range(width))

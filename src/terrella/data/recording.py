@@ -61,7 +61,7 @@ def record(
 
 @torch.no_grad()
 def _episode(world, policy, recorder, frames, rng, progress, max_steps, enough) -> None:
-    channels = [name for name in world.spec.channels if name not in ("reward", "done")]
+    channels = [name for name in world.spec.recorded if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]
     state, left, done = world.start(1, rng), frames - recorder.rows, False
     memory = policy.begin(1, rng)

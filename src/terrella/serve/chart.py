@@ -1,12 +1,19 @@
-"""What a world remembers, for the page: the map of its keyframes, and its pictures with what it invented tinted.
+"""What a world remembers, for the page: its map, and its pictures with what it invented tinted.
 
-It knows no kind of world: a world with the channels `pose` and `keyframes` [N, 4] (x, y in metres, heading in radians, kind:
-0 empty, 1 recorded, 2 observed, 3 imagined) is drawn as a map, one with `known` [H, W] in 0..1 can be tinted.
+It knows no kind of world: one with the channels `pose` and `keyframes` [N, 4] (x, y in metres, heading in radians, kind: 0
+empty, 1 recorded, 2 observed, 3 imagined) has a map of places, one with `mosaic` [H', W', 4] a map that is a picture; one with
+`known` [H, W] in 0..1 can be tinted.
 """
 
 from __future__ import annotations
 
+import base64
+import io
+
+import numpy as np
+import simplejpeg
 import torch
+from PIL import Image
 
 from ..core.spec import Spec
 from ..core.state import State
@@ -17,8 +24,16 @@ AMBER = (1.25, 0.95, 0.5)  # of what is invented: its brightness in this colour
 STRENGTH = 0.85
 
 
-def mapped(spec: Spec) -> bool:
-    return {"pose", "keyframes"} <= set(spec.channels)
+PLACES, MOSAIC = "places", "mosaic"  # kinds of maps
+EVERY_S = {PLACES: 0.1, MOSAIC: 0.25}  # between two maps
+FINEST, QUALITY = 640, 85  # pixels across the image of a mosaic, at most; of its JPEG
+
+
+def mapped(spec: Spec) -> str:
+    """Which kind of map the world has; "" for none."""
+    if {"pose", "keyframes"} <= set(spec.channels):
+        return PLACES
+    return MOSAIC if {"rgb", "mosaic"} <= set(spec.channels) else ""
 
 
 def knows_share(spec: Spec) -> bool:
@@ -26,9 +41,13 @@ def knows_share(spec: Spec) -> bool:
 
 
 def chart(world: World, state: State) -> dict:
-    """The map of the first entry of `state`, as the page gets it: camera [x, y, heading], to the millimetre; known, the share
-    of the picture that memory knew (None where the world does not say); keyframes, x, y, heading and kind of each, to the
-    centimetre, in one flat list without the empty slots."""
+    """The map of the first entry of `state`, as the page gets it (protocol.encode_event)."""
+    return {PLACES: _places, MOSAIC: _mosaic}[mapped(world.spec)](world, state)
+
+
+def _places(world: World, state: State) -> dict:
+    """camera [x, y, heading], to the millimetre; known, the share of the picture that memory knew (None where the world does not
+    say); keyframes, x, y, heading and kind of each, to the centimetre, in one flat list without the empty slots."""
     wanted = ["pose", "keyframes", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     held = seen["keyframes"][seen["keyframes"][:, 3] > 0]
@@ -37,6 +56,30 @@ def chart(world: World, state: State) -> dict:
         "known": round(float(seen["known"].mean()), 3) if "known" in seen else None,
         "keyframes": held.flatten().double().round(decimals=2).tolist(),
     }
+
+
+def _mosaic(world: World, state: State) -> dict:
+    """mosaic: as much of it around its middle as anything was seen in. size and view: how large that part and the picture in
+    its middle are; image: the part as a JPEG; mask: a PNG that is clear where nothing was seen; both in base64."""
+    whole = world.render(state, ("mosaic",))["mosaic"][0].cpu().numpy()
+    height, width = world.spec.channels["rgb"].shape[:2]
+    seen = whole[..., 3] > 0
+    top, left = (_margin(seen.any(1 - axis), least) for axis, least in enumerate((height, width)))
+    part = whole[top : whole.shape[0] - top, left : whole.shape[1] - left]
+    size = part.shape[1::-1]
+    step = -(-size[0] // FINEST)
+    part, mask = np.ascontiguousarray(part[::step, ::step]), io.BytesIO()
+    Image.fromarray(part[..., 3]).convert("1").save(mask, "PNG", compress_level=1, transparency=0)
+    image = simplejpeg.encode_jpeg(np.ascontiguousarray(part[..., :3]), quality=QUALITY, colorspace="RGB")
+    image, shape = (base64.b64encode(data).decode() for data in (image, mask.getvalue()))
+    return {"mosaic": {"size": size, "view": (width, height), "image": image, "mask": shape}}
+
+
+def _margin(seen: np.ndarray, least: int) -> int:
+    """How much can be cut off both ends of `seen` [n] so that nothing seen is lost, and the `least` in the middle stays."""
+    ends = np.flatnonzero(seen)
+    empty = min(int(ends[0]), len(seen) - 1 - int(ends[-1])) if len(ends) else len(seen)
+    return min(empty, (len(seen) - least) // 2)
 
 
 def tinted(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:

@@ -17,13 +17,13 @@ from starlette.websockets import WebSocket
 
 from ..core.errors import TerrellaError
 from . import protocol
+from .chart import EVERY_S
 from .history import Moment
 from .keys import KeyBook
 from .protocol import Controls, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
-CHART_S = 0.1  # between two maps
 
 
 class Session:
@@ -50,7 +50,7 @@ class Session:
         self._error = ""
         self._status_sent: dict[str, object] = {}
         self._show = Show(map=False, invented=False)
-        self._charted: list[float] | None = None  # the keyframes that the page has on its map
+        self._charted: dict[str, Any] = {}  # what the page has on its map
         self._chart_due = 0.0
         self._due = 0.0
 
@@ -206,7 +206,7 @@ class Session:
                 case "drive":
                     timeline.driving = value
                 case "show":
-                    self._show, self._charted, self._chart_due = value, None, 0.0
+                    self._show, self._charted, self._chart_due = value, {}, 0.0
                     timeline.look(value.cameras)
                     self._unseen = self._unseen or timeline.shown
             if kind in ("resume", "restart", "branch", "picture"):
@@ -240,17 +240,17 @@ class Session:
         moment = replace(moment, images=images, flags=moment.flags | protocol.REPLAY * timeline.rewound)
         past = timeline.history.oldest_step, timeline.history.newest.step
         await self._deliver(protocol.encode_frame(moment, self._sent, *past, controls, made_ms, time.time()))
-        if self._show.map and (time.perf_counter() >= self._chart_due or timeline.rewound):
+        if self._show.map and timeline.mapped and (time.perf_counter() >= self._chart_due or timeline.rewound):
             await self._chart(timeline)
 
     async def _chart(self, timeline: Timeline) -> None:
-        self._chart_due = time.perf_counter() + CHART_S
+        self._chart_due = time.perf_counter() + EVERY_S[timeline.mapped]
         found = await self._extra(timeline.chart)
         if found is not None:
-            if found["keyframes"] == self._charted:
-                del found["keyframes"]
-            self._charted = found.get("keyframes", self._charted)
-            await self._event("chart", **found)
+            large = {name: found.pop(name) for name in ("keyframes", "mosaic") if name in found}
+            news = {name: value for name, value in large.items() if value != self._charted.get(name)}
+            self._charted |= news
+            await self._event("chart", **found, **news)
 
     async def _extra(self, function: Callable, *arguments):
         """What is shown beyond the step itself; None, and no more of it, where the world fails."""

@@ -98,6 +98,11 @@ class Timeline:
     def rewound(self) -> bool:
         return self.shown.step < self.history.newest.step
 
+    @property
+    def mapped(self) -> str:
+        """Which kind of map `chart` gives; "" for none."""
+        return next((kind for world in reversed(self.worlds) if (kind := mapped(world.spec))), "")
+
     def pictures(self) -> list[tuple[bytes, ...]]:
         """The JPEGs of the recent past, oldest first, up to the moment shown, while the same cameras were looked through."""
         past = self.history.pictures()
@@ -226,7 +231,7 @@ class Timeline:
         action = action_of(self.obeyed, held, axes)
         if self._policy is None or not self.driving or not torch.equal(action, self._rest):
             return action
-        seen = self.worlds[0].render(self._states[0], tuple(self.spec.channels))
+        seen = self.worlds[0].render(self._states[0], self.spec.recorded)
         action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
         return action
 
@@ -312,7 +317,7 @@ class Timeline:
         spec = self.worlds[number].spec
         wanted = [*self._shown_of(number).values(), "uncertainty"]
         if number == 0:
-            wanted += ["reward", "done", *vitals(spec), *(spec.channels if self.recording.on else ())]
+            wanted += ["reward", "done", *vitals(spec), *(spec.recorded if self.recording.on else ())]
         names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))
         return self.worlds[number].render(self._states[number], names)
 

@@ -19,7 +19,7 @@ from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.matching import scrolled
-from ..space.mosaic import blank, held_in, remembered
+from ..space.mosaic import PICTURES, blank, held_in, remembered
 from .config import HistoryConfig
 from .generator import Conditioning, context_thumbnail, pixels
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
@@ -77,7 +77,11 @@ class FrameHistory:
         return self.config.slots
 
     def channels(self) -> Channels:
-        return Channels({"rgb": spaces.Box(0, 255, (*self.config.size, 3), np.uint8)}, observes=("rgb",))
+        shows: dict[str, spaces.Space] = {"rgb": spaces.Box(0, 255, (*self.config.size, 3), np.uint8)}
+        if len(set(self.config.moves)) > 1:  # else nothing ever scrolls, and what was seen is what is seen
+            height, width = (times * length for times, length in zip(PICTURES, self.config.size))
+            shows["mosaic"] = spaces.Box(0, 255, (height, width, 4), np.uint8)
+        return Channels(shows, observes=("rgb",))
 
     def begin(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
         """Pieces of recordings, by chance; which of the starts they are [B]."""
@@ -146,7 +150,16 @@ class FrameHistory:
         return remembered(state["mosaic"], frames[:, 0], self.moves[scrolled(frames[:, 1], frames[:, 0], self.moves)])
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        return {"rgb": lambda: state["frames"][:, 0].permute(0, 2, 3, 1).contiguous()}
+        return {
+            "rgb": lambda: state["frames"][:, 0].permute(0, 2, 3, 1).contiguous(),
+            "mosaic": lambda: _shown(self._joined(state)),
+        }
+
+
+def _shown(mosaic: torch.Tensor) -> torch.Tensor:
+    """The channel `mosaic` (core/world.py) of mosaics uint8 [B, 4, H', W'], colour and votes."""
+    seen = (mosaic[:, 3:] > 0).to(torch.uint8) * 255
+    return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
 
 
 def past(frames: torch.Tensor) -> Glimpse:

@@ -6,6 +6,7 @@ import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { MemoryMap } from './map.js';
+import { MosaicMap } from './mosaic.js';
 import { takePictures } from './picture.js';
 import { Screens } from './screens.js';
 import { Uncertainty } from './uncertainty.js';
@@ -17,13 +18,14 @@ const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vi
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
 let worlds = [], light = () => {}, status = {}, noRewind = '', noRecord = '', driver = '';
 let pending = null, controlsId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
-let state = 'connecting';
+let state = 'connecting', mapAsked = false;
 
 // -- the connection -------------------------------------------------------------------------------------------------
 
 const uncertainty = new Uncertainty($('uncertainty'), $('uncertainty-fill'));
 const screens = new Screens($('screens'), $('over'), $('stage'), $('glow'));
-const map = new MemoryMap($('map')), show = { map: false, invented: false, cameras: [] };
+const places = new MemoryMap($('map')), mosaic = new MosaicMap($('map')), show = { map: false, invented: false, cameras: [] };
+let map = places;
 const link = new Link({ frame: onFrame, event: onEvent, state: showState });
 const controls = new Controls((held, time) => {
   light(held);
@@ -49,7 +51,7 @@ function sendControls(time) {
 function onEvent(body) {
   if (body.type === 'hello') hello(body);
   if (body.type === 'status') onStatus(body);
-  if (body.type === 'chart' && show.map) map.show(body);
+  if (body.type === 'chart' && show.map) onChart(body);
   if (body.type === 'error') toast(body.text);
 }
 
@@ -58,15 +60,31 @@ function showMemory(change) {
   Object.assign(show, change);
   show.map &&= worlds.some((world) => world.mapped);
   show.invented &&= worlds.some((world) => world.knows_share);
-  $('map').hidden = !show.map;
+  showMap();
   $('map-open').setAttribute('aria-pressed', show.map);
   $('tint').setAttribute('aria-pressed', show.invented);
   for (const chip of $('cameras').children) chip.setAttribute('aria-pressed', chip.value === (show.cameras.length > 1 ? 'all' : show.cameras[0]));
   link.send({ type: 'show', ...show });
 }
 
+/** The map of the last world that has one; a mosaic only from when more was seen than the picture, or if it was asked for. */
+function showMap() {
+  const kind = worlds.findLast((world) => world.mapped)?.mapped, waits = kind === 'mosaic' && show.map && !mosaic.beyond && !mapAsked;
+  map = kind === 'mosaic' ? mosaic : places;
+  $('map').hidden = !show.map || waits;
+  $('map-open').hidden = !kind || waits;
+}
+
+async function onChart(body) {
+  await map.show(body);
+  if (!$('map').hidden || !mosaic.beyond) return;
+  showMap();
+  map.draw();
+}
+
 function toggleMap() {
   if ($('map-open').hidden) return;
+  mapAsked = true;
   showMemory({ map: !show.map });
   localStorage.setItem('terrella-map', show.map ? 'open' : 'closed');
 }
@@ -96,8 +114,7 @@ function hello(body) {
   ({ worlds, no_rewind: noRewind, no_record: noRecord, driver } = body);
   if (panel.take(worlds[0])) sendKeys();
   if (!same) build();
-  if (!body.resumed) map.clear();
-  $('map-open').hidden = !worlds.some((world) => world.mapped);
+  if (!body.resumed) { places.clear(); mosaic.clear(); }
   $('tint').hidden = !worlds.some((world) => world.knows_share);
   const wish = localStorage.getItem('terrella-map'), open = worlds.length === 1 ? wish !== 'closed' : wish === 'open';
   showMemory(same ? {} : { map: open && innerWidth > 1000 });
@@ -478,7 +495,7 @@ window.terrella = Object.freeze({
   get driving() { return !!status.driving; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
-  get map() { return { shown: show.map, step: map.step, camera: map.camera, keyframes: map.keys.length, path: map.path.length }; },
+  get map() { return { shown: !$('map').hidden, step: map.step, camera: places.camera, keyframes: places.keys.length, path: places.path.length, size: mosaic.size }; },
   get done() { return !!(now.flags & DONE); },
   get latencies() { return [...seen.latencies]; },
   get latencyCount() { return seen.latencyCount; },
