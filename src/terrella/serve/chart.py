@@ -22,8 +22,6 @@ from ..space.camera import yaw
 
 AMBER = (1.25, 0.95, 0.5)  # of what is invented: its brightness in this colour
 STRENGTH = 0.85
-
-
 PLACES, MOSAIC = "places", "mosaic"  # kinds of maps
 EVERY_S = {PLACES: 0.1, MOSAIC: 0.25}  # between two maps
 FINEST, QUALITY = 640, 85  # pixels across the image of a mosaic, at most; of its JPEG
