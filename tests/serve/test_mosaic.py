@@ -136,7 +136,7 @@ def test_who_asks_sees_it_though_it_is_the_picture(serve_world, open_page):  # n
     assert not page.evaluate("terrella.map.shown")
     page.click("#map-open")
     until(page, "terrella.map.shown && terrella.map.size !== null")
-    assert page.locator("#map-known").text_content() == "Nothing seen beyond the picture yet"
+    assert page.locator("#map-known").text_content() == "Nothing else seen yet"
     box = page.locator("#map").bounding_box()
     assert box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] < 200
 

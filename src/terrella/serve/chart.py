@@ -62,7 +62,7 @@ def _mosaic(world: World, state: State) -> dict:
     whole = world.render(state, ("mosaic",))["mosaic"][0].cpu().numpy()
     height, width = world.spec.channels["rgb"].shape[:2]
     seen = whole[..., 3] > 0
-    top, left = (_margin(seen.any(1 - axis), least) for axis, least in enumerate((height, width)))
+    top, left = (_margin(np.atleast_1d(seen.any(1 - axis)), least) for axis, least in enumerate((height, width)))
     part = whole[top : whole.shape[0] - top, left : whole.shape[1] - left]
     size = part.shape[1::-1]
     step = -(-size[0] // FINEST)

@@ -33,7 +33,7 @@ export class MosaicMap {
     const goal = [Math.max(size[0] / 2, view[0]), Math.max(size[1] / 2, 0.75 * view[1])];
     const fits = this.goal?.every((half, at) => goal[at] <= half + 0.5 && goal[at] >= LOOSE * half);
     if (!fits) Object.assign(this, { from: this.goal ? this.half() : goal, goal, moved: performance.now() });
-    this.tell(this.beyond ? '' : 'Nothing seen beyond the picture yet');
+    this.tell(this.beyond ? '' : 'Nothing else seen yet');
     this.draw();
   }
 
