@@ -11,11 +11,8 @@ from .kernels_numba.matching import explains as explains_kernel
 from .kernels_numba.matching import voted as voted_kernel
 from .views import arrays, each_view
 
-SHARP, NEAR, NEVER = (
-    10.0,
-    3.0,
-    60.0,
-)  # differences (of 255), of a pixel and around it, by which it is explained less by e
+# Differences (of 255): of a pixel, and around it, by which it is explained less by e; and of a pixel that is not explained.
+SHARP, NEAR, NEVER = 10.0, 3.0, 60.0
 CLEAR = 0.97  # of what is explained already is not left to others
 FEW, EQUAL = 0.01, 4  # the share of what has no vote; difference of 255 up to which what is drawn stays as it was
 SAME, TEXTURED = 16, 12  # differences of 255: of one pixel in two pictures, and of neighbours in one

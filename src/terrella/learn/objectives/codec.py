@@ -21,9 +21,8 @@ PAST = 24  # steps of a clip before those that are shown, of which its mosaic is
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
-STALE = (
-    0.15  # how much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it
-)
+# How much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it.
+STALE = 0.15
 CHANGED, OFF = 4, 20  # differences of 255
 
 
@@ -86,9 +85,7 @@ class CodecObjective:
         slots = self.generator.config.slots
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
-        follows = (
-            torch.arange(len(recorded), device=now.device)[:, None, None, None] % 2 == 0
-        )  # these are shown as recorded
+        follows = torch.arange(len(recorded), device=now.device)[:, None, None, None] % 2 == 0  # half is never dreamt
         follows = follows | (now.step * DREAM < RECORDED)
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
@@ -107,9 +104,8 @@ class CodecObjective:
         choices, features = codec.choices(seen, context)
         share, stays = explained(shown, truth, codec.moves)
         share, memory = preferred(share, move), explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known
-        within = share[:, : codec.config.moves + 1].amax(
-            1, keepdim=True
-        )  # what the last frame explains need not be recalled
+        # What the last frame explains need not be recalled.
+        within = share[:, : codec.config.moves + 1].amax(1, keepdim=True)
         share = torch.cat([share, memory * (1 - CLEAR * within)], 1)
         changes = (truth.int() - before.int()).abs().amax(1) > CHANGED
         some = changes | (stays > OFF)
