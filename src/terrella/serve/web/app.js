@@ -5,33 +5,31 @@ import { Controls } from './controls.js';
 import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
-import { MemoryMap } from './map.js';
-import { MosaicMap } from './mosaic.js';
+import { Past, write } from './past.js';
 import { takePictures } from './picture.js';
 import { Screens } from './screens.js';
 import { Uncertainty } from './uncertainty.js';
+import { Views } from './views.js';
 
 const $ = (id) => document.getElementById(id);
 const app = $('app'), KEPT = 8192;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
-let worlds = [], light = () => {}, status = {}, noRewind = '', noRecord = '', driver = '';
-let pending = null, controlsId = 0, rewinding = null, aim = 0, autoPaused = false, recordSince = 0, ticks = [], dirtyTimeline = true;
-let state = 'connecting', mapAsked = false;
+let worlds = [], light = () => {}, status = {}, noRecord = '', driver = '', state = 'connecting';
+let pending = null, controlsId = 0, autoPaused = false, recordSince = 0;
 
 // -- the connection -------------------------------------------------------------------------------------------------
 
 const uncertainty = new Uncertainty($('uncertainty'), $('uncertainty-fill'));
 const screens = new Screens($('screens'), $('over'), $('stage'), $('glow'));
-const places = new MemoryMap($('map')), mosaic = new MosaicMap($('map')), show = { map: false, invented: false, cameras: [] };
-let map = places;
 const link = new Link({ frame: onFrame, event: onEvent, state: showState });
+const views = new Views(screens, (show) => link.send({ type: 'show', ...show })), past = new Past(now, (message) => link.send(message), toast);
 const controls = new Controls((held, time) => {
   light(held);
   if (controls.active) {
     $('hint').classList.remove('show');
-    if (status.rewound && rewinding === null) link.send({ type: 'branch' });
+    if (status.rewound && past.rewinding === null) link.send({ type: 'branch' });
     if (status.paused && !status.rewound) link.send({ type: 'resume' });
   }
   sendControls(time);
@@ -51,73 +49,17 @@ function sendControls(time) {
 function onEvent(body) {
   if (body.type === 'hello') hello(body);
   if (body.type === 'status') onStatus(body);
-  if (body.type === 'chart' && show.map) onChart(body);
+  if (body.type === 'chart') views.onChart(body);
   if (body.type === 'error') toast(body.text);
-}
-
-/** Shows or hides the map, the tint of what is invented, or cameras, and asks the server for what is shown alone. */
-function showMemory(change) {
-  Object.assign(show, change);
-  show.map &&= worlds.some((world) => world.mapped);
-  show.invented &&= worlds.some((world) => world.knows_share);
-  showMap();
-  $('map-open').setAttribute('aria-pressed', show.map);
-  $('tint').setAttribute('aria-pressed', show.invented);
-  for (const chip of $('cameras').children) chip.setAttribute('aria-pressed', chip.value === (show.cameras.length > 1 ? 'all' : show.cameras[0]));
-  link.send({ type: 'show', ...show });
-}
-
-/** The map of the last world that has one; a mosaic only from when more was seen than the picture, or if it was asked for. */
-function showMap() {
-  const kind = worlds.findLast((world) => world.mapped)?.mapped, waits = kind === 'mosaic' && show.map && !mosaic.beyond && !mapAsked;
-  map = kind === 'mosaic' ? mosaic : places;
-  $('map').hidden = !show.map || waits;
-  $('map-open').hidden = !kind || waits;
-}
-
-async function onChart(body) {
-  await map.show(body);
-  if (!$('map').hidden || !mosaic.beyond) return;
-  showMap();
-  map.draw();
-}
-
-function toggleMap() {
-  if ($('map-open').hidden) return;
-  mapAsked = true;
-  showMemory({ map: !show.map });
-  localStorage.setItem('terrella-map', show.map ? 'open' : 'closed');
-}
-
-/** The next camera, and after the last one all of them. */
-function nextCamera() {
-  const chips = [...$('cameras').children], at = chips.findIndex((chip) => chip.ariaPressed === 'true');
-  if (chips.length) chips[(at + 1) % chips.length].click();
-}
-
-function drawCameras() {
-  const { cameras } = screens, chip = (value, textContent) => Object.assign(document.createElement('button'), { value, textContent });
-  show.cameras = [cameras[0].channel];
-  $('cameras').replaceChildren(...(cameras.length < 2 ? [] : [...cameras.map(({ channel, name }) => chip(channel, name)), chip('all', 'all')]));
-  for (const button of $('cameras').children) button.onclick = () => {
-    showMemory({ cameras: button.value === 'all' ? cameras.map(({ channel }) => channel) : [button.value] });
-    button.blur();
-  };
-}
-
-function toggleTint() {
-  if (!$('tint').hidden) showMemory({ invented: !show.invented });
 }
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
-  ({ worlds, no_rewind: noRewind, no_record: noRecord, driver } = body);
+  ({ worlds, no_record: noRecord, driver } = body);
+  past.take(worlds[0], body.no_rewind);
   if (panel.take(worlds[0])) sendKeys();
   if (!same) build();
-  if (!body.resumed) { places.clear(); mosaic.clear(); }
-  $('tint').hidden = !worlds.some((world) => world.knows_share);
-  const wish = localStorage.getItem('terrella-map'), open = worlds.length === 1 ? wish !== 'closed' : wish === 'open';
-  showMemory(same ? {} : { map: open && innerWidth > 1000 });
+  views.take(worlds, { same, resumed: body.resumed });
   sendControls(performance.now());
   now.actionId = controlsId;  // what is sent before anything is held measures nothing
   showState('starting');
@@ -159,18 +101,16 @@ function paint(time) {
     keep(seen.latencies, at - frame.clientMs);
     seen.latencyCount += 1;
   }
-  if (frame.step < now.oldest || frame.newest < now.newest) ticks = ticks.filter((step) => step <= frame.newest);
-  if (frame.flags & FRESH && frame.step > 0 && live) {
-    ticks.push(frame.step);
-    screens.flash();
-  }
+  const fresh = frame.flags & FRESH && frame.step > 0 && live;
+  past.pass(frame, fresh);
+  if (fresh) screens.flash();
   Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
   uncertainty.show(frame.uncertainty, !!(frame.flags & FRESH) || !live);
   seen.painted += 1;
   keep(seen.times, time);
   keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });
-  if (!live) drawTimeline(); else dirtyTimeline = true;
+  if (!live) past.draw();
   if (state === 'starting' && !status.text) onStatus(status);
 }
 
@@ -186,7 +126,7 @@ function build() {
   document.title = `${worlds[0].name} · Terrella`;
   $('what').textContent = worlds[worlds.length - 1].card.what ?? '';
   screens.setWorlds(worlds);
-  drawCameras();
+  views.drawCameras();
   drawKeys();
   drawCard($('facts'), worlds);
   $('score-cell').hidden = !worlds[0].scored;
@@ -201,9 +141,7 @@ function build() {
   $('drive').hidden = !driver;
   $('drive').title = `Let the policy act (G): ${driver}`;
   $('sync').hidden = worlds.length < 2;
-  app.classList.toggle('no-rewind', !!noRewind);
-  able($('rewind'), noRewind, 'Hold to rewind (Backspace)');
-  $('timeline').title = noRewind || '';
+  able($('rewind'), past.why, 'Hold to rewind (Backspace)');
   able($('record'), noRecord, 'Record to a dataset');
   able($('sync'), '', 'Set the dream to what the game shows now');
   $('keys-open').hidden = !worlds[0].actions.length;
@@ -245,7 +183,7 @@ function showState(name, text = '') {
   if (title) [$('banner-text').textContent, $('banner-more').textContent] = [title, text || more];
   $('banner-button').hidden = !button;
   $('banner-button').textContent = button ?? '';
-  dirtyTimeline = true;
+  past.dirty = true;
 }
 
 let toastTimer = 0;
@@ -263,14 +201,6 @@ function fps() {
   return times.length > 1 ? ((times.length - 1) * 1000) / (times[times.length - 1] - times[0]) : 0;
 }
 
-function write(id, value, unit = '') {
-  const node = $(id), text = `${value}${unit}`;
-  if (node.dataset.text === text) return;
-  node.dataset.text = text;
-  node.replaceChildren(String(value));
-  if (unit) node.append(Object.assign(document.createElement('small'), { textContent: unit }));
-}
-
 function drawFigures() {
   const recent = seen.latencies.slice(-24).sort((a, b) => a - b);
   write('fps', state === 'playing' ? Math.round(fps()) : '–');
@@ -282,23 +212,7 @@ function drawFigures() {
     const s = Math.floor((performance.now() - recordSince) / 1000);
     write('rec-time', `${Math.floor(s / 60)}:${String(s % 60).padStart(2, '0')}`);
   }
-  if (dirtyTimeline) drawTimeline();
-}
-
-function drawTimeline() {
-  dirtyTimeline = false;
-  const span = now.newest - now.oldest, part = span ? (now.step - now.oldest) / span : 1, dt = worlds[0]?.dt_s ?? 0;
-  $('fill').style.transform = `scaleX(${part})`;
-  $('thumb').style.left = `${part * 100}%`;
-  const shown = ticks.filter((step) => step > now.oldest && step <= now.newest);
-  while ($('ticks').childElementCount < shown.length) $('ticks').append(document.createElement('i'));
-  while ($('ticks').childElementCount > shown.length) $('ticks').lastChild.remove();
-  shown.forEach((step, index) => { $('ticks').children[index].style.left = `${((step - now.oldest) / span) * 100}%`; });
-  write('time-left', noRewind ? noRewind : !span ? '' : `−${(span * dt).toFixed(0)} s`);
-  write('time-right', noRewind || !span ? '' : 'now');
-  write('past-time', `−${((now.newest - now.step) * dt).toFixed(1)} s`);
-  const line = $('timeline');
-  line.ariaValueMin = now.oldest; line.ariaValueMax = now.newest; line.ariaValueNow = now.step;
+  if (past.dirty) past.draw();
 }
 
 // -- verbs ----------------------------------------------------------------------------------------------------------
@@ -307,29 +221,8 @@ function togglePause() {
   link.send({ type: status.paused || status.rewound ? 'resume' : 'pause' });
 }
 
-function seek(step) {
-  aim = Math.min(now.newest, Math.max(now.oldest, Math.round(step)));
-  link.send({ type: 'seek', step: aim });
-}
-
-function startRewind() {
-  if (noRewind) return toast(noRewind);
-  if (rewinding !== null) return;
-  const begun = performance.now(), rate = 1 / worlds[0].dt_s / 30;
-  aim = now.step;
-  $('rewind').classList.add('on');
-  rewinding = setInterval(() => seek(aim - Math.max(1, rate * (1 + Math.min(4, (performance.now() - begun) / 900)))), 33);
-  seek(aim - 1);
-}
-
-function stopRewind() {
-  clearInterval(rewinding);
-  rewinding = null;
-  $('rewind').classList.remove('on');
-}
-
 function restart(seed) {
-  ticks = [];
+  past.ticks = [];
   link.send({ type: 'restart', seed });
 }
 
@@ -386,7 +279,7 @@ function drawTouch() {
 
 const drive = () => driver && link.send({ type: 'drive', on: !status.driving });
 const escape = () => (panel.open ? showAside(null) : togglePause());
-const SHORTCUTS = { KeyM: toggleMap, KeyT: toggleTint, KeyC: nextCamera, KeyG: drive, KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: drive, KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 /** What the page itself does with a key, here and now; '' where it does nothing. */
 function pageUse(code) {
@@ -405,12 +298,12 @@ addEventListener('keydown', (event) => {
   if (event.target.tagName === 'INPUT' || event.ctrlKey || event.metaKey || event.altKey) return;
   const button = event.target.closest?.('button') && (event.code === 'Enter' || event.code === 'Space');
   if (controls.press(event.code, event.timeStamp)) event.preventDefault();
-  else if (event.code === 'Backspace') { event.preventDefault(); if (!event.repeat) startRewind(); }
+  else if (event.code === 'Backspace') { event.preventDefault(); if (!event.repeat) past.startRewind(); }
   else if (!event.repeat && !button && SHORTCUTS[event.code]) { event.preventDefault(); SHORTCUTS[event.code](); }
 });
 addEventListener('keyup', (event) => {
   controls.lift(event.code, event.timeStamp);
-  if (event.code === 'Backspace') stopRewind();
+  if (event.code === 'Backspace') past.stopRewind();
 });
 
 $('pause').onclick = togglePause;
@@ -422,15 +315,10 @@ $('drive').onclick = drive;
 $('clip').onclick = clip;
 $('sync').onclick = () => link.send({ type: 'sync' });
 $('full').onclick = fullscreen;
-$('map-open').onclick = toggleMap;
-$('tint').onclick = toggleTint;
 $('smooth').onclick = () => $('smooth').setAttribute('aria-pressed', app.classList.toggle('smooth'));
 $('branch').onclick = () => link.send({ type: 'branch' });
 $('now').onclick = () => link.send({ type: 'resume' });
 $('banner-button').onclick = () => (state === 'failed' ? restart(status.seed ?? 0) : link.connect());
-$('rewind').onpointerdown = (event) => { event.target.closest('button').setPointerCapture(event.pointerId); startRewind(); };
-for (const name of ['pointerup', 'pointercancel', 'lostpointercapture']) $('rewind').addEventListener(name, stopRewind);
-$('rewind').oncontextmenu = (event) => event.preventDefault();
 const card = { get open() { return !$('card').hidden; }, toggle(open) { $('card').hidden = !open; } };
 function showAside(which) {
   for (const [one, button] of [[card, $('about')], [panel, $('keys-open')]]) {
@@ -443,17 +331,6 @@ for (const [one, opens, closes] of [[card, 'about', 'card-close'], [panel, 'keys
   $(closes).onclick = () => showAside(null);
 }
 learnLayout(() => { if (worlds.length) drawKeys(); });
-
-let scrubbing = false, scrubbed = 0;
-const scrub = (event) => {
-  const box = $('timeline').getBoundingClientRect(), part = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
-  if (event.timeStamp - scrubbed < 25 && event.type === 'pointermove') return;
-  scrubbed = event.timeStamp;
-  seek(now.oldest + part * (now.newest - now.oldest));
-};
-$('timeline').onpointerdown = (event) => { if (noRewind) return; scrubbing = true; $('timeline').setPointerCapture(event.pointerId); scrub(event); };
-$('timeline').onpointermove = (event) => { if (scrubbing) scrub(event); };
-$('timeline').onpointerup = $('timeline').onpointercancel = (event) => { if (scrubbing && event.type === 'pointerup') { scrubbed = 0; scrub(event); } scrubbing = false; };
 
 takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes) => link.sendPicture(bytes), toast);
 controls.bindPad($('stick'), 'stick');
@@ -495,7 +372,7 @@ window.terrella = Object.freeze({
   get driving() { return !!status.driving; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
-  get map() { return { shown: !$('map').hidden, step: map.step, camera: places.camera, keyframes: places.keys.length, path: places.path.length, size: mosaic.size }; },
+  get map() { return views.figures; },
   get done() { return !!(now.flags & DONE); },
   get latencies() { return [...seen.latencies]; },
   get latencyCount() { return seen.latencyCount; },
