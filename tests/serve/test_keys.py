@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from terrella.core import Spec
 from terrella.core.errors import ProtocolError, TerrellaError
-from terrella.core.keys import default_keys
+from terrella.core.keys import default_keys, with_changes, with_controls
 from terrella.core.spec import neutral_action
 from terrella.serve.keys import KeyBook, Rebound, actions_of
 from terrella.serve.protocol import parse_message
@@ -111,6 +111,36 @@ def test_one_page_has_not_the_keys_of_another_unless_they_are_the_worlds(serve_w
                 assert world["first_keys"]["KeyW"] == 0
 
 
+def test_keys_of_the_world_reach_the_pages_that_are_open(serve_world):
+    server = serve_world([Panorama()], kept_in="in the world's folder", keep=lambda spec: None)
+    with Client(server.socket_url) as one, Client(server.socket_url) as other:
+        one.event("hello")
+        other.event("hello")
+        one.say("keys", keys={"KeyJ": 0}, names=[[0, "run"]])
+        told = other.event("keys")
+        assert told["keys"] == {"KeyJ": 0} and told["actions"][0]["name"] == "run"
+        other.say("controls", id=1, held=["KeyJ"], axes=[], t=5.0)
+        while other.frame().episode_return < 3:
+            pass
+        assert not any(event["type"] == "keys" for event in one.events)
+
+
+def test_what_is_kept_is_what_was_changed():
+    own = spec_of(spaces.Discrete(3), "left", "noop", "jump", keys={"KeyA": [0.0], "Space": [2.0]})
+    begun = with_controls(own, ["s=left", "space=2"], idle="left")
+    book = KeyBook(begun)
+    assert with_changes(own, begun, begun) == own
+    kept = with_changes(own, begun, book.changed(Rebound({"KeyS": 0, "KeyX": 2})))
+    assert kept == replace(own, keys={"KeyA": [0.0], "KeyX": [2.0]})
+    kept = with_changes(own, begun, book.changed(Rebound({"KeyS": 0, "Space": 2}, {1: "stand"})))
+    assert kept.action_names == ("left", "stand", "jump") and kept.keys == own.keys
+    assert kept.idle == (1.0,), "what rests in the world, and not what was said for once"
+    bare = spec_of(spaces.Discrete(3))
+    begun = with_controls(bare, action_names=["a", "b", "c"])
+    kept = with_changes(bare, begun, KeyBook(begun).changed(Rebound({}, {2: "jump"})))
+    assert kept.action_names == ("action 0", "action 1", "jump")
+
+
 # -- in a browser -----------------------------------------------------------------------------------------------------------
 
 
@@ -158,6 +188,26 @@ def test_what_was_set_is_there_again_after_a_reload_until_it_is_reset(serve_worl
     page.click("#keys-reset")
     assert caps(page, "forward") == ["W", "↑"] and caps(page, "turn left") == ["←"]
     assert page.evaluate("localStorage.length") == 0 and not page.locator("#keys-reset").is_visible()
+
+
+@pytest.mark.parametrize("kept_in", ["", "in the world's folder"])
+def test_a_key_that_is_changed_on_one_page_is_changed_on_the_other(serve_world, open_page, kept_in):  # noqa: F811
+    url = serve_world(kept_in=kept_in, keep=lambda spec: None).url
+    page = open_page(url)
+    other = page.context.new_page()
+    other.goto(url)
+    until(other, "!!window.terrella && terrella.painted > 2")
+    page.bring_to_front()
+    page.click("#keys-open")
+    row(page, "forward").locator(".cap").first.click()
+    page.keyboard.press("KeyI")
+    row(page, "turn left").locator("input").fill("port")
+    page.keyboard.press("Enter")
+    until(other, "terrella.keys.includes('KeyI') && !terrella.keys.includes('KeyW')")
+    until(other, "document.getElementById('keys').textContent.includes('port')")
+    page.click("#keys-reset")
+    until(other, "terrella.keys.includes('KeyW') && !document.getElementById('keys').textContent.includes('port')")
+    other.close()
 
 
 def test_conflicts_are_told_in_a_sentence(serve_world, open_page):  # noqa: F811

@@ -46,10 +46,12 @@ class Controls:
 
 
 class Keeper:
-    """The spec with the keys and names that a person last set on the page; a folder that may keep them does (library.py)."""
+    """The spec with the keys and names that a person last set on the page. A folder that may keep them does (library.py): what is
+    changed of `spec`, with which the page begins, is changed of `own`, the world's; what else `spec` says was said for once."""
 
-    def __init__(self, spec: Spec, folder: Path | None = None):
+    def __init__(self, spec: Spec, folder: Path | None = None, own: Spec | None = None):
         self.spec, self.folder = spec, folder
+        self._first, self._own = spec, own or spec
 
     @property
     def place(self) -> str:
@@ -63,11 +65,12 @@ class Keeper:
         return replace(layout, world=facts_of(self.spec))
 
     def __call__(self, spec: Spec) -> None:
+        from ..core.keys import with_changes
         from ..worlds.folder import save_keys
 
         self.spec = spec
         if self.folder:
-            save_keys(self.folder, spec)
+            save_keys(self.folder, with_changes(self._own, self._first, spec))
 
 
 @dataclass(frozen=True)

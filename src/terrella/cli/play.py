@@ -62,7 +62,7 @@ def play(
         worlds = [_game_like(learned, truth), learned]
     worlds = [controls.of(world) for world in worlds]
     own = library.folder_for_keys(name) if is_loopback(host) and not compare else None
-    keeper, sink = Keeper(worlds[0].spec, own), None
+    keeper, sink = Keeper(worlds[0].spec, own, learned.spec), None
     if record is not None:
         from ..data import Layout, Recorder
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .errors import TerrellaError
-from .spec import Spec, idle_name, neutral_action, shape_of
+from .spec import CHOICE, Spec, can_idle, idle_name, neutral_action, shape_of
 
 _CODES = {
     **{name: f"Arrow{name.title()}" for name in ("up", "down", "left", "right")},
@@ -201,6 +201,41 @@ def told_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
             found[code] = np.asarray(action, np.float64).reshape(-1).tolist()
     width = int(np.prod(shape_of(space)))
     return {code: action for code, action in found.items() if len(action) == width}
+
+
+def unnamed(space: spaces.Space) -> list[str]:
+    """Names for actions that have none."""
+    if isinstance(space, spaces.Discrete):
+        return [f"action {at}" for at in range(int(space.n))]
+    what = {"MultiBinary": "button", "MultiDiscrete": "choice"}.get(type(space).__name__, "axis")
+    return [f"{what} {at + 1}" for at in range(int(np.prod(shape_of(space))))]
+
+
+def all_names(spec: Spec) -> list[str]:
+    """A name for every action, made up where it has none."""
+    return [*spec.action_names, *unnamed(spec.action)[len(spec.action_names) :]]
+
+
+def renamed(spec: Spec, names: Mapping[int, str]) -> Spec:
+    """The spec with other names at these places; what rests goes on resting, whatever it is called. TerrellaError where two
+    would have one name."""
+    if not names:
+        return spec
+    whole = [names.get(at, name) for at, name in enumerate(all_names(spec))]
+    if len(set(whole)) < len(whole):
+        raise TerrellaError("two actions would have one name; give each its own.")
+    rests = spec.idle
+    if not rests and spec.action_mode == CHOICE and can_idle(spec):
+        rests = tuple(neutral_action(spec).ravel().astype(float).tolist())
+    return replace(spec, action_names=tuple(whole), idle=rests)
+
+
+def with_changes(own: Spec, before: Spec, after: Spec) -> Spec:
+    """`own` with the keys and names that differ between two other specs of its world, and nothing else of them."""
+    keys = {code: value for code, value in own.keys.items() if code in after.keys or code not in before.keys}
+    keys |= {code: value for code, value in after.keys.items() if before.keys.get(code) != value}
+    names = zip(all_names(before), all_names(after), strict=True)
+    return renamed(replace(own, keys=keys), {at: new for at, (old, new) in enumerate(names) if old != new})
 
 
 def with_controls(

@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.errors import TerrellaError
-from ..core.spec import CHOICE, Spec, can_idle, neutral_action
+from ..core.keys import all_names, renamed
+from ..core.spec import CHOICE, Spec, neutral_action
 from .actions import axes_of
 
 MAX_ACTIONS = 256  # that a page lists; further ones are listed where they have a key
@@ -46,7 +47,7 @@ def actions_of(spec: Spec) -> list[Action]:
 
 def _single(spec: Spec) -> Iterator[Action]:
     space, rest = spec.action, neutral_action(spec).ravel().astype(np.float64)
-    names = _names(spec)
+    names = [_tidy(name) for name in all_names(spec)]
 
     def only(at: int, value: float, others: np.ndarray) -> tuple[float, ...]:
         return tuple(np.where(np.arange(len(others)) == at, float(value), others).tolist())
@@ -70,19 +71,6 @@ def _single(spec: Spec) -> Iterator[Action]:
                 yield Action(names[at], only(at, end, 0 * rest), at, sign)
 
 
-def _unnamed(space: spaces.Space) -> list[str]:
-    """Names for actions that have none."""
-    if isinstance(space, spaces.Discrete):
-        return [f"action {at}" for at in range(int(space.n))]
-    what = {"MultiBinary": "button", "MultiDiscrete": "choice"}.get(type(space).__name__, "axis")
-    return [f"{what} {at + 1}" for at in range(int(np.prod(space.shape or ())))]
-
-
-def _names(spec: Spec) -> list[str]:
-    said = [_tidy(name) for name in spec.action_names]
-    return [*said, *_unnamed(spec.action)[len(said) :]]
-
-
 def _tidy(name: str) -> str:
     """MOVE_FORWARD is "forward", TURN_LEFT is "turn left"."""
     return name.lower().replace("_", " ").removeprefix("move ").strip() or name
@@ -92,7 +80,7 @@ def _joined(spec: Spec, value: list[float]) -> str:
     """The words for an action of several parts."""
     rest = 0 * np.asarray(value) if isinstance(spec.action, spaces.Box) else neutral_action(spec).ravel()
     numbers = not isinstance(spec.action, spaces.MultiBinary)
-    names = _names(spec)
+    names = [_tidy(name) for name in all_names(spec)]
     parts = [names[at] + (f" {number:g}" if numbers else "") for at, number in enumerate(value) if number != rest[at]]
     return ", ".join(parts) or "rest"
 
@@ -108,6 +96,7 @@ class KeyBook:
     def __init__(self, spec: Spec, keep: Keep | None = None, kept_in: str = ""):
         self.spec, self.kept_in = spec, kept_in
         self._first, self._keep = spec, keep
+        self.pages: set[Callable[[], None]] = set()  # called when a page has changed the keys, to look for news
         self._actions = actions_of(spec)  # whose places pages speak of, so that they stay
 
     def described(self) -> dict:
@@ -141,26 +130,24 @@ class KeyBook:
         if any(at >= len(self._actions) for at in (*asked.keys.values(), *asked.names)):
             raise TerrellaError(f"{spec.name} has {len(self._actions)} actions to give keys to; reload the page.")
         keys = {code: list(self._actions[at].value) for code, at in asked.keys.items()}
-        if not asked.names:
-            return replace(spec, keys=keys)
-        names = [*spec.action_names, *_unnamed(spec.action)[len(spec.action_names) :]]
+        names: dict[int, str] = {}
         for at, name in asked.names.items():
             place = self._actions[at].of
             if place is None:
                 raise TerrellaError(f"'{self._actions[at].name}' is made of other names; it has none of its own.")
             names[place] = name
-        if len(set(names)) < len(names):
-            raise TerrellaError("two actions would have one name; give each its own.")
-        rests = spec.idle
-        if not rests and spec.action_mode == CHOICE and can_idle(spec):
-            rests = tuple(neutral_action(spec).ravel().astype(float).tolist())
-        return replace(spec, keys=keys, action_names=tuple(names), idle=rests)
+        return renamed(replace(spec, keys=keys), names)
 
     def keep(self, spec: Spec) -> None:
         """TerrellaError where it cannot be kept; it is in use all the same."""
         self.spec = spec if self.kept_in else self.spec
         if self._keep is not None:
             self._keep(spec)
+
+    def news(self, spec: Spec) -> Spec | None:
+        """The world's keys, where they are others than those of `spec`, which a page uses; None where each page has its own."""
+        same = (spec.keys, spec.action_names) == (self.spec.keys, self.spec.action_names)
+        return None if same or not self.kept_in else self.spec
 
     def _places(self, spec: Spec) -> dict[str, int]:
         found = {code: _place(self._actions, value) for code, value in spec.keys.items()}

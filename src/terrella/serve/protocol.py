@@ -169,7 +169,8 @@ def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
 
 
 def encode_event(kind: str, **body) -> str:
-    """A JSON message to the page: hello, status, error, or chart: the map of a moment.
+    """A JSON message to the page: hello, status, error, keys: what another page has set (KeyBook.described), or chart: the map
+    of a moment.
 
     chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
     that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind

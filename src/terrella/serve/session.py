@@ -114,11 +114,14 @@ class Session:
     # -- the one task --------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
+        pages = set() if self._book is None else self._book.pages
+        pages.add(self._wake.set)
         try:
             await self._begin()
             while not self._closed:
                 await self._turn()
         finally:
+            pages.discard(self._wake.set)
             if self.timeline:
                 await asyncio.shield(self._work(self.timeline.close))
             await self._event("error", text="this session has ended; reload the page to begin anew.")
@@ -147,6 +150,7 @@ class Session:
             await self._obey(*self._commands.popleft(), self.timeline)
         timeline = self.timeline
         if self._socket is not None:
+            await self._send_keys(timeline)
             await self._send_status(timeline)
         if self._socket is None or timeline is None or self.unacked >= MAX_UNACKED:
             await self._wake.wait()
@@ -202,7 +206,11 @@ class Session:
                     await self._work(timeline.record, value)
                 case "keys" if self._book is not None:
                     timeline.obeyed = self._book.changed(value)
-                    await self._work(self._book.keep, timeline.obeyed)
+                    try:
+                        await self._work(self._book.keep, timeline.obeyed)
+                    finally:
+                        for wake in self._book.pages:
+                            wake()
                 case "drive":
                     timeline.driving = value
                 case "show":
@@ -218,6 +226,12 @@ class Session:
 
     def _work(self, function: Callable, *arguments):
         return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
+
+    async def _send_keys(self, timeline: Timeline | None) -> None:
+        """The keys that another page has set."""
+        if self._book is not None and timeline is not None and (news := self._book.news(timeline.obeyed)) is not None:
+            timeline.obeyed = news
+            await self._event("keys", **self._book.described())
 
     async def _send_status(self, timeline: Timeline | None) -> None:
         """What the page shows of the session, where that has changed since it was sent."""

@@ -41,6 +41,12 @@ function sendKeys() {
   link.send({ type: 'keys', keys: worlds[0].keys, names: panel.names });
 }
 
+/** Keys that were changed on another page of this world. */
+function onKeys({ type, ...keys }) {
+  panel.take(Object.assign(worlds[0], keys));
+  drawKeys();
+}
+
 function sendControls(time) {
   controlsId += 1;
   link.send({ type: 'controls', id: controlsId, t: time, held: controls.held, axes: controls.axes.values });
@@ -49,6 +55,7 @@ function sendControls(time) {
 function onEvent(body) {
   if (body.type === 'hello') hello(body);
   if (body.type === 'status') onStatus(body);
+  if (body.type === 'keys') onKeys(body);
   if (body.type === 'chart') views.onChart(body);
   if (body.type === 'error') toast(body.text);
 }

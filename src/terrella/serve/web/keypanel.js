@@ -30,6 +30,7 @@ export class KeyPanel {
     this.reset.onclick = () => this.restore();
     addEventListener('keydown', (event) => this.onDown(event), true);
     addEventListener('keyup', (event) => this.onUp(event), true);
+    addEventListener('storage', (event) => { if (event.key === this.place) this.follow(); });  // of another page
     addEventListener('pointerdown', (event) => { if (this.asked && !event.target.closest('.cap.asking')) this.ask(null); }, true);
   }
 
@@ -43,7 +44,7 @@ export class KeyPanel {
 
   // -- what is kept ---------------------------------------------------------------------------------------------------
 
-  /** Takes a world as the server tells it, and what this browser keeps of it; says whether that is something. */
+  /** Takes a world as the server tells it, and what this browser keeps of it; says whether that is something to tell the server. */
   take(world) {
     const before = this.world;
     this.world = world;
@@ -58,7 +59,14 @@ export class KeyPanel {
       Object.assign(world, { keys: before.keys, actions: before.actions });  // a browser that keeps nothing, after a reconnection
     }
     if (this.open) this.draw();
-    return this.edited;
+    return this.edited && !world.kept_in;
+  }
+
+  /** Takes what another page of this browser keeps now. */
+  follow() {
+    this.asServed();
+    this.take(this.world);
+    this.changed();
   }
 
   /** The names that were changed, each with the place of one of its actions. */
@@ -88,9 +96,13 @@ export class KeyPanel {
     this.changed();
   }
 
-  restore() {
+  asServed() {
     this.world.keys = { ...this.world.first_keys };
     for (const action of this.world.actions) action.name = action.first_name;
+  }
+
+  restore() {
+    this.asServed();
     this.asked = null;
     this.use('Keys and names are as they were.');
   }
