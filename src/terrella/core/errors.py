@@ -21,6 +21,10 @@ class ChannelError(TerrellaError):
     """A channel was asked for that the world cannot render."""
 
 
+class PlanningError(TerrellaError):
+    """No plan can be made: the goal does not fit the world, no candidate has a cost, or the search does not suit the actions."""
+
+
 class StaleStateError(TerrellaError):
     """A state of a world that cannot fork was used after the world had moved on."""
 

@@ -1,0 +1,129 @@
+"""What a plan costs: the distance to a goal in any channels, or the reward that it forgoes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from ...core.errors import ObservationError, PlanningError
+from ...core.spec import Spec
+from ...core.world import Observation, World, make_rng
+
+LATENT = "latent"  # the channel in which a world compares pictures, where it has one
+_ENDLESS = 1e6  # a range beyond which is none
+_TINY = 1e-12  # under a root, so that it has a slope at 0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The cost of futures, read off the channels that a world renders after each step.
+
+    channels:   what is rendered.
+    of_step:    (seen: channel -> [B, N, ...], goal: channel -> [B or 1, ...]) -> the cost of a step, float [B, N].
+    goal:       channel -> [B or 1, ...]: one goal for all episodes, or one for each.
+    over:       "sum": all steps count, so that sooner is better; "last": the end of the horizon alone, the terminal cost of the
+                papers; "least": the best moment of the horizon.
+    until_done: what comes after the step that ended the episode costs nothing (a reward); otherwise it costs what it shows.
+    """
+
+    channels: tuple[str, ...]
+    of_step: Callable[[Observation, Observation], torch.Tensor]
+    goal: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    over: Literal["sum", "last", "least"] = "sum"
+    until_done: bool = False
+
+    def goal_of(self, entry: int, batch: int) -> dict[str, torch.Tensor]:
+        """The goal [1, ...] of one of `batch` episodes; PlanningError where there are goals for another number."""
+        counts = {len(tensor) for tensor in self.goal.values()} - {1, batch}
+        if counts:
+            raise PlanningError(f"there are goals for {counts.pop()} episodes, and {batch} are played.")
+        return {name: tensor[entry : entry + 1] if len(tensor) > 1 else tensor for name, tensor in self.goal.items()}
+
+    def added(self, total: torch.Tensor | None, step: torch.Tensor) -> torch.Tensor:
+        """The cost of a future up to and with a step."""
+        if total is None or self.over == "last":
+            return step
+        return total + step if self.over == "sum" else torch.minimum(total, step)
+
+
+def negative_reward(spec: Spec) -> Cost:
+    """Less the sum of rewards up to the end of the episode. PlanningError for a world without the channel `reward`."""
+    if "reward" not in spec.channels:
+        raise PlanningError(f"{spec.name} tells no reward; it has {', '.join(spec.channels)}. Give it another goal.")
+    return Cost(("reward",), lambda seen, goal: -seen["reward"].float(), until_done=True)
+
+
+def distance_to(
+    world: World, goal: Mapping[str, torch.Tensor], over: Literal["sum", "last", "least"] = "sum", latent: bool = True
+) -> Cost:
+    """The distance to a goal: channel -> its value [*shape], or one for each episode [B, *shape]; NaN for numbers that may be any.
+
+    A world with the channel `latent` that can observe the goal compares latents (unless `latent` is False); others, and goals
+    with NaN, the channels themselves: see `distance`. Raises ChannelError or ObservationError for a goal that does not fit.
+    """
+    spec = world.spec
+    goals = checked(spec, goal)
+    whole = all(bool(torch.isfinite(tensor.float()).all()) for tensor in goals.values())
+    if latent and LATENT in spec.channels and spec.observes and set(spec.observes) <= set(goals) and whole:
+        with torch.no_grad():
+            goals = world.render(world.observe(goals, None, make_rng(0)), (LATENT,))
+    return Cost(tuple(goals), lambda seen, wanted: distance(spec, wanted, seen), dict(goals), over)
+
+
+def distance(spec: Spec, goal: Observation, seen: Observation) -> torch.Tensor:
+    """The mean over the channels of `goal` [B or 1, ...] of the root mean square difference of what is seen, [B, N, ...] or
+    [B, ...]: float [B, N] or [B]. Pictures count in shares of full brightness, numbers with bounds in shares of their range,
+    others as they are; NaN in a goal counts as met."""
+    total = []
+    for name, wanted in goal.items():
+        now = seen[name].float()
+        wanted, lead = wanted.to(now.device).float(), now.ndim - wanted.ndim + 1  # 2 where there are candidates
+        wanted = wanted[:, None] if lead == 2 else wanted
+        asked = ~torch.isnan(wanted)
+        apart = torch.where(asked, (now - wanted) / scale_of(spec.channels[name]).to(now.device), 0.0)
+        apart, asked = (each[..., None].flatten(lead) for each in (apart, asked))
+        total.append((apart.square().sum(-1) / asked.sum(-1).clamp_min(1) + _TINY).sqrt())
+    return torch.stack(total).mean(0)
+
+
+def scale_of(space: spaces.Space) -> torch.Tensor:
+    """By what differences of a channel are divided: the range of its numbers where they have one, else 1."""
+    if not isinstance(space, spaces.Box):
+        return torch.ones(())
+    width = space.high.astype(np.float64) - space.low.astype(np.float64)
+    return torch.from_numpy(np.where(np.isfinite(width) & (width > 0) & (width < _ENDLESS), width, 1.0)).float()
+
+
+def checked(spec: Spec, goal: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The goal with a batch axis. ChannelError for channels that the world lacks, ObservationError for values of another shape or
+    outside of the channel's range."""
+    if not goal:
+        raise PlanningError("a goal is at least one channel and its value.")
+    spec.check_channels(goal)
+    found = {}
+    for name, value in goal.items():
+        space, tensor = spec.channels[name], torch.as_tensor(value)
+        shape = tuple(space.shape or ())
+        if tuple(tensor.shape) == shape:
+            tensor = tensor[None]
+        if tuple(tensor.shape[1:]) != shape or not len(tensor):
+            what = "a picture (height, width, 3)" if len(shape) == 3 and shape[2] == 3 else "numbers"
+            raise ObservationError(
+                f"the goal for '{name}' has the shape {tuple(value.shape)}, where {spec.name} shows {what} of shape {shape}."
+            )
+        if isinstance(space, spaces.Box):
+            low, high = (torch.from_numpy(limit.astype(np.float64)) for limit in (space.low, space.high))
+            beyond = (tensor < low) | (tensor > high)
+            if beyond.any():
+                value = float(tensor.double()[beyond].flatten()[0])
+                raise ObservationError(
+                    f"the goal for '{name}' holds {value:g}, outside of what {spec.name} can show there "
+                    f"({float(low.min()):g} to {float(high.max()):g}): it can never be reached."
+                )
+        found[name] = tensor
+    return found
