@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -112,7 +113,8 @@ def folder_of(name: str | Path) -> Path:
         run = Path(text) / "world"  # where `terrella train` leaves the world of a run
         return run if (run / "world.json").is_file() else Path(text)
     bundled = sorted(_bundled())
-    likest = did_you_mean(text, [*bundled, GAME]) or "."
+    environment = f"; did you mean 'gym:{text}'?" if re.search(r"-v\d+$", text) else ""
+    likest = environment or did_you_mean(text, [*bundled, GAME]) or "."
     raise TerrellaError(
         f"There is no world '{text}'{likest} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
         "environment gym:CartPole-v1; or give the path of a checkpoint folder."

@@ -10,11 +10,14 @@ import sys
 from dataclasses import replace
 
 import pytest
+from tests.cli.tiny import FAILS
 from tests.worlds.made import place
 
 import terrella
+from terrella.care import doctor
 from terrella.cli import COMMANDS, main
 from terrella.core import make_rng
+from terrella.data import Dataset
 from terrella.worlds.controls import CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
 
@@ -190,6 +193,24 @@ def refusal(arguments: list, capsys) -> str:
 def test_an_unknown_world_is_named_and_the_known_are_listed(capsys):
     said = refusal(["play", "no-such-world"], capsys)
     assert "no-such-world" in said and "doom:my_way_home" in said
+
+
+def test_an_environment_without_its_gym_is_recognised(capsys):
+    assert "did you mean 'gym:CartPole-v1'?" in refusal(["learn", "CartPole-v1"], capsys)
+
+
+def test_a_file_is_no_folder_to_record_to(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "give a folder" in refusal(["play", "gym:CartPole-v1", "--record", tmp_path / "file"], capsys)
+
+
+def test_what_an_environment_played_before_it_failed_is_kept(capsys, tmp_path):
+    said = refusal(["record", "world", FAILS, "--out", tmp_path / "set", "--frames", 500], capsys)
+    assert said.startswith(
+        f"terrella: {FAILS} fails when it is stepped, by an error of its own: OSError: the engine is"
+    )
+    kept = Dataset(tmp_path / "set")
+    assert f"{kept.length} frames are safe" in said and kept.length > 100 and not doctor(tmp_path / "set")
 
 
 def test_an_unknown_scenario_is_named(capsys, tmp_path):

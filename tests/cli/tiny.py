@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 NAME = "gym:tests.cli.tiny:TerrellaTiny-v0"
+FAILS = NAME.replace("Tiny-", "Fails-")
 
 
 class Tiny(gymnasium.Env):
@@ -37,6 +38,18 @@ class Blind(Tiny):
         return np.array([self.at], np.float32)
 
 
-for name, kind in (("TerrellaTiny-v0", Tiny), ("TerrellaBlind-v0", Blind)):
+class Fails(Tiny):
+    """Fails for ever, from some step on, in whatever episode that is."""
+
+    taken = [0]
+
+    def step(self, action):
+        self.taken[0] += 1
+        if self.taken[0] > 600:
+            raise OSError("the engine is off")
+        return super().step(action)
+
+
+for name, kind in (("TerrellaTiny-v0", Tiny), ("TerrellaBlind-v0", Blind), ("TerrellaFails-v0", Fails)):
     if name not in gymnasium.registry:
         gymnasium.register(name, kind)

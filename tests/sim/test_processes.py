@@ -109,9 +109,7 @@ def test_the_laws_hold_and_what_is_past_is_stale(world):
 def test_a_crash_and_a_fault_are_one_sentence_and_a_reset_goes_on(world):
     env = as_env(world, 2)
     env.reset(seed=0)
-    with pytest.raises(
-        TerrellaError, match=r"gym:Walker failed in a process of its own: ValueError: the engine is off"
-    ):
+    with pytest.raises(TerrellaError, match=r"^gym:Walker fails when it is stepped, .*ValueError: the engine is off"):
         env.step(np.array([0, 3]))
     env.reset(seed=0)
     with pytest.raises(TerrellaError, match="a process of gym:Walker crashed .*after a reset"):

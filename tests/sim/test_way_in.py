@@ -156,6 +156,32 @@ def test_what_does_not_open_says_why(make, answer):
         GymnasiumWorld(make)
 
 
+class Falling(Headless):
+    """Fails in its 20th step, and when it is drawn after its 10th."""
+
+    def step(self, action):
+        if self.steps == 19:
+            raise ZeroDivisionError("float division by zero")
+        return super().step(action)
+
+    def render(self):
+        if self.steps > 10:
+            raise IndexError("list index out of range")
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+def test_an_error_of_the_environments_own_is_a_sentence_with_its_name():
+    world, rng = GymnasiumWorld(Falling), make_rng(0)
+    state = world.start(1, rng)
+    for _ in range(19):
+        state = world.imagine(state, torch.tensor([0]), rng)
+    with pytest.raises(TerrellaError, match="^gym:Falling fails when it is drawn, .*IndexError: list index"):
+        world.render(state, ("rgb",))
+    with pytest.raises(TerrellaError, match="^gym:Falling fails when it is stepped, .*ZeroDivisionError: float"):
+        world.imagine(state, torch.tensor([0]), rng)
+    assert world.imagine(world.start(1, rng), torch.tensor([0]), rng)["observation"].shape
+
+
 def test_pictures_that_change_their_size_are_refused_unless_one_size_is_given():
     world, rng = GymnasiumWorld(Growing), make_rng(0)
     state = world.imagine(world.start(1, rng), torch.tensor([0]), rng)

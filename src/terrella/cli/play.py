@@ -66,6 +66,9 @@ def play(
     if record is not None:
         from ..data import Layout, Recorder
 
+        if record.exists() and not record.is_dir():
+            raise TerrellaError(f"--record {record}: that is a file; give a folder.")
+
         layout, folder = Layout.of(worlds[0].spec), record
         sink = lambda: Recorder(folder, keeper.noted(layout), "play")  # noqa: E731
     names, driver = [world.spec.name for world in worlds], None

@@ -98,13 +98,20 @@ def explore(
 ) -> Recorder:
     """Lets a script play into the recording `out`, on from what lies there; `more` is what `record` takes."""
     from ..act.explorer import Explorer
+    from ..core.errors import DatasetError, TerrellaError
     from ..core.world import make_rng
     from ..data import Dataset, record
 
     player = Explorer(world.spec, out / ".explorer")
     kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
     player.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
-    return record(world, player, out, frames, make_rng(seed), report, pictures=pictures, **more)
+    try:
+        return record(world, player, out, frames, make_rng(seed), report, pictures=pictures, **more)
+    except DatasetError:
+        raise
+    except TerrellaError as error:  # the world's
+        safe = Dataset(out).length if (out / "meta" / "info.json").exists() else 0
+        raise TerrellaError(f"{error} {safe:,} frames are safe in {out}." if safe else str(error)) from error
 
 
 def _record(world: World, recording: Recording, frames: int, pictures: Literal["video", "png"] = "video") -> None:

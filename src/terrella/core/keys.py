@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from gymnasium import spaces
 
+from ..similar import did_you_mean
 from .errors import TerrellaError
 from .spec import CHOICE, Spec, can_idle, idle_name, neutral_action, shape_of
 
@@ -289,6 +290,7 @@ def _action(spec: Spec, said: str) -> list[float]:
     except ValueError:
         found = []
     if len(found) != len(low) or not ((low <= found).all() and (found <= high).all()):
-        there = f"; its actions are {', '.join(spec.action_names)}" if spec.action_names else ""
-        raise TerrellaError(f"'{said}' is no action of {spec.name}, which takes {spec.action}{there}.")
+        known = f"its actions are {', '.join(spec.action_names)}" if spec.action_names else "give it as a number"
+        near = did_you_mean(said, spec.action_names)
+        raise TerrellaError(f"'{said}' is no action of {spec.name}, which takes {spec.action}; {known}{near or '.'}")
     return found

@@ -36,7 +36,7 @@ def save_run(
         path.with_name(f"{path.name}.partial").replace(path)
     except (OSError, SafetensorError) as error:
         raise TrainingError(
-            f"{path.parent} cannot be written ({error}); free some space and run the same command again."
+            f"{path.parent} cannot be written ({error}); free some space and run the same command again, or give another --out."
         ) from error
 
 
@@ -88,7 +88,7 @@ def write_log(folder: Path, line: Mapping[str, object]) -> None:
             file.write(json.dumps(line) + "\n")
     except OSError as error:
         raise TrainingError(
-            f"{folder / LOG} cannot be written ({error}); free some space and run the same command again."
+            f"{folder / LOG} cannot be written ({error}); free some space and run the same command again, or give another --out."
         ) from error
 
 

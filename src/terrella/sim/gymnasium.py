@@ -128,7 +128,8 @@ class GymnasiumWorld:
             "adapter": adapter,
         }
         self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
-        seen, info = self._env.reset(seed=0)
+        with explained(self._name, "reset"):
+            seen, info = self._env.reset(seed=0)
         chosen: Adapter = adapter or getattr(self._env.unwrapped, "terrella", Adapter())
         settled = {at: self._settled(at, channel, info) for at, channel in chosen.channels.items()}
         self._adapter = replace(chosen, channels=settled)
@@ -165,12 +166,14 @@ class GymnasiumWorld:
 
     def begin(self, seed: int) -> dict[str, np.ndarray]:
         """Resets the one environment: what is seen of it."""
-        observation, info = self._env.reset(seed=seed)
-        return self._row(observation, 0.0, False, False, info)
+        with explained(self._name, "reset"):
+            observation, info = self._env.reset(seed=seed)
+            return self._row(observation, 0.0, False, False, info)
 
     def move(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Steps the one environment: what is seen of it."""
-        return self._row(*self._env.step(action))
+        with explained(self._name, "stepped"):
+            return self._row(*self._env.step(action))
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
@@ -266,11 +269,11 @@ class GymnasiumWorld:
     def look(self, name: str) -> np.ndarray:
         """One channel of the environment as it now stands."""
         channel, bare = self._adapter.channels.get(name), self._viewer.unwrapped
-        if channel is None:
-            return self._fitting(name, self._sized(np.asarray(self._viewer.render())))
-        return self._fitting(
-            name, followed(bare, {}, channel.read) if isinstance(channel.read, str) else channel.read(bare)
-        )
+        with explained(self._name, "drawn" if channel is None else f"asked for its {name}"):
+            if channel is None:
+                return self._fitting(name, self._sized(np.asarray(self._viewer.render())))
+            read = channel.read
+            return self._fitting(name, followed(bare, {}, read) if isinstance(read, str) else read(bare))
 
     def _sized(self, picture: np.ndarray) -> np.ndarray:
         if self._size is None and picture.shape[:2] != self._drawn:
@@ -372,6 +375,8 @@ def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> t
                     break
     except NotCopyable as error:
         return None, str(error)
+    except Exception as error:  # its own, or that of a copy by halves: what is played alone will tell
+        return None, f"a trial of it ended with {type(error).__name__}: {error}"
     return snapshots, ""
 
 

@@ -38,8 +38,11 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
                 built = gymnasium.make(env, render_mode="rgb_array", **options)
             return built, f"gym:{env}"
         except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound) as error:
-            hint = "" if module else " If its package is installed, say which: gym:PACKAGE:ID."
-            raise TerrellaError(f"Gymnasium cannot make '{env}': {_ended(error)}{hint}") from error
+            said = _ended(error).replace("mean: ", "mean ")
+            hint = (
+                "" if module or "Did you mean" in said else " If its package is installed, say which: gym:PACKAGE:ID."
+            )
+            raise TerrellaError(f"Gymnasium cannot make '{env}': {said}{hint}") from error
         except (gymnasium.error.Error, TypeError) as error:
             raise TerrellaError(f"Gymnasium cannot make '{env}': {error}") from error
 
@@ -77,7 +80,8 @@ def _sentence(name: str, doing: str, module: str, error: Exception) -> str:
 
 def _ended(error: Exception) -> str:
     """Its first line, as a sentence."""
-    return f"{(str(error).strip() or type(error).__name__).splitlines()[0].rstrip('. ')}."
+    first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(". ")
+    return first if first.endswith("?") else f"{first}."
 
 
 def picture_size(env: gymnasium.Env, name: str) -> tuple[int, int] | None:

@@ -118,7 +118,7 @@ class Processes:
         for seat in seats:
             try:
                 done, answer = seat.pipe.recv()
-                failed = failed or ("" if done else f"{self._name} failed in a process of its own: {answer}")
+                failed = failed or ("" if done else answer)
                 answers.append(answer)
             except (EOFError, OSError):
                 seat.pipe.close()
@@ -185,5 +185,6 @@ def _serve(pipe: Connection) -> None:
                     answer = getattr(episode, verb)(given)
                 answer = True, answer
             except Exception as error:
-                answer = False, str(error) if isinstance(error, TerrellaError) else f"{type(error).__name__}: {error}"
+                whole = f"an episode cannot be played in a process of its own: {type(error).__name__}: {error}"
+                answer = False, str(error) if isinstance(error, TerrellaError) else whole
             pipe.send(answer)
