@@ -29,6 +29,8 @@ OPTIONS = {
     "--seed --size",
     "play": "--action-names --compare --device --estimator --fast --host --idle --image --json --keys --memory-mb --no-memory "
     "--policy --port --record --remember --seed --token --truth",
+    "plan": "--adapter --block --budget-ms --cost --curve --device --episodes --fps --goal --horizon --iterations --json "
+    "--out --real --replan --samples --search --seed --size --steps --success --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

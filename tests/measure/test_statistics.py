@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from terrella.core import make_rng
-from terrella.measure.statistics import mean_band, mean_interval, median_interval, ratio_interval
+from terrella.measure.statistics import mean_band, mean_interval, median_interval, ratio_interval, wilson
 
 
 def test_interval_of_a_normal_sample_is_close_to_the_textbook():
@@ -52,3 +52,11 @@ def test_median_ignores_one_wild_clip():
 def test_one_clip_has_no_interval():
     for figure in (mean_interval(torch.tensor([3.0]), make_rng(0)), median_interval(torch.tensor([3.0]), make_rng(0))):
         assert figure.value == 3.0 and math.isnan(figure.low) and figure.count == 1
+
+
+def test_wilsons_interval_is_that_of_the_textbook():
+    for successes, count, low, high in ((0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (81, 263, 0.2553, 0.3662)):
+        figure = wilson(successes, count)
+        assert (figure.value, figure.count) == (successes / count, count)
+        assert figure.low == pytest.approx(low, abs=1e-4) and figure.high == pytest.approx(high, abs=1e-4)
+    assert math.isnan(wilson(0, 0).value)

@@ -17,6 +17,7 @@ DESCRIPTION = "Learn a world from recordings, step inside it, and measure how fa
 COMMANDS = {
     "learn": ("learn:learn", "record, train and score a world of an environment, in one go"),
     "play": ("play:play", "play a world in the browser"),
+    "plan": ("planning:plan", "plan in a world, act in the real environment"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),

@@ -56,6 +56,16 @@ def mean_band(values: torch.Tensor, rng: torch.Generator) -> Band:
     return _band(values.mean(0), lambda weights: weights @ values / weights.sum(1, keepdim=True), len(values), rng)
 
 
+def wilson(successes: int, count: int) -> Figure:
+    """The share of successes with Wilson's 95% interval (1927), which holds for few trials and for none or all of them too."""
+    if not count:
+        return Figure(math.nan, math.nan, math.nan, 0)
+    share, z2 = successes / count, 1.959964**2
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = math.sqrt(share * (1 - share) * z2 / count + (z2 / (2 * count)) ** 2) / (1 + z2 / count)
+    return Figure(share, max(0.0, middle - half), min(1.0, middle + half), count)
+
+
 def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
     """sum(top) / sum(bottom) over clips [n], both resampled together: no clip with a tiny denominator rules it."""
     return ratio_band(top[:, None], bottom[:, None], rng).at(0)

@@ -112,7 +112,8 @@ def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
     best = _Best()
     elites = codes = torch.zeros(task.batch, 0, task.horizon, moves.size)
     for number in _rounds(config):
-        count = config.samples if not icem else max(2 * config.best, int(config.samples * config.decay**-number))
+        fewer = max(2 * config.best, int(config.samples * config.decay**-number)) if icem else config.samples
+        count = min(config.samples, fewer)
         noise = coloured(seeds, count, task.horizon, moves.size, config.colour if icem else _WHITE, number)
         kept = [elites[:, : max(1, int(config.keep * config.best))], moves.best_of(belief)[:, None]]
         given = first if not number else kept if icem else []

@@ -1,0 +1,91 @@
+"""Goals as a person writes them: a picture's file, numbers, CHANNEL=VALUE, or the word reward."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..core.errors import ObservationError, PlanningError, TerrellaError
+from ..core.spec import Spec, kind_of
+
+REWARD = "reward"
+_PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
+_ANY = ("_", "any", "nan")
+_SCALARS = ("reward", "done", "uncertainty", "truncated")
+
+
+def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
+    """What `--goal` means in a world: {} for "reward", else channel -> value. Raises a sentence for what is no goal there."""
+    if text == REWARD:
+        return {}
+    name, equals, value = text.partition("=")
+    if equals and not Path(text).exists():
+        spec.check_channels((name,))
+        return {name: _value(value, name, spec)}
+    if text.lower().endswith(_PICTURES):
+        if "rgb" not in spec.channels:
+            raise ObservationError(f"{spec.name} shows no pictures; give a state, or CHANNEL=VALUE.")
+        return {"rgb": _picture(Path(text), spec, "rgb")}
+    channel = _state_channel(spec)
+    return {channel: _value(text, channel, spec)}
+
+
+def _state_channel(spec: Spec) -> str:
+    vectors = [
+        name
+        for name, space in spec.channels.items()
+        if len(space.shape or ()) == 1 and kind_of(name) not in ("snapshot", "latent", "instruction", *_SCALARS)
+    ]
+    first = "observation" if "observation" in vectors else vectors[0] if vectors else ""
+    if not first:
+        raise PlanningError(f"{spec.name} has no state of numbers; its channels are {', '.join(spec.channels)}.")
+    return first
+
+
+def _value(text: str, name: str, spec: Spec) -> torch.Tensor:
+    """Numbers with commas (_ for any), a .npy or .json file, or a picture's file."""
+    path = Path(text)
+    if text.lower().endswith(_PICTURES):
+        return _picture(path, spec, name)
+    try:
+        if path.suffix == ".npy":
+            array = np.load(path, allow_pickle=False)
+        elif path.suffix == ".json":
+            array = np.asarray(json.loads(path.read_text(encoding="utf-8")), np.float64)
+        else:
+            words = [word.strip() for word in text.strip("[]() ").split(",")]
+            array = np.array([np.nan if word in _ANY else float(word) for word in words])
+    except FileNotFoundError as error:
+        raise TerrellaError(f"there is no file {text}.") from error
+    except (ValueError, OSError) as error:
+        raise TerrellaError(
+            f"'{text}' is no goal: give a picture's file, numbers as in 0.5,_,0 (_ for any), CHANNEL=VALUE, or reward."
+        ) from error
+    shape = tuple(spec.channels[name].shape or ())
+    array = array.reshape(()) if array.size == 1 and shape == () else array
+    if array.shape != shape:
+        raise ObservationError(
+            f"the goal for '{name}' has {array.size} numbers, where {spec.name} has the shape {shape}."
+        )
+    return torch.from_numpy(array.astype(np.float32))
+
+
+def _picture(path: Path, spec: Spec, name: str) -> torch.Tensor:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            array = np.asarray(image.convert("RGB"))
+    except FileNotFoundError as error:
+        raise TerrellaError(f"there is no picture {path}.") from error
+    except (UnidentifiedImageError, OSError) as error:
+        raise TerrellaError(f"{path} is no picture that can be read ({error}).") from error
+    shape = tuple(spec.channels[name].shape or ())
+    if array.shape != shape:
+        raise ObservationError(
+            f"{path} is a picture of {array.shape[0]} x {array.shape[1]} pixels, where {spec.name} sees {shape[0]} x {shape[1]}."
+        )
+    return torch.from_numpy(array.copy())

@@ -1,0 +1,400 @@
+"""The command `terrella plan`: reaches a goal in a real environment by planning in a world, beside acting at random."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from PIL import Image
+from tyro.conf import Positional, arg
+
+from .. import library, progress
+from ..act.planning import (
+    Episode,
+    Judge,
+    Planner,
+    Played,
+    Revealed,
+    SearchConfig,
+    distance,
+    distance_to,
+    negative_reward,
+    play,
+)
+from ..core.errors import ActionError, PlanningError, TerrellaError
+from ..core.policy import Random
+from ..core.spec import Spec, kind_of
+from ..core.world import World, make_rng
+from ..data.storage.durable import write_json
+from ..measure.acted import compute_chart, film, film_strip, plan_page
+from ..measure.statistics import Figure, mean_interval, wilson
+from ..serve.picture import uncertainty_levels
+from .goals import REWARD, read_goal
+from .named import Device, Environment, device_of, load_named
+from .say import Json, Seed, result, say
+
+STEPS = 200  # of an episode, where the environment sets no limit
+DOUBLINGS = 5  # of the curve of success against compute
+_NEVER = (
+    "snapshot",
+    "reward",
+    "done",
+    "truncated",
+    "uncertainty",
+    "known",
+    "keyframes",
+    "mosaic",
+    "instruction",
+    "latent",
+)
+
+Kind = Literal["icem", "cem", "mppi", "gradient", "tree", "random"]
+Milliseconds = Annotated[
+    float | None,
+    arg(help="Search for so long a decision instead of --iterations; outcomes then depend on the machine."),
+]
+
+
+@dataclass(frozen=True)
+class Searching:
+    """How plans are searched.
+
+    Args:
+        search: icem, cem, mppi, random; gradient in worlds that can be differentiated; tree over choices.
+        samples: Plans that are tried in a round.
+        iterations: Rounds of a decision.
+        horizon: Moves of a plan.
+        block: Steps for which each move is held.
+        replan: Moves that are done before the next plan is made.
+        cost: Of a goal: sum (sooner is better), last (the end of the horizon alone) or least (its best moment).
+        trust: The world's uncertainty at which a plan ends; unless said, that from which it invents, if it tells one.
+    """
+
+    search: Kind = "icem"
+    samples: int = 64
+    iterations: int = 5
+    horizon: int = 12
+    block: int = 1
+    replan: int = 1
+    cost: Literal["sum", "last", "least"] = "sum"
+    trust: float | None = None
+    budget_ms: Milliseconds = None
+
+    @property
+    def config(self) -> SearchConfig:
+        return SearchConfig(
+            self.search, self.samples, self.iterations, self.horizon, self.block, budget_ms=self.budget_ms
+        )
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What is asked, with the worlds open."""
+
+    world: World
+    real: World
+    goal: Mapping[str, torch.Tensor]
+    judge: Judge
+    searching: Searching
+    episodes: int
+    steps: int
+    seed: int
+
+    def planner(self, searching: Searching) -> Planner:
+        spec, trust = self.world.spec, searching.trust
+        if trust is None and isinstance(spec.card.get("uncertainty"), dict) and (levels := uncertainty_levels(spec)):
+            trust = levels[1]
+        cost = distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(spec)
+        return Planner(self.world, cost, searching.config, trust, replan=searching.replan)
+
+    def played(self, policy, what: str, keep: tuple[str, ...] = ()) -> Played:
+        spec = self.world.spec
+        sees = (*spec.observes, *(name for name in spec.may_observe if name in self.real.spec.channels))
+        with progress.shown(what) as report:
+            told = (self.episodes, self.steps, self.seed, self.judge, sees, keep, 1 if keep else 0, report)
+            return play(self.real, policy, *told)
+
+
+def plan(
+    name: Positional[str],
+    environment: Environment,
+    searching: Searching,
+    goal: str = REWARD,
+    real: str | None = None,
+    episodes: int = 10,
+    steps: int | None = None,
+    within: float = 0.05,
+    success: str | None = None,
+    curve: bool = False,
+    out: Path | None = None,
+    device: Device = "auto",
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Plan in a world, act in the real environment, and say how often that reached the goal, beside acting at random.
+
+    Leaves a page, a film of dream and reality side by side, and all figures in a folder.
+
+    Args:
+        name: The world to plan in: what `terrella list` shows, the path of a checkpoint, or a simulator itself (gym:CartPole-v1).
+        goal: A picture's file, numbers of the state (0.5,_,0 with _ for any; --goal=-1,0 where the first is negative),
+            CHANNEL=VALUE, or reward.
+        real: The environment to act in (gym:CartPole-v1); without one, the world itself.
+        steps: Of an episode at most; default: the environment's own limit, or 200.
+        within: The distance at which a goal is reached: numbers count in shares of their range, pictures of full brightness.
+        success: A channel of the environment that is above 0 where an episode has succeeded (done), in place of --within.
+        curve: Also play with half, a quarter ... of the samples: does thinking longer help?
+        out: Folder for the page, the film and plan.json; default: plans/ and the world's name.
+    """
+    case = _opened(name, environment, searching, goal, real, episodes, steps, within, success, device, seed)
+    folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
+    keep = tuple(dict.fromkeys((*_seen_by(case), *_compared(case), *_pictured(case))))
+    mine = case.played(case.planner(searching), "planning", keep)
+    floor = case.played(Random(case.real.spec), "acting at random")
+    points = _curve(case, mine) if curve else []
+    about = {"world": name, "real": real or name, "goal": goal}
+    asked = {key: value for key, value in asdict(searching).items() if value is not None}
+    facts = {
+        **about,
+        **asked,
+        "steps": case.steps,
+        "episodes": episodes,
+        "seed": seed,
+        "solved_starts_left_out": mine.skipped,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    lines, whole = _report(case, mine, floor, points, facts, folder)
+    write_json(folder / "plan.json", _sound(whole))
+    del whole["played"], whole["divergence"]
+    result(_sound(whole), json, "\n".join([*lines, f"the page: {folder / 'plan.html'}"]))
+
+
+def _report(
+    case: _Case, mine: Played, floor: Played, points: list, facts: Mapping[str, object], folder: Path
+) -> tuple[list[str], dict[str, Any]]:
+    """Writes the page and the film; what came of it in words, and all of it."""
+    arms = {"planner": _figures(mine, case.seed), "random": _figures(floor, case.seed)}
+    what = "success" if case.judge.judges else "return"
+    curve = [(steps, figures[what]) for steps, figures in points]
+    lines = _lines(case, mine, arms, curve)
+    divergence, picture, filmed = _filmed(case, mine.episodes[0], folder)
+    chart = compute_chart(curve, arms["random"][what], what) if curve else ""
+    page = plan_page(f"{facts['world']}: {facts['goal']}", lines, arms, chart, picture, filmed, facts)
+    (folder / "plan.html").write_text(page, encoding="utf-8")
+    return lines, {
+        **facts,
+        **{arm: _plain(figures) for arm, figures in arms.items()},
+        "difference": _plain({what: _paired(mine, floor, what, case.seed)}),
+        "curve": [{"imagined": steps, **_plain(figures)} for steps, figures in points],
+        "divergence": divergence,
+        "played": [_told(episode) for episode in mine.episodes],
+        "page": str(folder / "plan.html"),
+        "film": str(folder / filmed) if filmed else "",
+    }
+
+
+def _opened(name, environment, searching, goal, real, episodes, steps, within, success, device, seed) -> _Case:
+    """The worlds by their names, held to each other; a sentence for what does not fit."""
+    if episodes < 1 or (steps is not None and steps < 1) or not within > 0:
+        raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
+    truth = library.is_truth(name)
+    world = environment.open(name) if truth else load_named(name, device_of(device))
+    if truth:
+        world = Revealed(world)
+    elif not world.spec.observes:
+        raise PlanningError(f"{name} observes nothing, so nobody can tell it where the episode stands.")
+    acted = world if real in (None, name) else _real(real, environment, world.spec)
+    _check_alike(world.spec, acted.spec)
+    wanted = read_goal(goal, world.spec)
+    if success and success not in acted.spec.channels:
+        raise PlanningError(f"{acted.spec.name} has no channel '{success}'; it has {', '.join(acted.spec.channels)}.")
+    judged = {} if success or any(at not in acted.spec.channels for at in wanted) else wanted
+    if wanted and not judged and not success:
+        raise PlanningError(
+            f"{acted.spec.name} does not show {', '.join(wanted)}, so nobody can tell whether the goal is reached: name a "
+            "channel that can with --success."
+        )
+    judge = Judge({at: value[None] for at, value in judged.items()}, within, success or "")
+    limit = steps or acted.spec.max_episode_steps or STEPS
+    case = _Case(world, acted, wanted, judge, searching, episodes, limit, seed)
+    case.planner(searching)  # what does not fit is said before anything is played
+    return case
+
+
+def _real(real: str, environment: Environment, spec: Spec) -> World:
+    shape = spec.channels["rgb"].shape if "rgb" in spec.channels else None
+    if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
+        environment = replace(environment, size=(shape[0], shape[1]))
+    found = environment.open(real)
+    told = any(kind_of(channel) == "snapshot" for channel in spec.observes)
+    return Revealed(found) if told else found
+
+
+def _check_alike(world: Spec, real: Spec) -> None:
+    """ActionError or PlanningError where what is planned in one cannot be done in the other."""
+    mine, theirs = world.action_limits, real.action_limits
+    if any(np.shape(a) != np.shape(b) or not np.allclose(a, b) for a, b in zip(mine, theirs)):
+        raise ActionError(
+            f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
+        )
+    for channel in world.observes:
+        if channel not in real.channels:
+            raise PlanningError(
+                f"{world.name} plans from '{channel}', which {real.name} does not show; it shows {', '.join(real.channels)}."
+            )
+        if real.channels[channel].shape != world.channels[channel].shape:
+            raise PlanningError(
+                f"{world.name} sees '{channel}' of shape {world.channels[channel].shape}, and {real.name} shows "
+                f"{real.channels[channel].shape}; --size HEIGHT WIDTH sets that of pictures."
+            )
+
+
+def _seen_by(case: _Case) -> tuple[str, ...]:
+    return (*case.world.spec.observes, *(at for at in case.world.spec.may_observe if at in case.real.spec.channels))
+
+
+def _compared(case: _Case) -> tuple[str, ...]:
+    """Channels in which dream and reality can be compared: pictures, and lists of numbers, that both show."""
+    both = {
+        name: space
+        for name, space in case.real.spec.channels.items()
+        if name in case.world.spec.channels and space.shape == case.world.spec.channels[name].shape
+    }
+    return tuple(
+        name for name, space in both.items() if kind_of(name) not in _NEVER and len(space.shape or ()) in (1, 3)
+    )
+
+
+def _pictured(case: _Case) -> tuple[str, ...]:
+    return ("rgb",) if "rgb" in case.real.spec.channels else ()
+
+
+def _figures(played: Played, seed: int) -> dict[str, Figure]:
+    episodes = played.episodes
+    count = len(episodes)
+    ms, imagined = ([value for one in episodes for value in getattr(one, name)] for name in ("ms", "imagined"))
+    figures = {}
+    if episodes[0].success is not None:
+        figures["success"] = wilson(sum(bool(one.success) for one in episodes), count)
+    figures["return"] = mean_interval(torch.tensor([one.reward for one in episodes]), make_rng(seed))
+    figures["steps"] = mean_interval(torch.tensor([float(one.steps) for one in episodes]), make_rng(seed))
+    if imagined:
+        figures["ms a decision"] = _middle(ms)
+        figures["steps imagined"] = _middle(imagined)
+    return figures
+
+
+def _middle(values: list) -> Figure:
+    """The median, with the 5th and the 95th percentile."""
+    low, middle, high = np.percentile(values, (5, 50, 95)).tolist()
+    return Figure(middle, low, high, len(values))
+
+
+def _paired(mine: Played, floor: Played, what: str, seed: int) -> Figure:
+    """By how much the planner is better than chance, start by start."""
+    worth = lambda one: float(bool(one.success)) if what == "success" else one.reward  # noqa: E731
+    apart = [worth(one) - worth(other) for one, other in zip(mine.episodes, floor.episodes)]
+    return mean_interval(torch.tensor(apart), make_rng(seed))
+
+
+def _curve(case: _Case, mine: Played) -> list[tuple[float, dict[str, Figure]]]:
+    """The same starts with the samples halved again and again, up to what was asked: steps imagined, figures."""
+    points = []
+    for halvings in range(DOUBLINGS - 1, -1, -1):
+        samples = case.searching.samples >> halvings
+        if samples < 2:
+            continue
+        searching = replace(case.searching, samples=samples)
+        played = case.played(case.planner(searching), f"planning with {samples} samples") if halvings else mine
+        figures = _figures(played, case.seed)
+        points.append((figures["steps imagined"].value, figures))
+    return points
+
+
+def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], points: list) -> list[str]:
+    """What came of it, for people."""
+    count, planner, floor = len(mine.episodes), arms["planner"], arms["random"]
+    lines = []
+    if "success" in planner:
+        lines.append(
+            f"reached in {_share(planner['success'])} of {count} episodes; at random {_share(floor['success'])}"
+        )
+    gained = f"{planner['return']}; at random {floor['return']}"
+    if "reward" in case.real.spec.channels:
+        lines.append(f"return {gained}")
+    took = planner["ms a decision"]
+    imagined = planner["steps imagined"].value
+    lines.append(
+        f"a decision takes {took.value:.0f} ms (95% within {took.high:.0f}) for {imagined:,.0f} imagined steps"
+    )
+    if mine.skipped:
+        lines.append(f"{mine.skipped} starts were already solved and left out")
+    if case.goal and planner.get("success") and not planner["success"].value:
+        nearest = min(one.nearest for one in mine.episodes)
+        away = f"; the nearest that it came is {nearest:.3g} (asked: {case.judge.within:g})" if case.judge.goal else ""
+        best = min(one.best_cost for one in mine.episodes)
+        lines.append(
+            f"the goal was never reached{away}; the best plan in the world cost {best:.3g}: it may be impossible"
+        )
+    lines += [f"{steps:>10,.0f} imagined steps: {figure}" for steps, figure in points]
+    if case.searching.budget_ms is not None:
+        lines.append("planned by the clock: another run may differ")
+    return lines
+
+
+def _share(figure: Figure) -> str:
+    return f"{figure.value:.0%} [{figure.low:.0%}, {figure.high:.0%}]"
+
+
+def _plain(figures: Mapping[str, Figure]) -> dict[str, object]:
+    return {name: asdict(figure) for name, figure in figures.items()}
+
+
+def _sound(value: Any) -> Any:
+    """The same as JSON can say it: null for what is no finite number."""
+    if isinstance(value, Mapping):
+        return {str(key): _sound(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_sound(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _told(episode: Episode) -> dict[str, object]:
+    told: dict[str, Any] = {"steps": episode.steps, "return": episode.reward, "success": episode.success}
+    return {**told, "nearest": episode.nearest, "ended": episode.ended, "best_cost": episode.best_cost}
+
+
+@torch.no_grad()
+def _filmed(case: _Case, episode: Episode, folder: Path) -> tuple[dict[str, list[float]], Image.Image | None, str]:
+    """The dream of an episode, from its first observation under its actions: the divergence in each channel, a strip of both,
+    and the film's file, "" where there are no pictures."""
+    seen, names = episode.seen, _compared(case)
+    shown = tuple(name for name in (*names, *_pictured(case)) if name in case.world.spec.channels)
+    first = {name: seen[0][name][None] for name in _seen_by(case)}
+    rng, dreamt = make_rng(case.seed), []
+    state = case.world.observe(first, None, rng)
+    for action in [*episode.actions, None]:
+        dreamt.append({name: value[0].cpu() for name, value in case.world.render(state, shown).items()})
+        state = state if action is None else case.world.imagine(state, action[None], rng)
+    divergence = {}
+    for name in names:
+        one, other = (torch.stack([frame[name] for frame in frames]) for frames in (seen, dreamt))
+        divergence[name] = distance(case.real.spec, {name: one}, {name: other}).tolist()
+    if "rgb" not in seen[0]:
+        say("No film: the environment shows no pictures.")
+        return divergence, None, ""
+    rows = {"reality": torch.stack([frame["rgb"] for frame in seen]).numpy()}
+    if "rgb" in shown:
+        height, width = rows["reality"].shape[1:3]
+        frames = [Image.fromarray(frame["rgb"].numpy()).resize((width, height)) for frame in dreamt]
+        rows["dream"] = np.stack([np.asarray(frame) for frame in frames])
+    what = next(iter(sorted(names, key=lambda name: name == "rgb")), "")
+    curve = divergence[what] if what else [0.0] * len(seen)
+    film(folder / "plan.mp4", rows, curve, f"divergence in {what}" if what else "", 1 / case.real.spec.dt_s)
+    return divergence, film_strip(rows), "plan.mp4"
