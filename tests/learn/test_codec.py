@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from terrella.core import make_rng
-from terrella.learn.moves import frequent_moves, mosaics, palette
+from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, palette
 from terrella.space.mosaic import recalled
 
 SIZE = (32, 40)
@@ -33,6 +33,20 @@ def test_a_palette_holds_the_colours_of_a_picture():
     picture = colours[torch.randint(0, 3, (2, 16, 16), generator=make_rng(0))].permute(0, 3, 1, 2)
     found = palette(picture, 8, np.random.default_rng(0))
     assert all((found.int() - colour.int()).abs().amax(1).min() <= 4 for colour in colours)
+
+
+def test_a_run_keeps_its_moves_and_palette_and_only_its_own(tmp_path):
+    found = Looks(torch.tensor([[0, -2], [3, 0]]), torch.tensor([[0, 9, 255]], dtype=torch.uint8), 2.5)
+    assert Looks.read(tmp_path, {}) is None
+    found.write(tmp_path, {"size": (64, 64)})
+    kept = Looks.read(tmp_path, {"size": (64, 64)})
+    assert kept is not None and kept.stress == 2.5 and kept.palette.dtype == torch.uint8
+    assert torch.equal(kept.moves, found.moves) and torch.equal(kept.palette, found.palette)
+    assert Looks.read(tmp_path, {"size": (32, 32)}) is None, "that of another recipe"
+    text = (tmp_path / LOOKS).read_text()
+    for damage in (text[:40], text.replace("255", "256"), text.replace("-2", "-99"), text.replace("2.5", "0.0"), "[]"):
+        (tmp_path / LOOKS).write_text(damage)
+        assert Looks.read(tmp_path, {"size": (64, 64)}) is None
 
 
 def test_a_mosaic_is_made_of_the_real_part_of_a_clip():

@@ -146,15 +146,20 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp
     assert all(torch.isfinite(value.float()).all() for value in saved.values())
 
 
-def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path):
+def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path, monkeypatch):
     with Recorder(tmp_path / "set", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(3):
             for step in range(60):
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)
                 recorder.add({"rgb": picture}, np.array([step % 2]) if step < 59 else None, 0.5, False)
             recorder.end_episode()
-    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    facts = train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
     world = load_world(tmp_path / "run" / "world")
+    steps = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])["step"]
+    assert facts["step"] == steps == world.spec.card["steps"] == 12, "each loss that is descended is a step, everywhere"
+    assert (tmp_path / "run" / "strip-000012.png").exists()
+    monkeypatch.delattr("terrella.learn.recipes.video.frequent_moves")  # what was found is not searched again
+    assert train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)["step"] == steps
     assert set(world.spec.channels) == {"rgb", "reward", "done"}
     assert "batches" in check_world(world)
     rng = make_rng(0)

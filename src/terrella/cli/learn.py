@@ -30,7 +30,7 @@ ENDLESS = 10**9  # steps: training ends with its time
 EPISODES = 12  # or more are recorded, if need be shorter ones: some are kept out of training, to score it
 SIZES, FEWEST = (50, 24, 12, 6, 3), 6  # numbers of clips, the most for which there is time; fewer are too few
 SAVE_EVERY_S = 30.0
-FEW_STEPS = 50  # after which a world has learned next to nothing
+FEW_STEPS = 600  # after which a world has learned next to nothing
 
 
 def learn(

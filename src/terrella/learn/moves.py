@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ..data.storage.durable import write_json
 from ..space.matching import scrolled
 from ..space.mosaic import blank, remembered
 
@@ -13,6 +19,35 @@ REACH = 12  # pixels that a block may move in a step
 BLOCK = 8  # pixels
 DIFFERENT = 4.0  # mean difference (of 255) of blocks above which a block has changed
 AWAY = 0.05  # by which each pixel of a move must improve the match
+LOOKS = "looks.json"  # of a run
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What a run finds once in its recording: moves int64 [n, 2], palette uint8 [n, 3], stress, how many times as much pixels
+    count that change."""
+
+    moves: torch.Tensor
+    palette: torch.Tensor
+    stress: float
+
+    @staticmethod
+    def read(run: Path, recipe: Mapping) -> Looks | None:
+        """What the folder of a run of this recipe keeps; None where it keeps nothing sound: then the same is found again."""
+        try:
+            found = json.loads((run / LOOKS).read_text(encoding="utf-8"))
+            moves = torch.tensor(found["moves"], dtype=torch.int64).view(-1, 2)
+            colours = torch.tensor(found["palette"], dtype=torch.int64).view(-1, 3)
+            stress, same = float(found["stress"]), found["recipe"] == json.loads(json.dumps(recipe))
+        except (OSError, ValueError, LookupError, TypeError, RuntimeError):
+            return None
+        sound = same and (moves.abs() <= REACH).all() and ((colours >= 0) & (colours < 256)).all() and len(colours)
+        return Looks(moves, colours.to(torch.uint8), stress) if sound and 0 < stress < float("inf") else None
+
+    def write(self, run: Path, recipe: Mapping) -> None:
+        run.mkdir(parents=True, exist_ok=True)
+        found = {"moves": self.moves.tolist(), "palette": self.palette.tolist(), "stress": self.stress}
+        write_json(run / LOOKS, {"recipe": dict(recipe), **found})
 
 
 def frequent_moves(before: torch.Tensor, after: torch.Tensor, most: int) -> torch.Tensor:

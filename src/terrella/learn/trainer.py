@@ -196,8 +196,9 @@ class Trainer:
     TrainingError where the run's folder holds one with another recipe.
 
     device:  where it is to run, if not where the others do.
+    strides: losses of a batch, each of which is descended. People count them: `steps`, `taken`, the log and the summary do.
     limit_s: seconds after which it ends.
-    facts:   recipe, step, seconds, and what `once` added; saved with the rest.
+    facts:   recipe, step (batches), seconds, and what `once` added; saved with the rest.
     """
 
     def __init__(
@@ -208,9 +209,11 @@ class Trainer:
         objective: Objective,
         steps: int,
         device: torch.device | None = None,
+        strides: int = 1,
     ):
         self.run, self.stage, self.feed, self.objective = run, stage, feed, objective
-        self.steps, self.limit_s, self.device = steps, run.budget.most_s(stage), device or run.device
+        self.strides, self.batches = strides, -(-steps // strides)
+        self.limit_s, self.device = run.budget.most_s(stage), device or run.device
         self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
         self.facts |= {"seconds": 0.0, "recent": []}
         self._file = resume_file(run.out, stage)
@@ -220,7 +223,7 @@ class Trainer:
         if found:
             self.facts |= load_run(self._file, objective.modules, self._optimisers) or {}
             feed.resume(self.facts["feed"])
-        trim_log(run.out, stage, self.facts["step"])
+        trim_log(run.out, stage, self.taken)
 
     @property
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -230,7 +233,12 @@ class Trainer:
     def summary(self) -> dict[str, Any]:
         """The facts that people read."""
         inner = ("recipe", "recent", "feed", "spent", "asked")
-        return {name: fact for name, fact in self.facts.items() if name not in inner}
+        return {name: fact for name, fact in self.facts.items() if name not in inner} | {"step": self.taken}
+
+    @property
+    def taken(self) -> int:
+        """Steps that were taken, of all runs."""
+        return self.facts["step"] * self.strides
 
     @property
     def finished(self) -> bool:
@@ -240,7 +248,7 @@ class Trainer:
     def share(self) -> float:
         """How much of the training is done, of its steps or of its time, whichever is more."""
         by_time = self.facts["seconds"] / self.limit_s if self.limit_s > 0 else 1.0
-        return max(self.facts["step"] / self.steps if self.steps > 0 else 1.0, by_time)
+        return max(self.facts["step"] / self.batches if self.batches > 0 else 1.0, by_time)
 
     def train(self, draw: Callable[[], None] | None = None) -> None:
         """Trains to the end; `draw()` now and then, which leaves what there is to look at."""
@@ -272,11 +280,11 @@ class Trainer:
                 drawn = time.monotonic()
         self.save()
         if stop.is_set():
-            done = f"{facts['step']} steps of '{self.stage}' are saved in {run.out}"
+            done = f"{self.taken} steps of '{self.stage}' are saved in {run.out}"
             raise KeyboardInterrupt(f"{done}; the same command goes on from there.")
 
     def _step(self, step: int) -> dict[str, float]:
-        """One whole step: a batch, and down each of its losses in turn. Returns the means of their parts."""
+        """One whole round: a batch, and down each of its losses in turn. Returns the means of their parts."""
         rng = np.random.default_rng([self.run.seed, step])
         noise = make_rng(int(rng.integers(2**62)))
         now = Now(step, self.share, self.device, rng, noise)
@@ -288,7 +296,7 @@ class Trainer:
         with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
             torch.manual_seed(int(rng.integers(2**62)))  # dropout knows no generator of its own
             for loss in self.objective.losses(self.feed.batch(now), now):
-                self._descend(loss, step)
+                self._descend(loss, step * self.strides)
                 for name, part in loss.parts.items():
                     found.setdefault(name, []).append(float(part.detach()))
         return {name: float(np.mean(values)) for name, values in found.items()}
@@ -323,7 +331,7 @@ class Trainer:
     def _log(self) -> None:
         facts, recent = self.facts, self.facts["recent"]
         mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
-        line = {"stage": self.stage, "step": facts["step"], "seconds": round(facts["seconds"]), **mean}
+        line = {"stage": self.stage, "step": self.taken, "seconds": round(facts["seconds"]), **mean}
         write_log(self.run.out, line)
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())

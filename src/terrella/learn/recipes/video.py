@@ -24,7 +24,7 @@ from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
 from ...worlds.outcome import Constant, ConstantConfig, Outcome
 from ...worlds.places import KeyframeScene
 from ..feeds import codec_feed, frames_feed
-from ..moves import frequent_moves, mosaics, palette
+from ..moves import Looks, frequent_moves, mosaics, palette
 from ..objectives.codec import CodecObjective
 from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
@@ -187,6 +187,7 @@ class _Learned:
         self.flow = self._codec() if fetches else self._flow()
         self.motion = Motion(self.video.motion)
         self.facts: dict = {}
+        self.starts: Starts | None = None  # of a world without depth, made once
 
     def _flow(self) -> Flow:
         config = self.config
@@ -194,9 +195,21 @@ class _Learned:
         return Flow(Generator(self.video.generator), *parts)
 
     def _codec(self) -> CodecObjective:
-        """A codec that knows how pictures of the recording move, and their colours."""
+        """A codec that knows how pictures of the recording move, and their colours; the run keeps what was found."""
         if self.video.slots < 2:
             raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
+        plain, found = self.video.generator, Looks.read(self.run.out, self.run.recipe)
+        if found is None:
+            found = self._looks()
+            found.write(self.run.out, self.run.recipe)
+        settings = CodecConfig(plain.size, plain.slots, plain.context, len(found.moves), len(found.palette))
+        levels = int(np.log2(min(plain.size) // COARSE)) + 1  # that so small a picture has room for
+        codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
+        codec.moves[1:], codec.palette[:] = found.moves, found.palette
+        codec.stress.fill_(found.stress)
+        return CodecObjective(codec, self.config.learning_rate or 2e-3)
+
+    def _looks(self) -> Looks:
         recording, rng = self.recording, np.random.default_rng(self.config.seed)
         rows = recording.within(1, 0)
         rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
@@ -205,13 +218,7 @@ class _Learned:
         most = max(32, MATCHED // before[0, 0].numel())  # pairs: each is matched at 625 displacements
         some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
-        plain = self.video.generator
-        settings = CodecConfig(plain.size, plain.slots, plain.context, len(moves), len(colours))
-        levels = int(np.log2(min(plain.size) // COARSE)) + 1  # that so small a picture has room for
-        codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
-        codec.moves[1:], codec.palette[:] = moves, colours
-        codec.stress.fill_(float(np.clip(STRESSED / change.mean(), 1, STRESS)))
-        return CodecObjective(codec, self.config.learning_rate or 2e-3)
+        return Looks(moves, colours, float(np.clip(STRESSED / change.mean(), 1, STRESS)))
 
     def _feed(self, batch: int) -> Feed:
         parts = self.video, batch, self.config.seed
@@ -233,7 +240,7 @@ class _Learned:
             if not resume_file(run.out, "flow").exists():  # the codec has learned with the scroll that it knows
                 learn_scroll(run, self.flow.scroll, recording, self.flow.generator.moves, self.video.slots)
             self.flow.knows_scroll()
-        trainer = Trainer(run, "flow", feed, self.flow, -(-config.steps // self.flow.strides))
+        trainer = Trainer(run, "flow", feed, self.flow, config.steps, strides=self.flow.strides)
         if self.memory is not None:
             self.facts |= learn_motion(run, self.motion, recording, self.memory, config.motion_steps)
         if self.outcome is not None:
@@ -299,7 +306,8 @@ class _Learned:
             outcome = self._outcome(ConstantConfig(usual))
             moves = self.flow.generator.moves.cpu() if isinstance(self.flow, CodecObjective) else torch.zeros(0, 2)
             kept = replace(self.video.frames, moves=tuple((int(x), int(y)) for x, y in moves))
-            scene = FrameHistory(kept, self._starts(moves))
+            self.starts = self.starts or self._starts(moves)
+            scene = FrameHistory(kept, self.starts)
             return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
         ends = self.happened.done & np.array(cache.action_valid)
         outcome = self._outcome(ConstantConfig(usual, _ending_pays(self.happened.reward - usual, ends)))
@@ -324,7 +332,7 @@ class _Learned:
             "what": f"Learned from {source.length:,} frames of {name}",
             "game": recording.cache.world.get("name"),
             "data": f"{recording.usable.sum():,} frames, {episodes} episodes",
-            "steps": trainer.facts["step"] * self.flow.strides,
+            "steps": trainer.taken,
             "hours": round(trainer.facts["seconds"] / 3600, 2),
             "keep_out": self.config.keep_out,
             "keyframes": 0 if self.memory is None else len(self.memory),
@@ -368,7 +376,7 @@ class _Learned:
         learns."""
         world = self.world(trainer)
         worlds = (world, world.without_memory()) if self.video.geometry else (world,)
-        draw_strip(worlds, self.recording, self.run.out / f"strip-{trainer.facts['step']:06d}.png")
+        draw_strip(worlds, self.recording, self.run.out / f"strip-{trainer.taken:06d}.png")
         save_world(world, self.run.out / "world")
 
 
