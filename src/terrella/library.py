@@ -158,14 +158,14 @@ def _read_card(folder: Path) -> Mapping[str, object]:
 
 
 def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
-    from .worlds.folder import load_world
+    from .worlds.folder import load_world, open_world
 
-    world = load_world(folder, **{name: value for name, value in options.items() if name != "fast"})
+    said = {name: value for name, value in options.items() if name != "fast"}
     if not options.get("fast"):
-        return world
+        return open_world(folder, **said)
     from .worlds.fast import quickened
 
-    return quickened(world)[0]
+    return quickened(load_world(folder, **said))[0]
 
 
 def _require(module: str, need: str, extra: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from tyro.conf import Positional
 
 from .. import progress
+from ..learn.recipes.latent import LatentTraining, train_latent
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
 from ..learn.recipes.parts import (
     EstimatorTraining,
@@ -34,6 +35,17 @@ def video(data: Positional[str], out: str, config: TrainConfig, json: Json = Fal
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
     _shown(lambda report: train_video(data, out, config, report), json, run=out)
+
+
+def latent(data: Positional[str], out: str, config: LatentTraining, json: Json = False) -> None:
+    """Train a latent world on a recording with pictures, state vectors or both: it predicts what matters instead of pixels, by the
+    thousand at once. Stop it with Ctrl-C at any time; the same command continues.
+
+    Args:
+        data: The recording: a folder, or an address (hf://..., s3://...).
+        out: Folder of the run: the world, a log, validation.json, and pictures of truth and prediction.
+    """
+    _shown(lambda report: train_latent(data, out, config, report), json, run=out)
 
 
 def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: Json = False) -> None:

@@ -46,11 +46,11 @@ class Controls:
     @property
     def numbers(self) -> int:
         """How many numbers networks take of an action."""
-        return sum(self._counts) if self.kind == CHOICE else len(self.low)
+        return sum(self.counts) if self.kind == CHOICE else len(self.low)
 
     @property
-    def _counts(self) -> list[int]:
-        """Of how many each choice is one."""
+    def counts(self) -> list[int]:
+        """Of how many each choice is one, in the order of the numbers of an action."""
         return [int(high - low) + 1 for low, high in zip(self.low, self.high)]
 
     def space(self) -> spaces.Space:
@@ -61,7 +61,7 @@ class Controls:
             starts = [int(low) for low in self.low]
             if len(starts) == 1:
                 return spaces.Discrete(self.numbers, start=starts[0])
-            return spaces.MultiDiscrete(self._counts, start=starts)
+            return spaces.MultiDiscrete(self.counts, start=starts)
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
     def encode(self, action: torch.Tensor) -> torch.Tensor:
@@ -70,8 +70,8 @@ class Controls:
         given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
             whole = given.round().long()
-            picked = [(whole[:, n] - int(low)).clamp(0, self._counts[n] - 1) for n, low in enumerate(self.low)]
-            return torch.cat([F.one_hot(one, count) for one, count in zip(picked, self._counts)], 1).float()
+            picked = [(whole[:, n] - int(low)).clamp(0, self.counts[n] - 1) for n, low in enumerate(self.low)]
+            return torch.cat([F.one_hot(one, count) for one, count in zip(picked, self.counts)], 1).float()
         if self.kind == AXES:
             low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
             return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)

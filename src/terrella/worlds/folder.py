@@ -30,6 +30,8 @@ from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfi
 from .controls import Controls
 from .generator import Generator
 from .history import FrameHistory, Starts
+from .latent import LatentWorld
+from .latent_network import LatentConfig, LatentNetwork
 from .learned import About, LearnedWorld
 from .objects import Objects, ObjectsConfig
 from .outcome import Constant, ConstantConfig, Outcome, OutcomeConfig
@@ -38,6 +40,7 @@ from .places import KeyframeScene
 from .uncertainty import Uncertainty, UncertaintyConfig
 
 KIND, VERSION = "learned", 3
+LATENT, LATENT_VERSION = "latent", 1
 WORLD_FILE, WEIGHTS_FILE, MEMORY_FILE = "world.json", "weights.safetensors", "memory.safetensors"
 Tensors = Mapping[str, torch.Tensor]
 Make = Callable[[Any, Tensors, Tensors], Any]
@@ -63,23 +66,40 @@ def save_world(
     weights = {
         f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()
     }
-    told = {
-        "kind": KIND,
-        "version": VERSION,
+    parts = {name: {"kind": part.kind, "config": _plain(part.config)} for name, part in world.parts.items()}
+    told = _told(KIND, VERSION, about, parts) | ({} if card is None else {"card": dict(card)})
+    try:
+        kept = None if remembered is None else (Path(remembered) / MEMORY_FILE).read_bytes()
+        write_folder(path, told, weights, kept if kept is not None else _remembered(world.scene, quality))
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
+
+
+def save_latent(world: LatentWorld, path: str | Path) -> None:
+    """Writes the folder of a latent world; CheckpointError where it cannot be written."""
+    network = world.network
+    parts = {"network": {"kind": network.kind, "config": asdict(network.config)}}
+    try:
+        told = _told(LATENT, LATENT_VERSION, world.about, parts)
+        write_folder(Path(path), told, network.state_dict(), {"starts": world.starts})
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
+
+
+def _told(kind: str, version: int, about: About, parts: Mapping[str, Any]) -> dict[str, Any]:
+    """What world.json says."""
+    return {
+        "kind": kind,
+        "version": version,
         "name": about.name,
         "about": {
             "controls": asdict(about.controls), "dt_s": about.dt_s, "action_names": list(about.action_names),
             "keys": dict(about.keys), "ignored": list(about.ignored), "idle": list(about.idle),
             "max_episode_steps": about.max_episode_steps,
         },
-        "parts": {name: {"kind": part.kind, "config": _plain(part.config)} for name, part in world.parts.items()},
-        "card": dict(about.card if card is None else card),
+        "parts": dict(parts),
+        "card": dict(about.card),
     }  # fmt: skip
-    try:
-        kept = None if remembered is None else (Path(remembered) / MEMORY_FILE).read_bytes()
-        write_folder(path, told, weights, kept if kept is not None else _remembered(world.scene, quality))
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
 
 
 def save_keys(path: str | Path, spec: Spec) -> None:
@@ -126,11 +146,7 @@ def load_world(
             if part["kind"] != Absent.kind:
                 config, make = KINDS[name][part["kind"]]
                 made[name] = make(_settings(config, part["config"] or {}), _below(weights, name), remembered)
-        told = about["about"]
-        controls = _settings(Controls, told["controls"])
-        names = tuple(told["action_names"]), told["keys"], about["card"], tuple(told["ignored"])
-        names = *names, tuple(told.get("idle", ())), told.get("max_episode_steps")
-        world = LearnedWorld(About(about["name"], controls, told["dt_s"], *names), **made)
+        world = LearnedWorld(_about(about), **made)
     except DAMAGE as error:
         raise CheckpointError(
             f"{path} is damaged or incomplete ({first_line(error)}); copy or train it again."
@@ -139,6 +155,44 @@ def load_world(
         world = world.with_memory_of(memory_mb)
     world = world if memory else world.without_memory()
     return world if torch.device(device).type == "cpu" else world.to(device)
+
+
+def load_latent(path: str | Path, device: str = "cpu") -> LatentWorld:
+    """Reads what `save_latent` wrote; CheckpointError says what is missing or foreign."""
+    path = Path(path)
+    about = read_about(path)
+    if (about.get("kind"), about.get("version")) != (LATENT, LATENT_VERSION):
+        raise CheckpointError(_foreign(path, about))
+    try:
+        config, make = NETWORKS[about["parts"]["network"]["kind"]]
+        network = make(_settings(config, about["parts"]["network"]["config"]))
+        network.load_state_dict(load_file(path / WEIGHTS_FILE))
+        world = LatentWorld(_about(about), network, load_file(path / MEMORY_FILE)["starts"])
+    except DAMAGE as error:
+        raise CheckpointError(
+            f"{path} is damaged or incomplete ({first_line(error)}); copy or train it again."
+        ) from error
+    return world if torch.device(device).type == "cpu" else world.to(device)
+
+
+def open_world(
+    path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
+) -> LearnedWorld | LatentWorld:
+    """The learned world of a folder, whatever its kind. A latent world has no keyframes to leave out, and no budget for them."""
+    if read_about(Path(path)).get("kind") != LATENT:
+        return load_world(path, memory, device, memory_mb)
+    if memory_mb is not None:
+        raise CheckpointError(
+            f"{path} is a latent world, which keeps no pictures of an episode; leave `memory_mb` out."
+        )
+    return load_latent(path, device)
+
+
+def _about(told: dict) -> About:
+    said = told["about"]
+    names = tuple(said["action_names"]), said["keys"], told["card"], tuple(said["ignored"])
+    names = *names, tuple(said.get("idle", ())), said.get("max_episode_steps")
+    return About(told["name"], _settings(Controls, said["controls"]), said["dt_s"], *names)
 
 
 def read_about(path: Path) -> dict:
@@ -162,9 +216,12 @@ def _foreign(path: Path, about: dict) -> str:
     kind, version = about.get("kind"), about.get("version")
     if (kind, version) == ("video", 2):
         return f"{path} was saved by an earlier release; convert it: terrella convert-world {path} NEW."
-    if kind != KIND:
+    if kind == LATENT and version == LATENT_VERSION:
+        return f"{path} is a latent world, which draws nothing but for people; give a world that `train video` made."
+    if kind not in (KIND, LATENT):
         return f"{path} is a world of kind {kind!r}; this loads kind '{KIND}'."
-    return f"{path} has version {version}, this release reads {VERSION}; update Terrella."
+    latest = LATENT_VERSION if kind == LATENT else VERSION
+    return f"{path} has version {version}, this release reads {latest}; update Terrella."
 
 
 # -- parts ----------------------------------------------------------------------------------------------------------------
@@ -222,6 +279,10 @@ KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "uncertainty": {"network": (UncertaintyConfig, _network(Uncertainty))},
     "estimator": {"network": (EstimatorConfig, _network(Estimator))},
 }
+
+
+# By kind of a latent world's network: its settings, and how it is made of them.
+NETWORKS: dict[str, tuple[type, Callable[[Any], LatentNetwork]]] = {LatentNetwork.kind: (LatentConfig, LatentNetwork)}
 
 
 def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, torch.Tensor]:

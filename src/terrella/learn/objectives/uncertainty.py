@@ -89,7 +89,7 @@ def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frame
     expected = answers(uncertainty, others)
     facts = {"sure": float(uncertainty.sure), "invents": float(uncertainty.invents), "frames": len(others.error)}
     facts |= {"error": float(others.error.mean()), "expected": float(expected.mean())}
-    facts["rank_correlation"] = _rank_correlation(expected, others.error)
+    facts["rank_correlation"] = rank_correlation(expected, others.error)
     shutil.rmtree(run.out / DREAMT, ignore_errors=True)
     return uncertainty, facts
 
@@ -300,7 +300,7 @@ def _unlikely(expected: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
     return (expected.log() + error / expected).mean()
 
 
-def _rank_correlation(a: torch.Tensor, b: torch.Tensor) -> float:
+def rank_correlation(a: torch.Tensor, b: torch.Tensor) -> float:
     """Spearman's."""
     ranks = torch.stack([values.argsort().argsort().double() for values in (a, b)])
     return float(torch.corrcoef(ranks)[0, 1])

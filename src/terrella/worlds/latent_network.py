@@ -1,0 +1,238 @@
+"""The networks of a latent world: encoder, predictor, heads and, for people, a decoder (LeWorldModel, Maes et al. 2026)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from ..core.spec import kind_of
+
+KNOTS = 17  # of the map from the spread of the ensemble to the error to expect
+FARTHEST = 8.0  # a latent is held within so many standard deviations, inputs likewise
+COARSE = 16  # the encoder's last map has a cell for so many pixels
+
+
+@dataclass(frozen=True)
+class LatentConfig:
+    """actions: numbers in an action; rewards: values between which a reward is told apart, ascending; vectors: (name, width) of
+    the channels of numbers, all of which are predicted; size: (height, width) of the pictures, multiples of 16, None without;
+    sees_pictures, sees_vectors: which of them are evidence; latent: its width; history: last latents and actions that the
+    predictor sees; hidden: width of its layers; members: predictors of the ensemble."""
+
+    actions: int
+    rewards: tuple[float, ...] = (0.0, 1.0)
+    vectors: tuple[tuple[str, int], ...] = ()
+    size: tuple[int, int] | None = None
+    sees_pictures: bool = True
+    sees_vectors: bool = True
+    latent: int = 32
+    history: int = 3
+    hidden: int = 192
+    members: int = 3
+
+    @property
+    def width(self) -> int:
+        """Numbers of all vectors together."""
+        return sum(width for _, width in self.vectors)
+
+    @property
+    def seen(self) -> tuple[str, ...]:
+        """The vectors that are evidence: all but poses, which few know of themselves."""
+        return tuple(name for name, _ in self.vectors if kind_of(name) != "pose") if self.sees_vectors else ()
+
+    @property
+    def columns(self) -> list[int]:
+        """Of all numbers, those of the vectors that are evidence."""
+        names = [name for name, width in self.vectors for _ in range(width)]
+        return [column for column, name in enumerate(names) if name in self.seen]
+
+    @property
+    def pictured(self) -> bool:
+        """Whether pictures are evidence."""
+        return self.size is not None and self.sees_pictures
+
+
+class Outcomes(NamedTuple):
+    """Logits [B, len(rewards)] of the reward, and [B] of the episode's end."""
+
+    reward: torch.Tensor
+    done: torch.Tensor
+
+
+class Encoder(nn.Module):
+    """Picture and numbers to a latent; its projector ends in BatchNorm and one linear layer, as SIGReg asks for."""
+
+    def __init__(self, config: LatentConfig):
+        super().__init__()
+        hidden, width = config.hidden, 0
+        if config.pictured:
+            assert config.size is not None
+            cells = (config.size[0] // COARSE) * (config.size[1] // COARSE)
+            widths = (3, 16, 32, 64, 96)
+            layers = [part for a, b in zip(widths, widths[1:]) for part in (nn.Conv2d(a, b, 4, 2, 1), nn.SiLU())]
+            self.look = nn.Sequential(*layers, nn.Flatten(), nn.Linear(widths[-1] * cells, hidden), nn.SiLU())
+            width += hidden
+        if config.columns:
+            first = nn.Linear(len(config.columns) + 1, hidden)
+            self.sense = nn.Sequential(first, nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
+            width += hidden
+        self.project = nn.Sequential(
+            nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.SiLU(), nn.Linear(hidden, config.latent)
+        )
+
+    def forward(self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, there: torch.Tensor | None):
+        """rgb uint8 [N, 3, H, W]; numbers [N, S], scaled; there [N]: 0 where the numbers are unknown. Returns [N, D]."""
+        parts = []
+        if rgb is not None:
+            parts.append(self.look((rgb.float() / 127.5 - 1).contiguous(memory_format=torch.channels_last)))
+        if numbers is not None:
+            known = numbers.new_ones(len(numbers)) if there is None else there.float()
+            parts.append(self.sense(torch.cat([numbers * known[:, None], known[:, None]], 1)))
+        return self.project(torch.cat(parts, 1))
+
+
+class Ensemble(nn.Module):
+    """Residual perceptrons that share nothing but their input, all computed at once; `slowly` is the same, one by one."""
+
+    def __init__(self, members: int, into: int, hidden: int, out: int):
+        super().__init__()
+
+        def uniform(*shape: int, fan: int) -> nn.Parameter:
+            return nn.Parameter(torch.empty(*shape).uniform_(-1, 1) * fan**-0.5)
+
+        self.enter, self.entered = uniform(members, into, hidden, fan=into), uniform(members, 1, hidden, fan=into)
+        self.inner, self.bias = uniform(members, hidden, hidden, fan=hidden), uniform(members, 1, hidden, fan=hidden)
+        self.leave = nn.Parameter(0.1 * uniform(members, hidden, out, fan=hidden).data)  # begins near copy-last
+        self.left = nn.Parameter(torch.zeros(members, 1, out))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """x [B, into]. Returns [members, B, out]."""
+        members, into, hidden = self.enter.shape
+        flat = x @ self.enter.transpose(0, 1).reshape(into, members * hidden)
+        first = F.silu(_normed(flat.view(-1, members, hidden).transpose(0, 1) + self.entered))
+        second = first + F.silu(_normed(torch.baddbmm(self.bias, first, self.inner)))
+        return torch.baddbmm(self.left, second, self.leave)
+
+    def slowly(self, x: torch.Tensor) -> torch.Tensor:
+        """The same, one member after the other."""
+        found = []
+        for one in range(len(self.enter)):
+            first = F.silu(_normed(x @ self.enter[one] + self.entered[one]))
+            second = first + F.silu(_normed(first @ self.inner[one] + self.bias[one]))
+            found.append(second @ self.leave[one] + self.left[one])
+        return torch.stack(found)
+
+
+def _normed(x: torch.Tensor) -> torch.Tensor:
+    return F.layer_norm(x, x.shape[-1:])
+
+
+class Decoder(nn.Module):
+    """A latent as a picture, for people: it learns from latents, never they from it. What is left of its cost is at low
+    resolution (sub-pixel convolution, Shi et al. 2016)."""
+
+    def __init__(self, latent: int, size: tuple[int, int]):
+        super().__init__()
+        self.cells, widths = (size[0] // COARSE, size[1] // COARSE), (64, 32, 24, 12)
+        self.enter = nn.Linear(latent, widths[0] * self.cells[0] * self.cells[1])
+        self.layers = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, 1, 1) for a, b in zip(widths, widths[1:]))
+        self.output = nn.Conv2d(widths[-1], 12, 3, 1, 1)
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        """latent [N, D]. Returns [N, 3, H, W], about 0 to 1."""
+        x = F.silu(self.enter(latent)).view(len(latent), -1, *self.cells)
+        for layer in self.layers:
+            x = F.silu(F.pixel_shuffle(layer(x), 2))
+        return 0.5 + F.pixel_shuffle(self.output(x), 2)
+
+
+class LatentNetwork(nn.Module):
+    """All that is learned. A window [B, K, D] holds the last latents, the newest last."""
+
+    mean: torch.Tensor  # of each number of the vectors
+    scale: torch.Tensor  # its standard deviation
+    rewards: torch.Tensor
+    spread: torch.Tensor  # KNOTS summed variances of the ensemble, ascending from 0
+    error: torch.Tensor  # the error usual at each
+
+    kind = "joint-embedding"
+
+    def __init__(self, config: LatentConfig):
+        super().__init__()
+        self.config = config
+        latent, hidden, window = config.latent, config.hidden, config.history * config.latent
+        self.encoder = Encoder(config)
+        self.predictor = Ensemble(config.members, window + config.history * config.actions, hidden, latent)
+        self.heads = nn.ModuleDict(
+            {
+                "numbers": _perceptron(window, hidden, config.width) if config.width else nn.Identity(),
+                "outcome": _perceptron(window + config.actions + latent, hidden // 2, len(config.rewards) + 1),
+                "inverse": _perceptron(window + latent, hidden // 2, config.actions),
+            }
+        )
+        self.decoder = Decoder(latent, config.size) if config.size else nn.Identity()
+        self.register_buffer("mean", torch.zeros(config.width))
+        self.register_buffer("scale", torch.ones(config.width))
+        self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
+        self.register_buffer("spread", torch.linspace(0, 1, KNOTS))
+        self.register_buffer("error", torch.linspace(0, 1, KNOTS))
+
+    def scaled(self, numbers: torch.Tensor) -> torch.Tensor:
+        """Numbers [..., width] in standard deviations from their mean."""
+        return ((numbers - self.mean) / self.scale).clamp(-FARTHEST, FARTHEST)
+
+    def encode(
+        self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, there: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Evidence to latents [N, D]: rgb uint8 [N, 3, H, W] where the world sees pictures; numbers [N, width] as recorded, of
+        which it takes those that it sees; there [N]: whether they are known (they need not be, beside a picture)."""
+        seen = None
+        if self.config.columns:
+            if numbers is None:
+                assert rgb is not None
+                numbers, there = self.mean.expand(len(rgb), -1), torch.zeros(len(rgb), device=rgb.device)
+            seen = self.scaled(numbers)[:, self.config.columns]
+        return self.encoder(rgb if self.config.pictured else None, seen, there)
+
+    def predict(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """The next latent as each member has it [members, B, D], after actions [B, K, A], the newest last."""
+        found = window[:, -1] + self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
+        return found.clamp(-FARTHEST, FARTHEST)
+
+    def numbers(self, window: torch.Tensor) -> torch.Tensor:
+        """The vectors that are read off a window, scaled: [B, width]."""
+        return self.heads["numbers"](window.flatten(1))
+
+    def outcome(self, window: torch.Tensor, action: torch.Tensor, after: torch.Tensor) -> Outcomes:
+        """What a step from `window` by `action` [B, A] to the latent `after` [B, D] brings."""
+        found = self.heads["outcome"](torch.cat([window.flatten(1), action, after], 1))
+        return Outcomes(found[:, :-1], found[:, -1])
+
+    def paid(self, logits: torch.Tensor) -> torch.Tensor:
+        """The reward expected [B]."""
+        return (logits.softmax(1) * self.rewards).sum(1)
+
+    def inverse(self, window: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+        """The action [B, A] that led from `window` to the latent `after` [B, D]: logits, or axes from -1 to 1."""
+        return self.heads["inverse"](torch.cat([window.flatten(1), after], 1))
+
+    def decode(self, latent: torch.Tensor) -> torch.Tensor:
+        """Pictures uint8 [B, H, W, 3] of latents [B, D]."""
+        return (self.decoder(latent) * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
+
+    def expected(self, spread: torch.Tensor) -> torch.Tensor:
+        """The error [B] that is usual at this spread [B] of the ensemble, linear between the knots."""
+        at = torch.searchsorted(self.spread, spread.contiguous()).clamp(1, KNOTS - 1)
+        low, high = self.spread[at - 1], self.spread[at]
+        share = ((spread - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
+        return torch.lerp(self.error[at - 1], self.error[at], share)
+
+
+def _perceptron(into: int, hidden: int, out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(into, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
+    )
