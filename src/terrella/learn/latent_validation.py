@@ -80,7 +80,7 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
     unit = encoded(world, recording, _some(recording, PROBED)).std(0, correction=0).clamp_min(1e-6)
     latent, vectors, spread = {}, {}, {}
     began = {name: _vector(recording, name, rows) for name, _ in world.network.config.vectors}
-    first = encoded(world, recording, rows)
+    first, paid = encoded(world, recording, rows), _rewards(recording)
     for arm, hands in ((ARMS[0], rows), (ARMS[1], others)):
         state = _folded(world, recording, rows, context)
         for step in range(1, fitting[-1] + 1):
@@ -91,6 +91,9 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
             latent[arm, step] = _per_clip((state["window"][:, -1] - truth) / unit)
             latent[ARMS[2], step] = _per_clip((first - truth) / unit)
             spread.setdefault(step, state["spread"])
+            if paid is not None:
+                for given, reward in ((arm, state["reward"].cpu()), (ARMS[2], paid[rows - 1])):
+                    vectors["reward", given, step] = (reward - paid[rows + step - 1])[:, None]
             shown = world.render(state, tuple(began))
             for name in began:
                 really, scale = _vector(recording, name, rows + step), _scale(world, name)
@@ -209,6 +212,15 @@ def _vector(recording: Recording, name: str, rows: np.ndarray) -> torch.Tensor:
     cache = recording.cache
     array = cache.arrays[cache.keys.get(name, name)]
     return torch.from_numpy(np.array(array[rows], np.float32)).reshape(len(rows), -1).nan_to_num(0.0, 0.0, 0.0)
+
+
+def _rewards(recording: Recording) -> torch.Tensor | None:
+    """The reward [N] that followed each row, in standard deviations; None where it is always the same."""
+    if recording.cache.reward is None:
+        return None
+    reward = torch.from_numpy(np.array(recording.cache.reward, np.float32)).reshape(-1)
+    unit = reward[torch.from_numpy(np.flatnonzero(recording.usable))].std(correction=0)
+    return reward / unit if unit > 1e-6 else None
 
 
 def _scale(world: LatentWorld, name: str) -> torch.Tensor:

@@ -101,6 +101,8 @@ def _report(exam: Exam, found: Found) -> Report:
 def _missing(exam: Exam, world: World) -> str:
     if "uncertainty" not in world.spec.channels:
         return "needs uncertainty, a channel of the world"
+    if "picture" not in world.spec.units.get("uncertainty", "picture"):
+        return "needs an uncertainty of pictures"
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 

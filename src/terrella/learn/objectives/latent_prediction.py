@@ -62,7 +62,7 @@ def latent_clips(
 def sigreg(latents: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """How far projections of latents [N, D] on directions [D, P] of length 1 are from standard normal: the Epps-Pulley statistic
     (1983), N times the squared distance of the characteristic functions under a normal window; its mean over directions."""
-    knots = torch.linspace(0, REACH, KNOTS, device=latents.device)
+    knots = torch.linspace(0, REACH, KNOTS, dtype=latents.dtype, device=latents.device)
     normal = (-knots.square() / 2).exp()
     weights = torch.full_like(knots, 2 * REACH / (KNOTS - 1)) * normal  # both halves of a symmetric integral
     weights[[0, -1]] /= 2

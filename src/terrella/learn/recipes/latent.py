@@ -20,7 +20,7 @@ from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
 from ..feeds import Streamed
-from ..latent_validation import calibrate, encoded, foreseen, validate
+from ..latent_validation import ARMS, calibrate, encoded, foreseen, validate
 from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, settle_scale
 from ..objectives.outcome import levels
 from ..recording import Recording
@@ -284,4 +284,6 @@ class _Learned:
 
 
 def _with(about: About, found: dict[str, Any]) -> About:
-    return replace(about, card={**about.card, "validation": found})
+    usual = found["errors"]["latent"][ARMS[0]]
+    levels = {"sure": min(usual.values()), "invents": 0.5}  # what the page of play calls sure and invented
+    return replace(about, card={**about.card, "uncertainty": levels, "validation": found})

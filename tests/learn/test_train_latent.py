@@ -1,0 +1,183 @@
+"""train latent on toy recordings: it goes on exactly, does not collapse, and foretells better than its baselines."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from tests.learn.stopping import goes_on_exactly, quiet
+
+import terrella
+from terrella.core import check_world
+from terrella.core.errors import DatasetError, TrainingError
+from terrella.data import Recorder
+from terrella.learn.latent_validation import effective_rank, linear_probe
+from terrella.learn.objectives.latent_prediction import sigreg
+from terrella.learn.recipes.latent import LatentTraining, train_latent
+
+from ..data.layouts import layout_of
+
+QUICK = LatentTraining(steps=150, batch=32, latent=8, rollout=4, strip_every_s=1e9)
+LIMITS = {
+    "action_low": [-1.0],
+    "action_high": [1.0],
+    "action_space": "Box(-1, 1)",
+    "keys": {"KeyA": [-1.0]},
+    "dt_s": 0.1,
+}
+
+
+def drifting(folder, pictures=None, acted=True, vectors=True, episodes=6, length=60):
+    """A mass that a force pushes to and fro; a picture is a bar where it is. It ends at the right wall, which pays."""
+    rng = np.random.default_rng(0)
+    told = {"state": 2} if vectors else {}
+    layout = layout_of(10.0, ("force",), rgb=pictures, vectors=told, world={"name": "drift", **LIMITS})
+    layout = type(layout)(**{**vars(layout), "pictures": "png"})
+    with Recorder(folder, layout) as recorder:
+        for _ in range(episodes):
+            at, speed = rng.uniform(-0.8, 0.8), 0.0
+            force = 0.0
+            for row in range(length):
+                force = rng.uniform(-1, 1) if row % 4 == 0 else force
+                seen = {"state": np.array([at, speed], np.float32)} if vectors else {}
+                if pictures:
+                    seen["rgb"] = picture(at, *pictures)
+                last = row == length - 1
+                recorder.add(seen, None if last else np.array([force], np.float32), float(at > 0.5), False)
+                speed = float(np.clip(0.9 * speed + 0.1 * force, -1, 1))
+                at = float(np.clip(at + 0.5 * speed, -1, 1))
+            recorder.end_episode()
+    return folder
+
+
+def picture(at: float, height: int, width: int) -> np.ndarray:
+    seen = np.full((height, width, 3), 40, np.uint8)
+    middle = int((at + 1) / 2 * (width - 1))
+    seen[:, max(0, middle - 3) : middle + 4] = (220, 180, 60)
+    return seen
+
+
+@pytest.fixture(scope="module")
+def vectors(tmp_path_factory):
+    return drifting(tmp_path_factory.mktemp("latent") / "vectors")
+
+
+@pytest.fixture(scope="module")
+def run(vectors, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    facts = train_latent(vectors, out, QUICK, quiet)
+    return out, facts
+
+
+def test_it_foretells_and_does_not_collapse(run):
+    out, facts = run
+    assert facts == {**facts, **json.loads((out / "validation.json").read_text())}
+    for channel in ("latent", "state"):
+        errors = facts["errors"][channel]
+        for step in ("8", "16"):
+            assert errors["true actions"][step] < 0.8 * errors["copy-last"][step], (channel, step, errors)
+            assert errors["true actions"][step] < 0.8 * errors["another's actions"][step], (channel, step, errors)
+    assert facts["effective_rank"] > 2 and facts["probe_r2"]["state"] > 0.8
+
+
+def test_the_world_of_the_run_is_opened_by_name_and_keeps_the_contract(run):
+    world = terrella.load(run[0])
+    assert (
+        world.spec.keys == {"KeyA": [-1.0]} and world.spec.observes == ("state",) and "rgb" not in world.spec.channels
+    )
+    assert "gradients_reach_the_action" in check_world(world, steps=3)
+    assert world.spec.card["validation"] == json.loads((run[0] / "validation.json").read_text())
+
+
+def test_its_uncertainty_grows_with_what_was_not_seen(run):
+    world, rng = terrella.load(run[0]), terrella.make_rng(0)
+    state = world.observe({"state": torch.zeros(1, 2)}, None, rng)
+    levels = [0.0]
+    for _ in range(12):
+        state = world.imagine(state, torch.ones(1, 1), rng)
+        levels.append(float(world.render(state, ("uncertainty",))["uncertainty"]))
+    assert levels == sorted(levels) and levels[-1] > levels[1] >= 0
+
+
+def test_a_stopped_run_goes_on_exactly(vectors, tmp_path):
+    config = LatentTraining(steps=24, batch=8, latent=8, rollout=3, strip_every_s=1e9)
+    goes_on_exactly(
+        lambda out: train_latent(vectors, out, config, quiet), tmp_path / "a", tmp_path / "b", {"latent": 9}
+    )
+
+
+def test_a_finished_run_says_again_what_it_found(run, vectors):
+    assert train_latent(vectors, run[0], QUICK, quiet) == run[1]
+
+
+def test_pictures_of_an_odd_size_are_seen_and_decoded(tmp_path):
+    data = drifting(tmp_path / "data", pictures=(37, 90), episodes=4, length=30)
+    config = LatentTraining(steps=8, batch=4, latent=8, rollout=2, strip_every_s=1e9)
+    facts = train_latent(data, tmp_path / "run", config, quiet)
+    world, rng = terrella.load(tmp_path / "run"), terrella.make_rng(0)
+    assert world.spec.observes == ("rgb",) and world.spec.may_observe == ("state",)
+    assert world.render(world.start(2, rng), ("rgb",))["rgb"].shape == (2, 32, 64, 3)
+    assert "state" in facts["errors"] and list((tmp_path / "run").glob("strip-*.png"))
+    bare = LatentTraining(**{**vars(config), "vectors": False})
+    train_latent(data, tmp_path / "bare", bare, quiet)
+    spec = terrella.load(tmp_path / "bare").spec
+    assert spec.observes == ("rgb",) and spec.may_observe == () and "state" in spec.channels
+
+
+def test_what_cannot_be_learned_is_refused_in_a_sentence(vectors, tmp_path):
+    def refused(error, match, data=vectors, **settings):
+        with pytest.raises(error, match=match):
+            train_latent(data, tmp_path / "run", LatentTraining(**settings), quiet)
+
+    refused(TrainingError, "multiples of 16", size=(30, 40))
+    refused(TrainingError, "leaves nothing to see", pictures=False, vectors=False)
+    refused(TrainingError, "--batch", batch=1)
+    refused(DatasetError, "no pictures and no state vectors", vectors=False)
+    refused(DatasetError, "--rollout 64", rollout=64)
+    refused(DatasetError, "rows of a clip", history=16, data=drifting(tmp_path / "short", episodes=12, length=8))
+
+
+def test_a_recording_without_actions_is_refused(tmp_path):
+    layout = layout_of(10.0, ("force",), vectors={"state": 2})
+    kept = {name: sensor for name, sensor in layout.sensors.items() if name != "action"}
+    with Recorder(tmp_path / "data", type(layout)(**{**vars(layout), "sensors": kept})) as recorder:
+        for _ in range(80):
+            recorder.add({"state": np.zeros(2, np.float32)}, None, 0.0, False)
+        recorder.end_episode()
+    with pytest.raises(DatasetError, match="action"):
+        train_latent(tmp_path / "data", tmp_path / "run", QUICK, quiet)
+
+
+def test_sigreg_knows_a_normal_from_a_collapse():
+    rng = terrella.make_rng(0)
+    normal = torch.randn(512, 8, generator=rng)
+    directions = torch.nn.functional.normalize(torch.randn(8, 64, generator=rng), dim=0)
+    flat = normal * torch.tensor([1.0] * 4 + [0.01] * 4)
+    found = [float(sigreg(part, directions)) for part in (normal, flat, 0.01 * normal)]
+    assert found[0] < 1.5 and found[0] < found[1] / 3 and found[1] < found[2]
+
+
+def test_sigreg_is_the_integral_that_it_stands_for():
+    """Against a fine grid over both halves, direction by direction."""
+    rng = terrella.make_rng(1)
+    latents = torch.rand(40, 3, generator=rng, dtype=torch.float64)
+    directions = torch.eye(3, dtype=torch.float64)
+    grid = torch.linspace(-3, 3, 2001, dtype=torch.float64)
+    slow = []
+    for axis in range(3):
+        seen = torch.exp(1j * latents[:, axis, None] * grid).mean(0)
+        away = (seen - (-grid.square() / 2).exp()).abs().square() * (-grid.square() / 2).exp()
+        slow.append(40 * float(torch.trapezoid(away, grid)))
+    assert float(sigreg(latents, directions)) == pytest.approx(np.mean(slow), rel=0.01)
+
+
+def test_figures_of_latents_whose_answers_are_known():
+    rng = terrella.make_rng(0)
+    latents = torch.randn(2000, 6, generator=rng)
+    assert effective_rank(latents) > 5.9 and effective_rank(latents[:, :2] @ torch.randn(2, 6, generator=rng)) < 2.01
+    told = latents @ torch.randn(6, 2, generator=rng)
+    assert linear_probe(latents[:1000], told[:1000], latents[1000:], told[1000:]) > 0.99
+    noise = torch.randn(2000, 2, generator=rng)
+    assert linear_probe(latents[:1000], noise[:1000], latents[1000:], noise[1000:]) < 0.1
