@@ -31,15 +31,31 @@ def fetched(frames: torch.Tensor, source: torch.Tensor, moves: torch.Tensor) -> 
     return flat.gather(2, place[:, None].expand(-1, 3, -1)).unflatten(2, (height, width))
 
 
+def half_a_pixel(frame: torch.Tensor) -> torch.Tensor:
+    """The least and the largest colours that each pixel of uint8 [B, 3, H, W] takes when the picture is displaced by up to half a
+    pixel: uint8 [B, 2, 3, H, W]. Pictures scroll by parts of pixels, and sources are displaced by whole ones."""
+    both = []
+    for least in (torch.minimum, torch.maximum):
+        bound = frame.to(torch.int16) * 16
+        for dim in (2, 3):
+            length = bound.shape[dim]
+            before = bound.index_select(dim, torch.arange(-1, length - 1, device=frame.device).clamp_min(0))
+            after = bound.index_select(dim, torch.arange(1, length + 1, device=frame.device).clamp_max(length - 1))
+            bound = least(bound, (bound + least(before, after)) // 2)
+        both.append(bound // 16)
+    return torch.stack(both, 1).to(torch.uint8)
+
+
 def explained(frames: torch.Tensor, truth: torch.Tensor, moves: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """How well each source (see `fetched`) explains each pixel of the next frames `truth` (uint8 [B, 3, H, W]): 0..1 [B, sources,
-    H, W], the pixel's own difference and that of 5 x 5 around it counting; and the largest difference [B, H, W], of 255, of
-    what stays."""
+    H, W], the pixel's own difference and that of 5 x 5 around it counting, up to half a pixel of what is displaced; and the
+    largest difference [B, H, W], of 255, of what stays."""
     if frames.device.type != "cpu":
         return explained_slowly(frames, truth, moves)
     share = torch.empty(len(frames), len(moves) + frames.shape[1] - 1, *truth.shape[-2:])
     stays = torch.empty(len(frames), *truth.shape[-2:])
-    each_view(explained_kernel, arrays(frames, truth, share, stays), *arrays(moves), (SHARP, NEAR, NEVER))
+    views = arrays(frames, half_a_pixel(frames[:, 0]), truth, share, stays)
+    each_view(explained_kernel, views, *arrays(moves), (SHARP, NEAR, NEVER))
     return share, stays
 
 
@@ -50,7 +66,12 @@ def explained_slowly(
     size = truth.shape[-2:]
     sources = torch.arange(len(moves) + frames.shape[1] - 1, device=truth.device)
     each = sources[:, None, None, None].expand(-1, len(truth), *size)
-    error = torch.stack([(fetched(frames, one, moves).int() - truth.int()).abs() for one in each], 1).float()
+    error = [(fetched(frames, one, moves).int() - truth.int()).abs() for one in each]
+    bounds = half_a_pixel(frames[:, 0]).transpose(0, 1)[:, :, None]
+    for number in range(1, len(moves)):
+        least, most = (fetched(bound, each[number], moves).int() for bound in bounds)
+        error[number] = torch.maximum(least - truth.int(), truth.int() - most).clamp_min(0)
+    error = torch.stack(error, 1).float()
     own, near = error.amax(2), F.avg_pool2d(error.mean(2), 5, 1, 2, count_include_pad=False)
     worse = near - near.amin(1, keepdim=True)
     share = torch.exp(-worse / NEAR - (own - 4).clamp_min(0) / SHARP) * (own <= NEVER) * (worse <= 8 * NEAR)

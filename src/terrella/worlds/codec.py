@@ -110,6 +110,7 @@ class Codec(nn.Module):
             HIDDEN, self.sources + 3, 1
         )  # its last two: goes as most of the picture does, and as before
         self.colour = nn.Sequential(nn.Linear(HIDDEN + 6, 64), nn.SiLU(), nn.Linear(64, config.colours))
+        self.common = nn.Parameter(torch.tensor(0.5))  # how much likelier colours are that the picture has already
         nn.init.zeros_(self.choice.weight)
         bias = torch.full((self.sources + 3,), -1.0)
         bias[0], bias[-2], bias[-1] = 3.0, 6.0, 2.0  # at first everything goes as most of the picture does
@@ -172,7 +173,16 @@ class Codec(nn.Module):
         """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1).float() / 127.5 - 1
         known = torch.cat([features, near], 1).permute(0, 2, 3, 1)
-        return self.colour(known.flatten(0, 2) if where is None else known[where])
+        where = torch.ones_like(known[..., 0], dtype=torch.bool) if where is None else where
+        often = self._often(seen.sources[:, 0])
+        return self.colour(known[where]) + self.common * often[where.nonzero()[:, 0]]
+
+    def _often(self, frame: torch.Tensor) -> torch.Tensor:
+        """How often each colour of the palette is the nearest of a pixel of uint8 [B, 3, H, W]: log [B, colours]."""
+        every = frame[..., ::2, ::2].flatten(2).transpose(1, 2).float()
+        nearest = torch.cdist(every, self.palette.float()).argmin(2)
+        counts = torch.zeros(len(frame), len(self.palette), device=frame.device)
+        return (counts.scatter_add_(1, nearest, torch.ones_like(every[..., 0])) / every.shape[1] + 1e-3).log()
 
     def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""

@@ -22,31 +22,32 @@ def around(plane, rows, mean):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def differences(frame, truth, x, y, most, mean):
-    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those of `frame` x, y away."""
+def differences(low, high, truth, x, y, most, mean):
+    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those x, y away, from `low` to `high`
+    uint8 [3, H, W]."""
     _, height, width = truth.shape
     first, stop = min(max(0, x), width), max(min(width, width + x), 0)
     for v in range(height):
         j = min(max(v - y, 0), height - 1)
         most[v], mean[v] = 0, 0
         for c in range(3):
-            there, here = frame[c, j], truth[c, v]
+            least, largest, here = low[c, j], high[c, j], truth[c, v]
             for u in range(first):
-                off = np.float32(abs(np.int32(there[0]) - np.int32(here[u])))
+                off = np.float32(max(np.int32(least[0]) - here[u], np.int32(here[u]) - largest[0], 0))
                 most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
             for u in range(first, stop):
-                off = np.float32(abs(np.int32(there[u - x]) - np.int32(here[u])))
+                off = np.float32(max(np.int32(least[u - x]) - here[u], np.int32(here[u]) - largest[u - x], 0))
                 most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
             for u in range(stop, width):
-                off = np.float32(abs(np.int32(there[width - 1]) - np.int32(here[u])))
+                off = np.float32(max(np.int32(least[width - 1]) - here[u], np.int32(here[u]) - largest[width - 1], 0))
                 most[v, u], mean[v, u] = max(most[v, u], off), mean[v, u] + off
         mean[v] *= np.float32(1 / 3)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def explained(frames, truth, share, stays, moves, scales):
-    """The kernel of matching.explained_slowly: frames uint8 [slots, 3, H, W], truth uint8 [3, H, W], moves [M, 2]; fills share
-    [sources, H, W] and stays [H, W]."""
+def explained(frames, bounds, truth, share, stays, moves, scales):
+    """The kernel of matching.explained_slowly: frames uint8 [slots, 3, H, W], bounds uint8 [2, 3, H, W] of the first of them, truth
+    uint8 [3, H, W], moves [M, 2]; fills share [sources, H, W] and stays [H, W]."""
     sources, height, width = share.shape
     sharp, near, never = np.float32(scales[0]), np.float32(scales[1]), np.float32(scales[2])
     differs, rows = np.empty((height, width), np.float32), np.empty((height, width + 4), np.float32)
@@ -55,7 +56,10 @@ def explained(frames, truth, share, stays, moves, scales):
     for k in range(sources):
         slot = max(0, k - len(moves) + 1)
         x, y = (moves[k, 0], moves[k, 1]) if slot == 0 else (0, 0)
-        differences(frames[slot], truth, x, y, share[k], differs)
+        if 0 < k < len(moves):
+            differences(bounds[0], bounds[1], truth, x, y, share[k], differs)
+        else:
+            differences(frames[slot], frames[slot], truth, x, y, share[k], differs)
         around(differs, rows, mean[k])
         for v in range(height):
             for u in range(width):
