@@ -30,6 +30,7 @@ ENDLESS = 10**9  # steps: training ends with its time
 EPISODES = 12  # or more are recorded, if need be shorter ones: some are kept out of training, to score it
 SIZES, FEWEST = (50, 24, 12, 6, 3), 6  # numbers of clips, the most for which there is time; fewer are too few
 SAVE_EVERY_S = 30.0
+SMALL, SOON_MIN = 64 * 96, 60  # pixels of a picture at most, where there are fewer minutes than these: else it learns too little
 FEW_STEPS = 600  # after which a world has learned next to nothing
 
 
@@ -94,7 +95,7 @@ _DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for
 
 
 def _record(plan: Plan, name: str, controls: Controls, environment: Environment, report: Report) -> dict[str, object]:
-    world = controls.of(_open(name, environment))
+    world = controls.of(_open(name, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
     for line in described(world.spec):
         say(line)
     out, frames = plan.folder / RECORDING, plan.asked["frames"]
@@ -106,8 +107,8 @@ def _record(plan: Plan, name: str, controls: Controls, environment: Environment,
     return looked_at(Dataset(out), world.spec.name)
 
 
-def _open(name: str, environment: Environment) -> World:
-    """The environment, with pictures of the size at which they are learned, if that is smaller."""
+def _open(name: str, environment: Environment, most: int) -> World:
+    """The environment, with pictures of the size at which they are learned, of `most` pixels, if that is smaller."""
     world = environment.open(name)
     drawn = world.spec.channels.get("rgb")
     if drawn is None:
@@ -116,11 +117,11 @@ def _open(name: str, environment: Environment) -> World:
             "or its observation is a picture."
         )
     height, width = (drawn.shape or (0, 0))[:2]
-    if environment.size or not name.startswith("gym:") or height * width <= MOST:
+    if environment.size or not name.startswith("gym:") or height * width <= most:
         return world
     if callable(close := getattr(world, "close", None)):
         close()
-    return replace(environment, size=learned_size(height, width)).open(name)
+    return replace(environment, size=learned_size(height, width, most)).open(name)
 
 
 def _longest(world: World, frames: int, seconds: float) -> int:

@@ -197,9 +197,9 @@ def fitting(dataset: Dataset) -> tuple[int, int]:
     return (96, 128) if dataset.rgb_key is None else learned_size(*dataset.sensors[dataset.rgb_key].shape[:2])
 
 
-def learned_size(height: int, width: int) -> tuple[int, int]:
+def learned_size(height: int, width: int, most: int = MOST) -> tuple[int, int]:
     """The size at which pictures of so many pixels are learned, see `fitting`."""
-    scale = min(1.0, math.sqrt(MOST / (height * width)))
+    scale = min(1.0, math.sqrt(most / (height * width)))
     return max(16, 8 * round(scale * height / 8)), max(16, 8 * round(scale * width / 8))
 
 

@@ -21,6 +21,7 @@ from .generator import Block, Conditioning, down_and_up, encode_depth
 COARSE = 4  # the trunk sees squares of so many pixels; what is chosen is chosen for each pixel
 PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
 HIDDEN = 32  # of each pixel, of which its choice is made
+AROUND = 8  # pixels of a side of the squares, near which colours are counted
 UNKNOWN = -1e4  # the logit of what is not there
 
 
@@ -110,7 +111,7 @@ class Codec(nn.Module):
             HIDDEN, self.sources + 3, 1
         )  # its last two: goes as most of the picture does, and as before
         self.colour = nn.Sequential(nn.Linear(HIDDEN + 6, 64), nn.SiLU(), nn.Linear(64, config.colours))
-        self.common = nn.Parameter(torch.tensor(0.5))  # how much likelier colours are that the picture has already
+        self.common = nn.Parameter(torch.tensor([0.3, 0.3]))  # how much likelier are colours that are in the picture, and near
         nn.init.zeros_(self.choice.weight)
         bias = torch.full((self.sources + 3,), -1.0)
         bias[0], bias[-2], bias[-1] = 3.0, 6.0, 2.0  # at first everything goes as most of the picture does
@@ -174,15 +175,19 @@ class Codec(nn.Module):
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1).float() / 127.5 - 1
         known = torch.cat([features, near], 1).permute(0, 2, 3, 1)
         where = torch.ones_like(known[..., 0], dtype=torch.bool) if where is None else where
-        often = self._often(seen.sources[:, 0])
-        return self.colour(known[where]) + self.common * often[where.nonzero()[:, 0]]
+        batch, v, u = where.nonzero(as_tuple=True)
+        around = self._around(seen.scrolled)
+        whole, local = around.mean((2, 3))[batch], around.permute(0, 2, 3, 1)[batch, v // AROUND, u // AROUND]
+        often = (torch.stack([whole, local], -1) + 1e-3).log()
+        return self.colour(known[where]) + often @ self.common
 
-    def _often(self, frame: torch.Tensor) -> torch.Tensor:
-        """How often each colour of the palette is the nearest of a pixel of uint8 [B, 3, H, W]: log [B, colours]."""
-        every = frame[..., ::2, ::2].flatten(2).transpose(1, 2).float()
-        nearest = torch.cdist(every, self.palette.float()).argmin(2)
-        counts = torch.zeros(len(frame), len(self.palette), device=frame.device)
-        return (counts.scatter_add_(1, nearest, torch.ones_like(every[..., 0])) / every.shape[1] + 1e-3).log()
+    def _around(self, frame: torch.Tensor) -> torch.Tensor:
+        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B,
+        colours, H / AROUND, W / AROUND]."""
+        every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
+        nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
+        each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])
+        return F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False)
 
     def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
