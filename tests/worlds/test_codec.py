@@ -11,7 +11,7 @@ from terrella.core import check_world, make_rng
 from terrella.data import Layout
 from terrella.space.matching import SAME, fetched
 from terrella.space.mosaic import blank, remembered
-from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen
+from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen, shared_chance
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.folder import load_world, save_world
@@ -126,6 +126,30 @@ def test_what_is_likelier_painted_has_a_colour_of_the_palette():
     assert ((colours[:, None].int() - made.palette.int()).abs().amax(-1) <= SAME).any(1).all()
     there = fetched(seen.sources, torch.ones(2, *SIZE, dtype=torch.int64), made.moves)
     assert like(drawn[0, :, 4:], there[0, :, 4:]) and like(drawn[1], there[1])
+
+
+def test_colours_that_are_in_the_picture_and_near_are_the_likelier_ones():
+    made = codec()
+    for weight in made.colour[-1].parameters():
+        torch.nn.init.zeros_(weight)
+    frame = made.palette[3][:, None, None].expand(3, *SIZE).clone()
+    frame[:, :, :12] = made.palette[1][:, None, None]
+    seen = shown(made)._replace(scrolled=frame[None])
+    best = made.colours(seen, torch.zeros(1, HIDDEN, *SIZE)).argmax(1).unflatten(0, SIZE)
+    assert (best[:, :8] == 1).all() and (best[:, 16:] == 3).all()
+    made.common.data.zero_()
+    assert made.colours(seen, torch.zeros(1, HIDDEN, *SIZE)).std(1).max() == 0
+
+
+def test_pixels_in_doubt_go_one_way_together():
+    noise = torch.randn(2, 4, *SIZE, generator=make_rng(0))
+    doubt = torch.zeros(2, 6, *SIZE)
+    picks = (doubt + shared_chance(noise, doubt)).argmax(1)
+    assert (picks == picks[:, :1, :1]).all() and picks[0, 0, 0] != picks[1, 0, 0]
+    many = torch.randn(4000, 4, 2, 2, generator=make_rng(1))
+    odds = torch.tensor([0.6, 0.3, 0.1]).log()[None, :, None, None].expand(4000, -1, 2, 2)
+    counts = torch.bincount((odds + shared_chance(many, odds)).argmax(1)[:, 0, 0], minlength=3) / 4000
+    assert torch.allclose(counts, torch.tensor([0.6, 0.3, 0.1]), atol=0.03)
 
 
 def test_the_stress_on_what_changes_is_taken_back():

@@ -21,6 +21,7 @@ from .generator import Block, Conditioning, down_and_up, encode_depth
 COARSE = 4  # the trunk sees squares of so many pixels; what is chosen is chosen for each pixel
 PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
 HIDDEN = 32  # of each pixel, of which its choice is made
+CHANCE = 0.5  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
 AROUND = 8  # pixels of a side of the squares, near which colours are counted
 UNKNOWN = -1e4  # the logit of what is not there
 
@@ -124,12 +125,13 @@ class Codec(nn.Module):
         return self.config.moves + self.config.slots + 1
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
-        """The next frame [B, 4, H, W] in the generator's code, the likeliest one; noise and time say nothing to it."""
+        """The next frame [B, 4, H, W] in the generator's code, by the chance that is in `noisy`; the time says nothing to it."""
         frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
         context, mosaic = conditioning.context, conditioning.mosaic
         assert mosaic is not None
         seen = self.seen(frames, mosaic, self.scroll(frames, context))
-        drawn = self.drawn(seen, *self.choices(seen, context)).float() / 127.5 - 1
+        choices, features = self.choices(seen, context)
+        drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def scroll(self, frames: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
@@ -174,20 +176,22 @@ class Codec(nn.Module):
         """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1).float() / 127.5 - 1
         known = torch.cat([features, near], 1).permute(0, 2, 3, 1)
-        where = torch.ones_like(known[..., 0], dtype=torch.bool) if where is None else where
-        batch, v, u = where.nonzero(as_tuple=True)
         around = self._around(seen.scrolled)
-        whole, local = around.mean((2, 3))[batch], around.permute(0, 2, 3, 1)[batch, v // AROUND, u // AROUND]
-        often = (torch.stack([whole, local], -1) + 1e-3).log()
-        return self.colour(known[where]) + often @ self.common
+        shares = torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
+        often = (shares + 1e-3).log() @ self.common
+        if where is None:
+            often = often.repeat_interleave(AROUND, 1).repeat_interleave(AROUND, 2)
+            return (self.colour(known) + often).flatten(0, 2)
+        batch, v, u = where.nonzero(as_tuple=True)
+        return self.colour(known[batch, v, u]) + often[batch, v // AROUND, u // AROUND]
 
     def _around(self, frame: torch.Tensor) -> torch.Tensor:
-        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B,
-        colours, H / AROUND, W / AROUND]."""
+        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B, H /
+        AROUND, W / AROUND, colours]."""
         every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
         nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
         each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])
-        return F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False)
+        return F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1)
 
     def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
@@ -207,6 +211,13 @@ class Codec(nn.Module):
         y = (torch.arange(height, device=went.device) - self.moves[:, 1:]).clamp(0, height - 1)
         place = (y[:, :, None] * width + x[:, None]).flatten(1)
         return went.flatten(2).gather(2, place.expand(len(went), -1, -1)).unflatten(2, (height, width))
+
+
+def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:
+    """Gumbel noise [B, K, 1, 1] for choices [B, K, H, W], of normal `noise`: the same for all pixels of a picture, so that those
+    which are in doubt go one way together, and a thing stays whole (a maximal coupling of their choices)."""
+    uniform = torch.special.ndtr(noise.flatten(1)[:, : choices.shape[1]]).clamp(1e-6, 1 - 1e-6)
+    return -(-uniform.log()).log()[:, :, None, None]
 
 
 def likeliest(logits: torch.Tensor) -> torch.Tensor:
