@@ -13,7 +13,7 @@ from terrella.learn.objectives import scroll as stage
 from terrella.learn.objectives.scroll import Scrolling, learn_scroll
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run
-from terrella.worlds.codec import CodecConfig, Scroll, likeliest
+from terrella.worlds.codec import CodecConfig, Scroll, least_off
 
 SIZE, SLOTS = (32, 40), 3
 MOVES = torch.tensor([[0, 0], [2, 0], [-2, 0]])
@@ -49,7 +49,7 @@ def test_what_a_button_does_to_the_picture_is_learned(tmp_path, monkeypatch):
     piece = objective.piece(objective.rows[::7])
     went = piece.found[:, : SLOTS - 1].flip(1)
     with torch.no_grad():
-        guess = likeliest(made(made.glanced(piece.frames[:, 0]), piece.context[:, 0], went))
+        guess = least_off(made(made.glanced(piece.frames[:, 0]), piece.context[:, 0], went), MOVES)
     right = guess == piece.found[:, SLOTS - 1].argmax(1)
     assert right.float().mean() > 0.85, "going on as before would be right in two of three"
 
@@ -70,4 +70,10 @@ def test_a_game_that_never_scrolls_is_not_learned_from(tmp_path):
     assert all(torch.equal(weight, before[name]) for name, weight in made.state_dict().items())
     frames = torch.randint(0, 256, (2, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
     went = torch.rand(2, SLOTS - 1, len(MOVES), generator=make_rng(1))
-    assert not likeliest(made(made.glanced(frames), torch.zeros(2, 36 + 2 * SLOTS), went)).any()
+    assert not least_off(made(made.glanced(frames), torch.zeros(2, 36 + 2 * SLOTS), went), MOVES).any()
+
+
+def test_in_doubt_the_picture_goes_the_middle_way():
+    moves = torch.tensor([[0, 0], [4, 0], [2, 0], [-3, 0]])
+    odds = torch.tensor([[0.1, 0.4, 0.45, 0.05], [0.35, 0.45, 0.1, 0.1], [0.7, 0.3, 0.0, 0.0]])
+    assert least_off(odds.log(), moves).tolist() == [2, 2, 0]

@@ -48,7 +48,9 @@ def test_kernels_are_as_their_slow_twins():
 def test_what_scrolls_by_part_of_a_pixel_is_explained():
     fine = torch.rand(1, 3, 12, 24, generator=make_rng(0))
     fine = F.interpolate(fine, scale_factor=(8, 12), mode="bicubic")  # four times as fine as the pictures, and smooth
-    views = [F.avg_pool2d(255 * fine[..., x : x + 96].clamp(0, 1), 4).to(torch.uint8) for x in (20, 17)]  # 3/4 of a pixel
+    views = [
+        F.avg_pool2d(255 * fine[..., x : x + 96].clamp(0, 1), 4).to(torch.uint8) for x in (20, 17)
+    ]  # 3/4 of a pixel
     share, _ = explained(views[0][:, None], views[1], torch.tensor([[0, 0], [1, 0], [3, 0]]))
     nothing, exact, far = share[..., 1:-1, 4:-4].mean((0, 2, 3))
     assert exact > 0.95 and far < 0.6 and nothing < 0.8

@@ -30,7 +30,8 @@ ENDLESS = 10**9  # steps: training ends with its time
 EPISODES = 12  # or more are recorded, if need be shorter ones: some are kept out of training, to score it
 SIZES, FEWEST = (50, 24, 12, 6, 3), 6  # numbers of clips, the most for which there is time; fewer are too few
 SAVE_EVERY_S = 30.0
-SMALL, SOON_MIN = 64 * 96, 60  # pixels of a picture at most, where there are fewer minutes than these: else it learns too little
+SMALL = 64 * 96  # pixels of a picture at most, if there are fewer minutes than SOON_MIN: of more it learns too little
+SOON_MIN = 60
 FEW_STEPS = 600  # after which a world has learned next to nothing
 
 

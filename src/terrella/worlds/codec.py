@@ -112,7 +112,9 @@ class Codec(nn.Module):
             HIDDEN, self.sources + 3, 1
         )  # its last two: goes as most of the picture does, and as before
         self.colour = nn.Sequential(nn.Linear(HIDDEN + 6, 64), nn.SiLU(), nn.Linear(64, config.colours))
-        self.common = nn.Parameter(torch.tensor([0.3, 0.3]))  # how much likelier are colours that are in the picture, and near
+        self.common = nn.Parameter(
+            torch.tensor([0.3, 0.3])
+        )  # how much likelier are colours that are in the picture, and near
         nn.init.zeros_(self.choice.weight)
         bias = torch.full((self.sources + 3,), -1.0)
         bias[0], bias[-2], bias[-1] = 3.0, 6.0, 2.0  # at first everything goes as most of the picture does
@@ -137,7 +139,8 @@ class Codec(nn.Module):
     def scroll(self, frames: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
         """By which of the moves most of the picture goes on: int64 [B]. frames: uint8 [B, slots, 3, H, W], the newest first."""
         went = [explains(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
-        return likeliest(self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1)))
+        logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
+        return least_off(logits, self.moves)
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, move: torch.Tensor) -> Seen:
         """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]."""
@@ -220,8 +223,8 @@ def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:
     return -(-uniform.log()).log()[:, :, None, None]
 
 
-def likeliest(logits: torch.Tensor) -> torch.Tensor:
-    """Of choices [B, K, ...] the first, to stay, where it is likelier than all others together; else the likeliest of those."""
-    if logits.shape[1] == 1:  # nothing ever moves
-        return torch.zeros_like(logits[:, 0], dtype=torch.int64)
-    return torch.where(logits.softmax(1)[:, 0] > 0.5, 0, 1 + logits[:, 1:].argmax(1))
+def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
+    """Of `moves` [K, 2] of these logits [B, K] the one that is expected to be the fewest pixels off: int64 [B]. Where much is
+    likely that is a middle one, and a picture that is off stays off."""
+    off = (moves[:, None] - moves).abs().sum(2).float()
+    return (logits.softmax(1) @ off).argmin(1)

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ...space.matching import clearest, explains
-from ...worlds.codec import Scroll, likeliest
+from ...worlds.codec import Scroll, least_off
 from ...worlds.generator import context_thumbnail
 from ..feeds import Drawn
 from ..recording import Recording
@@ -43,7 +43,7 @@ class Scrolling:
     """The likelihood of any displacement that explains the next picture about as well as the best does."""
 
     def __init__(self, scroll: Scroll, recording: Recording, moves: torch.Tensor, slots: int):
-        self.scroll, self.recording, self.slots = scroll, recording, slots
+        self.scroll, self.recording, self.moves, self.slots = scroll, recording, moves, slots
         rows = np.arange(1, recording.cache.length)
         parts = [rows[first : first + _ROWS] for first in range(0, len(rows), _ROWS)]
         found = [explains(recording.rgb(part - 1), recording.rgb(part), moves) for part in parts]
@@ -82,7 +82,7 @@ class Scrolling:
             near = (wanted - wanted.amax(1, keepdim=True)) / ALIKE
             known = (wanted.amax(1) > 0.2).float()
             losses.append(-((logits.log_softmax(1) + near).logsumexp(1) * known).sum() / known.sum().clamp_min(1))
-            guess = likeliest(logits.detach())
+            guess = least_off(logits.detach(), self.moves)
             right.append((wanted.gather(1, guess[:, None]) > wanted.amax(1, keepdim=True) - ALIKE).float().mean())
             went.insert(0, torch.where(dreamt, F.one_hot(guess, wanted.shape[1]).float(), wanted))
         loss = torch.stack(losses).mean()
