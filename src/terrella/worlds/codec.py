@@ -189,8 +189,8 @@ class Codec(nn.Module):
         return self.colour(known[batch, v, u]) + often[batch, v // AROUND, u // AROUND]
 
     def _around(self, frame: torch.Tensor) -> torch.Tensor:
-        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B, H /
-        AROUND, W / AROUND, colours]."""
+        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B,
+        H / AROUND, W / AROUND, colours]."""
         every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
         nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
         each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])

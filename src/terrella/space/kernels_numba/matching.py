@@ -23,8 +23,8 @@ def around(plane, rows, mean):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def differences(low, high, truth, x, y, most, mean):
-    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those x, y away, from `low` to `high`
-    uint8 [3, H, W]."""
+    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those x, y away, from `low` to
+    `high` uint8 [3, H, W]."""
     _, height, width = truth.shape
     first, stop = min(max(0, x), width), max(min(width, width + x), 0)
     for v in range(height):
