@@ -14,7 +14,7 @@ SIZE = (32, 40)
 
 def scrolling(x: int, y: int, count: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
     """Pictures of noise, and the same x pixels further to the right and y down, with a status line that stands still."""
-    wide = torch.randint(0, 256, (count, 3, 64, 80), dtype=torch.uint8, generator=make_rng(x + 31 * y))
+    wide = torch.randint(0, 256, (count, 3, 64, 96), dtype=torch.uint8, generator=make_rng(x + 31 * y))
     before, after = wide[..., 16:48, 20:60].clone(), wide[..., 16 - y : 48 - y, 20 - x : 60 - x].clone()
     after[..., :8, :] = before[..., :8, :]
     return before, after
@@ -25,6 +25,9 @@ def test_the_moves_of_most_blocks_are_found():
     before, after = (torch.cat(part) for part in zip(*pairs))
     found = frequent_moves(before, after, 2)
     assert found.tolist() == [[3, 0], [-2, 5]]
+    assert frequent_moves(*(torch.cat([part, part]) for part in scrolling(-18, 4)), 1).tolist() == [[-18, 4]], (
+        "far ones too"
+    )
     assert not len(frequent_moves(before, before, 2)), "nothing moves where nothing changes"
 
 

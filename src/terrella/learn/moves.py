@@ -15,7 +15,7 @@ from ..data.storage.durable import write_json
 from ..space.matching import scrolled
 from ..space.mosaic import blank, remembered
 
-REACH = 12  # pixels that a block may move in a step
+REACH, NEAR = 24, 5  # pixels that a block may move in a step; up to NEAR, all moves are tried at the full size
 BLOCK = 8  # pixels
 DIFFERENT = 4.0  # mean difference (of 255) of blocks above which a block has changed
 AWAY = 0.05  # by which each pixel of a move must improve the match
@@ -52,22 +52,36 @@ class Looks:
 
 def frequent_moves(before: torch.Tensor, after: torch.Tensor, most: int) -> torch.Tensor:
     """The `most` displacements that explain most blocks which change from `before` to `after` (uint8 [N, 3, H, W]), the
-    commonest first: int64 [n, 2] = x, y in pixels. Found by block matching, as video codecs do."""
+    commonest first: int64 [n, 2] = x, y in pixels. Found by block matching, as video codecs do, far ones at half the size first."""
     one, other = before.float(), after.float()
-    still = _block_errors(one, other)
+    halves = F.avg_pool2d(one, 2), F.avg_pool2d(other, 2)
+    far = _commonest(*halves, _within(REACH // 2), most, BLOCK // 2)
+    tried = {(2 * x + i, 2 * y + j) for x, y in far for i, j in _within(1)} | set(_within(NEAR))
+    tried = sorted(move for move in tried if max(map(abs, move)) <= REACH)
+    moves = _commonest(one, other, tried, most, BLOCK)
+    return torch.tensor(moves, dtype=torch.int64).view(-1, 2)
+
+
+def _within(reach: int) -> list[tuple[int, int]]:
+    """All moves of up to so many pixels each way."""
+    return [(x, y) for y in range(-reach, reach + 1) for x in range(-reach, reach + 1)]
+
+
+def _commonest(
+    one: torch.Tensor, other: torch.Tensor, tried: list[tuple[int, int]], most: int, block: int
+) -> list[tuple[int, int]]:
+    """Of the moves `tried` those that explain most blocks which change."""
+    moves = [(0, 0), *(move for move in tried if move != (0, 0))]
+    still = _block_errors(one, other, block)
     best, found = still.clone(), torch.zeros_like(still, dtype=torch.int64)
-    reach = range(-REACH, REACH + 1)
-    moves = [(0, 0), *((x, y) for y in reach for x in reach if (x, y) != (0, 0))]
     for number, (x, y) in enumerate(moves[1:], 1):
-        error = _block_errors(_shifted(one, x, y), other) + AWAY * (abs(x) + abs(y))
+        error = _block_errors(_shifted(one, x, y), other, block) + AWAY * (abs(x) + abs(y))
         better = error < best
         best, found = torch.where(better, error, best), torch.where(better, number, found)
     good = (still > DIFFERENT) & (best < 0.5 * still)
     counts = torch.bincount(found[good], minlength=len(moves))
-    commonest = [
-        number for number in counts.argsort(descending=True, stable=True)[:most].tolist() if counts[number] > 1
-    ]
-    return torch.tensor([moves[number] for number in commonest], dtype=torch.int64).view(-1, 2)
+    order = counts.argsort(descending=True, stable=True)[:most].tolist()
+    return [moves[number] for number in order if counts[number] > 1]
 
 
 def palette(frames: torch.Tensor, colours: int, rng: np.random.Generator) -> torch.Tensor:
@@ -103,5 +117,5 @@ def _shifted(pictures: torch.Tensor, x: int, y: int) -> torch.Tensor:
     return pictures[..., rows, :][..., columns]
 
 
-def _block_errors(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    return F.avg_pool2d((one - other).abs().mean(1), BLOCK)
+def _block_errors(one: torch.Tensor, other: torch.Tensor, block: int) -> torch.Tensor:
+    return F.avg_pool2d((one - other).abs().mean(1), block)
