@@ -45,7 +45,7 @@ def load(
              ("gym:CartPole-v1"), or the path of a checkpoint folder or of a training run.
     options: for a learned world what its `load` takes (memory=False, device="cuda") and fast=True (ONNX Runtime or a
              compiled graph where that is faster here: worlds/fast.py), for the game the fields of
-             DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes.
+             DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes (with forkable=True MuJoCo's are copied, too).
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `estimator`, a file that
              `terrella train estimator` wrote or a world that has one, gives pose and depth where the world does not (to give one
              asks to remember).
@@ -78,6 +78,10 @@ def load(
     if text.startswith("gym:"):
         from .sim.gymnasium import GymnasiumWorld
 
+        if options.get("forkable") and _over_mujoco(text.partition(":")[2]):
+            from .sim.mujoco import MujocoSnapshots
+
+            options = {"snapshots": MujocoSnapshots, **options}
         return GymnasiumWorld(text.partition(":")[2], **options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
 
@@ -144,6 +148,14 @@ def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
         found = sorted({file.parent for pattern in patterns for file in folder.glob(pattern)})
         entries += [Entry(str(path), "checkpoint", _read_card(path)) for path in found]
     return entries
+
+
+def _over_mujoco(name: str) -> bool:
+    """Whether an environment is one of Gymnasium's own over MuJoCo, by its id."""
+    import gymnasium
+
+    known = gymnasium.registry.get(name)
+    return known is not None and "envs.mujoco" in str(known.entry_point) and find_spec("mujoco") is not None
 
 
 def _bundled() -> list[str]:

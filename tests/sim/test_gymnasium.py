@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
+import terrella
 from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
 from terrella.core.spec import POSE, POSE_UNIT
@@ -406,3 +407,12 @@ def test_a_channel_of_another_shape_than_it_declares_is_refused_by_name():
     world = GymnasiumWorld(Turntable, adapter=wrong)
     with pytest.raises(TerrellaError, match="gave 'depth' of shape"):
         world.render(world.start(1, make_rng(0)), ("depth",))
+
+
+def test_mujocos_state_is_copied_where_that_is_asked_for():
+    for module in ("mujoco", "imageio"):  # Gymnasium draws MuJoCo with both
+        pytest.importorskip(module, reason=f"{module} is missing: pip install 'gymnasium[mujoco]'")
+    world = terrella.load("gym:Reacher-v5", rgb=False, forkable=True)
+    assert "a_batch_equals_its_singles" in check_world(world, steps=6)
+    assert not terrella.load("gym:Reacher-v5", rgb=False).spec.forkable  # several episodes are processes, as before
+    world.close()

@@ -87,8 +87,8 @@ class Environment:
     fps: float | None = None
     adapter: str | None = None
 
-    def open(self, name: str) -> World:
-        """The world of this name, as was said."""
+    def open(self, name: str, forkable: bool = False) -> World:
+        """The world of this name, as was said. `forkable`: an environment that can be copied, or TerrellaError."""
         from .. import library
         from ..core.errors import TerrellaError
 
@@ -105,6 +105,8 @@ class Environment:
             raise TerrellaError(
                 "--size, --fps and --adapter are for Gymnasium environments; other worlds are as they are."
             )
+        if forkable:
+            options["forkable"] = True
         return library.load(name, **options)
 
 

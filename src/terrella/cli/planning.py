@@ -114,10 +114,8 @@ class _Case:
         return Planner(self.world, cost, searching.config, trust, replan=searching.replan)
 
     def played(self, policy, what: str, keep: tuple[str, ...] = ()) -> Played:
-        spec = self.world.spec
-        sees = (*spec.observes, *(name for name in spec.may_observe if name in self.real.spec.channels))
         with progress.shown(what) as report:
-            told = (self.episodes, self.steps, self.seed, self.judge, sees, keep, 1 if keep else 0, report)
+            told = (self.episodes, self.steps, self.seed, self.judge, _seen_by(self), keep, 1 if keep else 0, report)
             return play(self.real, policy, *told)
 
 
@@ -204,10 +202,8 @@ def _opened(name, environment, searching, goal, real, episodes, steps, within, s
     if episodes < 1 or (steps is not None and steps < 1) or not within > 0:
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     truth = library.is_truth(name)
-    world = environment.open(name) if truth else load_named(name, device_of(device))
-    if truth:
-        world = Revealed(world)
-    elif not world.spec.observes:
+    world = Revealed(_copied(name, environment)) if truth else load_named(name, device_of(device))
+    if not world.spec.observes:
         raise PlanningError(f"{name} observes nothing, so nobody can tell it where the episode stands.")
     acted = world if real in (None, name) else _real(real, environment, world.spec)
     _check_alike(world.spec, acted.spec)
@@ -231,9 +227,13 @@ def _real(real: str, environment: Environment, spec: Spec) -> World:
     shape = spec.channels["rgb"].shape if "rgb" in spec.channels else None
     if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
         environment = replace(environment, size=(shape[0], shape[1]))
-    found = environment.open(real)
     told = any(kind_of(channel) == "snapshot" for channel in spec.observes)
-    return Revealed(found) if told else found
+    return Revealed(_copied(real, environment)) if told else environment.open(real)
+
+
+def _copied(name: str, environment: Environment) -> World:
+    """A simulator whose states are values, if it can be one."""
+    return environment.open(name, forkable=name.startswith("gym:") and not name.startswith("gym:ALE/"))
 
 
 def _check_alike(world: Spec, real: Spec) -> None:

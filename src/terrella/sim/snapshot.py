@@ -36,6 +36,8 @@ class NotCopyable(Exception):
 class Snapshots:
     """Takes and puts back snapshots of environments built alike; the layout is read from `env`, after a reset."""
 
+    ignored = frozenset(_IGNORED)
+
     def __init__(self, env: gymnasium.Env):
         self._slots: list[tuple[int, str, int, tuple[int, ...]]] = []  # layer, attribute, numbers, array shape
         self._fixed: list[tuple[int, str, object]] = []
@@ -43,7 +45,7 @@ class Snapshots:
         self._names = [set(layer) for layer in layers]
         for depth, layer in enumerate(layers):
             for name, value in layer.items():
-                if name in _IGNORED:
+                if name in self.ignored:
                     continue
                 parts = _parts(value)
                 if parts is not None:

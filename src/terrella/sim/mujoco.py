@@ -1,0 +1,41 @@
+"""The state of a Gymnasium environment over MuJoCo as plain numbers, and back: so that it can be planned in."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations, and gymnasium's Env does not declare `model` and `data`
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from .snapshot import Snapshots
+
+_WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that the next step depends on, the solver's warm start too
+
+
+class MujocoSnapshots(Snapshots):
+    """The attributes that `Snapshots` takes, and MuJoCo's integration state. What is derived from that (where bodies are) is
+    computed anew when it is put back."""
+
+    ignored = Snapshots.ignored | {"model", "data", "mujoco_renderer", "_ezpickle_args", "_ezpickle_kwargs"}
+
+    def __init__(self, env: gymnasium.Env):
+        self._size = mujoco.mj_stateSize(env.unwrapped.model, _WHOLE)
+        super().__init__(env)
+
+    def take(self, env: gymnasium.Env) -> tuple[list[float], list[int]]:
+        numbers, kinds = super().take(env)
+        state, bare = np.empty(self._size), env.unwrapped
+        mujoco.mj_getState(bare.model, bare.data, state, _WHOLE)
+        return [*numbers, *state.tolist()], kinds
+
+    def put(self, env: gymnasium.Env, numbers: Sequence[float], kinds: Sequence[int]) -> None:
+        super().put(env, numbers[: -self._size], kinds)
+        bare, state = env.unwrapped, np.array(numbers[-self._size :])
+        model, data = bare.model, bare.data
+        mujoco.mj_setState(model, data, state, _WHOLE)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_setState(model, data, state, _WHOLE)  # which the pass forward has changed
