@@ -21,6 +21,9 @@ PAST = 24  # steps of a clip before those that are shown, of which its mosaic is
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
+BLIND = (
+    0.4  # the share of a batch that is not shown how things went on: else what is done, mostly as before, goes unheard
+)
 # How much a pixel counts that stands still in the recording, and is another in the dream: nobody can know it.
 STALE = 0.15
 CHANGED, OFF = 4, 20  # differences of 255
@@ -101,6 +104,8 @@ class CodecObjective:
         codec = self.generator
         move = scrolled(shown[:, 0], truth, codec.moves)
         seen = codec.seen(shown, mosaic, move)
+        shows = torch.from_numpy(now.rng.random(len(shown)) >= BLIND).to(now.device)[:, None, None, None]
+        seen = seen._replace(went=seen.went * shows)
         choices, features = codec.choices(seen, context)
         share, stays = explained(shown, truth, codec.moves)
         share, memory = preferred(share, move), explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known
