@@ -70,8 +70,8 @@ $(VENV)/.ready-play: pyproject.toml constraints.txt | $(BIN)/python
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade
 	@$(PIP) -q torch
 	@$(PIP) -q -e '.[sim]'
-	@echo "compiling the geometry, so that the first play need not"
-	@$(BIN)/python -c "import terrella as t; r = t.make_rng(0); [w.imagine(w.start(1, r), w.spec.sample_action(1, r), r) for w in map(t.load, ('doom-maze', 'doom-corridor'))]"
+	@echo "compiling what draws the worlds, so that the first play need not"
+	@$(BIN)/python -c "import terrella as t; r = t.make_rng(0); [w.imagine(w.start(1, r), w.spec.sample_action(1, r), r) for w in map(t.load, ('doom-maze', 'doom-corridor', 'islet'))]"
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready-play

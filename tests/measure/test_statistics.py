@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from terrella.core import make_rng
-from terrella.measure.statistics import mean_band, mean_interval, median_interval, ratio_interval, wilson
+from terrella.measure.statistics import Figure, mean_band, mean_interval, median_interval, ratio_interval, wilson
 
 
 def test_interval_of_a_normal_sample_is_close_to_the_textbook():
@@ -60,3 +60,8 @@ def test_wilsons_interval_is_that_of_the_textbook():
         assert (figure.value, figure.count) == (successes / count, count)
         assert figure.low == pytest.approx(low, abs=1e-4) and figure.high == pytest.approx(high, abs=1e-4)
     assert math.isnan(wilson(0, 0).value)
+
+
+def test_figures_are_read_without_exponents():
+    assert str(Figure(-1074.2, -1410.0, -0.798, 4)) == "-1,074 [-1,410, -0.798] (n=4)"
+    assert str(Figure(999.7, 12.345, 1e5, 9)) == "1,000 [12.3, 100,000] (n=9)"

@@ -21,7 +21,8 @@ class Figure:
     count: int
 
     def __str__(self) -> str:
-        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}] (n={self.count})"
+        value, low, high = (f"{x:,.0f}" if abs(x) >= 999.5 else f"{x:.3g}" for x in (self.value, self.low, self.high))
+        return f"{value} [{low}, {high}] (n={self.count})"
 
 
 @dataclass(frozen=True)
