@@ -195,6 +195,13 @@ def _about(told: dict) -> About:
     return About(told["name"], _settings(Controls, said["controls"]), said["dt_s"], *names)
 
 
+def with_kept(about: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What a recording says of its world, with the keys and names of the world that is in `folder`, if one is there: they may
+    have been changed while it was played."""
+    kept = read_about(folder)["about"] if (folder / WORLD_FILE).exists() else {}
+    return {**about, **{name: kept[name] for name in ("keys", "action_names", "idle") if kept.get(name)}}
+
+
 def read_about(path: Path) -> dict:
     """What world.json says; CheckpointError where there is none, or none that can be read."""
     try:

@@ -15,7 +15,7 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
 from ...data import Clips, Dataset
-from ...worlds.folder import WORLD_FILE, read_about, save_latent
+from ...worlds.folder import WORLD_FILE, save_latent, with_kept
 from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
@@ -242,10 +242,8 @@ class _Learned:
 
     def world(self, trainer: Trainer) -> LatentWorld:
         """The world as it now is, on the CPU, of copies."""
-        recording, cache, about = self.recording, self.recording.cache, self.recording.cache.world
-        if (self.run.out / "world" / WORLD_FILE).exists():  # keys and names may have been changed while it was played
-            kept = read_about(self.run.out / "world")["about"]
-            about = {**about, **{name: kept[name] for name in ("keys", "action_names", "idle") if kept.get(name)}}
+        recording, cache = self.recording, self.recording.cache
+        about = with_kept(cache.world, self.run.out / "world")
         names = about.get("action_names") or cache.action_names
         named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
         limits = {"idle": tuple(about.get("idle", ())), "max_episode_steps": about.get("max_episode_steps")}

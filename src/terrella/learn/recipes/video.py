@@ -16,7 +16,7 @@ from ...space.mosaic import recalled
 from ...worlds.body import Motion, MotionBody
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
-from ...worlds.folder import WORLD_FILE, read_about, save_world
+from ...worlds.folder import save_world, with_kept
 from ...worlds.generator import Generator
 from ...worlds.history import FrameHistory, Starts
 from ...worlds.learned import About, LearnedWorld
@@ -291,10 +291,8 @@ class _Learned:
 
     def world(self, trainer: Trainer) -> LearnedWorld:
         """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""
-        recording, cache, about = self.recording, self.recording.cache, self.recording.cache.world
-        if (self.run.out / "world" / WORLD_FILE).exists():  # keys and names may have been changed while it was played
-            kept = read_about(self.run.out / "world")["about"]
-            about = {**about, **{name: kept[name] for name in ("keys", "action_names", "idle") if kept.get(name)}}
+        recording, cache = self.recording, self.recording.cache
+        about = with_kept(cache.world, self.run.out / "world")
         names = about.get("action_names") or cache.action_names  # of a choice, the recording names each
         named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
         assert recording.controls is not None  # see NEEDS
