@@ -11,13 +11,20 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .core import Spec, State, World, check_world, make_rng, rollout
     from .core.env import as_env
-    from .library import as_sb3, load, worlds
+    from .library import as_sb3, load, load_policy, worlds
 
 __version__ = "0.1.0"
-__all__ = ["Spec", "State", "World", "as_env", "as_sb3", "check_world", "load", "make_rng", "rollout", "worlds"]
+__all__ = ["Spec", "State", "World", "as_env", "as_sb3", "check_world", "load", "load_policy"]
+__all__ += ["make_rng", "rollout", "worlds"]
 
 _HOME = dict.fromkeys(["Spec", "State", "World", "check_world", "make_rng", "rollout"], ".core")
-_HOME |= {"as_env": ".core.env", "as_sb3": ".library", "load": ".library", "worlds": ".library"}
+_HOME |= {
+    "as_env": ".core.env",
+    "as_sb3": ".library",
+    "load": ".library",
+    "load_policy": ".library",
+    "worlds": ".library",
+}
 
 
 def __getattr__(name: str):

@@ -17,6 +17,8 @@ from .space.estimator import Estimator
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+    from .core.policy import Policy
+    from .core.spec import Spec
     from .sim.gymnasium import Adapter
 
 BUNDLED = Path(__file__).parent / "bundled"
@@ -93,6 +95,20 @@ def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:
     from .core.stable_baselines3 import WorldVecEnv
 
     return WorldVecEnv(world, num_envs, **options)
+
+
+def load_policy(name: str | Path, spec: Spec, world: World | None = None) -> Policy:
+    """A policy for the actions of `spec`, by its name.
+
+    name:  random, idle, explorer; constant:VALUE (a number for each axis, or the action's name); plan, or with settings
+           plan:samples=16,horizon=12, which plans for reward in `world`; the folder of a learned policy; MODULE:NAME or
+           FILE.py:NAME of your own (a Policy, a function (observation, rng) -> actions, or a function of a Spec that returns
+           such). With @0.3 behind it each action is a random one instead with probability 0.3.
+    Raises TerrellaError where there is none of that name, or where it is for other actions.
+    """
+    from .act.named import policy_of
+
+    return policy_of(str(name), spec, world)
 
 
 def load_adapter(source: str) -> Adapter:

@@ -16,7 +16,8 @@ from .world import Observation
 @runtime_checkable
 class Policy(Protocol):
     """Acts in any World. What it remembers of a batch of episodes is handed back to it at each step, so that a policy itself
-    never changes and one policy can play many episodes at once."""
+    never changes and one policy can play many episodes at once. It may name the channels that it is to be shown, as `sees`;
+    one that does not is shown all that a recording would hold."""
 
     def begin(self, batch: int, rng: torch.Generator) -> Any:
         """The memory in which `batch` episodes begin: None, or a State, tensor or list that leads with the batch."""
@@ -68,6 +69,8 @@ class Reactive:
 class Replay:
     """Plays given actions [T, B, *action.shape]; ContractError after the last. Its memory is the step."""
 
+    sees = ()
+
     def __init__(self, actions: torch.Tensor):
         self.actions = torch.as_tensor(actions)
 
@@ -85,6 +88,8 @@ class Replay:
 
 class Idle:
     """Does as little as the world's actions allow: the baseline "do nothing"."""
+
+    sees = ()
 
     def __init__(self, spec: Spec):
         self.action = torch.from_numpy(neutral_action(spec))
@@ -107,6 +112,8 @@ class Held(NamedTuple):
 
 class Random:
     """Uniformly random actions, each held for `hold` steps, between the least and the most, both counted."""
+
+    sees = ()
 
     def __init__(self, spec: Spec, hold: tuple[int, int] = (1, 1)):
         self.spec, self.hold = spec, hold

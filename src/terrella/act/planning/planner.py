@@ -91,6 +91,11 @@ class Planner:
         self._trust, self._proposal, self._proposals, self._replan = trust, proposal, proposals, replan
         self._sees = tuple(spec.recorded if sees is None else sees)
 
+    @property
+    def sees(self) -> tuple[str, ...]:
+        """What it is to be shown: the evidence that its world takes."""
+        return (*self.world.spec.observes, *self.world.spec.may_observe)
+
     def begin(self, batch: int, rng: torch.Generator) -> list[Thought]:
         seeds = chance.seeds(batch, rng, "cpu").bitwise_and(2**63 - 1).tolist()
         return [Thought(seed, self.cost.goal_of(entry, batch)) for entry, seed in enumerate(seeds)]
