@@ -7,6 +7,8 @@ import torch
 from tests.act.tiny_worlds import Grid, Point
 
 import terrella
+from terrella.act.actor import Actor
+from terrella.act.actor_network import ActorConfig, ActorNetwork
 from terrella.act.planning import Planner
 from terrella.core.errors import TerrellaError
 from terrella.core.policy import Reactive, act
@@ -68,6 +70,17 @@ def test_it_plans_with_settings():
     assert isinstance(planner, Planner) and planner.sees == world.spec.observes
     assert (planner.config.kind, planner.config.samples, planner.config.horizon) == ("cem", 8, 3)
     assert done_by("plan:samples=8,iterations=1", batch=4, plans_in=world).shape == (4, 2)
+
+
+def test_a_learned_policy_is_opened_by_its_folder(tmp_path):
+    spec = Point().spec
+    network = ActorNetwork(ActorConfig.of(spec, ("observation",), 8))
+    Actor(network, spec).save(tmp_path / "learned")
+    policy = terrella.load_policy(tmp_path / "learned", spec)
+    assert isinstance(policy, Actor) and policy.sees == ("observation",)
+    assert done_by(f"{tmp_path / 'learned'}@0.5").shape == (400, 2)
+    with pytest.raises(TerrellaError, match="Grid"):
+        terrella.load_policy(tmp_path / "learned", Grid().spec)
 
 
 def test_a_policy_slips_as_often_as_it_is_told():

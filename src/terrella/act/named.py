@@ -21,6 +21,7 @@ from ..core.policy import Idle, Policy, Random, Reactive
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
+from .actor import Actor
 from .explorer import Explorer
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
@@ -103,7 +104,7 @@ def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Pol
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
-        raise TerrellaError(f"{name} holds no policy that was learned.")
+        return Actor.load(name, spec)
     likest = did_you_mean(name, [*simple, "constant", "plan"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{likest} There are: {KNOWN}.")
 
