@@ -15,7 +15,8 @@ from ...worlds.codec import Codec, Scroll
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
 from ..moves import mosaics
-from ..trainer import Average, Loss, Now, adamw, warmed
+from ..muon import muon
+from ..trainer import Average, Loss, Now, warmed
 
 PAST = 24  # steps of a clip before those that are shown, of which its mosaic is made; fewer where episodes are short
 DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
@@ -73,7 +74,9 @@ class CodecObjective:
         self.generator = channels_last(codec)
         self.smooth = Average(self.generator, 0.998)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
-        self.learners = {"generator": adamw((self.generator,), warmed(learning_rate, 10, 0.02), average=self.smooth)}
+        heads = self.generator.choice, self.generator.colour[-1], self.generator.scrolling
+        rate = warmed(learning_rate, 10, 0.02)
+        self.learners = {"generator": muon((self.generator,), rate, heads, self.smooth)}
 
     @property
     def scroll(self) -> Scroll:
