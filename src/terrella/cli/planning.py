@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -27,33 +26,19 @@ from ..act.planning import (
     negative_reward,
     play,
 )
-from ..core.errors import ActionError, PlanningError, TerrellaError
+from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Random
-from ..core.spec import Spec, kind_of
 from ..core.world import World, make_rng
 from ..data.storage.durable import write_json
 from ..measure.acted import compute_chart, film, film_strip, plan_page
 from ..measure.statistics import Figure, mean_interval, wilson
 from ..serve.picture import uncertainty_levels
+from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
 from .goals import REWARD, read_goal
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result, say
 
-STEPS = 200  # of an episode, where the environment sets no limit
 DOUBLINGS = 5  # of the curve of success against compute
-_NEVER = (
-    "snapshot",
-    "reward",
-    "done",
-    "truncated",
-    "uncertainty",
-    "known",
-    "keyframes",
-    "mosaic",
-    "instruction",
-    "latent",
-)
-
 Kind = Literal["icem", "cem", "mppi", "gradient", "tree", "random"]
 Milliseconds = Annotated[
     float | None,
@@ -152,7 +137,7 @@ def plan(
     """
     case = _opened(name, environment, searching, goal, real, episodes, steps, within, success, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
-    keep = tuple(dict.fromkeys((*_seen_by(case), *_compared(case), *_pictured(case))))
+    keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
     mine = case.played(case.planner(searching), "planning", keep)
     floor = case.played(Random(case.real.spec), "acting at random")
     points = _curve(case, mine) if curve else []
@@ -168,9 +153,9 @@ def plan(
     }
     folder.mkdir(parents=True, exist_ok=True)
     lines, whole = _report(case, mine, floor, points, facts, folder)
-    write_json(folder / "plan.json", _sound(whole))
+    write_json(folder / "plan.json", sound(whole))
     del whole["played"], whole["divergence"]
-    result(_sound(whole), json, "\n".join([*lines, f"the page: {folder / 'plan.html'}"]))
+    result(sound(whole), json, "\n".join([*lines, f"the page: {folder / 'plan.html'}"]))
 
 
 def _report(
@@ -202,11 +187,11 @@ def _opened(name, environment, searching, goal, real, episodes, steps, within, s
     if episodes < 1 or (steps is not None and steps < 1) or not within > 0:
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     truth = library.is_truth(name)
-    world = Revealed(_copied(name, environment)) if truth else load_named(name, device_of(device))
+    world = Revealed(open_copied(name, environment)) if truth else load_named(name, device_of(device))
     if not world.spec.observes:
         raise PlanningError(f"{name} observes nothing, so nobody can tell it where the episode stands.")
-    acted = world if real in (None, name) else _real(real, environment, world.spec)
-    _check_alike(world.spec, acted.spec)
+    acted = world if real in (None, name) else open_real(real, environment, world.spec)
+    check_alike(world.spec, acted.spec)
     wanted = read_goal(goal, world.spec)
     if success and success not in acted.spec.channels:
         raise PlanningError(f"{acted.spec.name} has no channel '{success}'; it has {', '.join(acted.spec.channels)}.")
@@ -223,52 +208,8 @@ def _opened(name, environment, searching, goal, real, episodes, steps, within, s
     return case
 
 
-def _real(real: str, environment: Environment, spec: Spec) -> World:
-    shape = spec.channels["rgb"].shape if "rgb" in spec.channels else None
-    if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
-        environment = replace(environment, size=(shape[0], shape[1]))
-    told = any(kind_of(channel) == "snapshot" for channel in spec.observes)
-    return Revealed(_copied(real, environment)) if told else environment.open(real)
-
-
-def _copied(name: str, environment: Environment) -> World:
-    """A simulator whose states are values, if it can be one."""
-    return environment.open(name, forkable=name.startswith("gym:") and not name.startswith("gym:ALE/"))
-
-
-def _check_alike(world: Spec, real: Spec) -> None:
-    """ActionError or PlanningError where what is planned in one cannot be done in the other."""
-    mine, theirs = world.action_limits, real.action_limits
-    if any(np.shape(a) != np.shape(b) or not np.allclose(a, b) for a, b in zip(mine, theirs)):
-        raise ActionError(
-            f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
-        )
-    for channel in world.observes:
-        if channel not in real.channels:
-            raise PlanningError(
-                f"{world.name} plans from '{channel}', which {real.name} does not show; it shows {', '.join(real.channels)}."
-            )
-        if real.channels[channel].shape != world.channels[channel].shape:
-            raise PlanningError(
-                f"{world.name} sees '{channel}' of shape {world.channels[channel].shape}, and {real.name} shows "
-                f"{real.channels[channel].shape}; --size HEIGHT WIDTH sets that of pictures."
-            )
-
-
 def _seen_by(case: _Case) -> tuple[str, ...]:
     return (*case.world.spec.observes, *(at for at in case.world.spec.may_observe if at in case.real.spec.channels))
-
-
-def _compared(case: _Case) -> tuple[str, ...]:
-    """Channels in which dream and reality can be compared: pictures, and lists of numbers, that both show."""
-    both = {
-        name: space
-        for name, space in case.real.spec.channels.items()
-        if name in case.world.spec.channels and space.shape == case.world.spec.channels[name].shape
-    }
-    return tuple(
-        name for name, space in both.items() if kind_of(name) not in _NEVER and len(space.shape or ()) in (1, 3)
-    )
 
 
 def _pictured(case: _Case) -> tuple[str, ...]:
@@ -356,15 +297,6 @@ def _plain(figures: Mapping[str, Figure]) -> dict[str, object]:
     return {name: asdict(figure) for name, figure in figures.items()}
 
 
-def _sound(value: Any) -> Any:
-    """The same as JSON can say it: null for what is no finite number."""
-    if isinstance(value, Mapping):
-        return {str(key): _sound(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_sound(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _told(episode: Episode) -> dict[str, object]:
     told: dict[str, Any] = {"steps": episode.steps, "return": episode.reward, "success": episode.success}
     return {**told, "nearest": episode.nearest, "ended": episode.ended, "best_cost": episode.best_cost}
@@ -374,7 +306,7 @@ def _told(episode: Episode) -> dict[str, object]:
 def _filmed(case: _Case, episode: Episode, folder: Path) -> tuple[dict[str, list[float]], Image.Image | None, str]:
     """The dream of an episode, from its first observation under its actions: the divergence in each channel, a strip of both,
     and the film's file, "" where there are no pictures."""
-    seen, names = episode.seen, _compared(case)
+    seen, names = episode.seen, compared(case.world.spec, case.real.spec)
     shown = tuple(name for name in (*names, *_pictured(case)) if name in case.world.spec.channels)
     first = {name: seen[0][name][None] for name in _seen_by(case)}
     rng, dreamt = make_rng(case.seed), []

@@ -1,11 +1,11 @@
 """Planners over any World: what futures cost, how good ones are searched, and the policy that acts on what it finds."""
 
 from .costs import Cost, distance, distance_to, negative_reward
-from .episodes import Episode, Judge, Played, play
+from .episodes import Episode, Judge, Played, play, play_from
 from .planner import Decision, Planner, Thought
 from .revealed import Revealed
 from .searches import Found, Hints, SearchConfig, search
 from .task import Task
 
 __all__ = ["Cost", "Decision", "Episode", "Found", "Hints", "Judge", "Planner", "Played", "Revealed", "SearchConfig"]
-__all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "play", "search"]
+__all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "play", "play_from", "search"]

@@ -125,6 +125,27 @@ def play(
     return Played(found, skipped)
 
 
+def play_from(
+    world: World,
+    state: State,
+    policy: Policy,
+    steps: int,
+    seed: int,
+    judge: Judge | None = None,
+    sees: Sequence[str] = (),
+    keep: Sequence[str] = (),
+    kept: int = 0,
+) -> list[Episode]:
+    """The episodes that begin in `state`, as `play` plays them. What the policy draws by chance is the same in any world, as long
+    as none of the episodes ends."""
+    judge = judge or Judge()
+    told = [name for name in ("reward", "done") if name in world.spec.channels]
+    world.spec.check_channels((*judge.channels, *sees, *keep))
+    channels = tuple(dict.fromkeys((*sees, *judge.channels, *told)))
+    group = _Group(world, policy, judge, channels, tuple(keep), kept, steps, make_rng(seed))
+    return group.play(state, make_rng(seed + 1), make_rng(seed + 2))
+
+
 @dataclass
 class _Group:
     """Episodes that are played at once; those that are over are left out, where the world lets them."""
@@ -136,6 +157,7 @@ class _Group:
     keep: tuple[str, ...]
     kept: int
     steps: int
+    moves: torch.Generator | None = None  # of the world alone
 
     @torch.no_grad()
     def play(self, state: State, chance: torch.Generator, begins: torch.Generator) -> list[Episode]:
@@ -151,7 +173,7 @@ class _Group:
             ms = 1e3 * (time.perf_counter() - began) / len(going)
             for entry, number in enumerate(going):
                 _decided(episodes[number], action[entry], ms, memory, entry)
-            state = self.world.imagine(state, action, chance)
+            state = self.world.imagine(state, action, self.moves or chance)
             seen = self.world.render(state, self.channels)
             over = self._judged(episodes, going, seen)
             if over.any():
