@@ -24,6 +24,8 @@ def play(
     remember: bool = False,
     estimator: str | None = None,
     memory_mb: float | None = None,
+    agent: str = "",
+    agent_ms: float = 30.0,
     policy: Literal["explore", "random"] | None = None,
     record: Path | None = None,
     port: Port = 8765,
@@ -45,14 +47,22 @@ def play(
         remember: Add a spatial memory to a world that has none.
         estimator: Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one.
         memory_mb: Size limit of the spatial memory in MiB; default: as the world was saved, or 16.
-        policy: Who acts while nobody touches the controls: a script that explores, or random actions.
+        agent: Who drives when the page lets it: plan, explorer, random, the folder of a learned policy, MODULE:NAME; default: a
+            planner where there is a reward to plan for, else the explorer. Goals that are set on the page are always planned for.
+        agent_ms: Milliseconds that a planner may take for a decision.
+        policy: Who acts from the beginning, whenever nobody touches the controls: a script that explores, or random actions.
         record: Folder of a dataset to which the page can record.
     """
     from .. import library
     from ..core.errors import TerrellaError
     from ..serve import serve
     from ..serve.guard import is_loopback
+    from .driving import Driving
 
+    if policy is not None and agent:
+        raise TerrellaError("--policy and --agent both say who drives; give one of them.")
+    if not agent_ms > 0:
+        raise TerrellaError("--agent-ms is a time above 0.")
     learned = load_named(name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb)
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
@@ -71,7 +81,8 @@ def play(
 
         layout, folder = Layout.of(worlds[0].spec), record
         sink = lambda: Recorder(folder, keeper.noted(layout), "play")  # noqa: E731
-    names, driver = [world.spec.name for world in worlds], None
+    names = [world.spec.name for world in worlds]
+    driver: Any = Driving(worlds[0], worlds[1] if compare else None, agent, agent_ms).agents()
     if policy is not None:
         from ..act.explorer import Explorer
         from ..core.policy import Random

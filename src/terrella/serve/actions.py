@@ -70,6 +70,21 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
     return torch.as_tensor(np.asarray(flat.reshape(space.shape or ()), dtype_of(space)))[None]
 
 
+def keys_of(spec: Spec, action: torch.Tensor) -> list[str]:
+    """The keys that an action [1, *spec.action.shape] stands for, to be lit as a person's are: of buttons those that are down, of
+    choices what is chosen, of axes those that go at most twice as far. Of two keys that do the same, the first."""
+    flat, rest = action[0].cpu().numpy().ravel().astype(np.float64), neutral_action(spec).ravel()
+    single = isinstance(spec.action, spaces.Box | spaces.MultiBinary)  # parts that are held each for itself
+    lit: dict[tuple[float, ...], str] = {}
+    for code, value in spec.keys.items():
+        row = np.asarray(value, np.float64)
+        says = row != (0 if single else rest)
+        meant = (flat == row) if not isinstance(spec.action, spaces.Box) else flat * np.sign(row) >= 0.5 * np.abs(row)
+        if says.any() and meant[says].all():
+            lit.setdefault(tuple(value), code)
+    return list(dict.fromkeys(part for code in lit.values() for part in code.split("+")))
+
+
 def _together(spec: Spec, held: Sequence[str]) -> list[str]:
     """The combinations of keys ("ArrowUp+Space") that are held, those of most keys last; a key that does the same as another
     counts as that."""

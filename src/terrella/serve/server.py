@@ -23,6 +23,7 @@ from ..core.spec import suffix_of
 from ..core.world import World
 from . import protocol
 from .actions import axes_of
+from .agent import Agents, agents_of
 from .chart import knows_share, mapped
 from .clip import make_clip
 from .door import application, serve_page
@@ -60,18 +61,18 @@ class Sessions:
         seed: int = 0,
         sink_factory: SinkFactory | None = None,
         picture: torch.Tensor | None = None,
-        policy: Policy | None = None,
+        policy: Policy | Agents | None = None,
         config: ServeConfig | None = None,
         keep: Keep | None = None,
         kept_in: str = "",
     ):
         check_playable(worlds)
         self.worlds, self.config = tuple(worlds), config or ServeConfig()
-        self._sink_factory, self._policy = sink_factory, policy
+        self._sink_factory, self._agents = sink_factory, agents_of(policy)
         kept = self.config.history_s, self.config.state_mb
         self._book = KeyBook(worlds[0].spec, keep, kept_in)
         self._make_timeline = lambda: Timeline(
-            self.worlds, seed, sink_factory, picture, policy, *kept, keys=self._book.spec
+            self.worlds, seed, sink_factory, picture, self._agents, *kept, keys=self._book.spec
         )
         self._seats = self.config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
@@ -128,7 +129,8 @@ class Sessions:
             ],
             no_rewind=no_rewind(self.worlds),
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
-            driver=type(self._policy).__name__ if self._policy else "",
+            agent=self._agents is not None,
+            goals={"places": bool(self._agents and self._agents.places), "pictures": bool(self._agents and self._agents.pictures)},
         )
 
 
@@ -247,13 +249,13 @@ def serve(
     seed: int = 0,
     config: ServeConfig | None = None,
     picture: torch.Tensor | None = None,
-    policy: Policy | None = None,
+    policy: Policy | Agents | None = None,
     keep: Keep | None = None,
     kept_in: str = "",
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
     Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
-    touches the controls. `keep` is called with the spec whenever a person has changed the keys on a page; `kept_in` says, in
+    touches the controls; Agents (agent.py) drive when a person lets them. `keep` is called with the spec whenever a person has changed the keys on a page; `kept_in` says, in
     words, where it keeps them for all pages, and is "" where each page keeps its own, in its browser.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is

@@ -17,6 +17,7 @@ from starlette.websockets import WebSocket
 
 from ..core.errors import TerrellaError
 from . import protocol
+from .actions import MAX_AXES, axes_of, keys_of
 from .chart import EVERY_S
 from .history import Moment
 from .keys import KeyBook
@@ -48,7 +49,7 @@ class Session:
         self._paused = self._closed = False
         self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
         self._error = ""
-        self._status_sent: dict[str, object] = {}
+        self._sent_last: dict[str, dict[str, object]] = {}  # events that tell what is so, by kind
         self._show = Show(map=False, invented=False)
         self._charted: dict[str, Any] = {}  # what the page has on its map
         self._chart_due = 0.0
@@ -67,7 +68,7 @@ class Session:
     def attach(self, socket: WebSocket) -> WebSocket | None:
         """Plays on through `socket`; gives the socket that was attached until now."""
         before, self._socket = self._socket, socket
-        self.detached_at, self._acked, self._status_sent = None, self._sent, {}
+        self.detached_at, self._acked, self._sent_last = None, self._sent, {}
         self._controls = Controls(0)  # a new page counts its messages anew
         self._show = Show(map=False, invented=False)
         self.heard_at = time.monotonic()
@@ -152,6 +153,7 @@ class Session:
         if self._socket is not None:
             await self._send_keys(timeline)
             await self._send_status(timeline)
+            await self._send_agent(timeline)
         if self._socket is None or timeline is None or self.unacked >= MAX_UNACKED:
             await self._wake.wait()
         elif self._unseen is not None:
@@ -212,7 +214,7 @@ class Session:
                         for wake in self._book.pages:
                             wake()
                 case "drive":
-                    timeline.driving = value
+                    timeline.driver.let(value)
                 case "show":
                     self._show, self._charted, self._chart_due = value, {}, 0.0
                     timeline.look(value.cameras)
@@ -239,11 +241,27 @@ class Session:
         if timeline is not None:
             status |= {
                 "paused": self._paused, "rewound": timeline.rewound, "recording": timeline.recording.on,
-                "driving": timeline.driving, "seed": timeline.seed, "notice": timeline.notice,
+                "driving": timeline.driver.on, "seed": timeline.seed, "notice": timeline.notice,
             }  # fmt: skip
-        if status != self._status_sent and (timeline is not None or self._error):
-            await self._event("status", **status)
-            self._status_sent = status
+        if timeline is not None or self._error:
+            await self._news("status", status)
+
+    async def _send_agent(self, timeline: Timeline | None) -> None:
+        """Who drives, and the agent's action of the last step as keys and axes."""
+        if timeline is None or timeline.driver.agents is None:
+            return
+        driver = timeline.driver
+        await self._news("agent", driver.described())
+        if not driver.on or driver.acted is None:
+            return await self._news("acted", {"held": [], "axes": []})
+        axes = driver.acted.double().flatten().tolist()[:MAX_AXES] if axes_of(timeline.spec) else []
+        await self._news("acted", {"held": keys_of(timeline.obeyed, driver.acted), "axes": axes})
+
+    async def _news(self, kind: str, body: dict[str, object]) -> None:
+        """Sends what is so where it has changed since it was sent."""
+        if body != self._sent_last.get(kind):
+            await self._event(kind, **body)
+            self._sent_last[kind] = body
 
     async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: Controls) -> None:
         self._unseen = None

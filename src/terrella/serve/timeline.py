@@ -1,4 +1,4 @@
-"""A timeline: one world, or a game with a dream beside it, stepped by a person or a policy, with its past and its recording."""
+"""A timeline: one world, or a game with a dream beside it, stepped by a person or an agent, with its past and its recording."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import ServeError, TerrellaError
-from ..core.policy import Policy, act
+from ..core.policy import Policy
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
-from .actions import action_of
+from .agent import Agents, agents_of
 from .chart import chart, mapped, tinted
+from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, uncertainty_levels
 from .protocol import DONE, FRESH
@@ -64,9 +65,9 @@ def check_playable(worlds: Sequence[World]) -> None:
 class Timeline:
     """Not thread-safe, and slow: the session calls it from one worker thread, a verb at a time.
 
-    The first world is the one that is played; a dream beside it follows. `policy` drives while nobody touches the controls;
-    without one, or with `driving` off, the person at the page does. history_s: seconds of pictures kept (for rewinding and
-    clips); state_mb: memory for the states among them. keys: the spec with other keys than the world's own.
+    The first world is the one that is played; a dream beside it follows. policy: who may drive in place of the person
+    (driver.py). history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory for the states among them.
+    keys: the spec with other keys than the world's own.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Timeline:
         seed: int,
         sink_factory: SinkFactory | None = None,
         picture: torch.Tensor | None = None,
-        policy: Policy | None = None,
+        policy: Policy | Agents | None = None,
         history_s: float = 30.0,
         state_mb: int = 256,
         keys: Spec | None = None,
@@ -86,12 +87,12 @@ class Timeline:
         self.no_rewind = no_rewind(worlds)
         self.notice = ""  # something that a person should know, in one sentence
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
-        self.driving = policy is not None
+        self.driver = Driver(agents_of(policy), worlds[0])
         self.recording = Recording(sink_factory)
         frames = int(min(max(history_s / self.spec.dt_s, 64), 4096))
         self.history = History(frames, state_mb * 2**20)
         self.shown: Moment  # that the timeline stands at: the newest, unless it was rewound
-        self._picture, self._policy, self._rest = picture, policy, action_of(self.spec)
+        self._picture = picture
         self.restart(seed)
 
     @property
@@ -152,12 +153,12 @@ class Timeline:
 
     @torch.inference_mode()
     def step(self, held: Sequence[str] = (), axes: Sequence[float] = ()) -> Moment:
-        """One step of every world under what is held, or under the policy; after `done`, the first moment of a new episode."""
+        """One step of every world under what is held, or under the agent; after `done`, the first moment of a new episode."""
         if self.rewound:
             self._return_to(self.history.newest)
         if self.shown.flags & DONE:
             return self._begin(self.shown.step + 1, self._starts(self._rngs, self._picture))
-        action = self._action(held, axes)
+        action = self.driver.action(self.obeyed, held, axes, self._states[0], self._rngs[-1])
         pairs = zip(self.worlds, self._states, self._rngs, strict=False)
         self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
         return self._show(self.shown.step + 1, 0, action)
@@ -226,15 +227,6 @@ class Timeline:
         known = dict(enumerate(self.worlds[number].spec.kinds("rgb")))
         return {at: name for at, name in known.items() if name in self.cameras} or {0: known[0]}
 
-    def _action(self, held: Sequence[str], axes: Sequence[float]) -> torch.Tensor:
-        """[1, ...], the person's, or the policy's while it drives and nobody touches the controls."""
-        action = action_of(self.obeyed, held, axes)
-        if self._policy is None or not self.driving or not torch.equal(action, self._rest):
-            return action
-        seen = self.worlds[0].render(self._states[0], self.spec.recorded)
-        action, self._memory = act(self._policy, seen, self._memory, 1, self.spec, self._rngs[-1])
-        return action
-
     def _starts(self, rngs: tuple[torch.Generator, ...], picture: torch.Tensor | None) -> tuple[State, ...]:
         if picture is not None:
             return (self._entered(picture, rngs[0]),)
@@ -245,11 +237,8 @@ class Timeline:
     def _begin(self, step: int, states: tuple[State, ...]) -> Moment:
         self.recording.end_episode()
         self._states, self._return = states, 0.0
-        self._begin_policy()
+        self.driver.forget()
         return self._show(step, FRESH, None)
-
-    def _begin_policy(self) -> None:
-        self._memory = self._policy.begin(1, self._rngs[-1]) if self._policy is not None else None
 
     def _entered(self, picture: torch.Tensor, rng: torch.Generator) -> State:
         """The played world after it observed `picture`; a notice says so where it is unlike what the world knows."""
@@ -327,7 +316,7 @@ class Timeline:
             self._states, self._return = moment.states, moment.episode_return
             for rng, state in zip(self._rngs, moment.rngs, strict=True):
                 rng.set_state(state)
-            self._begin_policy()
+            self.driver.forget()
 
 
 def encode_jpeg(rgb: torch.Tensor) -> bytes:

@@ -2,10 +2,12 @@
 
 from .costs import Cost, distance, distance_to, negative_reward
 from .episodes import Episode, Judge, Played, play, play_from
+from .pace import paced, tells_apart
 from .planner import Decision, Planner, Thought
 from .revealed import Revealed
 from .searches import Found, Hints, SearchConfig, search
 from .task import Task
 
 __all__ = ["Cost", "Decision", "Episode", "Found", "Hints", "Judge", "Planner", "Played", "Revealed", "SearchConfig"]
-__all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "play", "play_from", "search"]
+__all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "paced", "play", "play_from", "search"]
+__all__ += ["tells_apart"]

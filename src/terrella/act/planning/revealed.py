@@ -21,21 +21,23 @@ class Revealed:
     """A World around a World whose states are values: each tensor of the state is a channel `snapshot.NAME`, and to observe those
     is to be in that state. So a Planner over a simulator is a Policy like any other: it sees what it needs to copy it.
 
-    PlanningError for a world that cannot be copied (an external game), or whose state lies elsewhere (an arena).
+    PlanningError for a world that cannot be copied (an external game), or whose state lies elsewhere (an arena), unless what is
+    shown is observed in this process while it is fresh (`here`): then the numbers of an arena's rows say enough.
     """
 
-    def __init__(self, world: World):
+    def __init__(self, world: World, here: bool = False):
         spec = world.spec
         if not spec.forkable:
             raise PlanningError(
                 f"{spec.name} cannot be planned in: it cannot go back to a state (forkable=False). Learn a world of it first."
             )
         state = world.start(1, make_rng(0))
-        if state.arenas:
+        if state.arenas and not here:
             raise PlanningError(
                 f"{spec.name} remembers in an arena, which no channel can show; plan in the world itself."
             )
-        self._world, self._names = world, {f"{_KIND}.{name}": name for name in state}
+        self._world, self._arenas = world, state.arenas
+        self._names = {f"{_KIND}.{name}": name for name in state}
         shown = {channel: _space_of(state[name][0]) for channel, name in self._names.items()}
         self.spec: Spec = replace(
             spec, channels={**spec.channels, **shown}, observes=tuple(self._names), may_observe=()
@@ -55,7 +57,7 @@ class Revealed:
                     f"'{name}' of the state is {tuple(observation[channel].shape[1:])}, where {self.spec.name} has "
                     f"{self.spec.channels[channel].shape}: this is another environment."
                 )
-        return State({name: observation[channel] for channel, name in self._names.items()})
+        return State({name: observation[channel] for channel, name in self._names.items()}, self._arenas)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         return self._world.imagine(state, action, rng)
@@ -72,7 +74,7 @@ class Revealed:
 
 
 def _space_of(tensor: torch.Tensor) -> spaces.Space:
-    array = tensor.numpy()
+    array = tensor.cpu().numpy()
     if array.dtype == np.bool_:
         return spaces.Box(0, 1, array.shape, np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
     if array.dtype.kind == "f":

@@ -2,6 +2,7 @@
 
 import { drawCard } from './card.js';
 import { Controls } from './controls.js';
+import { DriverView } from './driver.js';
 import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
@@ -16,7 +17,7 @@ const app = $('app'), KEPT = 8192;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
-let worlds = [], light = () => {}, status = {}, noRecord = '', driver = '', state = 'connecting';
+let worlds = [], light = () => {}, status = {}, noRecord = '', state = 'connecting';
 let pending = null, controlsId = 0, autoPaused = false, recordSince = 0;
 
 // -- the connection -------------------------------------------------------------------------------------------------
@@ -34,6 +35,11 @@ const controls = new Controls((held, time) => {
   }
   sendControls(time);
 }, $('axes'));
+
+const driver = new DriverView({
+  send: (message) => link.send(message), say: toast, quiet: () => { controls.release(); controls.axes.rest(); }, light: (held) => light([...held, ...controls.held]), axes: controls.axes,
+  go: () => { if (status.rewound) link.send({ type: 'branch' }); if (status.paused) link.send({ type: 'resume' }); $('hint').classList.remove('show'); },
+});
 
 const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
 
@@ -57,12 +63,15 @@ function onEvent(body) {
   if (body.type === 'status') onStatus(body);
   if (body.type === 'keys') onKeys(body);
   if (body.type === 'chart') views.onChart(body);
+  if (body.type === 'agent') driver.show(body);
+  if (body.type === 'acted') driver.acted(body);
   if (body.type === 'error') toast(body.text);
 }
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
-  ({ worlds, no_record: noRecord, driver } = body);
+  ({ worlds, no_record: noRecord } = body);
+  driver.take(body);
   past.take(worlds[0], body.no_rewind);
   if (panel.take(worlds[0])) sendKeys();
   if (!same) build();
@@ -78,7 +87,6 @@ function onStatus(body) {
   status = body;
   app.classList.toggle('recording', !!body.recording);
   $('record').setAttribute('aria-pressed', !!body.recording);
-  $('drive').setAttribute('aria-pressed', !!body.driving);
   if (body.seed !== undefined && document.activeElement !== $('seed')) $('seed').value = body.seed;
   const paused = body.paused || body.rewound;
   $('pause').querySelector('use').setAttribute('href', paused ? '#i-play' : '#i-pause');
@@ -145,8 +153,6 @@ function build() {
     $('score-cell').after(cell);
   }
   uncertainty.levels = worlds[worlds.length - 1].uncertainty;
-  $('drive').hidden = !driver;
-  $('drive').title = `Let the policy act (G): ${driver}`;
   $('sync').hidden = worlds.length < 2;
   able($('rewind'), past.why, 'Hold to rewind (Backspace)');
   able($('record'), noRecord, 'Record to a dataset');
@@ -284,14 +290,13 @@ function drawTouch() {
 
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
-const drive = () => driver && link.send({ type: 'drive', on: !status.driving });
 const escape = () => (panel.open ? showAside(null) : togglePause());
-const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: drive, KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 /** What the page itself does with a key, here and now; '' where it does nothing. */
 function pageUse(code) {
   const uses = {
-    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver && 'lets the policy act',
+    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive',
     KeyC: screens.cameras.length > 1 && 'changes the camera', KeyP: 'pauses', KeyR: 'restarts', KeyF: 'fills the screen', Enter: 'goes on from the past',
   };
   return uses[code] || '';
@@ -318,7 +323,6 @@ $('restart').onclick = restartTyped;
 $('dice').onclick = () => restart(null);
 $('seed').onkeydown = (event) => { if (event.code === 'Enter') { restartTyped(); $('seed').blur(); } if (event.code === 'Escape') $('seed').blur(); };
 $('record').onclick = record;
-$('drive').onclick = drive;
 $('clip').onclick = clip;
 $('sync').onclick = () => link.send({ type: 'sync' });
 $('full').onclick = fullscreen;
@@ -377,6 +381,7 @@ window.terrella = Object.freeze({
   get seed() { return status.seed; },
   get axes() { return [...controls.axes.values]; },
   get driving() { return !!status.driving; },
+  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held] }; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
   get map() { return views.figures; },

@@ -37,7 +37,7 @@ export function stickPlan(axes, keys, pick) {
 export class Axes {
   /** `changed(time)` is called whenever a value has changed; the values are in `values`. */
   constructor(root, changed) {
-    Object.assign(this, { root, changed, axes: [], set: [], values: [], plan: {}, inputs: {}, rows: [], running: false });
+    Object.assign(this, { root, changed, axes: [], set: [], values: [], plan: {}, inputs: {}, rows: [], running: false, led: null });
   }
 
   setWorld(world, pick) {
@@ -59,7 +59,7 @@ export class Axes {
     ends.append(make('span', digits(axis.low)), make('span', digits(axis.high)));
     const stick = STICKS.find((one) => this.moves(one, at)), by = stick ? `; the ${STICK_NAMES[stick]} moves it` : '';
     label.title = `${axis.name}: ${digits(axis.low)} to ${digits(axis.high)} ${axis.unit}${by}; double click for ${digits(axis.neutral)}`;
-    slider.oninput = (event) => { this.set[at] = Number(slider.value); this.merge(event.timeStamp); };
+    slider.oninput = (event) => { this.lead(); this.set[at] = Number(slider.value); this.merge(event.timeStamp); };
     slider.onchange = () => slider.blur();  // the keys are the world's again
     label.ondblclick = (event) => { this.set[at] = axis.neutral; this.merge(event.timeStamp); };
     label.append(name, value, slider, ends);
@@ -79,6 +79,18 @@ export class Axes {
 
   get active() { return this.values.some((value, at) => value !== this.axes[at].neutral); }
 
+  /** Shows what an agent does; null: it does nothing any more. */
+  follow(values) {
+    this.led = values;
+    this.draw();
+  }
+
+  /** A person takes over: positions go on from where the agent left them. */
+  lead() {
+    if (this.led && this.sweeps) this.set = this.set.map((value, at) => this.led[at] ?? value);
+    this.led = null;
+  }
+
   /** Lets go of sticks and sliders. */
   rest() {
     this.inputs = {};
@@ -90,6 +102,7 @@ export class Axes {
   push(source, deflections, time) {
     const quiet = !deflections || STICKS.every((stick) => Math.abs(deflections[stick] ?? 0) < DEAD);
     if (quiet && !(source in this.inputs)) return;
+    if (!quiet) this.lead();
     if (quiet) delete this.inputs[source]; else this.inputs[source] = deflections;
     if (this.sweeps) this.run(); else this.merge(time);
   }
@@ -136,7 +149,7 @@ export class Axes {
     this.held = held;
     this.rows.forEach(({ slider, value }, at) => {
       const pressed = held.map((code) => this.keys[code]?.[at] ?? 0).reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a), 0);
-      const shown = pressed || this.values[at], text = `${digits(shown)} ${this.axes[at].unit}`.trim();
+      const shown = this.led?.[at] ?? (pressed || this.values[at]), text = `${digits(shown)} ${this.axes[at].unit}`.trim();
       if (document.activeElement !== slider || slider.value !== String(shown)) slider.value = shown;
       if (value.textContent !== text) value.textContent = text;
     });

@@ -1,0 +1,142 @@
+"""Who acts in a timeline: the person at the page, or an agent that they let drive until they touch the controls."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from ..core.errors import TerrellaError
+from ..core.policy import act
+from ..core.spec import Spec
+from ..core.state import State
+from ..core.world import Observation, World
+from .actions import action_of
+from .agent import Agent, Agents, Futures, seen_by
+
+PATIENCE_S = 12.0  # of the world, in which an agent must have come nearer to its goal
+_NEARER = 0.97  # of the least distance so far counts as nearer
+
+
+class Driver:
+    """One timeline's. What an agent raises never stops the world: it is told in a sentence, and the person drives."""
+
+    def __init__(self, agents: Agents | None, world: World):
+        self.agents, self.world, self.spec = agents, world, world.spec
+        self.on = agents is not None and agents.at_once
+        self.goal: Observation = {}
+        self.said = ""  # the last thing to know of the agent, in one sentence
+        self.away: float | None = None  # from the goal, when it last acted
+        self.acted: torch.Tensor | None = None  # its action of the last step; None where the person acted
+        self._agent: Agent | None = None
+        self._rest = action_of(self.spec)
+        self._ms: deque[float] = deque(maxlen=32)
+        self._futures: Futures | None = None
+        self.forget()
+
+    @property
+    def name(self) -> str:
+        """Of the agent; "" while nobody knows which it will be."""
+        return self._agent.name if self._agent else ""
+
+    def described(self) -> dict[str, object]:
+        """For the page (protocol.encode_event): rounded, so that it changes seldom."""
+        longest = sorted(self._ms)[int(0.9 * (len(self._ms) - 1))] if self._ms else 0.0
+        return {
+            "driving": self.on,
+            "name": self.name,
+            "said": self.said,
+            "thinks_ms": float(f"{longest:.1g}"),
+            "away": None if self.away is None else float(f"{self.away:.2g}"),
+            "unit": self._agent.unit if self._agent else "",
+        }
+
+    # -- what a person says -------------------------------------------------------------------------------------------
+
+    def let(self, on: bool) -> None:
+        """The agent drives from now on, or the person does."""
+        self.said = ""
+        if on and self.agents is None:
+            self.said = "there is no agent here to drive."
+        elif on != self.on:
+            self.on = on
+            self.forget()
+
+    def seek(self, goal: Observation) -> None:
+        """Drives to a goal; {} for none. The sentence says where there is none that could."""
+        self.goal, self._agent, self.away = goal, None, None
+        self._ms.clear()
+        self.forget()
+        if goal:
+            self.let(True)
+
+    def forget(self) -> None:
+        """What the agent remembers is of another episode or moment."""
+        self._memory: Any = None
+        self._begun = False
+        self._futures = None
+        self._best, self._since = float("inf"), 0
+
+    # -- each step ----------------------------------------------------------------------------------------------------
+
+    def action(
+        self, keys: Spec, held: Sequence[str], axes: Sequence[float], state: State, rng: torch.Generator
+    ) -> torch.Tensor:
+        """The action [1, ...] of this step: the person's where they touch the controls, who then drives; else the agent's while
+        it does. keys: the spec whose keys they press."""
+        asked, self.acted = action_of(keys, held, axes), None
+        if not self.on or self.agents is None:
+            return asked
+        if any(code in keys.keys for code in held) or not torch.equal(asked, self._rest):
+            if not self.agents.at_once:
+                self.stop("")
+            return asked
+        try:
+            return self._chosen(self.agents, state, rng)
+        except Exception as error:  # a policy is a stranger's code
+            reason = str(error)
+            if not isinstance(error, TerrellaError):
+                traceback.print_exc(file=sys.stderr)
+                reason = f"{type(error).__name__}: {error}."
+            self.stop(f"the agent stopped: {reason} You drive.")
+            return asked
+
+    def stop(self, said: str) -> None:
+        """The person drives from now on, for this reason."""
+        self.on, self.said, self.acted = False, said, None
+        self.forget()
+
+    def _chosen(self, agents: Agents, state: State, rng: torch.Generator) -> torch.Tensor:
+        if self._agent is None:
+            self._agent = agents.make(self.goal)
+        agent = self._agent
+        if agent.away is not None and self._arrived(agent, agent.away(state)):
+            return self._rest
+        began = time.perf_counter()
+        if not self._begun:
+            self._memory, self._begun = agent.policy.begin(1, rng), True
+        action, self._memory = act(agent.policy, seen_by(agent, self.world, state), self._memory, 1, self.spec, rng)
+        self.acted = self.spec.check_action(action, 1)
+        self._ms.append(1e3 * (time.perf_counter() - began))
+        return self.acted
+
+    def _arrived(self, agent: Agent, away: float) -> bool:
+        """Whether there is no more to do: the goal is reached, or it has not come nearer for long."""
+        self.away = away
+        told = f"{away:.1f} {agent.unit}" if agent.unit else f"{away:.3f}"
+        if away <= agent.near:
+            self.stop(f"reached: {told} from the goal. You drive.")
+            return True
+        self._since += 1
+        if away < _NEARER * self._best:
+            self._best, self._since = away, 0
+        elif self._since * self.spec.dt_s > PATIENCE_S:
+            best = f"{self._best:.1f} {agent.unit}" if agent.unit else f"{self._best:.3f}"
+            self.stop(f"the goal cannot be reached from here: {best} is the nearest that the agent came. You drive.")
+            return True
+        return False

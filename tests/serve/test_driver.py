@@ -1,0 +1,178 @@
+"""Who drives: an agent acts when it is let, a touch takes over in the same step, and what it raises is told, never fatal."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.core.errors import PlanningError
+from terrella.core.policy import Idle, Reactive
+from terrella.core.spec import Spec
+from terrella.serve.actions import action_of, keys_of
+from terrella.serve.agent import Agent, Agents
+from terrella.serve.timeline import Timeline
+
+from .panorama import BUTTONS, Panorama
+from .test_page import open_page, until  # noqa: F401  (a fixture)
+from .test_session import FakeSocket, Session, asyncio
+from .test_session import until as happens
+
+
+def pressing(*names: str) -> torch.Tensor:
+    return torch.tensor([[float(name in names) for name in BUTTONS]]).to(torch.int8)
+
+
+def walker(**more) -> Agents:
+    return Agents(lambda goal: Agent("a walker", Reactive(lambda seen, rng: pressing("MOVE_FORWARD")), **more))
+
+
+def test_an_agent_waits_until_it_is_let_and_a_key_takes_over_in_the_same_step():
+    timeline = Timeline([Panorama()], 0, policy=walker())
+    timeline.step()
+    assert timeline.shown.episode_return == 0 and timeline.driver.acted is None
+    timeline.driver.let(True)
+    timeline.step()
+    assert timeline.shown.episode_return == 1 and timeline.driver.name == "a walker"
+    assert keys_of(timeline.obeyed, timeline.driver.acted) == ["KeyW"]
+    timeline.step(["KeyS"])
+    assert timeline.shown.episode_return == 0, "the very step of the key is the person's"
+    assert not timeline.driver.on and timeline.driver.acted is None
+    timeline.step()
+    assert timeline.shown.episode_return == 0, "and the agent does not come back by itself"
+
+
+def test_a_key_of_another_keyboard_touches_nothing():
+    timeline = Timeline([Panorama()], 0, policy=walker())
+    timeline.driver.let(True)
+    timeline.step(["KeyZ"])
+    assert timeline.driver.on and timeline.shown.episode_return == 1
+
+
+@pytest.mark.parametrize("fault", ["error", "sentence", "nan", "shape", "made"])
+def test_an_agent_that_fails_is_told_in_a_sentence_and_the_person_drives(fault, capsys):
+    def act(seen, rng):
+        if fault == "error":
+            raise RuntimeError("the paint is wet")
+        if fault == "sentence":
+            raise PlanningError("none of 8 plans has a cost that is a finite number.")
+        return torch.full((1, 6), torch.nan) if fault == "nan" else torch.zeros(1, 5)
+
+    def make(goal):
+        if fault == "made":
+            raise PlanningError("there is no reward to plan for.")
+        return Agent("a stranger", Reactive(act))
+
+    timeline = Timeline([Panorama()], 0, policy=Agents(make))
+    timeline.driver.let(True)
+    timeline.step()
+    said = timeline.driver.said
+    assert not timeline.driver.on and said.startswith("the agent stopped: ") and said.endswith("You drive.")
+    words = {"error": "RuntimeError: the paint is wet", "sentence": "finite", "nan": "finite", "shape": "shape"}
+    assert words.get(fault, "no reward") in said
+    assert timeline.shown.episode_return == 0, "nothing is done in its place"
+    timeline.step(["KeyW"])
+    assert timeline.shown.episode_return == 1
+    timeline.driver.let(True)
+    assert timeline.driver.said == ""
+
+
+def test_a_goal_that_is_reached_ends_the_drive():
+    def away(state) -> float:
+        return 1.0 - float(state["x"][0])
+
+    timeline = Timeline([Panorama()], 0, policy=walker(away=away, near=0.55, unit="m"))
+    timeline.driver.let(True)
+    for _ in range(8):
+        timeline.step()
+    assert not timeline.driver.on and timeline.driver.said == "reached: 0.5 m from the goal. You drive."
+    assert float(timeline._states[0]["x"][0]) == pytest.approx(0.5), "and it goes no further"
+
+
+@pytest.mark.parametrize("away", [3.0, float("nan")])
+def test_a_goal_that_does_not_come_nearer_ends_the_drive(away):
+    timeline = Timeline([Panorama(dt_s=0.5)], 0, policy=walker(away=lambda state: away, near=0.5, unit="m"))
+    timeline.driver.let(True)
+    for _ in range(30):
+        timeline.step()
+    assert not timeline.driver.on and ("cannot be reached" in timeline.driver.said) == (away == 3.0)
+    assert timeline.driver.said.endswith("You drive.")
+
+
+def test_after_a_rewind_the_agent_remembers_nothing():
+    class Counting(Idle):
+        begun = 0
+
+        def begin(self, batch, rng):
+            Counting.begun += 1
+            return super().begin(batch, rng)
+
+    world = Panorama()
+    timeline = Timeline([world], 0, policy=Agents(lambda goal: Agent("a counter", Counting(world.spec))))
+    timeline.driver.let(True)
+    for _ in range(6):
+        timeline.step()
+    timeline.stand_at(2)
+    timeline.branch()
+    timeline.step()
+    assert Counting.begun == 2
+
+
+def spec_of(action: spaces.Space, keys: dict[str, list[float]], **more) -> Spec:
+    return Spec(name="test", action=action, channels={}, observes=(), dt_s=0.1, keys=keys, **more)
+
+
+def test_the_keys_of_an_action_are_those_that_a_person_would_press():
+    buttons = Panorama().spec
+    assert keys_of(buttons, pressing("MOVE_FORWARD", "TURN_LEFT")) == ["KeyW", "ArrowLeft"], "not the second key for each"
+    choice = spec_of(spaces.Discrete(3), {"KeyA": [1], "KeyD": [2], "KeyA+Space": [2], "KeyS": [0]})
+    assert keys_of(choice, torch.tensor([1])) == ["KeyA"] and keys_of(choice, torch.tensor([0])) == []
+    axes = spec_of(spaces.Box(-1, 1, (2,)), {"KeyW": [1, 0], "KeyS": [-1, 0], "KeyD": [0, -1]})
+    assert keys_of(axes, torch.tensor([[0.7, 0.2]])) == ["KeyW"] and keys_of(axes, torch.tensor([[0.2, -0.6]])) == ["KeyD"]
+    several = spec_of(spaces.MultiDiscrete([3, 2]), {"KeyA": [1, 0], "KeyD": [2, 0], "Space": [0, 1]})
+    assert keys_of(several, torch.tensor([[2, 1]])) == ["KeyD", "Space"]
+    for spec in (buttons, choice, axes, several):
+        for code in (code for code in spec.keys if "+" not in code and code not in ("KeyS", "ArrowUp", "ArrowDown")):
+            assert keys_of(spec, action_of(spec, [code]))[:1] in ([code], ["KeyA"])
+
+
+def test_a_session_tells_who_drives_and_two_pages_have_agents_of_their_own():
+    from concurrent.futures import ThreadPoolExecutor
+
+    async def main() -> None:
+        with ThreadPoolExecutor(1) as worker:
+            make = lambda: Timeline([Panorama(dt_s=1 / 400)], 0, policy=walker())  # noqa: E731
+            sessions = [Session(make, worker) for _ in range(2)]
+            tasks = [asyncio.create_task(session.run()) for session in sessions]
+            sockets = [FakeSocket(session) for session in sessions]
+            try:
+                for session, socket in zip(sessions, sockets):
+                    session.attach(socket)
+                sessions[0].hear("drive", True)
+                told = lambda socket, kind: [event for event in socket.events if event["type"] == kind]  # noqa: E731
+                await happens(lambda: any(event["held"] == ["KeyW"] for event in told(sockets[0], "acted")))
+                await happens(lambda: sockets[0].last.episode_return == 1 and len(sockets[1].frames) > 5)
+                assert told(sockets[0], "agent")[-1]["name"] == "a walker" and told(sockets[0], "agent")[-1]["driving"]
+                assert not any(event["driving"] for event in told(sockets[1], "agent"))
+                assert all(frame.episode_return == 0 for frame in sockets[1].frames)
+            finally:
+                for session in sessions:
+                    session.close()
+                await asyncio.gather(*tasks)
+
+    asyncio.run(main())
+
+
+@pytest.mark.browser
+def test_the_page_shows_who_drives_and_a_key_takes_over(serve_world, open_page):  # noqa: F811
+    page = open_page(serve_world([Panorama()], policy=walker()).url)
+    assert not page.evaluate("terrella.driving") and page.locator("#drive").is_visible()
+    page.keyboard.press("KeyG")
+    until(page, "terrella.driving && terrella.agent.held.join() === 'KeyW'")
+    assert page.locator("#driver-name").text_content() == "A walker drives"
+    assert page.locator("#keys kbd.held b").all_text_contents() == ["W"]
+    page.keyboard.down("ArrowLeft")
+    until(page, "!terrella.driving && terrella.agent.held.length === 0")
+    assert page.locator("#driver-name").text_content() == "You drive"
+    assert page.locator("#keys kbd.held b").all_text_contents() == ["←"]
+    page.keyboard.up("ArrowLeft")
