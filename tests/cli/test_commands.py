@@ -27,8 +27,8 @@ OPTIONS = {
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --fps --frames --human --idle --json --keys --live-mcap --out --pictures --port "
     "--seed --size",
-    "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys --memory-mb --no-memory "
-    "--policy --port --record --remember --seed --token --truth",
+    "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
+    "--memory-mb --no-memory --policy --port --record --remember --seed --token --truth",
     "plan": "--adapter --block --budget-ms --cost --curve --device --episodes --fps --goal --horizon --iterations --json "
     "--out --real --replan --samples --search --seed --size --steps --success --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",

@@ -93,7 +93,7 @@ def test_a_policy_drives_until_somebody_touches_the_controls():
     assert seen == [set(world.spec.channels)] * 3, "it sees all that the world shows"
     timeline.step((), (-1.0,))
     assert len(seen) == 3, "a person has taken over"
-    timeline.driving = False
+    timeline.driver.let(False)
     timeline.step()
     assert len(seen) == 3
 

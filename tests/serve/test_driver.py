@@ -124,11 +124,15 @@ def spec_of(action: spaces.Space, keys: dict[str, list[float]], **more) -> Spec:
 
 def test_the_keys_of_an_action_are_those_that_a_person_would_press():
     buttons = Panorama().spec
-    assert keys_of(buttons, pressing("MOVE_FORWARD", "TURN_LEFT")) == ["KeyW", "ArrowLeft"], "not the second key for each"
+    assert keys_of(buttons, pressing("MOVE_FORWARD", "TURN_LEFT")) == ["KeyW", "ArrowLeft"], (
+        "not the second key for each"
+    )
     choice = spec_of(spaces.Discrete(3), {"KeyA": [1], "KeyD": [2], "KeyA+Space": [2], "KeyS": [0]})
     assert keys_of(choice, torch.tensor([1])) == ["KeyA"] and keys_of(choice, torch.tensor([0])) == []
     axes = spec_of(spaces.Box(-1, 1, (2,)), {"KeyW": [1, 0], "KeyS": [-1, 0], "KeyD": [0, -1]})
-    assert keys_of(axes, torch.tensor([[0.7, 0.2]])) == ["KeyW"] and keys_of(axes, torch.tensor([[0.2, -0.6]])) == ["KeyD"]
+    assert keys_of(axes, torch.tensor([[0.7, 0.2]])) == ["KeyW"] and keys_of(axes, torch.tensor([[0.2, -0.6]])) == [
+        "KeyD"
+    ]
     several = spec_of(spaces.MultiDiscrete([3, 2]), {"KeyA": [1, 0], "KeyD": [2, 0], "Space": [0, 1]})
     assert keys_of(several, torch.tensor([[2, 1]])) == ["KeyD", "Space"]
     for spec in (buttons, choice, axes, several):
@@ -151,7 +155,7 @@ def test_a_session_tells_who_drives_and_two_pages_have_agents_of_their_own():
                 sessions[0].hear("drive", True)
                 told = lambda socket, kind: [event for event in socket.events if event["type"] == kind]  # noqa: E731
                 await happens(lambda: any(event["held"] == ["KeyW"] for event in told(sockets[0], "acted")))
-                await happens(lambda: sockets[0].last.episode_return == 1 and len(sockets[1].frames) > 5)
+                await happens(lambda: sockets[0].last.episode_return > 0 and len(sockets[1].frames) > 5)
                 assert told(sockets[0], "agent")[-1]["name"] == "a walker" and told(sockets[0], "agent")[-1]["driving"]
                 assert not any(event["driving"] for event in told(sockets[1], "agent"))
                 assert all(frame.episode_return == 0 for frame in sockets[1].frames)
@@ -163,7 +167,6 @@ def test_a_session_tells_who_drives_and_two_pages_have_agents_of_their_own():
     asyncio.run(main())
 
 
-@pytest.mark.browser
 def test_the_page_shows_who_drives_and_a_key_takes_over(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Panorama()], policy=walker()).url)
     assert not page.evaluate("terrella.driving") and page.locator("#drive").is_visible()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 import traceback
@@ -127,6 +128,9 @@ class Driver:
 
     def _arrived(self, agent: Agent, away: float) -> bool:
         """Whether there is no more to do: the goal is reached, or it has not come nearer for long."""
+        if not math.isfinite(away):
+            self.stop(f"{self.spec.name} cannot say how far the goal is from here. You drive.")
+            return True
         self.away = away
         told = f"{away:.1f} {agent.unit}" if agent.unit else f"{away:.3f}"
         if away <= agent.near:

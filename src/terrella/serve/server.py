@@ -130,7 +130,10 @@ class Sessions:
             no_rewind=no_rewind(self.worlds),
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             agent=self._agents is not None,
-            goals={"places": bool(self._agents and self._agents.places), "pictures": bool(self._agents and self._agents.pictures)},
+            goals={
+                "places": bool(self._agents and self._agents.places),
+                "pictures": bool(self._agents and self._agents.pictures),
+            },
         )
 
 
@@ -255,8 +258,9 @@ def serve(
 ) -> None:
     """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
     Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
-    touches the controls; Agents (agent.py) drive when a person lets them. `keep` is called with the spec whenever a person has changed the keys on a page; `kept_in` says, in
-    words, where it keeps them for all pages, and is "" where each page keeps its own, in its browser.
+    touches the controls; Agents (agent.py) when a person lets them. `keep` is called with the spec
+    whenever a person has changed the keys on a page; `kept_in` says, in words, where it keeps them for all pages, and is ""
+    where each page keeps its own, in its browser.
 
     `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
     given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.

@@ -16,7 +16,10 @@ from .task import Task
 
 _FEWEST_MOVES, _MOST_MOVES = 4, 16
 _FEWEST_SAMPLES = 8
-_HOLD_S, _AHEAD_S = 0.4, 2.0  # how long random actions are held, and how far ahead, to see whether a cost tells plans apart
+_HOLD_S, _AHEAD_S = (
+    0.4,
+    2.0,
+)  # how long random actions are held, and how far ahead, to see whether a cost tells plans apart
 
 
 @torch.no_grad()
