@@ -14,6 +14,7 @@ import pytest
 
 from terrella.cli import main
 from terrella.cli.plan import RECORDING, SCORING, TRAINING, Plan, folder_for
+from terrella.cli.record import explore
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
 from terrella.learn.trainer import Trainer
@@ -144,3 +145,12 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     assert "is finished" in again.err and facts["verdict"][0] in again.out and "play it: terrella play" in again.out
     assert main([*command(out), "--seed", "5"]) == 2
     assert "seed 0, not 5" in capsys.readouterr().err
+
+
+def test_too_few_frames_are_said_and_kept(tmp_path, capsys, monkeypatch):
+    few = lambda world, out, frames, *rest, **more: explore(world, out, 20, *rest, **more)  # noqa: E731
+    monkeypatch.setattr("terrella.cli.learn.explore", few)
+    out = tmp_path / "few"
+    assert main(command(out)) == 2
+    assert "20 frames" in (said := capsys.readouterr().err) and "goes on recording" in said
+    assert Dataset(out / RECORDING).length == 20 and not (out / "run").exists()

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from terrella.core import make_rng
+from terrella.core.errors import DatasetError
 from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, palette
+from terrella.learn.objectives.codec import Spans, clip
+from terrella.learn.trainer import Now
 from terrella.space.mosaic import recalled
+from terrella.worlds.controls import Controls
 
 SIZE = (32, 40)
 
@@ -60,3 +65,32 @@ def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
     assert torch.equal(known[0, :3, 8:], after[0, :, 8:]) and not known[1].any()
     gone = recalled(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
     assert torch.equal(gone[0, :3, 8:], before[0, :, 8:])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "spans"),
+    [
+        ([400, 300], (24, 4, 12)),
+        ([20] * 30, (0, 4, 12)),
+        ([9] * 50, (0, 4, 3)),
+        ([9] * 50 + [700], (24, 4, 12)),
+        ([9] * 200 + [12] * 200, (0, 4, 6)),
+    ],
+)
+def test_clips_are_as_long_as_episodes_allow(lengths, spans):
+    assert Spans.fitting(np.array(lengths), 4) == Spans(*spans)
+
+
+def test_episodes_of_a_few_rows_make_no_clip():
+    with pytest.raises(DatasetError, match="the 7 rows that a clip has"):
+        Spans.fitting(np.array([5, 6]), 4)
+
+
+def test_of_few_clips_some_are_taken_twice():
+    rgb = np.zeros((3, 7, 8, 8, 3), np.uint8)
+    rgb[:, :, 0, 0, 0] = np.arange(3)[:, None]
+    now = Now(0, 0.0, torch.device("cpu"), np.random.default_rng(0), torch.Generator())
+    found = {"rgb": rgb, "action": np.zeros((3, 7, 2), np.float32)}
+    made = clip(found, Controls.buttons(2), torch.zeros(1, 2, dtype=torch.int64), Spans(0, 4, 3), 5, now)
+    assert made.frames.shape == (5, 7, 3, 8, 8) and made.actions.shape[:2] == (5, 7)
+    assert set(made.frames[:, 0, 0, 0, 0].tolist()) <= {0, 1, 2}

@@ -32,6 +32,7 @@ SIZES, FEWEST = (50, 24, 12, 6, 3), 6  # numbers of clips, the most for which th
 SAVE_EVERY_S = 30.0
 SMALL = 64 * 96  # pixels of a picture at most, if there are fewer minutes than SOON_MIN: of more it learns too little
 SOON_MIN = 60
+FEW_FRAMES, FEWEST_FRAMES = 600, 100  # so many are recorded if half of the time allows it; fewer teach nothing
 FEW_STEPS = 600  # after which a world has learned next to nothing
 
 
@@ -102,10 +103,26 @@ def _record(plan: Plan, name: str, controls: Controls, environment: Environment,
     out, frames = plan.folder / RECORDING, plan.asked["frames"]
     plan.facts.setdefault("longest", _longest(world, frames, plan.share_s[RECORDING]))
     plan.save()
-    enough = lambda: plan.left_s(RECORDING) <= 0  # noqa: E731
+    rows = 0
+
+    def told(done: float, total: float, *words: Any) -> None:
+        nonlocal rows
+        rows = done
+        report(done, total, *words)
+
+    def enough() -> bool:
+        few = rows < FEW_FRAMES and plan.spent[RECORDING] < plan.seconds / 2
+        return plan.left_s(RECORDING) <= 0 and not few
+
     more: dict[str, Any] = {"max_episode_steps": plan.facts["longest"], "enough": enough}
-    explore(world, out, frames, plan.asked["seed"], report, stored_as(world.spec), **more)
-    return looked_at(Dataset(out), world.spec.name)
+    explore(world, out, frames, plan.asked["seed"], told, stored_as(world.spec), **more)
+    dataset = Dataset(out)
+    if dataset.length < min(FEWEST_FRAMES, frames):
+        raise DatasetError(
+            f"{name} gave {dataset.length} frames in {_minutes(plan.spent[RECORDING])}, too few to learn from; the same command "
+            "with more --minutes goes on recording."
+        )
+    return looked_at(dataset, world.spec.name)
 
 
 def _open(name: str, environment: Environment, most: int) -> World:

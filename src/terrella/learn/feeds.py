@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..core.errors import DatasetError
@@ -65,26 +64,22 @@ def frames_feed(
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))
 
 
-def codec_feed(recording: Recording, config: VideoConfig, moves: torch.Tensor, size: int, seed: int) -> Feed:
+def codec_feed(
+    recording: Recording, config: VideoConfig, moves: torch.Tensor, spans: codec.Spans, size: int, seed: int
+) -> Feed:
     """Clips for a codec of these `moves`, `size` at a time: of thrice as many those in which more happens are the likelier."""
-    lengths = np.array(
-        [stop - first for first, stop in (recording.cache.episodes[number] for number in recording.seen)]
-    )
-    if lengths.max(initial=0) < (least := codec.clip_length(config.slots, 0)):
-        raise DatasetError(f"no episode of {recording.name} has the {least} rows that a clip has; record longer ones.")
-    pasts = codec.PAST, codec.PAST // 2, 0
-    most = [lengths[lengths >= codec.clip_length(config.slots, past)].sum() for past in pasts]
-    past = next(past for past, rows in zip(pasts, most) if rows >= 0.9 * most[-1])  # else episodes are too short for it
-    clips = clips_of(recording, codec.clip_length(config.slots, past), 3 * size, config, seed)
+    clips = clips_of(recording, spans.length, 3 * size, config, seed, drop_last=False)
     controls = recording.controls or Controls.buttons(config.actions)
-    return Streamed(clips, lambda found, now: codec.clip(found, controls, moves, config.slots, size, now))
+    return Streamed(clips, lambda found, now: codec.clip(found, controls, moves, spans, size, now))
 
 
-def clips_of(recording: Recording, length: int, size: int, config: VideoConfig, seed: int) -> Clips:
+def clips_of(
+    recording: Recording, length: int, size: int, config: VideoConfig, seed: int, drop_last: bool = True
+) -> Clips:
     """Clips of `length` rows, `size` at a time, of the episodes that training may see."""
     ranges = recording.cache.episodes  # of what is kept out, whole episodes are left out: clips know no rows
     whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
     channels = ("rgb", "action", *("instruction",) * ("task" in recording.cache.arrays))
-    return Clips(recording.cache, length, channels, size, config.size, seed=seed, episodes=whole)
+    return Clips(recording.cache, length, channels, size, config.size, seed=seed, drop_last=drop_last, episodes=whole)

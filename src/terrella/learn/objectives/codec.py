@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ...core.errors import DatasetError
 from ...space.matching import CLEAR, explained, preferred, scrolled
 from ...space.mosaic import remembered
 from ...worlds.codec import Codec, Scroll
@@ -19,7 +20,7 @@ from ..muon import muon
 from ..trainer import Average, Loss, Now, warmed
 
 PAST = 24  # steps of a clip before those that are shown, of which its mosaic is made; fewer where episodes are short
-DREAM = 12  # steps of a clip that are dreamt, each from those before it; losses of each are descended
+DREAM = 12  # steps of a clip that are dreamt, each from those before it, and descended; fewer where episodes are short
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
 BLIND = (
@@ -32,7 +33,7 @@ CHANGED, OFF = 4, 20  # differences of 255
 
 @dataclass(frozen=True)
 class Clip:
-    """frames uint8 [B, slots + DREAM, 3, H, W] and actions [B, slots + DREAM, A] as networks take them, action t leading from
+    """frames uint8 [B, slots + dream, 3, H, W] and actions [B, slots + dream, A] as networks take them, action t leading from
     frame t to the next; the oldest first. mosaic uint8 [B, 4, H', W']: as of the frame before the last of the slots."""
 
     frames: torch.Tensor
@@ -40,19 +41,38 @@ class Clip:
     mosaic: torch.Tensor
 
 
-def clip_length(slots: int, past: int = PAST) -> int:
-    return past + slots + DREAM
+@dataclass(frozen=True)
+class Spans:
+    """Steps of a clip: those of which its mosaic is made, those that are shown, and those that are dreamt."""
+
+    past: int
+    slots: int
+    dream: int
+
+    @property
+    def length(self) -> int:
+        return self.past + self.slots + self.dream
+
+    @staticmethod
+    def fitting(lengths: np.ndarray, slots: int) -> Spans:
+        """The longest for which there are rows enough in episodes of these lengths; DatasetError where all are too short."""
+        rows = lambda past, dream: lengths[lengths >= past + slots + dream].sum()  # noqa: E731
+        dreams, pasts = (DREAM, DREAM // 2, DREAM // 4), (PAST, PAST // 2, 0)
+        if not rows(0, dreams[-1]):
+            raise DatasetError(f"no episode has the {slots + dreams[-1]} rows that a clip has; record longer ones.")
+        dream = next(dream for dream in dreams if rows(0, dream) >= 0.5 * rows(0, dreams[-1]))
+        return Spans(next(past for past in pasts if rows(past, dream) >= 0.9 * rows(0, dream)), slots, dream)
 
 
 def clip(
-    found: Mapping[str, np.ndarray], controls: Controls, moves: torch.Tensor, slots: int, batch: int, now: Now
+    found: Mapping[str, np.ndarray], controls: Controls, moves: torch.Tensor, spans: Spans, batch: int, now: Now
 ) -> Clip:
     """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
     rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
-    past = rgb.shape[1] - slots - DREAM
+    past, slots = spans.past, spans.slots
     differs = np.abs(rgb[:, past + slots :].astype(np.int16) - rgb[:, past + slots - 1 : -1]).max(-1) > 2 * CHANGED
     weight = 0.3 + (differs.mean((2, 3)) > 0.005).mean(1)
-    picks = now.rng.choice(len(rgb), batch, replace=False, p=weight / weight.sum())
+    picks = now.rng.choice(len(rgb), batch, replace=len(rgb) < batch, p=weight / weight.sum())
     whole = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
     actions = controls.encode(torch.from_numpy(action[picks][:, past:]).flatten(0, 1)).unflatten(0, (batch, -1))
     begins = torch.from_numpy(now.rng.random(batch) < STILL)[:, None]
@@ -66,11 +86,10 @@ def clip(
 
 
 class CodecObjective:
-    """The likelihood of each pixel under the mixture of its sources and of the palette."""
+    """The likelihood of each pixel under the mixture of its sources and of the palette, in clips of these `spans`."""
 
-    strides = DREAM  # losses of a batch, each of which is descended
-
-    def __init__(self, codec: Codec, learning_rate: float):
+    def __init__(self, codec: Codec, learning_rate: float, spans: Spans):
+        self.spans, self.strides = spans, spans.dream  # losses of a batch, each of which is descended
         self.generator = channels_last(codec)
         self.smooth = Average(self.generator, 0.998)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
@@ -92,7 +111,7 @@ class CodecObjective:
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
         follows = torch.arange(len(recorded), device=now.device)[:, None, None, None] % 2 == 0  # half is never dreamt
-        follows = follows | (now.step * DREAM < RECORDED)
+        follows = follows | (now.step * self.strides < RECORDED)
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)

@@ -25,7 +25,7 @@ from ...worlds.outcome import Constant, ConstantConfig, Outcome
 from ...worlds.places import KeyframeScene
 from ..feeds import codec_feed, frames_feed
 from ..moves import Looks, frequent_moves, mosaics, palette
-from ..objectives.codec import CodecObjective
+from ..objectives.codec import CodecObjective, Spans
 from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
@@ -207,7 +207,9 @@ class _Learned:
         codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
         codec.moves[1:], codec.palette[:] = found.moves, found.palette
         codec.stress.fill_(found.stress)
-        return CodecObjective(codec, self.config.learning_rate or 2e-3)
+        ranges = self.recording.cache.episodes
+        lengths = np.array([np.diff(ranges[number])[0] for number in self.recording.seen] or [0])
+        return CodecObjective(codec, self.config.learning_rate or 2e-3, Spans.fitting(lengths, self.video.slots))
 
     def _looks(self) -> Looks:
         recording, rng = self.recording, np.random.default_rng(self.config.seed)
@@ -223,7 +225,8 @@ class _Learned:
     def _feed(self, batch: int) -> Feed:
         parts = self.video, batch, self.config.seed
         if isinstance(self.flow, CodecObjective):
-            return codec_feed(self.recording, self.video, self.flow.generator.moves, *parts[1:])
+            moves, spans = self.flow.generator.moves, self.flow.spans
+            return codec_feed(self.recording, self.video, moves, spans, *parts[1:])
         dream = self.flow.dream if self.config.flow_steps == 1 else None  # a teacher sees recorded frames alone
         return frames_feed(self.recording, self.memory, *parts, dream)
 
