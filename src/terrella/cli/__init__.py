@@ -22,6 +22,7 @@ COMMANDS = {
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
+    "train policy": ("practice:policy", "let a policy practise in a world alone"),
     "train estimator": ("train:estimator", "learn to estimate depth and camera motion from pictures"),
     "train uncertainty": ("train:uncertainty", "add an estimator and an uncertainty to a trained world"),
     "train objects": ("train:objects", "learn what moving objects do, from another recording"),

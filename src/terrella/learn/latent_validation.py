@@ -12,7 +12,7 @@ import torch
 
 from ..core.errors import DatasetError
 from ..core.state import State
-from ..core.world import make_rng
+from ..core.world import World, make_rng
 from ..worlds.latent import LatentWorld
 from ..worlds.latent_network import KNOTS, LatentNetwork
 from .objectives.uncertainty import pooled, rank_correlation
@@ -59,7 +59,7 @@ def encoded(world: LatentWorld, recording: Recording, rows: np.ndarray) -> torch
     """Latents [n, D] of rows of a recording."""
     parts = np.array_split(rows, max(1, -(-len(rows) // 512)))
     return torch.cat(
-        [world.observe(_evidence(world, recording, some), None, make_rng(0))["window"][:, -1] for some in parts]
+        [world.observe(evidence(world, recording, some), None, make_rng(0))["window"][:, -1] for some in parts]
     )
 
 
@@ -82,7 +82,7 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
     began = {name: _vector(recording, name, rows) for name, _ in world.network.config.vectors}
     first, paid = encoded(world, recording, rows), _rewards(recording)
     for arm, hands in ((ARMS[0], rows), (ARMS[1], others)):
-        state = _folded(world, recording, rows, context)
+        state = folded(world, recording, rows, context)
         for step in range(1, fitting[-1] + 1):
             state = world.imagine(state, recording.played(world.spec, hands + step - 1), make_rng(0))
             if step not in fitting:
@@ -155,7 +155,7 @@ def foreseen(world: LatentWorld, recording: Recording, steps: int = 64) -> list[
     if not fits:
         return []
     rows, every = data.within(context, fits[-1], acted=True)[:1], fits[-1] // 8
-    state = _folded(world, recording, rows, context)
+    state = folded(world, recording, rows, context)
     frames = [world.render(state, ("rgb",))["rgb"]]
     for step in range(fits[-1]):
         state = world.imagine(state, recording.played(world.spec, rows + step), make_rng(0))
@@ -187,22 +187,22 @@ def effective_rank(latents: torch.Tensor) -> float:
     return float(torch.special.entr(shares).sum().exp())
 
 
-def _folded(world: LatentWorld, recording: Recording, rows: np.ndarray, context: int) -> State:
+def folded(world: World, recording: Recording, rows: np.ndarray, context: int) -> State:
     """The state at `rows`, each row before it being evidence upon what was imagined from the one before."""
     rng = make_rng(0)
-    state = world.observe(_evidence(world, recording, rows - context), None, rng)
+    state = world.observe(evidence(world, recording, rows - context), None, rng)
     for back in range(context, 0, -1):
         state = world.imagine(state, recording.played(world.spec, rows - back), rng)
-        state = world.observe(_evidence(world, recording, rows - back + 1), state, rng)
+        state = world.observe(evidence(world, recording, rows - back + 1), state, rng)
     return state
 
 
-def _evidence(world: LatentWorld, recording: Recording, rows: np.ndarray) -> dict[str, torch.Tensor]:
+def evidence(world: World, recording: Recording, rows: np.ndarray) -> dict[str, torch.Tensor]:
     seen = {}
     for name in (*world.spec.observes, *world.spec.may_observe):
         if name == "rgb":
             seen[name] = recording.rgb(rows).permute(0, 2, 3, 1)
-        else:
+        elif recording.cache.keys.get(name, name) in recording.cache.arrays:
             seen[name] = _vector(recording, name, rows)
     return seen
 

@@ -1,0 +1,105 @@
+"""The command `terrella train policy`: practice in a world alone, and what it is worth in the real environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from tyro.conf import arg
+
+from .. import library, progress
+from ..act.actor import Actor
+from ..act.planning.episodes import Played, play
+from ..core.errors import TerrellaError
+from ..core.policy import Policy, Random
+from ..core.world import World, make_rng
+from ..learn.recipes.policy import Practice, train_policy
+from ..measure.statistics import Figure, mean_interval
+from .named import Device, Environment, load_named
+from .say import Json, result
+
+STEPS = 200  # of an episode, where the environment sets no limit
+
+
+@dataclass(frozen=True)
+class Real:
+    """What the policy is tried on.
+
+    Args:
+        real: The environment to act in afterwards (gym:Pendulum-v1), beside acting at random from the same starts.
+        episodes: Episodes that it plays there.
+    """
+
+    real: str | None = None
+    episodes: int = 20
+
+
+def policy(
+    world: Annotated[str, arg(name="in")],
+    out: Path,
+    config: Practice,
+    environment: Environment,
+    tried: Real,
+    recording: Annotated[str | None, arg(name="from")] = None,
+    device: Device = "auto",
+    json: Json = False,
+) -> None:
+    """Let a policy practise in a world alone, by the hundred episodes at once, and say what it is worth in the real environment.
+    Stop it with Ctrl-C at any time; the same command continues.
+
+    Args:
+        world: The world to practise in: what `terrella list` shows, the path of a checkpoint or a run, or a simulator (gym:ID).
+        out: Folder of the run: the policy, its checkpoint and a log.
+        recording: A recording in whose states practice begins; default: where the world's own episodes do.
+    """
+    if tried.episodes < 1:
+        raise TerrellaError("--episodes is a whole number from 1 up.")
+    inside = environment.open(world) if library.is_truth(world) else load_named(world, device)
+    outside = None if tried.real is None else environment.open(tried.real)
+    with progress.shown("practising") as report:
+        facts = train_policy(inside, world, out, config, report, recording)
+    if outside is None:
+        facts["play"] = f"terrella train policy --in {world} --out {out} --real ENVIRONMENT says what it is worth"
+        return result(facts, json)
+    figures = tried_out(out, inside, outside, tried.episodes, config.seed)
+    lines = told(figures, inside, outside, facts)
+    plain = {name: asdict(figure) for name, figure in figures.items()}
+    result({"verdict": lines[0], **plain, **facts}, json, "\n".join([*lines, f"the policy: {facts['policy']}"]))
+
+
+def tried_out(out: Path, inside: World, outside: World, episodes: int, seed: int) -> dict[str, Figure]:
+    """The policy's returns in the environment, those of chance from the same starts, what it is better by, start by start, and what
+    a learned world promised."""
+    steps = outside.spec.max_episode_steps or STEPS
+    actor = Actor.load(out, outside.spec)
+
+    def returns(world: World, policy: Policy, what: str) -> torch.Tensor:
+        with progress.shown(what) as report:
+            sees = [name for name in actor.sees if name in world.spec.channels]
+            played: Played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
+        return torch.tensor([one.reward for one in played.episodes])
+
+    mine = returns(outside, actor, "acting")
+    floor = returns(outside, Random(outside.spec), "acting at random")
+    found = {"return": mine, "at random": floor, "better by": mine - floor}
+    if inside.spec.observes:
+        found["promised"] = returns(inside, Actor.load(out, inside.spec), "dreaming")
+    return {name: mean_interval(values, make_rng(seed)) for name, values in found.items()}
+
+
+def told(figures: Mapping[str, Figure], inside: World, outside: World, facts: Mapping[str, Any]) -> list[str]:
+    """What came of it, for people: the verdict first."""
+    better, name = figures["better by"], outside.spec.name
+    if better.low > 0:
+        verdict = f"It acts better than chance in {name}, by {better}."
+    elif better.high < 0:
+        verdict = f"It acts worse than chance in {name}, by {better}: the world it practised in misleads it."
+    else:
+        verdict = f"It is not seen to act better than chance in {name}: by {better}."
+    lines = [verdict, f"return {figures['return']}; at random from the same starts {figures['at random']}"]
+    if "promised" in figures:
+        lines.append(f"in {inside.spec.name} itself, where it practised: {figures['promised']}")
+    return [*lines, f"{facts['practised_steps']:,} steps of practice in {facts['minutes']:.1f} minutes"]

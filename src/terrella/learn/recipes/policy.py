@@ -1,0 +1,175 @@
+"""train policy: practice in a world, learned or a simulator; see objectives/actor_critic.py."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...act.actor import RUN, Actor
+from ...act.actor_network import ActorConfig, ActorNetwork
+from ...core.errors import ChannelError, TrainingError
+from ...core.spec import BUTTONS, CHOICE, Spec
+from ...core.world import World
+from ...data import Dataset
+from ..imagination import Continued, Imagination, Recorded, check_practised, recorded_starts
+from ..objectives.actor_critic import ActorCritic, Critic, Wanted
+from ..recording import Recording
+from ..trainer import Report, Run, Trainer
+
+STAGE = "practice"
+UNLESS_SAID_MIN = 5.0
+ENDLESS = 10**9  # steps: practice ends with its time
+LONGEST = 64  # steps of a dream that begins at a learned world's own starts
+UNSEEN_SIDE = 64  # pixels of a recording whose pictures nobody looks at
+
+
+@dataclass(frozen=True)
+class Practice:
+    """Settings of a policy's practice.
+
+    Args:
+        sees: Channels that the policy sees. Default: the numbers that the world observes, else its latent; of a simulator its
+            observation.
+        minutes: Minutes of practice, earlier runs included. Default: 5, unless --steps are said.
+        steps: Steps of training, each on a batch of dreams.
+        batch: Dreams at a time.
+        horizon: Steps of a dream.
+        discount: Of a reward a step later.
+        blend: Lambda, of the returns: 0 the critic's word after one step, 1 what came to the end of the dream.
+        entropy: What a nat of chance in the actions is worth, in ranges of returns.
+        gradients: Of axes, follow the world's own gradients where it has some. --no-gradients learns from what paid.
+        trust: The world's uncertainty at which a dream ends. Default: as the world says that it invents, if it does.
+        hidden: Width of the networks' layers.
+        learning_rate: Highest learning rate.
+        save_every_s: Seconds between saves.
+        seed: Random seed.
+    """
+
+    sees: tuple[str, ...] = ()
+    minutes: float | None = None
+    steps: int | None = None
+    batch: int = 256
+    horizon: int = 16
+    discount: float = 0.99
+    blend: float = 0.95
+    entropy: float = 3e-4
+    gradients: bool = True
+    trust: float | None = None
+    hidden: int = 128
+    learning_rate: float = 1e-3
+    save_every_s: float = 30.0
+    seed: int = 0
+
+
+def train_policy(
+    world: World, name: str, out: str | Path, config: Practice, report: Report, recording: str | Path | None = None
+) -> dict[str, Any]:
+    """Practises in `world`, or goes on with it; the policy lies in `out`/policy from the first save on. Returns its facts.
+
+    recording: where dreams begin; without one, at the world's own starts. ChannelError and TrainingError for what cannot be.
+    """
+    _check(config)
+    spec, out = world.spec, Path(out)
+    check_practised(spec)
+    sees = config.sees or seen_unless_said(spec)
+    torch.manual_seed(config.seed)
+    shape = ActorConfig.of(spec, sees, config.hidden)
+    actor, critic = ActorNetwork(shape), Critic(shape)
+    _writable(out)
+    run = Run.of(out, config, report, device_of(world), ("minutes",), practised_in=name, begins_in=str(recording or ""))
+    run = replace(run, strip_every_s=config.save_every_s)  # when the policy is written
+    run.found(STAGE)
+    starts = _starts(world, config, recording, report)
+    trust = config.trust if config.trust is not None else _invents(spec)
+    gradients = config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
+    usual = starts.usual(sees)
+    actor.to(run.device), critic.to(run.device)
+    actor.eyes.settle(usual)
+    critic.eyes.settle(usual)
+    wanted = Wanted(config.discount, config.blend, config.entropy)
+    objective = ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
+    feed = Imagination(world, actor, starts, config.horizon, gradients, trust)
+    trainer = Trainer(run, STAGE, feed, objective, config.steps or ENDLESS)
+    minutes = config.minutes or (math.inf if config.steps else UNLESS_SAID_MIN)
+    trainer.limit_s = 60 * minutes
+
+    def save() -> None:
+        Actor(actor, spec, card=_card(trainer, name, spec, config)).save(out / RUN)
+
+    try:
+        trainer.train(save)
+    finally:
+        save()
+    return {**trainer.summary, **_card(trainer, name, spec, config), "policy": str(out / RUN)}
+
+
+def seen_unless_said(spec: Spec) -> tuple[str, ...]:
+    """The channels that a policy sees: numbers of which a learned world takes evidence, else its latent; of a simulator its
+    observation, else its pictures."""
+    evidence = (*spec.observes, *spec.may_observe)
+    numbers = tuple(name for name in evidence if len(spec.channels[name].shape or ()) == 1)
+    if numbers and "rgb" not in spec.observes:
+        return numbers
+    found = next((name for name in ("latent", "observation", "rgb") if name in spec.channels), None)
+    if found is None:
+        raise ChannelError(f"say what the policy sees with --sees; {spec.name} has {', '.join(spec.channels)}.")
+    return (found,)
+
+
+def device_of(world: World) -> torch.device:
+    """Where a world computes; a simulator, on the CPU."""
+    return getattr(world, "device", torch.device("cpu"))
+
+
+def _starts(world: World, config: Practice, recording: str | Path | None, report: Report) -> Recorded | Continued:
+    if recording is None:
+        longest = LONGEST if world.spec.observes else world.spec.max_episode_steps or 1000
+        return Continued(world, config.batch, max(longest, config.horizon), config.seed)
+    dataset = Dataset(recording)
+    drawn = world.spec.channels["rgb"].shape if "rgb" in world.spec.observes else None
+    size = (drawn[0], drawn[1]) if drawn else (UNSEEN_SIDE, UNSEEN_SIDE)
+    opened = Recording.open(dataset, size, report, needs=("action",), why="dreams begin between actions").enough()
+    report(0, 1, "showing the world where dreams begin")
+    return Recorded(world, recorded_starts(world, opened), config.batch)
+
+
+def _invents(spec: Spec) -> float | None:
+    """The uncertainty from which a world says that it invents; None where it says nothing."""
+    told = spec.card.get("uncertainty")
+    if "uncertainty" not in spec.channels or not isinstance(told, Mapping):
+        return None
+    level = told.get("invents")
+    return float(level) if isinstance(level, int | float) else None
+
+
+def _card(trainer: Trainer, name: str, spec: Spec, config: Practice) -> dict[str, Any]:
+    steps = trainer.taken
+    return {
+        "what": f"A policy that practised in {spec.name}",
+        "practised_in": name,
+        "practised_steps": steps * config.batch * config.horizon,
+        "minutes": round(trainer.facts["seconds"] / 60, 2),
+    }
+
+
+def _writable(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / ".probe").touch()
+        (out / ".probe").unlink()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise TrainingError(f"{out} cannot be written ({why}); give another --out.") from error
+
+
+def _check(config: Practice) -> None:
+    counts = (config.batch, config.horizon, config.hidden, 1 if config.steps is None else config.steps)
+    if any(count < 1 for count in counts) or not (config.minutes is None or config.minutes > 0):
+        raise TrainingError("--batch, --horizon, --hidden and --steps are 1 or more, and --minutes is above 0.")
+    if not (0 < config.discount < 1 and 0 <= config.blend <= 1 and config.entropy >= 0):
+        raise TrainingError("--discount is between 0 and 1, --blend from 0 to 1, and --entropy is 0 or more.")
