@@ -88,9 +88,8 @@ def train_policy(
     trust = config.trust if config.trust is not None else _invents(spec)
     gradients = config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
     usual = starts.usual(sees)
-    actor.to(run.device), critic.to(run.device)
-    actor.eyes.settle(usual)
-    critic.eyes.settle(usual)
+    for network in (actor, critic):
+        network.to(run.device).eyes.settle(usual)
     wanted = Wanted(config.discount, config.blend, config.entropy)
     objective = ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
     feed = Imagination(world, actor, starts, config.horizon, gradients, trust)
