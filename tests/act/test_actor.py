@@ -9,9 +9,11 @@ from gymnasium import spaces
 
 from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork, symexp, symlog
+from terrella.act.through import actor_of
 from terrella.core.errors import ActionError, ChannelError, CheckpointError
 from terrella.core.policy import Policy, act
 from terrella.core.spec import DONE, REWARD, Spec
+from terrella.core.state import State
 from terrella.core.world import make_rng
 
 SPACES = {
@@ -144,3 +146,37 @@ def test_what_is_no_policy_is_refused_in_a_sentence(tmp_path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CheckpointError, match="cannot be written"):
         actor_for(SPACES["buttons"]).save(tmp_path / "file" / "policy")
+
+
+def test_a_policy_of_what_a_world_makes_of_things_acts_through_that_world(tmp_path) -> None:
+    class Doubling:
+        """A world that sees `state`, and shows its double, which the policy sees."""
+
+        spec = Spec(
+            "doubling", SPACES["axes"], {"state": CHANNELS["state"], "latent": CHANNELS["state"]}, ("state",), 0.1
+        )
+
+        def observe(self, observation, prior, rng):
+            steps = torch.zeros(len(observation["state"])) if prior is None else prior["steps"]
+            return State({"at": observation["state"], "steps": steps})
+
+        def imagine(self, state, action, rng):
+            return state.replace(steps=state["steps"] + 1)
+
+        def render(self, state, channels):
+            return {name: state["at"] * (2 if name == "latent" else 1) for name in channels}
+
+    world, rng = Doubling(), make_rng(0)
+    torch.manual_seed(0)
+    actor = Actor(ActorNetwork(ActorConfig.of(world.spec, ("latent",), hidden=8)).requires_grad_(False), world.spec)
+    actor.save(tmp_path)
+    real = Spec("real", SPACES["axes"], CHANNELS, (), 0.1)
+    policy = actor_of(tmp_path, real, world)
+    seen = {"state": torch.randn(3, 3)}
+    memory = policy.begin(3, rng)
+    for step in (1, 2):
+        action, memory = act(policy, seen, memory, 3, real, rng)
+        assert memory["steps"].tolist() == [step] * 3
+    assert torch.equal(action, actor.act({"latent": 2 * seen["state"]}, None, rng)[0])
+    with pytest.raises(ChannelError, match="sees 'latent', which real does not show"):
+        actor_of(tmp_path, real)

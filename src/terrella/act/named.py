@@ -21,10 +21,10 @@ from ..core.policy import Idle, Policy, Random, Reactive
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
-from .actor import Actor
 from .explorer import Explorer
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
+from .through import actor_of
 
 KNOWN = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "
@@ -104,7 +104,7 @@ def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Pol
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
-        return Actor.load(name, spec)
+        return actor_of(name, spec, world)
     likest = did_you_mean(name, [*simple, "constant", "plan"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{likest} There are: {KNOWN}.")
 

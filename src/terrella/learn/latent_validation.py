@@ -92,8 +92,9 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
             latent[ARMS[2], step] = _per_clip((first - truth) / unit)
             spread.setdefault(step, state["spread"])
             if paid is not None:
-                for given, reward in ((arm, state["reward"].cpu()), (ARMS[2], paid[rows - 1])):
-                    vectors["reward", given, step] = (reward - paid[rows + step - 1])[:, None]
+                reward, scale = paid
+                for given, found in ((arm, state["reward"].cpu()), (ARMS[2], reward[rows - 1])):
+                    vectors["reward", given, step] = ((found - reward[rows + step - 1]) / scale)[:, None]
             shown = world.render(state, tuple(began))
             for name in began:
                 really, scale = _vector(recording, name, rows + step), _scale(world, name)
@@ -214,13 +215,13 @@ def _vector(recording: Recording, name: str, rows: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.array(array[rows], np.float32)).reshape(len(rows), -1).nan_to_num(0.0, 0.0, 0.0)
 
 
-def _rewards(recording: Recording) -> torch.Tensor | None:
-    """The reward [N] that followed each row, in standard deviations; None where it is always the same."""
+def _rewards(recording: Recording) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """The reward [N] that followed each row, and its standard deviation; None where it is always the same."""
     if recording.cache.reward is None:
         return None
     reward = torch.from_numpy(np.array(recording.cache.reward, np.float32)).reshape(-1)
     unit = reward[torch.from_numpy(np.flatnonzero(recording.usable))].std(correction=0)
-    return reward / unit if unit > 1e-6 else None
+    return (reward, unit) if unit > 1e-6 else None
 
 
 def _scale(world: LatentWorld, name: str) -> torch.Tensor:

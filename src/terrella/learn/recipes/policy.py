@@ -19,6 +19,7 @@ from ...data import Dataset
 from ..imagination import Continued, Imagination, Recorded, check_practised, recorded_starts
 from ..objectives.actor_critic import ActorCritic, Critic, Wanted
 from ..recording import Recording
+from ..run_folder import load_run, resume_file
 from ..trainer import Report, Run, Trainer
 
 STAGE = "practice"
@@ -67,11 +68,18 @@ class Practice:
 
 
 def train_policy(
-    world: World, name: str, out: str | Path, config: Practice, report: Report, recording: str | Path | None = None
+    world: World,
+    name: str,
+    out: str | Path,
+    config: Practice,
+    report: Report,
+    recording: str | Path | None = None,
+    before: Path | None = None,
 ) -> dict[str, Any]:
     """Practises in `world`, or goes on with it; the policy lies in `out`/policy from the first save on. Returns its facts.
 
-    recording: where dreams begin; without one, at the world's own starts. ChannelError and TrainingError for what cannot be.
+    recording: where dreams begin; without one, at the world's own starts. before: the folder of an earlier run, whose networks a
+    new one begins with. ChannelError and TrainingError for what cannot be.
     """
     _check(config)
     spec, out = world.spec, Path(out)
@@ -83,7 +91,7 @@ def train_policy(
     _writable(out)
     run = Run.of(out, config, report, device_of(world), ("minutes",), practised_in=name, begins_in=str(recording or ""))
     run = replace(run, strip_every_s=config.save_every_s)  # when the policy is written
-    run.found(STAGE)
+    begun = run.found(STAGE) is not None
     starts = _starts(world, config, recording, report)
     trust = config.trust if config.trust is not None else _invents(spec)
     gradients = config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
@@ -92,6 +100,8 @@ def train_policy(
         network.to(run.device).eyes.settle(usual)
     wanted = Wanted(config.discount, config.blend, config.entropy)
     objective = ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
+    if before is not None and not begun:
+        load_run(resume_file(before, STAGE), {"actor": actor, "critic": critic, "slow": objective.slow}, {})
     feed = Imagination(world, actor, starts, config.horizon, gradients, trust)
     trainer = Trainer(run, STAGE, feed, objective, config.steps or ENDLESS)
     minutes = config.minutes or (math.inf if config.steps else UNLESS_SAID_MIN)

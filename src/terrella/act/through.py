@@ -1,0 +1,47 @@
+"""Through: a policy that sees an environment as a world does, by the world's latent or whatever else that makes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import final
+
+import torch
+
+from ..core.errors import ChannelError
+from ..core.policy import Policy
+from ..core.spec import Spec
+from ..core.state import State
+from ..core.world import Observation, World
+from .actor import Actor
+
+
+@final
+class Through:
+    """The world folds what is seen into its state, the policy is shown what it sees of that. Its memory is the world's state."""
+
+    def __init__(self, world: World, actor: Actor):
+        self.world, self.actor = world, actor
+        self.sees = (*world.spec.observes, *world.spec.may_observe)
+
+    def begin(self, batch: int, rng: torch.Generator) -> None:
+        return None
+
+    def act(self, observation: Observation, memory: State | None, rng: torch.Generator) -> tuple[torch.Tensor, State]:
+        evidence = {name: observation[name] for name in self.sees if name in observation}
+        state = self.world.observe(evidence, memory, rng)
+        action, _ = self.actor.act(self.world.render(state, self.actor.sees), None, rng)
+        return action, self.world.imagine(state, action, rng)
+
+
+def actor_of(folder: str | Path, spec: Spec, world: World | None = None) -> Policy:
+    """The learned policy of a folder, for the actions of `spec`; where it sees what that does not show but `world` does, through
+    the world. ActionError or ChannelError where it does not fit."""
+    try:
+        return Actor.load(folder, spec)
+    except ChannelError:
+        if world is None:
+            raise
+    lacks = [name for name in world.spec.observes if name not in spec.channels]
+    if lacks:
+        raise ChannelError(f"{world.spec.name} observes {', '.join(lacks)}, which {spec.name} does not show.")
+    return Through(world, Actor.load(folder, world.spec))
