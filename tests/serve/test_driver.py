@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import base64
+
 import pytest
 import torch
 from gymnasium import spaces
 
+from terrella.act.planning import Planner, Revealed, SearchConfig, distance_to, imagined
 from terrella.core.errors import PlanningError
 from terrella.core.policy import Idle, Reactive
 from terrella.core.spec import Spec
+from terrella.core.world import make_rng
 from terrella.serve.actions import action_of, keys_of
 from terrella.serve.agent import Agent, Agents
+from terrella.serve.picture import picture_of
 from terrella.serve.timeline import Timeline
 
 from .panorama import BUTTONS, Panorama
@@ -179,3 +184,65 @@ def test_the_page_shows_who_drives_and_a_key_takes_over(serve_world, open_page):
     assert page.locator("#driver-name").text_content() == "You drive"
     assert page.locator("#keys kbd.held b").all_text_contents() == ["←"]
     page.keyboard.up("ArrowLeft")
+
+
+def test_futures_come_in_pieces_only_while_the_agent_drives():
+    pieces = []
+
+    def futures(memory):
+        for step in range(3):
+            pieces.append(step)
+            yield None
+        yield [(0.5, torch.zeros(4, 96, 128, 3, dtype=torch.uint8)), (float("inf"), torch.zeros(4, 96, 128, 3).byte())]
+
+    timeline = Timeline([Panorama()], 0, policy=walker(futures=futures))
+    assert timeline.consider() is None and not pieces
+    timeline.driver.let(True)
+    timeline.step()
+    assert [timeline.consider() for _ in range(3)] == [None] * 3 and pieces == [0, 1, 2]
+    found = timeline.consider()
+    assert [plan["cost"] for plan in found["plans"]] == [0.5, None] and found["frames"] == 4 and found["step"] == 1
+    strip = picture_of(base64.b64decode(found["plans"][0]["image"]), (72, 4 * 96))
+    assert strip.float().mean() < 3
+    assert timeline.consider() is None and pieces == [0, 1, 2, 0], "and then anew"
+    timeline.step(["KeyW"])
+    assert timeline.consider() is None and pieces == [0, 1, 2, 0], "nobody considers anything while a person drives"
+
+
+def test_what_a_planner_considered_is_imagined_anew():
+    world = Revealed(Panorama())
+    cost = distance_to(world, {"pose": torch.tensor([5.0, *[torch.nan] * 6])})
+    planner = Planner(world, cost, SearchConfig(samples=8, iterations=1, horizon=5))
+    rng = make_rng(0)
+    memory = planner.begin(1, rng)
+    state = world.start(1, rng)
+    assert list(imagined(world, cost, memory[0])) == []
+    _, memory = planner.act(world.render(state, world.spec.observes), memory, rng)
+    *waiting, found = imagined(world, cost, memory[0], count=4)
+    assert waiting == [None] * 6 and 2 <= len(found) <= 3
+    assert found[0].cost == pytest.approx(memory[0].decision.cost, rel=1e-5) and found[0].cost == min(found)[0]
+    assert all(one.pictures.shape == (4, 48, 64, 3) for one in found)
+    assert torch.equal(found[0].pictures[0], world.render(state, ("rgb",))["rgb"][0])
+
+
+@pytest.mark.parametrize("considers", [True, False])
+def test_the_page_draws_what_the_agent_considers(serve_world, open_page, considers):  # noqa: F811
+    def futures(memory):
+        yield None
+        yield [(cost, torch.full((6, 48, 64, 3), 200, dtype=torch.uint8)) for cost in (0.25, 1.0, 4.0)]
+
+    agents = walker(futures=futures if considers else None)
+    page = open_page(serve_world([Panorama(dt_s=1 / 100)], policy=agents).url)
+    page.keyboard.press("KeyV")
+    page.keyboard.press("KeyG")
+    if not considers:
+        until(page, "document.getElementById('futures-said').textContent.includes('does not plan')")
+        return
+    until(page, "terrella.agent.futures > 1")
+    assert page.locator("#futures li b").all_text_contents() == ["chosen", "middling", "worst"]
+    assert page.locator("#futures li span").all_text_contents() == ["cost 0.25", "cost 1", "cost 4"]
+    picture, deck = page.locator("figure").bounding_box(), page.locator("#deck").bounding_box()
+    strips = page.locator("#futures").bounding_box()
+    assert picture["y"] + picture["height"] <= strips["y"] + 1 and strips["y"] + strips["height"] <= deck["y"] + 1
+    page.keyboard.press("KeyV")
+    until(page, "document.getElementById('futures').hidden")

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from .. import library
 from ..act.explorer import Explorer
-from ..act.planning import Planner, Revealed, negative_reward, paced, tells_apart
+from ..act.planning import Planner, Revealed, imagined, negative_reward, paced, tells_apart
 from ..core.errors import PlanningError
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
-from ..serve.agent import Agent, Agents
+from ..serve.agent import Agent, Agents, Futures
 
 _REPLAN_S = 0.06  # of world time, in which a plan is acted on before the next is made
 _SHOWN = ("pose", "keyframes")  # beside what a planner's world observes: what ways are found by
@@ -40,7 +42,9 @@ class Driving:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
             return found
         policy = library.load_policy(self.name, self.played.spec, self.world)
-        return Agent(self.name, policy, self.see if isinstance(policy, Planner) else None)
+        if not isinstance(policy, Planner):
+            return Agent(self.name, policy)
+        return Agent(self.name, policy, self.see, futures=self._futures(policy))
 
     # -- where it plans -----------------------------------------------------------------------------------------------
 
@@ -74,7 +78,14 @@ class Driving:
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
         planner = Planner(world, cost, config, replan=min(moves, config.horizon))
-        return Agent("a planner, for reward", planner, self.see)
+        return Agent("a planner, for reward", planner, self.see, futures=self._futures(planner))
+
+    def _futures(self, planner: Planner) -> Callable[[Any], Futures] | None:
+        """How a planner's memory becomes pictures, where its world shows any."""
+        if "rgb" not in planner.world.spec.channels:
+            return None
+        world, cost, block = planner.world, planner.cost, planner.config.block
+        return lambda memory: imagined(world, cost, memory[0], block)
 
     def _first(self, world: World) -> State:
         """A state in which episodes begin, to time the world with."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -13,15 +13,9 @@ from ..core.state import State
 from ..core.world import Observation, World
 
 
-class Future(NamedTuple):
-    """What a plan would lead to: what it costs, and pictures uint8 [T, H, W, 3] of it, evenly spread in time."""
-
-    cost: float
-    pictures: torch.Tensor
-
-
-# In pieces, so that a stream can go on between them: None while it is not finished.
-Futures = Iterator[Sequence[Future] | None]
+# What plans would lead to: of each its cost, and pictures uint8 [T, H, W, 3], evenly spread in time. In pieces, so that a stream
+# can go on between them: None while it is not finished.
+Futures = Iterator[Sequence[tuple[float, torch.Tensor]] | None]
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ class Driver:
             "thinks_ms": float(f"{longest:.1g}"),
             "away": None if self.away is None else float(f"{self.away:.2g}"),
             "unit": self._agent.unit if self._agent else "",
+            "considers": bool(self._agent and self._agent.futures),
         }
 
     # -- what a person says -------------------------------------------------------------------------------------------
@@ -82,6 +83,16 @@ class Driver:
         self._begun = False
         self._futures = None
         self._best, self._since = float("inf"), 0
+
+    def consider(self) -> Sequence[tuple[float, torch.Tensor]] | None:
+        """A piece of the work of imagining what the agent considers; the futures where that was the last."""
+        if self._agent is None or self._agent.futures is None or not self._begun:
+            return None
+        if self._futures is None:
+            self._futures = self._agent.futures(self._memory)
+        found = next(self._futures, ())
+        self._futures = self._futures if found is None else None
+        return found or None
 
     # -- each step ----------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from pathlib import Path
 
@@ -58,6 +59,18 @@ def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS
         raise ServeError(
             f"{name} is an image that cannot be decoded ({type(error).__name__}); save it again."
         ) from error
+
+
+def strip_of(pictures: torch.Tensor, height: int = 72) -> str:
+    """Pictures uint8 [T, H, W, 3] side by side, each at most `height` pixels tall, as a JPEG in base64."""
+    frames = [Image.fromarray(picture.numpy()) for picture in pictures]
+    scale = min(1.0, height / frames[0].height)
+    width, height = (max(1, round(scale * side)) for side in frames[0].size)
+    strip, data = Image.new("RGB", (width * len(frames), height)), io.BytesIO()
+    for at, frame in enumerate(frames):
+        strip.paste(frame.resize((width, height), Image.Resampling.BILINEAR), (at * width, 0))
+    strip.save(data, "JPEG", quality=80)
+    return base64.b64encode(data.getvalue()).decode()
 
 
 def uncertainty_levels(spec: Spec) -> tuple[float, float] | None:

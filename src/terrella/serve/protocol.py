@@ -49,12 +49,13 @@ class Controls:
 
 @dataclass(frozen=True)
 class Show:
-    """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures; cameras are picture
-    channels, none for the main one."""
+    """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures, `futures` for what the agent
+    considers; cameras are picture channels, none for the main one."""
 
     map: bool
     invented: bool
     cameras: tuple[str, ...] = ()
+    futures: bool = False
 
 
 def encode_frame(
@@ -133,9 +134,12 @@ _READERS: dict[str, Callable[[dict], Any]] = {
     "rewind": lambda body: _integer(body, "steps", -U32, U32),  # back from the moment shown, and stand there
     "seek": lambda body: _integer(body, "step", 0, U32),  # stand there, or at the nearest that is remembered
     "record": lambda body: _switch(body, "on"),
-    "drive": lambda body: _switch(body, "on"),  # whether the policy acts while nobody touches the controls
+    "drive": lambda body: _switch(body, "on"),  # whether the agent drives, until a person touches the controls
     "show": lambda body: Show(
-        _switch(body, "map"), _switch(body, "invented"), _names(body, "cameras", MAX_CAMERAS, "picture channels")
+        _switch(body, "map"),
+        _switch(body, "invented"),
+        _names(body, "cameras", MAX_CAMERAS, "picture channels"),
+        "futures" in body and _switch(body, "futures"),
     ),
 }
 
@@ -169,8 +173,14 @@ def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
 
 
 def encode_event(kind: str, **body) -> str:
-    """A JSON message to the page: hello, status, error, keys: what another page has set (KeyBook.described), or chart: the map
-    of a moment.
+    """A JSON message to the page: hello, status, error, keys: what another page has set (KeyBook.described), chart: the map
+    of a moment, or agent, acted and futures.
+
+    agent: whether it is driving, its name, said: the last thing to know of it, thinks_ms of its longer decisions, away from its goal
+    in unit (or null), and whether it considers futures. acted: its action of the last step as held keys and, of axes, as numbers;
+    nothing of either where the person acts. futures: step at which they were asked for, and plans, the chosen one first, then
+    others down to the worst: the cost of each (null where that is no number) and image, a JPEG in base64 of as many frames as
+    `frames` says side by side, from the moment of the decision to the plan's end.
 
     chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
     that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind

@@ -25,6 +25,8 @@ from .protocol import Controls, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
+FUTURES_SHARE = 0.4  # of the worker's time, at most, for showing what an agent considers
+FUTURES_EVERY_S = 0.5  # between two of them
 
 
 class Session:
@@ -52,7 +54,7 @@ class Session:
         self._sent_last: dict[str, dict[str, object]] = {}  # events that tell what is so, by kind
         self._show = Show(map=False, invented=False)
         self._charted: dict[str, Any] = {}  # what the page has on its map
-        self._chart_due = 0.0
+        self._chart_due = self._futures_due = 0.0
         self._due = 0.0
 
     # -- the socket's side: called on the event loop, never waits ------------------------------------------------
@@ -274,6 +276,17 @@ class Session:
         await self._deliver(protocol.encode_frame(moment, self._sent, *past, controls, made_ms, time.time()))
         if self._show.map and timeline.mapped and (time.perf_counter() >= self._chart_due or timeline.rewound):
             await self._chart(timeline)
+        if self._show.futures and timeline.driver.on and time.perf_counter() >= self._futures_due:
+            await self._futures(timeline)
+
+    async def _futures(self, timeline: Timeline) -> None:
+        """A piece of what the agent considers, and then nothing of it for as long as keeps it to its share of the time."""
+        began = time.perf_counter()
+        found = await self._extra(timeline.consider)
+        ended = time.perf_counter()
+        self._futures_due = ended + (1 / FUTURES_SHARE - 1) * (ended - began) + (FUTURES_EVERY_S if found else 0.0)
+        if found is not None:
+            await self._event("futures", **found)
 
     async def _chart(self, timeline: Timeline) -> None:
         self._chart_due = time.perf_counter() + EVERY_S[timeline.mapped]

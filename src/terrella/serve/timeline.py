@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,7 +19,7 @@ from .agent import Agents, agents_of
 from .chart import chart, mapped, tinted
 from .driver import Driver
 from .history import History, Image, Moment
-from .picture import MAX_DROPPED_PIXELS, picture_of, uncertainty_levels
+from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
 from .protocol import DONE, FRESH
 from .recording import Recording, SinkFactory
 
@@ -120,6 +121,17 @@ class Timeline:
             return None
         found = chart(self.worlds[number], (self.shown.states or self._states)[number])
         return {"world": number, "step": self.shown.step, **found}
+
+    @torch.inference_mode()
+    def consider(self) -> dict | None:
+        """A piece of the work of showing what the agent considers; as the page gets it where that is done (protocol.py)."""
+        futures = self.driver.consider()
+        if not futures:
+            return None
+        plans = [
+            {"cost": cost if math.isfinite(cost) else None, "image": strip_of(pictures)} for cost, pictures in futures
+        ]
+        return {"step": self.shown.step, "frames": len(futures[0][1]), "plans": plans}
 
     @torch.inference_mode()
     def images(self, moment: Moment, invented: bool = False) -> tuple[Image, ...]:

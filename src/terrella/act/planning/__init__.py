@@ -2,12 +2,14 @@
 
 from .costs import Cost, distance, distance_to, negative_reward
 from .episodes import Episode, Judge, Played, play, play_from
+from .futures import Imagined, imagined
 from .pace import paced, tells_apart
 from .planner import Decision, Planner, Thought
 from .revealed import Revealed
 from .searches import Found, Hints, SearchConfig, search
 from .task import Task
+from .ways import Wayfinder
 
 __all__ = ["Cost", "Decision", "Episode", "Found", "Hints", "Judge", "Planner", "Played", "Revealed", "SearchConfig"]
 __all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "paced", "play", "play_from", "search"]
-__all__ += ["tells_apart"]
+__all__ += ["Imagined", "Wayfinder", "imagined", "tells_apart"]

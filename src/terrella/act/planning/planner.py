@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -25,13 +25,16 @@ _OBSERVE, _PRIOR, _SEARCH, _PROPOSE = range(4)  # what an episode's seed is spen
 @dataclass(frozen=True)
 class Decision:
     """What a plan was worth when it was made: its cost, the steps imagined for it, the time it took (of a batch: its share),
-    how many moves the world knew, and the plans considered last, the best first, as actions [M, H, *action.shape]."""
+    how many moves the world knew, and plans that were considered, as actions [M, H, *action.shape]: the one that was chosen, then
+    the median and the worst of the last round. state [1] and goal are those that it was made for."""
 
     cost: float
     steps: int
     ms: float
     known: int
     considered: torch.Tensor
+    state: State | None = None
+    goal: Observation = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -168,8 +171,9 @@ class Planner:
         plan, known = found.plan[entry], int(task.known[entry])
         done = min(self._replan, known)
         fresh = self.moves.first(1, self.config.horizon, self.config.spread)[0]
+        considered = self.moves.actions(torch.cat([plan[None], found.considered[entry, 1:]]))
         decision = Decision(
-            float(found.cost[entry]), task.spent, ms, known, self.moves.actions(found.considered[entry])
+            float(found.cost[entry]), task.spent, ms, known, considered, task.state.at(entry), thought.goal
         )
         return replace(
             thought,

@@ -16,7 +16,6 @@ from .moves import Axes, coloured
 from .task import Task, check_some
 
 _MOST_ROUNDS = 10_000  # of a search by the clock
-_CONSIDERED = 4  # plans of the last round that are handed on, for people to see
 _RATE = 0.1  # of Adam, in codes
 _TREE, _WHITE = 1 << 20, 0.0
 
@@ -78,8 +77,8 @@ class Hints:
 
 @dataclass(frozen=True)
 class Found:
-    """plan [B, H, D] and its cost [B]; the belief that the next decision may begin with, and some plans of the last round
-    [B, M, H, D], the best first."""
+    """plan [B, H, D] and its cost [B]; the belief that the next decision may begin with, and plans of the last round
+    [B, M, H, D] for people to see: its best, its median and its worst, as far as there are so many."""
 
     plan: torch.Tensor
     cost: torch.Tensor
@@ -130,7 +129,7 @@ def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
         mean = moves.best_of(belief)
         cost = task.evaluate(mean[:, None], settled=True)[:, 0]
         best = _Best(*best.where(torch.isfinite(cost), mean, cost))
-    return Found(best.codes, best.costs, belief, codes[:, :_CONSIDERED])
+    return Found(best.codes, best.costs, belief, _some(codes))
 
 
 def _random(task: Task, config: SearchConfig, hints: Hints) -> Found:
@@ -146,7 +145,7 @@ def _random(task: Task, config: SearchConfig, hints: Hints) -> Found:
         codes = _picked(codes, order)
         best.look(codes[:, 0], costs.gather(1, order)[:, 0], task.shortened)
     check_some(best.costs[:, None], task)
-    return Found(best.codes, best.costs, _prior(task, config), codes[:, :_CONSIDERED])
+    return Found(best.codes, best.costs, _prior(task, config), _some(codes))
 
 
 def _gradient(task: Task, config: SearchConfig, hints: Hints) -> Found:
@@ -175,8 +174,8 @@ def _gradient(task: Task, config: SearchConfig, hints: Hints) -> Found:
             first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope.square()
             descent = first / (1 - 0.9**taken) / ((second / (1 - 0.999**taken)).sqrt() + 1e-8)
             codes = (codes.detach() - _RATE * descent).clamp(-1, 1).requires_grad_()
-    order = costs.detach().argsort(dim=1, stable=True)[:, :_CONSIDERED]
-    return Found(best.codes, best.costs, _prior(task, config), _picked(codes.detach(), order))
+    order = costs.detach().argsort(dim=1, stable=True)
+    return Found(best.codes, best.costs, _prior(task, config), _some(_picked(codes.detach(), order)))
 
 
 def _tree(task: Task, config: SearchConfig, hints: Hints) -> Found:
@@ -219,7 +218,8 @@ def _tree(task: Task, config: SearchConfig, hints: Hints) -> Found:
         before = _Best(hints.plan, task.evaluate(hints.plan[:, None], settled=True)[:, 0])
         before.look(result.codes, result.costs)
         result = before
-    return Found(result.codes, result.costs, _prior(task, config), result.codes[:, None])
+    whole = paths.shape[2] == task.horizon
+    return Found(result.codes, result.costs, _prior(task, config), _some(paths) if whole else result.codes[:, None])
 
 
 def _order(state: State, costs: torch.Tensor, tie: torch.Tensor, width: int) -> torch.Tensor:
@@ -273,6 +273,11 @@ def _weights(costs: torch.Tensor, temperature: float | None) -> torch.Tensor:
     away = torch.where(sound, costs - costs[:, :1], torch.inf)
     reach = torch.where(sound, away, 0.0).amax(1, keepdim=True).clamp_min(1e-12)
     return torch.softmax(-away / (temperature * reach), 1)
+
+
+def _some(codes: torch.Tensor) -> torch.Tensor:
+    """Of plans [B, N, H, D], the best first, the best, the median and the worst."""
+    return codes[:, sorted({0, codes.shape[1] // 2, codes.shape[1] - 1})]
 
 
 def _single(plan: torch.Tensor | None) -> torch.Tensor | None:

@@ -3,6 +3,7 @@
 import { drawCard } from './card.js';
 import { Controls } from './controls.js';
 import { DriverView } from './driver.js';
+import { Futures } from './futures.js';
 import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
@@ -41,6 +42,8 @@ const driver = new DriverView({
   go: () => { if (status.rewound) link.send({ type: 'branch' }); if (status.paused) link.send({ type: 'resume' }); $('hint').classList.remove('show'); },
 });
 
+const futures = new Futures((on) => views.change({ futures: on }));
+
 const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
 
 function sendKeys() {
@@ -63,7 +66,8 @@ function onEvent(body) {
   if (body.type === 'status') onStatus(body);
   if (body.type === 'keys') onKeys(body);
   if (body.type === 'chart') views.onChart(body);
-  if (body.type === 'agent') driver.show(body);
+  if (body.type === 'agent') { driver.show(body); futures.follow(body); }
+  if (body.type === 'futures') futures.show(body);
   if (body.type === 'acted') driver.acted(body);
   if (body.type === 'error') toast(body.text);
 }
@@ -76,6 +80,7 @@ function hello(body) {
   if (panel.take(worlds[0])) sendKeys();
   if (!same) build();
   views.take(worlds, { same, resumed: body.resumed });
+  futures.take(body);
   sendControls(performance.now());
   now.actionId = controlsId;  // what is sent before anything is held measures nothing
   showState('starting');
@@ -291,12 +296,12 @@ function drawTouch() {
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
 const escape = () => (panel.open ? showAside(null) : togglePause());
-const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyV: () => futures.toggle(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 /** What the page itself does with a key, here and now; '' where it does nothing. */
 function pageUse(code) {
   const uses = {
-    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive',
+    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive', KeyV: futures.there && 'shows what the agent considers',
     KeyC: screens.cameras.length > 1 && 'changes the camera', KeyP: 'pauses', KeyR: 'restarts', KeyF: 'fills the screen', Enter: 'goes on from the past',
   };
   return uses[code] || '';
@@ -381,7 +386,7 @@ window.terrella = Object.freeze({
   get seed() { return status.seed; },
   get axes() { return [...controls.axes.values]; },
   get driving() { return !!status.driving; },
-  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held] }; },
+  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count }; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
   get map() { return views.figures; },

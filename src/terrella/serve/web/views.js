@@ -8,7 +8,7 @@ const $ = (id) => document.getElementById(id);
 export class Views {
   /** `ask(show)` asks the server for what is shown alone. */
   constructor(screens, ask) {
-    Object.assign(this, { screens, ask, worlds: [], mapAsked: false, show: { map: false, invented: false, cameras: [] } });
+    Object.assign(this, { screens, ask, worlds: [], mapAsked: false, show: { map: false, invented: false, cameras: [], futures: false } });
     this.places = new MemoryMap($('map'));
     this.mosaic = new MosaicMap($('map'));
     this.map = this.places;

@@ -1,0 +1,136 @@
+"""Ways to a place that is further off than a planner sees: over places where a camera was before, and planned stretch by stretch."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from ...core.errors import PlanningError
+from ...core.world import Observation
+from .planner import Planner, Thought
+
+STRIDE_M = 1.6  # between two known places that lie on one way; walls seldom stand between such
+CELL_M = 0.4  # places nearer to each other are one
+_STUCK_STEPS, _STUCK_M = 45, 0.35  # who has not come further than this in so many steps tries another way
+_DETOUR_M = 4.0  # by which a place that could not be walked to counts as further
+_ANEW_STEPS = 70  # after which ways are looked for among the places that are known by now
+
+
+@dataclass(frozen=True)
+class Walk:
+    """The memory of one episode: the planner's, the ways, the place walked to next, and where the walker was some steps ago."""
+
+    thought: Thought
+    ways: "Ways | None" = None
+    next: tuple[float, float] | None = None
+    step: int = 0
+    before: tuple[float, float] = (math.inf, math.inf)
+    noted: int = 0
+    avoided: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Known places [N, 2] in metres, how far each is from the goal along them [N] (inf: no way is known), and the next one on the
+    way there, -1 for the goal itself."""
+
+    places: np.ndarray
+    left_m: np.ndarray
+    onward: np.ndarray = field(repr=False)
+
+    def target(self, here: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
+        """The place [2] to walk to next from `here`: as far along the best way as a stride reaches; and what is left to go."""
+        straight = float(np.linalg.norm(goal - here))
+        if straight <= STRIDE_M or not len(self.places):
+            return goal, straight
+        away = np.linalg.norm(self.places - here, axis=1)
+        near = away <= STRIDE_M
+        if not (near & np.isfinite(self.left_m)).any():
+            near = away <= away.min() + 1e-6  # off all ways: to the nearest place
+        total = np.where(near, away + self.left_m, np.inf)
+        if not np.isfinite(total).any():
+            return goal, math.inf
+        at = int(total.argmin())
+        left = float(total[at])
+        while self.onward[at] >= 0 and away[self.onward[at]] <= STRIDE_M:
+            at = int(self.onward[at])
+        return (goal if self.onward[at] < 0 and away[at] < 2 * CELL_M else self.places[at]), left
+
+
+def ways_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, float], ...] = ()) -> Ways:
+    """Dijkstra (1959) from the goal [2] over known places [N, 2]; places near `avoided` ones count as further off."""
+    cells = np.round(known / CELL_M).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    places = known[np.sort(first)].astype(np.float64)
+    toll = np.zeros(len(places))
+    for spot in avoided:
+        toll += _DETOUR_M * (np.linalg.norm(places - np.asarray(spot), axis=1) < 0.8)
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    start = np.linalg.norm(places - goal, axis=1)
+    left, onward = np.full(len(places), np.inf), np.full(len(places), -1)
+    queue = [(float(start[at]), at, -1) for at in np.flatnonzero(start <= STRIDE_M)]
+    heapq.heapify(queue)
+    while queue:
+        far, at, after = heapq.heappop(queue)
+        if far >= left[at]:
+            continue
+        left[at], onward[at] = far, after
+        for other in np.flatnonzero(apart[at] <= STRIDE_M):
+            further = far + apart[at, other] + toll[other]
+            if further < left[other]:
+                heapq.heappush(queue, (float(further), int(other), at))
+    return Ways(places, left, onward)
+
+
+class Wayfinder:
+    """Walks to `place`, x and y in metres, in a world with the channel `pose`.
+
+    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Ways lead over the places of the channel
+    `keyframes` where it is seen; else straight on. PlanningError where none is known.
+    """
+
+    def __init__(self, planner: Planner, place: tuple[float, float]):
+        if "pose" not in planner.cost.channels:
+            raise PlanningError("who walks to a place plans for a goal in 'pose'.")
+        self.planner, self.place = planner, np.asarray(place, np.float64)
+
+    def begin(self, batch: int, rng: torch.Generator) -> list[Walk]:
+        return [Walk(thought) for thought in self.planner.begin(batch, rng)]
+
+    def act(
+        self, observation: Observation, memory: list[Walk], rng: torch.Generator
+    ) -> tuple[torch.Tensor, list[Walk]]:
+        walks = [self._led(walk, observation, entry) for entry, walk in enumerate(memory)]
+        actions, thoughts = self.planner.act(observation, [walk.thought for walk in walks], rng)
+        return actions, [replace(walk, thought=thought) for walk, thought in zip(walks, thoughts)]
+
+    def _led(self, walk: Walk, observation: Observation, entry: int) -> Walk:
+        """The walk with the next place as its planner's goal."""
+        here = observation["pose"][entry, :2].double().cpu().numpy()
+        walk = self._noted(walk, here)
+        if walk.ways is None or walk.step % _ANEW_STEPS == 0:
+            known = np.zeros((0, 2))
+            if "keyframes" in observation:
+                held = observation["keyframes"][entry].double().cpu().numpy()
+                known = held[held[:, 3] > 0, :2]
+            walk = replace(walk, ways=ways_to(self.place, known, walk.avoided))
+        assert walk.ways is not None
+        target, left = walk.ways.target(here, self.place)
+        if not math.isfinite(left):
+            raise PlanningError("no way to that place is known: choose one near where somebody has been.")
+        pose = walk.thought.goal["pose"].clone()
+        pose[0, :2] = torch.from_numpy(target).to(pose)
+        thought = replace(walk.thought, goal={**walk.thought.goal, "pose": pose})
+        return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
+
+    def _noted(self, walk: Walk, here: np.ndarray) -> Walk:
+        """Notices who does not get on: the place walked to is then avoided."""
+        if math.dist(here, walk.before) > _STUCK_M:
+            return replace(walk, before=(float(here[0]), float(here[1])), noted=walk.step)
+        if walk.step - walk.noted < _STUCK_STEPS or walk.next is None:
+            return walk
+        return replace(walk, ways=None, avoided=(*walk.avoided, walk.next), noted=walk.step)
