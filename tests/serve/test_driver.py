@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import base64
+import io
 
 import pytest
 import torch
 from gymnasium import spaces
+from PIL import Image
 
 from terrella.act.planning import Planner, Revealed, SearchConfig, distance_to, imagined
-from terrella.core.errors import PlanningError
+from terrella.core.errors import PlanningError, ProtocolError, ServeError
 from terrella.core.policy import Idle, Reactive
 from terrella.core.spec import Spec
 from terrella.core.world import make_rng
 from terrella.serve.actions import action_of, keys_of
 from terrella.serve.agent import Agent, Agents
 from terrella.serve.picture import picture_of
+from terrella.serve.protocol import GOAL_MARK, Goal, parse_message
 from terrella.serve.timeline import Timeline
 
+from .mapped import Mapped
 from .panorama import BUTTONS, Panorama
 from .test_page import open_page, until  # noqa: F401  (a fixture)
 from .test_session import FakeSocket, Session, asyncio
@@ -246,3 +250,83 @@ def test_the_page_draws_what_the_agent_considers(serve_world, open_page, conside
     assert picture["y"] + picture["height"] <= strips["y"] + 1 and strips["y"] + strips["height"] <= deck["y"] + 1
     page.keyboard.press("KeyV")
     until(page, "document.getElementById('futures').hidden")
+
+
+def place_of(goal) -> tuple[float, float]:
+    return tuple(goal["pose"][0, :2].tolist())
+
+
+def test_a_place_is_driven_to_at_once_a_picture_when_the_agent_is_let(tmp_path):
+    asked = []
+
+    def make(goal):
+        asked.append(goal)
+        return Agent("a walker", Reactive(lambda seen, rng: pressing("MOVE_FORWARD")))
+
+    timeline = Timeline([Mapped()], 0, policy=Agents(make, places=True, pictures=True))
+    driver = timeline.driver
+    timeline.seek(Goal(at=(1.5, -2.0)))
+    timeline.step()
+    assert driver.on and place_of(asked[-1]) == (1.5, -2.0) and bool(asked[-1]["pose"][0, 2:].isnan().all())
+    assert driver.mark == {"at": [1.5, -2.0], "image": None}
+    timeline.seek(Goal(here=True))
+    assert not driver.on and driver.mark["at"] is None and driver.mark["image"]
+    timeline.step(["KeyW"])
+    driver.let(True)
+    timeline.step()
+    assert set(asked[-1]) == set(timeline.spec.recorded) and asked[-1]["rgb"].shape == (1, 48, 64, 3)
+    data = io.BytesIO()
+    Image.new("RGB", (200, 90), "teal").save(data, "PNG")
+    timeline.seek(parse_message(GOAL_MARK + data.getvalue())[1])
+    timeline.step()
+    assert driver.on and set(asked[-1]) == {"rgb"} and asked[-1]["rgb"].shape == (1, 48, 64, 3)
+    timeline.seek(Goal())
+    timeline.step()
+    assert not driver.on and driver.goal == {} and driver.mark == {"at": None, "image": None}
+
+
+def test_goals_that_nobody_can_seek_are_refused():
+    for agents, kind in ((None, "no place"), (walker(), "no place")):
+        with pytest.raises(ServeError, match=kind):
+            Timeline([Mapped()], 0, policy=agents).seek(Goal(at=(0.0, 0.0)))
+    with pytest.raises(ServeError, match="no picture"):
+        Timeline([Mapped()], 0, policy=walker()).seek(Goal(here=True))
+    with pytest.raises(ServeError, match="no image"):
+        Timeline([Mapped()], 0, policy=Agents(walker().make, pictures=True)).seek(Goal(picture=b"junk"))
+
+
+@pytest.mark.parametrize(
+    "junk", ['"at": 3', '"at": [1]', '"at": [1, NaN]', '"at": [1, "2"]', '"here": 1', '"at": [1e30, 0]']
+)
+def test_a_goal_that_is_none_is_named(junk):
+    with pytest.raises(ProtocolError):
+        parse_message(f'{{"type": "goal", {junk}}}')
+    assert parse_message('{"type": "goal", "at": [1, 2.5]}') == ("goal", Goal((1.0, 2.5)))
+    assert parse_message('{"type": "goal", "here": true}') == ("goal", Goal(here=True))
+    assert parse_message('{"type": "goal"}') == ("goal", Goal())
+    show = '{"type": "show", "map": false, "invented": false, "futures": %s}'
+    assert parse_message(show % "true")[1].futures
+    with pytest.raises(ProtocolError, match="true or false"):
+        parse_message(show % "1")
+
+
+def test_a_click_on_the_map_is_walked_to_and_told_when_reached(serve_world, open_page):  # noqa: F811
+    def make(goal):
+        x, y = place_of(goal)
+
+        def steer(seen, rng):
+            return pressing("MOVE_FORWARD" if float(seen["pose"][0, 0]) < x else "MOVE_BACKWARD")
+
+        return Agent("a walker", Reactive(steer), away=lambda state: abs(x - float(state["x"][0])), near=0.2, unit="m")
+
+    page = open_page(serve_world([Mapped(dt_s=1 / 100)], policy=Agents(make, places=True)).url)
+    until(page, "terrella.map.shown && terrella.map.camera !== null")
+    box = page.locator("#map canvas").bounding_box()
+    page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
+    until(page, "terrella.agent.goal !== null && terrella.driving")
+    place = page.evaluate("terrella.agent.goal")
+    assert 1 < place[0] < 4 and abs(place[1]) < 0.2, "where the click was, in metres"
+    until(page, "!terrella.driving && terrella.agent.said.startsWith('reached: ')")
+    until(page, "terrella.agent.goal === null")
+    assert page.evaluate("terrella.map.camera")[0] == pytest.approx(place[0], abs=0.5)
+    assert "Reached" in page.locator("#toast").text_content()

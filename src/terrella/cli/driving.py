@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import torch
+
 from .. import library
 from ..act.explorer import Explorer
-from ..act.planning import Planner, Revealed, imagined, negative_reward, paced, tells_apart
-from ..core.errors import PlanningError
+from ..act.planning import (
+    Planner,
+    Revealed,
+    Wayfinder,
+    distance,
+    distance_to,
+    imagined,
+    negative_reward,
+    paced,
+    tells_apart,
+)
+from ..core.errors import PlanningError, TerrellaError
+from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
 from ..serve.agent import Agent, Agents, Futures
+from ..space.camera import yaw
+from .goals import state_channel
 
 _REPLAN_S = 0.06  # of world time, in which a plan is acted on before the next is made
+_STRIDE_S = 0.115  # for which a walker holds a move
+_NEAR_M, _NEAR, _FACING = 0.5, 0.05, 0.35  # metres, shares of a range, and radians within which a goal is reached
 _SHOWN = ("pose", "keyframes")  # beside what a planner's world observes: what ways are found by
 
 
@@ -30,10 +48,17 @@ class Driving:
     budget_ms: float = 30.0
 
     def agents(self) -> Agents:
-        return Agents(self.make)
+        """For the page; what is wrong with the name is said now."""
+        if self.name not in ("", "plan"):
+            self.make({})
+        spec = self.played.spec
+        places = self.world is not None and "pose" in spec.channels and "pose" in self.world.spec.channels
+        return Agents(self.make, places, pictures=self.world is not None and "rgb" in spec.channels)
 
     def make(self, goal: Observation) -> Agent:
         """The agent that drives, to a goal or, with {}, as its name says."""
+        if goal:
+            return self._seeking(goal)
         if self.name == "":
             return self._planning(always=False) or Agent("the explorer", Explorer(self.played.spec))
         if self.name == "plan":
@@ -78,7 +103,7 @@ class Driving:
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
         planner = Planner(world, cost, config, replan=min(moves, config.horizon))
-        return Agent("a planner, for reward", planner, self.see, futures=self._futures(planner))
+        return Agent("a planner for reward", planner, self.see, futures=self._futures(planner))
 
     def _futures(self, planner: Planner) -> Callable[[Any], Futures] | None:
         """How a planner's memory becomes pictures, where its world shows any."""
@@ -87,6 +112,68 @@ class Driving:
         world, cost, block = planner.world, planner.cost, planner.config.block
         return lambda memory: imagined(world, cost, memory[0], block)
 
+    def _seeking(self, goal: Observation) -> Agent:
+        """A planner for a goal: a place to walk to, else a state in numbers, else a picture."""
+        world = self.world
+        if world is None:
+            raise PlanningError(
+                f"{self.played.spec.name} can neither be copied nor was learned: nobody can plan in it."
+            )
+        goal = self._placed(goal)
+        if "pose" in goal and "pose" in self.played.spec.channels:
+            return self._walking(world, goal["pose"][0])
+        source, told = self.learned or self.played, [name for name in goal if name == _vector(self.played.spec)]
+        aim = {name: goal[name] for name in (told or ["rgb"])}
+        whole = {name: goal[name] for name in source.spec.observes if name in goal}
+        latent = "latent" in source.spec.channels and set(whole) == set(source.spec.observes) and whole
+        cost = distance_to(source, whole) if latent else distance_to(world, aim, latent=False)
+        config, _ = paced(world, cost, self._first(world), self.budget_ms, block=2)
+        planner = Planner(world, cost, config)
+
+        def away(state: State) -> float:
+            return float(distance(self.played.spec, aim, self.played.render(state, list(aim)))[0])
+
+        name = "a planner, to the goal"
+        return Agent(name, planner, self.see, away, _NEAR, futures=self._futures(planner))
+
+    def _walking(self, world: World, pose: torch.Tensor) -> Agent:
+        """Who walks to a pose [7], of which NaN may be any."""
+        asked = torch.full((7,), torch.nan)
+        asked[:2] = pose[:2]
+        cost = distance_to(world, {"pose": asked})
+        config, _ = paced(world, cost, self._first(world), self.budget_ms, max(1, round(_STRIDE_S / world.spec.dt_s)))
+        planner = Planner(world, cost, config)
+        heading = float(yaw(pose)) if bool(torch.isfinite(pose).all()) else None
+        way = Wayfinder(planner, (float(pose[0]), float(pose[1])), heading)
+
+        def away(state: State) -> float:
+            now = self.played.render(state, ("pose",))["pose"][0].cpu()
+            far = float((now[:2] - asked[:2]).norm())
+            off = 0.0 if heading is None else abs(math.remainder(float(yaw(now)) - heading, math.tau))
+            return far if far > _NEAR_M or off < _FACING else _NEAR_M + 0.1 * off
+
+        futures = self._futures(planner)
+        shown = futures and (lambda memory: futures([memory[0].thought]))
+        return Agent("a walker", way, self.see, away, _NEAR_M, "m", shown)
+
+    def _placed(self, goal: Observation) -> Observation:
+        """A lone picture with the pose from which the world believes it to be taken, where it can say that."""
+        source = self.learned or self.played
+        if set(goal) != {"rgb"} or not {"rgb", "pose"} <= set(source.spec.channels):
+            return goal
+        try:
+            return {**goal, **source.render(source.observe(goal, None, make_rng(0)), ("pose",))}
+        except TerrellaError:
+            return goal
+
     def _first(self, world: World) -> State:
         """A state in which episodes begin, to time the world with."""
         return world.start(1, make_rng(0))
+
+
+def _vector(spec: Spec) -> str:
+    """The channel of the state in numbers; "" where there is none."""
+    try:
+        return state_channel(spec)
+    except PlanningError:
+        return ""

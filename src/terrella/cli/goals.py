@@ -29,11 +29,12 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
         if "rgb" not in spec.channels:
             raise ObservationError(f"{spec.name} shows no pictures; give a state, or CHANNEL=VALUE.")
         return {"rgb": _picture(Path(text), spec, "rgb")}
-    channel = _state_channel(spec)
+    channel = state_channel(spec)
     return {channel: _value(text, channel, spec)}
 
 
-def _state_channel(spec: Spec) -> str:
+def state_channel(spec: Spec) -> str:
+    """The channel of a world's state in numbers, by which a goal is told; PlanningError where it has none."""
     vectors = [
         name
         for name, space in spec.channels.items()

@@ -12,7 +12,6 @@ from ..core.policy import Policy
 from ..core.state import State
 from ..core.world import Observation, World
 
-
 # What plans would lead to: of each its cost, and pictures uint8 [T, H, W, 3], evenly spread in time. In pieces, so that a stream
 # can go on between them: None while it is not finished.
 Futures = Iterator[Sequence[tuple[float, torch.Tensor]] | None]

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..core.errors import TerrellaError
+from ..core.errors import ServeError, TerrellaError
 from ..core.policy import act
 from ..core.spec import Spec
 from ..core.state import State
@@ -20,6 +20,7 @@ from ..core.world import Observation, World
 from .actions import action_of
 from .agent import Agent, Agents, Futures, seen_by
 
+NO_GOAL: dict[str, object] = {"at": None, "image": None}
 PATIENCE_S = 12.0  # of the world, in which an agent must have come nearer to its goal
 _NEARER = 0.97  # of the least distance so far counts as nearer
 
@@ -31,6 +32,7 @@ class Driver:
         self.agents, self.world, self.spec = agents, world, world.spec
         self.on = agents is not None and agents.at_once
         self.goal: Observation = {}
+        self.mark: dict[str, object] = NO_GOAL
         self.said = ""  # the last thing to know of the agent, in one sentence
         self.away: float | None = None  # from the goal, when it last acted
         self.acted: torch.Tensor | None = None  # its action of the last step; None where the person acted
@@ -69,13 +71,14 @@ class Driver:
             self.on = on
             self.forget()
 
-    def seek(self, goal: Observation) -> None:
-        """Drives to a goal; {} for none. The sentence says where there is none that could."""
-        self.goal, self._agent, self.away = goal, None, None
+    def seek(self, goal: Observation, mark: dict[str, object] | None = None, now: bool = True) -> None:
+        """Takes a goal, {} for none, and drives to it `now`, or when it is let. mark: how the page shows it."""
+        if goal and self.agents is None:
+            raise ServeError("there is no agent here that could seek a goal.")
+        self.goal, self.mark, self._agent, self.away = goal, mark or NO_GOAL, None, None
         self._ms.clear()
         self.forget()
-        if goal:
-            self.let(True)
+        self.said, self.on = "", bool(goal) and now
 
     def forget(self) -> None:
         """What the agent remembers is of another episode or moment."""
@@ -145,6 +148,8 @@ class Driver:
         self.away = away
         told = f"{away:.1f} {agent.unit}" if agent.unit else f"{away:.3f}"
         if away <= agent.near:
+            if self.mark["at"] is not None:  # a place is done with; a picture stays until it is taken away
+                self.seek({})
             self.stop(f"reached: {told} from the goal. You drive.")
             return True
         self._since += 1

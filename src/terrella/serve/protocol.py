@@ -17,6 +17,7 @@ from .keys import Rebound
 VERSION = 3
 MAX_MESSAGE = 4096  # bytes of one message from a page
 MAX_PICTURE = 2**16 - 256  # bytes of a picture from a page, which are all that it sends as bytes
+GOAL_MARK = b"\x00"  # no image file begins with it
 MAX_HELD = 16  # keys held at once
 MAX_KEYS = 256  # of a world
 MAX_NAME = 40  # letters of an action's name
@@ -48,6 +49,16 @@ class Controls:
 
 
 @dataclass(frozen=True)
+class Goal:
+    """What the agent is to reach: the place `at` on the map, x and y in metres; `here`: the moment shown, as soon as a person lets
+    it drive; `picture`: the bytes of an image file. Nothing of these: no goal any more."""
+
+    at: tuple[float, float] | None = None
+    here: bool = False
+    picture: bytes = b""
+
+
+@dataclass(frozen=True)
 class Show:
     """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures, `futures` for what the agent
     considers; cameras are picture channels, none for the main one."""
@@ -76,11 +87,11 @@ def encode_frame(
 
 def parse_message(data: str | bytes) -> tuple[str, Any]:
     """A message from a page, its kind and its value: text is JSON of a kind in `_READERS`, bytes are a picture's file, with
-    which a new episode begins. ProtocolError says what is wrong with it."""
+    which a new episode begins; after a byte 0 they are a goal's. ProtocolError says what is wrong with it."""
     if isinstance(data, bytes):
         if not 0 < len(data) <= MAX_PICTURE:
             raise ProtocolError(f"a picture of {len(data)} bytes came; at most {MAX_PICTURE} are taken.")
-        return "picture", data
+        return ("goal", Goal(picture=data[1:])) if data[:1] == GOAL_MARK else ("picture", data)
     if len(data) > MAX_MESSAGE:
         raise ProtocolError(f"a message of {len(data)} bytes is too long; the limit is {MAX_MESSAGE}.")
     try:
@@ -103,6 +114,14 @@ def _controls(body: dict) -> Controls:
     held = _names(body, "held", MAX_HELD, "key codes")
     numbers = tuple(_finite(value, "axes") for value in axes)
     return Controls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
+
+
+def _goal(body: dict) -> Goal:
+    at = body.get("at")
+    if at is not None and (not isinstance(at, list) or len(at) != 2):
+        raise ProtocolError("'at' must be a place, a list of x and y in metres.")
+    place = None if at is None else (_finite(at[0], "at"), _finite(at[1], "at"))
+    return Goal(place, "here" in body and _switch(body, "here"))
 
 
 def _rebound(body: dict) -> Rebound:
@@ -135,6 +154,7 @@ _READERS: dict[str, Callable[[dict], Any]] = {
     "seek": lambda body: _integer(body, "step", 0, U32),  # stand there, or at the nearest that is remembered
     "record": lambda body: _switch(body, "on"),
     "drive": lambda body: _switch(body, "on"),  # whether the agent drives, until a person touches the controls
+    "goal": _goal,
     "show": lambda body: Show(
         _switch(body, "map"),
         _switch(body, "invented"),
@@ -174,13 +194,14 @@ def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
 
 def encode_event(kind: str, **body) -> str:
     """A JSON message to the page: hello, status, error, keys: what another page has set (KeyBook.described), chart: the map
-    of a moment, or agent, acted and futures.
+    of a moment, or agent, acted, goal and futures.
 
-    agent: whether it is driving, its name, said: the last thing to know of it, thinks_ms of its longer decisions, away from its goal
-    in unit (or null), and whether it considers futures. acted: its action of the last step as held keys and, of axes, as numbers;
-    nothing of either where the person acts. futures: step at which they were asked for, and plans, the chosen one first, then
-    others down to the worst: the cost of each (null where that is no number) and image, a JPEG in base64 of as many frames as
-    `frames` says side by side, from the moment of the decision to the plan's end.
+    agent: whether it is driving, its name, said: the last thing to know of it, thinks_ms of its longer decisions, away from its
+    goal in unit (or null), and whether it considers futures. acted: its action of the last step as held keys and, of axes, as
+    numbers; nothing of either where the person acts. goal: the place `at` on the map, or image, a JPEG in base64, or null for both.
+    futures: step at which they were asked for, and plans, the chosen one first, then others down to the worst: the cost of each
+    (null where that is no number) and image, a JPEG in base64 of as many frames as `frames` says side by side, from the moment of
+    the decision to the plan's end.
 
     chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
     that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind

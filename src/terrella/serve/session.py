@@ -217,6 +217,8 @@ class Session:
                             wake()
                 case "drive":
                     timeline.driver.let(value)
+                case "goal":
+                    await self._work(timeline.seek, value)
                 case "show":
                     self._show, self._charted, self._chart_due = value, {}, 0.0
                     timeline.look(value.cameras)
@@ -254,6 +256,7 @@ class Session:
             return
         driver = timeline.driver
         await self._news("agent", driver.described())
+        await self._news("goal", driver.mark)
         if not driver.on or driver.acted is None:
             return await self._news("acted", {"held": [], "axes": []})
         axes = driver.acted.double().flatten().tolist()[:MAX_AXES] if axes_of(timeline.spec) else []

@@ -20,7 +20,7 @@ from .chart import chart, mapped, tinted
 from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
-from .protocol import DONE, FRESH
+from .protocol import DONE, FRESH, Goal
 from .recording import Recording, SinkFactory
 
 JPEG_QUALITY = 90
@@ -205,6 +205,29 @@ class Timeline:
         if self.rewound:
             self._return_to(self.history.newest)
         return self._begin(self.shown.step + 1, states)
+
+    @torch.inference_mode()
+    def seek(self, goal: Goal) -> None:
+        """Gives the agent a goal; ServeError where it takes none of its kind."""
+        agents = self.driver.agents
+        if goal.at is not None:
+            if agents is None or not agents.places:
+                raise ServeError(
+                    "the agent here walks to no place: it takes a world that tells its pose, and can be planned in."
+                )
+            pose = torch.tensor([[*goal.at, *[torch.nan] * 5]])
+            return self.driver.seek({"pose": pose}, {"at": list(goal.at), "image": None})
+        if not goal.here and not goal.picture:
+            return self.driver.seek({})
+        if agents is None or not agents.pictures:
+            raise ServeError("the agent here seeks no picture: nobody can plan in this world.")
+        if goal.picture:
+            height, width = self.spec.channels["rgb"].shape[:2]
+            seen = {"rgb": picture_of(goal.picture, (height, width), MAX_DROPPED_PIXELS, "this picture")[None]}
+        else:
+            seen = self.worlds[0].render((self.shown.states or self._states)[0], self.spec.recorded)
+        mark = {"at": None, "image": strip_of(seen["rgb"])}
+        self.driver.seek(seen, mark, now=not goal.here)
 
     @torch.inference_mode()
     def sync(self) -> Moment:

@@ -1,4 +1,4 @@
-"""Ways to a place that is further off than a planner sees: over places where a camera was before, and planned stretch by stretch."""
+"""Ways to a place that is further off than a planner sees: over places where a camera was before, planned stretch by stretch."""
 
 from __future__ import annotations
 
@@ -17,20 +17,8 @@ STRIDE_M = 1.6  # between two known places that lie on one way; walls seldom sta
 CELL_M = 0.4  # places nearer to each other are one
 _STUCK_STEPS, _STUCK_M = 45, 0.35  # who has not come further than this in so many steps tries another way
 _DETOUR_M = 4.0  # by which a place that could not be walked to counts as further
+_TURNS_M = 0.6  # from the place, within which who has arrived turns to the heading
 _ANEW_STEPS = 70  # after which ways are looked for among the places that are known by now
-
-
-@dataclass(frozen=True)
-class Walk:
-    """The memory of one episode: the planner's, the ways, the place walked to next, and where the walker was some steps ago."""
-
-    thought: Thought
-    ways: "Ways | None" = None
-    next: tuple[float, float] | None = None
-    step: int = 0
-    before: tuple[float, float] = (math.inf, math.inf)
-    noted: int = 0
-    avoided: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,6 +49,19 @@ class Ways:
         return (goal if self.onward[at] < 0 and away[at] < 2 * CELL_M else self.places[at]), left
 
 
+@dataclass(frozen=True)
+class Walk:
+    """The memory of one episode: the planner's, the ways, the place walked to next, and where the walker was some steps ago."""
+
+    thought: Thought
+    ways: Ways | None = None
+    next: tuple[float, float] | None = None
+    step: int = 0
+    before: tuple[float, float] = (math.inf, math.inf)
+    noted: int = 0
+    avoided: tuple[tuple[float, float], ...] = ()
+
+
 def ways_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, float], ...] = ()) -> Ways:
     """Dijkstra (1959) from the goal [2] over known places [N, 2]; places near `avoided` ones count as further off."""
     cells = np.round(known / CELL_M).astype(np.int64)
@@ -72,31 +73,32 @@ def ways_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, flo
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     start = np.linalg.norm(places - goal, axis=1)
     left, onward = np.full(len(places), np.inf), np.full(len(places), -1)
-    queue = [(float(start[at]), at, -1) for at in np.flatnonzero(start <= STRIDE_M)]
+    queue = [(float(start[at]), at, -1) for at in np.flatnonzero(start <= STRIDE_M).tolist()]
     heapq.heapify(queue)
     while queue:
         far, at, after = heapq.heappop(queue)
         if far >= left[at]:
             continue
         left[at], onward[at] = far, after
-        for other in np.flatnonzero(apart[at] <= STRIDE_M):
+        for other in np.flatnonzero(apart[at] <= STRIDE_M).tolist():
             further = far + apart[at, other] + toll[other]
             if further < left[other]:
-                heapq.heappush(queue, (float(further), int(other), at))
+                heapq.heappush(queue, (float(further), other, at))
     return Ways(places, left, onward)
 
 
 class Wayfinder:
-    """Walks to `place`, x and y in metres, in a world with the channel `pose`.
+    """Walks to `place`, x and y in metres, in a world with the channel `pose`; there it turns to `heading` radians, if one is
+    given.
 
-    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Ways lead over the places of the channel
-    `keyframes` where it is seen; else straight on. PlanningError where none is known.
+    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Ways lead over the places of the
+    channel `keyframes` where it is seen; else straight on. PlanningError where none is known.
     """
 
-    def __init__(self, planner: Planner, place: tuple[float, float]):
+    def __init__(self, planner: Planner, place: tuple[float, float], heading: float | None = None):
         if "pose" not in planner.cost.channels:
             raise PlanningError("who walks to a place plans for a goal in 'pose'.")
-        self.planner, self.place = planner, np.asarray(place, np.float64)
+        self.planner, self.place, self.heading = planner, np.asarray(place, np.float64), heading
 
     def begin(self, batch: int, rng: torch.Generator) -> list[Walk]:
         return [Walk(thought) for thought in self.planner.begin(batch, rng)]
@@ -110,7 +112,8 @@ class Wayfinder:
 
     def _led(self, walk: Walk, observation: Observation, entry: int) -> Walk:
         """The walk with the next place as its planner's goal."""
-        here = observation["pose"][entry, :2].double().cpu().numpy()
+        now = observation["pose"][entry].double().cpu()
+        here = now[:2].numpy()
         walk = self._noted(walk, here)
         if walk.ways is None or walk.step % _ANEW_STEPS == 0:
             known = np.zeros((0, 2))
@@ -122,8 +125,14 @@ class Wayfinder:
         target, left = walk.ways.target(here, self.place)
         if not math.isfinite(left):
             raise PlanningError("no way to that place is known: choose one near where somebody has been.")
-        pose = walk.thought.goal["pose"].clone()
+        pose = torch.full_like(walk.thought.goal["pose"], torch.nan)
         pose[0, :2] = torch.from_numpy(target).to(pose)
+        if self.heading is not None and left < _TURNS_M:
+            half = torch.tensor([self.heading / 2], dtype=torch.float64)
+            turned = torch.cat(
+                [half.cos(), half.sin()]
+            )  # of two quaternions for one heading that which is nearer to now
+            pose[0, [3, 6]] = (turned * (1 if float(turned @ now[[3, 6]]) >= 0 else -1)).to(pose)
         thought = replace(walk.thought, goal={**walk.thought.goal, "pose": pose})
         return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
 

@@ -4,6 +4,7 @@ import { drawCard } from './card.js';
 import { Controls } from './controls.js';
 import { DriverView } from './driver.js';
 import { Futures } from './futures.js';
+import { Goal } from './goal.js';
 import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
@@ -44,6 +45,7 @@ const driver = new DriverView({
 
 const futures = new Futures((on) => views.change({ futures: on }));
 
+const goal = new Goal({ send: (message) => link.send(message), map: views.places, say: toast });
 const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
 
 function sendKeys() {
@@ -67,6 +69,7 @@ function onEvent(body) {
   if (body.type === 'keys') onKeys(body);
   if (body.type === 'chart') views.onChart(body);
   if (body.type === 'agent') { driver.show(body); futures.follow(body); }
+  if (body.type === 'goal') goal.show(body);
   if (body.type === 'futures') futures.show(body);
   if (body.type === 'acted') driver.acted(body);
   if (body.type === 'error') toast(body.text);
@@ -81,6 +84,7 @@ function hello(body) {
   if (!same) build();
   views.take(worlds, { same, resumed: body.resumed });
   futures.take(body);
+  goal.take(body);
   sendControls(performance.now());
   now.actionId = controlsId;  // what is sent before anything is held measures nothing
   showState('starting');
@@ -296,12 +300,12 @@ function drawTouch() {
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
 const escape = () => (panel.open ? showAside(null) : togglePause());
-const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyV: () => futures.toggle(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
+const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyV: () => futures.toggle(), KeyB: () => goal.keep(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 /** What the page itself does with a key, here and now; '' where it does nothing. */
 function pageUse(code) {
   const uses = {
-    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive', KeyV: futures.there && 'shows what the agent considers',
+    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive', KeyV: futures.there && 'shows what the agent considers', KeyB: goal.pictures && 'remembers the goal',
     KeyC: screens.cameras.length > 1 && 'changes the camera', KeyP: 'pauses', KeyR: 'restarts', KeyF: 'fills the screen', Enter: 'goes on from the past',
   };
   return uses[code] || '';
@@ -348,7 +352,7 @@ for (const [one, opens, closes] of [[card, 'about', 'card-close'], [panel, 'keys
 }
 learnLayout(() => { if (worlds.length) drawKeys(); });
 
-takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes) => link.sendPicture(bytes), toast);
+takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes, asGoal) => link.sendPicture(bytes, asGoal), toast, (x) => goal.dropped(x));
 controls.bindPad($('stick'), 'stick');
 controls.bindPad($('turn'), 'turn');
 controls.axes.bindMouse($('screens'));
@@ -386,7 +390,7 @@ window.terrella = Object.freeze({
   get seed() { return status.seed; },
   get axes() { return [...controls.axes.values]; },
   get driving() { return !!status.driving; },
-  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count }; },
+  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count, goal: goal.at, goalPicture: !!goal.shown }; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
   get map() { return views.figures; },

@@ -33,7 +33,7 @@ export class DriverView {
     $('drive').title = driving ? 'Drive yourself (G, or any key of the world)' : `Let the agent drive${name ? `: ${name}` : ''} (G)`;
     if (driving) {
       $('driver-name').textContent = name ? `${name[0].toUpperCase()}${name.slice(1)} drives` : 'The agent is getting ready';
-      const facts = [away !== null && `${away}${unit ? ` ${unit}` : ''} to go`, ms >= 5 && `thinks ${ms} ms`].filter(Boolean);
+      const facts = [away !== null && `${away}${unit ? ` ${unit}` : ''} to go`, ms >= 5 && `thinks ${ms < 1000 ? `${ms} ms` : `${ms / 1000} s`}`].filter(Boolean);
       $('driver-more').textContent = [...facts, $('app').classList.contains('touchable') ? 'touch to take over' : 'any key takes over'].join(' · ');
     } else if (handed) {
       [$('driver-name').textContent, $('driver-more').textContent] = ['You drive', ''];

@@ -111,9 +111,9 @@ export class Link {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  /** The bytes of an image file (at most 64 kB): a new episode begins with it. */
-  sendPicture(bytes) {
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(bytes);
+  /** The bytes of an image file (at most 64 kB): a new episode begins with it, or it is the agent's goal. */
+  sendPicture(bytes, asGoal = false) {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(asGoal ? new Blob([new Uint8Array(1), bytes]) : bytes);
   }
 
   clipAddress() {

@@ -11,7 +11,7 @@ export class MemoryMap {
   }
 
   clear() {
-    Object.assign(this, { keys: [], path: [], camera: null, box: null, layer: null, step: -1 });
+    Object.assign(this, { keys: [], path: [], camera: null, box: null, layer: null, step: -1, goal: null });
   }
 
   /** A chart event (see serve/protocol.py); `length` is how many steps are remembered of the way. */
@@ -64,6 +64,33 @@ export class MemoryMap {
 
   at(x, y) { return [this.box.x + this.box.scale * x, this.box.y - this.box.scale * y]; }  // x to the right, y up
 
+  /** The place in the world at a place on the canvas, in CSS pixels: x and y in metres; null where there is no map yet. */
+  place(u, v) {
+    if (!this.box) return null;
+    const ratio = this.canvas.width / this.canvas.clientWidth, { x, y, scale } = this.box;
+    return [(u * ratio - x) / scale, (y - v * ratio) / scale].map((metres) => Math.round(1000 * metres) / 1000);
+  }
+
+  /** Where the agent is to go: a ring with a dot, and a faint line to it. */
+  drawGoal(context, ratio) {
+    const [u, v] = this.at(...this.goal), [x, y] = this.at(this.camera[0], this.camera[1]);
+    context.strokeStyle = context.fillStyle = '#7fe3c4';
+    context.lineWidth = 1.25 * ratio;
+    context.globalAlpha = 0.5;
+    context.setLineDash([2 * ratio, 4 * ratio]);
+    context.beginPath();
+    context.moveTo(x, y);
+    context.lineTo(u, v);
+    context.stroke();
+    context.setLineDash([]);
+    context.globalAlpha = 1;
+    for (const [radius, fill] of [[7, false], [2.5, true]]) {
+      context.beginPath();
+      context.arc(u, v, radius * ratio, 0, 7);
+      if (fill) context.fill(); else { context.lineWidth = 2 * ratio; context.stroke(); }
+    }
+  }
+
   /** What changes seldom: the ground, the keyframes, the scale. */
   drawLayer(width, height, ratio) {
     this.layer = Object.assign(document.createElement('canvas'), { width, height });
@@ -109,6 +136,7 @@ export class MemoryMap {
     for (const { x, y, jumped } of this.path) context[jumped ? 'moveTo' : 'lineTo'](...this.at(x, y));
     context.stroke();
     context.globalAlpha = 1;
+    if (this.goal) this.drawGoal(context, ratio);
     const [u, v] = this.at(this.camera[0], this.camera[1]), size = 6.5 * ratio;
     context.save();
     context.translate(u, v);

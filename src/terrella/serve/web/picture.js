@@ -2,13 +2,13 @@
 
 const MOST_BYTES = 64 * 2 ** 20, MOST_SENT = 60000;
 
-/** root: where files may be dropped; input: a file input; size(): [height, width] of the world; send(bytes); say(text). */
-export function takePictures(root, input, size, send, say) {
-  const take = async (file) => {
+/** root: where files may be dropped; input: a file input; size(): [height, width] of the world; send(bytes, as a goal); say(text); isGoal(x): of what is dropped there. */
+export function takePictures(root, input, size, send, say, isGoal) {
+  const take = async (file, asGoal = false) => {
     try {
       if (!size()) return;
       if (file.size > MOST_BYTES) throw new Error('it is larger than 64 MB');
-      send(await scaled(file, size()));
+      send(await scaled(file, size()), asGoal);
     } catch (error) {
       const why = error instanceof DOMException ? 'this is no image that the browser can read' : error.message;
       say(`No picture: ${why}.`);
@@ -16,13 +16,13 @@ export function takePictures(root, input, size, send, say) {
   };
   const carries = (event) => [...(event.dataTransfer?.types ?? [])].includes('Files');
   const dropping = (on) => root.classList.toggle('dropping', on);
-  addEventListener('dragover', (event) => { if (carries(event)) { event.preventDefault(); dropping(true); } });
+  addEventListener('dragover', (event) => { if (carries(event)) { event.preventDefault(); dropping(true); root.classList.toggle('as-goal', isGoal(event.clientX)); } });
   addEventListener('dragleave', (event) => { if (!event.relatedTarget) dropping(false); });
   addEventListener('drop', (event) => {
     if (!carries(event)) return;
     event.preventDefault();
     dropping(false);
-    if (event.dataTransfer.files.length) take(event.dataTransfer.files[0]);
+    if (event.dataTransfer.files.length) take(event.dataTransfer.files[0], isGoal(event.clientX));
   });
   input.addEventListener('change', () => {
     if (input.files.length) take(input.files[0]);

@@ -1,0 +1,123 @@
+"""Ways to a place: over known places round a wall, planned stretch by stretch, and a sentence where there is none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.act.planning import Planner, Revealed, SearchConfig, Wayfinder, distance_to, paced, tells_apart
+from terrella.act.planning.ways import STRIDE_M, ways_to
+from terrella.core import Spec, State, check_world
+from terrella.core.errors import ContractError, ObservationError, PlanningError
+from terrella.core.spec import POSE
+from terrella.core.world import make_rng
+
+# A wall along x = 2 from y = -9 to y = 3, and places round its end.
+KNOWN = np.array([[x, y] for x in range(5) for y in range(-1, 5) if x != 2 or y > 3], np.float64)
+
+
+class Yard:
+    """A body that goes 0.2 m a step to the sides, and a wall that stops it."""
+
+    def __init__(self):
+        self.spec = Spec(
+            name="yard",
+            action=spaces.Box(-1, 1, (2,), np.float32),
+            channels={"pose": POSE, "keyframes": spaces.Box(-np.inf, np.inf, (len(KNOWN) + 1, 4), np.float32)},
+            observes=("pose",),
+            dt_s=0.1,
+        )
+
+    def start(self, batch, rng):
+        if batch < 1:
+            raise ContractError("a yard holds one or more.")
+        return State({"at": torch.zeros(batch, 2)})
+
+    def observe(self, observation, prior, rng):
+        if "pose" not in observation:
+            raise ObservationError("a yard is told where one stands.")
+        return State({"at": observation["pose"][:, :2]})
+
+    def imagine(self, state, action, rng):
+        before = state["at"]
+        after = before + 0.2 * self.spec.check_action(action, state.batch)
+        crossed = (before[:, 0] < 2) != (after[:, 0] < 2)
+        return State({"at": torch.where((crossed & (after[:, 1] < 3))[:, None], before, after)})
+
+    def render(self, state, channels):
+        self.spec.check_channels(channels)
+        zero = torch.zeros(state.batch, 1)
+        shown = {"pose": lambda: torch.cat([state["at"], zero, zero + 1, zero, zero, zero], 1)}
+        rows = torch.from_numpy(np.c_[KNOWN, 0 * KNOWN[:, 0], 1 + 0 * KNOWN[:, 0]]).float()
+        table = torch.cat([rows, torch.zeros(1, 4)])
+        shown["keyframes"] = lambda: table.expand(state.batch, *table.shape)
+        return {name: shown[name]() for name in channels}
+
+
+def walk(place, steps=120):
+    world = Revealed(Yard())
+    cost = distance_to(world, {"pose": torch.tensor([*place, *[torch.nan] * 5])})
+    way = Wayfinder(Planner(world, cost, SearchConfig(samples=24, iterations=2, horizon=5)), place)
+    rng = make_rng(0)
+    state, memory, trace = world.start(1, rng), way.begin(1, rng), []
+    for _ in range(steps):
+        seen = world.render(state, (*world.spec.observes, "pose", "keyframes"))
+        trace.append(seen["pose"][0, :2].tolist())
+        if math.dist(trace[-1], place) < 0.4:
+            return trace
+        action, memory = way.act(seen, memory, rng)
+        state = world.imagine(state, action, rng)
+    return trace
+
+
+def test_the_yard_keeps_the_contract():
+    check_world(Yard())
+
+
+def test_ways_lead_round_the_wall_and_grow_shorter():
+    goal = np.array([4.0, 0.0])
+    ways = ways_to(goal, KNOWN)
+    here = np.array([0.0, 0.0])
+    target, left = ways.target(here, goal)
+    assert target[1] > 0 and left > 2 * math.dist(here, goal), "not straight at the wall"
+    for _ in range(40):
+        if math.dist(here, goal) <= STRIDE_M:
+            break
+        target, further = ways.target(here, goal)
+        assert further <= left + 1e-9 and not (here[0] < 2 < target[0] and target[1] < 3)
+        here, left = target, further
+    assert math.dist(here, goal) <= STRIDE_M
+
+
+def test_a_walker_goes_round_a_wall_that_its_planner_does_not_see_past():
+    trace = walk((4.0, 0.0))
+    assert math.dist(trace[-1], (4.0, 0.0)) < 0.4 and max(y for _, y in trace) > 2.9
+
+
+def test_a_place_that_nobody_knows_is_refused_in_a_sentence():
+    with pytest.raises(PlanningError, match="no way to that place is known"):
+        walk((20.0, 20.0))
+    assert not np.isfinite(ways_to(np.array([20.0, 20.0]), KNOWN).left_m).any()
+
+
+def test_a_place_that_could_not_be_walked_to_is_avoided():
+    goal = np.array([4.0, 4.0])
+    far = ways_to(goal, KNOWN, avoided=((1.0, 4.0),)).left_m - ways_to(goal, KNOWN).left_m
+    assert (far >= -1e-9).all() and far.max() > 0.5
+
+
+def test_a_search_is_paced_and_knows_whether_there_is_anything_to_plan_for():
+    world = Revealed(Yard())
+    state = world.start(1, make_rng(0))
+    near = distance_to(world, {"pose": torch.tensor([1.0, 0.0, *[torch.nan] * 5])})
+    config, fits = paced(world, near, state, 1e4)
+    assert fits and config.horizon == 16 and config.samples == 32
+    config, fits = paced(world, near, state, 1e-3)
+    assert not fits and config.horizon == 4 and config.samples == 8
+    assert tells_apart(world, near, state)
+    same = distance_to(world, {"pose": torch.tensor([torch.nan, torch.nan, 0.0, *[torch.nan] * 4])})
+    assert not tells_apart(world, same, state)
