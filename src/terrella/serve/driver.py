@@ -118,13 +118,19 @@ class Driver:
             if not isinstance(error, TerrellaError):
                 traceback.print_exc(file=sys.stderr)
                 reason = f"{type(error).__name__}: {error}."
-            self.stop(f"the agent stopped: {reason} You drive.")
+            self._end(f"the agent stopped: {reason} You drive.")
             return asked
 
     def stop(self, said: str) -> None:
         """The person drives from now on, for this reason."""
         self.on, self.said, self.acted = False, said, None
         self.forget()
+
+    def _end(self, said: str) -> None:
+        """The agent is done. With a place, too; a picture stays the goal until it is taken away."""
+        if self.mark["at"] is not None:
+            self.seek({})
+        self.stop(said)
 
     def _chosen(self, agents: Agents, state: State, rng: torch.Generator) -> torch.Tensor:
         if self._agent is None:
@@ -143,20 +149,18 @@ class Driver:
     def _arrived(self, agent: Agent, away: float) -> bool:
         """Whether there is no more to do: the goal is reached, or it has not come nearer for long."""
         if not math.isfinite(away):
-            self.stop(f"{self.spec.name} cannot say how far the goal is from here. You drive.")
+            self._end(f"{self.spec.name} cannot say how far the goal is from here. You drive.")
             return True
         self.away = away
         told = f"{away:.1f} {agent.unit}" if agent.unit else f"{away:.3f}"
         if away <= agent.near:
-            if self.mark["at"] is not None:  # a place is done with; a picture stays until it is taken away
-                self.seek({})
-            self.stop(f"reached: {told} from the goal. You drive.")
+            self._end(f"reached: {told} from the goal. You drive.")
             return True
         self._since += 1
         if away < _NEARER * self._best:
             self._best, self._since = away, 0
         elif self._since * self.spec.dt_s > PATIENCE_S:
             best = f"{self._best:.1f} {agent.unit}" if agent.unit else f"{self._best:.3f}"
-            self.stop(f"the goal cannot be reached from here: {best} is the nearest that the agent came. You drive.")
+            self._end(f"the goal cannot be reached from here: {best} is the nearest that the agent came. You drive.")
             return True
         return False

@@ -124,7 +124,7 @@ class Wayfinder:
         assert walk.ways is not None
         target, left = walk.ways.target(here, self.place)
         if not math.isfinite(left):
-            raise PlanningError("no way to that place is known: choose one near where somebody has been.")
+            raise PlanningError("no way to that place is known; choose one near where somebody has been.")
         pose = torch.full_like(walk.thought.goal["pose"], torch.nan)
         pose[0, :2] = torch.from_numpy(target).to(pose)
         if self.heading is not None and left < _TURNS_M:
