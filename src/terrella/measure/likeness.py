@@ -130,14 +130,18 @@ def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor
 
 
 def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) -> list[Row]:
-    """By how much the true actions are better than another player's, and than none, clip by clip."""
-    rows = []
+    """By how much the true actions are better than another player's, and than none, clip by clip; and of pooled errors, those
+    that say most."""
+    rows, lead = [], next((series.what for series in made.get(PREDICTED, ()) if series.counts is not None), None)
     for name in (OTHERS, IDLE):
         for mine, theirs in zip(made.get(PREDICTED, ()), made.get(name, ())):
-            for step in exam.config.control_horizons if mine.counts is None else ():
+            for step in exam.config.control_horizons if mine.counts is None or mine.what == lead else ():
                 if step <= theirs.values.shape[1]:
-                    values = mine.values[:, step - 1], theirs.values[:, step - 1]
-                    better = mean_interval(mine.better * (values[0] - values[1]), exam.rng())
+                    values = mine.values[:, step - 1 : step], theirs.values[:, step - 1 : step]
+                    if mine.counts is None:
+                        better = mean_interval(mine.better * (values[0] - values[1])[:, 0], exam.rng())
+                    else:
+                        better = ratio_band(values[1], values[0], exam.rng()).in_db().at(0)
                     what = f"{mine.what}: true actions over {name}"
                     where = "control", mine.channel, what, mine.unit, place, arm, PREDICTED, step
                     rows.append(Row(*where, better, 1))

@@ -16,7 +16,7 @@ from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_e
 from .frechet import frechet_interval
 from .likeness import Series, report
 from .roll import Results, Tick, Watch, rows_at
-from .scorecard import COPY_LAST, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
+from .scorecard import COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
 from .statistics import mean_interval, ratio_band, ratio_interval
 from .work import Unit
 
@@ -27,7 +27,6 @@ LEAD = (
     "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. The Frechet "
     "distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
 )
-POOLED = "pooled PSNR"
 _LEAST_SSIM = 11  # pixels: the size of its window
 
 

@@ -12,6 +12,7 @@ from .statistics import Band, Figure
 PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alone; or at each step the true pose
 OTHERS, IDLE = "other actions", "no action"  # actions of another clip; the action at rest, held
 COPY_LAST = "copy last"
+POOLED = "pooled PSNR"  # that of all errors of all clips together
 GAIN = ": gain over copy-last"  # of a measure: the curve by which it is compared at every step
 
 

@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from .endurance import COLOUR_WITHIN, SHARP_WITHIN
-from .scorecard import COPY_LAST, GAIN, OTHERS, PREDICTED, Curve, Row, Scorecard, words_of
+from .scorecard import COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, words_of
 from .statistics import Figure
 
 BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
@@ -115,7 +115,10 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
     stillness = [row for row in mine if row.probe == "stillness"]
     asked = (
-        (_first(control), lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys")),
+        (
+            _first([row for row in control if row.what.startswith(POOLED)] or control),
+            lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys"),
+        ),
         (closed, lambda row: _sure(row, REMEMBERED_DB, math.inf, "remembers", "does not surely remember", "forgets")),
         (_first([row for row in sharp if row.horizon == reach]), _sharpness),
         (stillness, _stands),

@@ -21,7 +21,7 @@ from .generator import Block, Conditioning, down_and_up, encode_depth
 COARSE = 4  # the trunk sees squares of so many pixels; what is chosen is chosen for each pixel
 PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
 HIDDEN = 32  # of each pixel, of which its choice is made
-CHANCE = 0.5  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
+CHANCE = 0.25  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
 AROUND = 8  # pixels of a side of the squares, near which colours are counted
 UNKNOWN = -1e4  # the logit of what is not there
 
