@@ -20,7 +20,7 @@ from ..muon import muon
 from ..trainer import Average, Loss, Now, warmed
 
 PAST = 24  # steps of a clip before those that are shown, of which its mosaic is made; fewer where episodes are short
-DREAM = 12  # steps of a clip that are dreamt, each from those before it, and descended; fewer where episodes are short
+DREAM = 6  # steps of a clip that are dreamt, each from those before it, and descended; fewer where episodes are short
 RECORDED = 300  # training steps with recorded frames alone
 STILL = 0.1  # the share of clips that are shown as if an episode began with them: play begins with a lone frame, too
 BLIND = (
