@@ -12,6 +12,7 @@ import torch
 
 from .. import library
 from ..act.explorer import Explorer
+from ..act.named import Slipping, seen_by
 from ..act.planning import (
     Planner,
     Revealed,
@@ -67,9 +68,11 @@ class Driving:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
             return found
         policy = library.load_policy(self.name, self.played.spec, self.world)
-        if not isinstance(policy, Planner):
-            return Agent(self.name, policy)
-        return Agent(self.name, policy, self.see, futures=self._futures(policy))
+        plans = policy.policy if isinstance(policy, Slipping) else policy
+        if isinstance(plans, Planner):
+            return Agent(self.name, policy, self.see, futures=self._futures(plans) if plans is policy else None)
+        sees = seen_by(policy, self.played.spec)
+        return Agent(self.name, policy, lambda state: self.played.render(state, sees))
 
     # -- where it plans -----------------------------------------------------------------------------------------------
 

@@ -1,0 +1,116 @@
+"""The agent that suits a world: a planner where there is something to plan for, walkers to places, sentences for what cannot be."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from terrella.act.planning import Wayfinder
+from terrella.cli.driving import Driving
+from terrella.core.errors import TerrellaError
+from terrella.core.world import make_rng
+from terrella.serve.protocol import Goal
+from terrella.serve.timeline import Timeline
+
+from .mapped import Mapped
+from .panorama import Panorama
+
+PATIENT_MS = 500.0  # so that no machine is too slow
+
+
+class Dull(Panorama):
+    """Nothing that is done here brings more than anything else."""
+
+    def _channel(self, state, name):
+        return 0 * super()._channel(state, name) if name == "reward" else super()._channel(state, name)
+
+
+def driven(timeline: Timeline, steps: int) -> Timeline:
+    for _ in range(steps):
+        timeline.step()
+    return timeline
+
+
+def test_where_plans_bring_reward_a_planner_drives_and_gains():
+    agents = Driving(Panorama(), budget_ms=PATIENT_MS).agents()
+    assert agents.make({}).name == "a planner for reward" and agents.pictures
+    timeline = Timeline([Panorama()], 0, policy=Driving(Panorama(), budget_ms=5.0, name="plan").agents())
+    timeline.driver.let(True)
+    assert driven(timeline, 20).shown.episode_return > 10
+
+
+def test_where_all_plans_bring_the_same_the_explorer_drives():
+    agents = Driving(Dull(), budget_ms=PATIENT_MS).agents()
+    assert agents.make({}).name == "the explorer" and agents.make({}).futures is None
+    assert Driving(Dull(), name="plan", budget_ms=PATIENT_MS).make({}).name == "a planner for reward", (
+        "asked for by name"
+    )
+
+
+def test_a_walker_goes_to_a_place_and_shows_what_it_considers():
+    world = Mapped()
+    world.start(1, make_rng(0))
+    agents = Driving(world, budget_ms=5.0).agents()
+    assert agents.places
+    agent = agents.make({"pose": torch.tensor([[1.0, 0.0, *[torch.nan] * 5]])})
+    assert isinstance(agent.policy, Wayfinder) and agent.unit == "m"
+    timeline = Timeline([world], 0, policy=agents)
+    timeline.seek(Goal(at=(1.2, 0.0)))
+    driven(timeline, 1)
+    found = next(found for found in (timeline.consider() for _ in range(200)) if found)
+    assert found["frames"] == 6 and found["plans"][0]["cost"] is not None
+    driven(timeline, 60)
+    assert timeline.driver.said.startswith("reached: 0."), timeline.driver.said
+    assert float(timeline._states[0]["x"][0]) == pytest.approx(1.2, abs=0.55)
+
+
+def test_a_picture_that_is_remembered_is_gone_back_to_with_its_heading():
+    world = Mapped()
+    agents = Driving(world, budget_ms=5.0).agents()
+    timeline = Timeline([world], 0, policy=agents)
+    seen = world.render(timeline._states[0], world.spec.recorded)
+    agent = agents.make(seen)
+    assert isinstance(agent.policy, Wayfinder) and agent.policy.heading is not None
+    assert agent.away(timeline._states[0]) == 0.0
+    driven(timeline, 3)
+    alone = agents.make({"rgb": seen["rgb"]})
+    assert not isinstance(alone.policy, Wayfinder) and alone.unit == "", (
+        "a panorama cannot tell where a picture was taken"
+    )
+    assert 0 <= alone.away(timeline._states[0]) < 0.2
+
+
+def test_a_game_that_cannot_be_copied_takes_no_goals():
+    driving = Driving(Panorama(forkable=False))
+    agents = driving.agents()
+    assert not agents.places and not agents.pictures and agents.make({}).name == "the explorer"
+    with pytest.raises(TerrellaError, match="neither be copied nor was learned"):
+        agents.make({"pose": torch.zeros(1, 7)})
+    with pytest.raises(TerrellaError, match="cannot be planned in for reward"):
+        Driving(Panorama(forkable=False), name="plan").make({})
+
+
+def test_beside_a_game_it_plans_in_the_dream():
+    driving = Driving(Panorama(forkable=False), Panorama(), budget_ms=PATIENT_MS)
+    agent = driving.agents().make({})
+    assert agent.name == "a planner for reward"
+    timeline = Timeline([driving.played, driving.learned], 0, policy=driving.agents())
+    timeline.driver.let(True)
+    driven(timeline, 3)
+    assert timeline.driver.on and timeline.shown.episode_return > 0
+
+
+@pytest.mark.parametrize(
+    "name", ["idle", "random", "plan:samples=4,iterations=1,horizon=3", "plan:samples=4,horizon=3@0.2"]
+)
+def test_an_agent_is_named_as_policies_are(name):
+    timeline = Timeline([Panorama()], 0, policy=Driving(Panorama(), name=name).agents())
+    timeline.driver.let(True)
+    driven(timeline, 3)
+    assert timeline.driver.on and timeline.driver.name == name and timeline.driver.said == ""
+    assert bool(timeline.driver.described()["considers"]) == name.startswith("plan:") * ("@" not in name)
+
+
+def test_an_agent_of_no_known_name_is_refused_at_once():
+    with pytest.raises(TerrellaError, match="no policy 'explorre'"):
+        Driving(Panorama(), name="explorre").agents()
