@@ -92,7 +92,7 @@ class Wayfinder:
     given.
 
     planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Ways lead over the places of the
-    channel `keyframes` where it is seen; else straight on. PlanningError where none is known.
+    channel `keyframes`, seen or remembered by the planner's world; without any, straight on. PlanningError where none is known.
     """
 
     def __init__(self, planner: Planner, place: tuple[float, float], heading: float | None = None):
@@ -115,11 +115,8 @@ class Wayfinder:
         now = observation["pose"][entry].double().cpu()
         here = now[:2].numpy()
         walk = self._noted(walk, here)
-        if walk.ways is None or walk.step % _ANEW_STEPS == 0:
-            known = np.zeros((0, 2))
-            if "keyframes" in observation:
-                held = observation["keyframes"][entry].double().cpu().numpy()
-                known = held[held[:, 3] > 0, :2]
+        if walk.ways is None or walk.step % _ANEW_STEPS == 0 or not len(walk.ways.places):
+            known = self._known(observation, walk, entry)
             walk = replace(walk, ways=ways_to(self.place, known, walk.avoided))
         assert walk.ways is not None
         target, left = walk.ways.target(here, self.place)
@@ -135,6 +132,16 @@ class Wayfinder:
             pose[0, [3, 6]] = (turned * (1 if float(turned @ now[[3, 6]]) >= 0 else -1)).to(pose)
         thought = replace(walk.thought, goal={**walk.thought.goal, "pose": pose})
         return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
+
+    def _known(self, observation: Observation, walk: Walk, entry: int) -> np.ndarray:
+        """The places [N, 2] where a camera was, as they are seen, or as the planner's world remembers them."""
+        if "keyframes" in observation:
+            held = observation["keyframes"][entry]
+        elif "keyframes" in self.planner.world.spec.channels and walk.thought.prior is not None:
+            held = self.planner.world.render(walk.thought.prior, ("keyframes",))["keyframes"][0]
+        else:
+            return np.zeros((0, 2))
+        return held[held[:, 3] > 0, :2].double().cpu().numpy()
 
     def _noted(self, walk: Walk, here: np.ndarray) -> Walk:
         """Notices who does not get on: the place walked to is then avoided."""

@@ -38,14 +38,14 @@ const controls = new Controls((held, time) => {
   sendControls(time);
 }, $('axes'));
 
+const go = () => { if (status.rewound) link.send({ type: 'branch' }); if (status.paused) link.send({ type: 'resume' }); $('hint').classList.remove('show'); };
 const driver = new DriverView({
-  send: (message) => link.send(message), say: toast, quiet: () => { controls.release(); controls.axes.rest(); }, light: (held) => light([...held, ...controls.held]), axes: controls.axes,
-  go: () => { if (status.rewound) link.send({ type: 'branch' }); if (status.paused) link.send({ type: 'resume' }); $('hint').classList.remove('show'); },
+  send: (message) => link.send(message), say: toast, quiet: () => { controls.release(); controls.axes.rest(); }, light: (held) => light([...held, ...controls.held]), axes: controls.axes, go,
 });
 
 const futures = new Futures((on) => views.change({ futures: on }));
 
-const goal = new Goal({ send: (message) => link.send(message), map: views.places, say: toast });
+const goal = new Goal({ send: (message) => link.send(message), map: views.places, say: toast, go });
 const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
 
 function sendKeys() {
