@@ -23,7 +23,7 @@ from terrella.worlds.folder import load_world, save_world
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --seed --size",
+    "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --practise --seed --size",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --fps --frames --human --idle --json --keys --live-mcap --out --pictures --port "
     "--seed --size",

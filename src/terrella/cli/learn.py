@@ -21,6 +21,7 @@ from ..learn.recording import MOST, learned_size
 from ..measure import CLIPS, Exam, ExamConfig, verdict, within
 from .named import Controls, Environment
 from .plan import RECORDING, SCORING, TRAINING, Plan, folder_for
+from .practising import practise as rounds_of_practice
 from .record import described, explore, looked_at, stored_as
 from .say import Json, Seed, result, say
 from .score import QUICK_HORIZONS, arms_of, carded, exam_of
@@ -43,6 +44,7 @@ def learn(
     minutes: float = 30.0,
     out: Path | None = None,
     frames: int = 20_000,
+    practise: bool = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -55,9 +57,12 @@ def learn(
         minutes: Time for all of it, earlier runs included. With more than a finished world had, it is trained on.
         out: Folder for the recording, the run and the score; default: learned/ and the environment's name.
         frames: Frames to record at most; an eighth of the time is recorded if there are not so many sooner.
+        practise: Learn a policy, too: collect with it, learn a latent world, practise in that, and again (see docs/practice.md).
     """
     if not 0 < minutes < math.inf or frames < 100:
         raise TerrellaError("--minutes is a time above 0, and --frames are 100 or more.")
+    if practise:
+        return rounds_of_practice(name, environment, minutes, out or folder_for(name), frames, seed, json)
     asked = {"environment": name, "frames": frames, "seed": seed, **asdict(environment), **asdict(controls)}
     plan = Plan(out or folder_for(name), asked, minutes)
     if SCORING in plan.facts:

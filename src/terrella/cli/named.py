@@ -87,8 +87,9 @@ class Environment:
     fps: float | None = None
     adapter: str | None = None
 
-    def open(self, name: str, forkable: bool = False) -> World:
-        """The world of this name, as was said. `forkable`: an environment that can be copied, or TerrellaError."""
+    def open(self, name: str, forkable: bool = False, rgb: bool = True) -> World:
+        """The world of this name, as was said. `forkable`: an environment that can be copied, or TerrellaError. `rgb`: with
+        pictures."""
         from .. import library
         from ..core.errors import TerrellaError
 
@@ -107,6 +108,8 @@ class Environment:
             )
         if forkable:
             options["forkable"] = True
+        if not rgb:
+            options["rgb"] = False
         return library.load(name, **options)
 
 

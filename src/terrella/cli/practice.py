@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from tyro.conf import arg
 
 from .. import library, progress
 from ..act.actor import Actor
-from ..act.planning.episodes import Played, play
+from ..act.named import seen_by
+from ..act.planning.episodes import play
+from ..act.through import actor_of
 from ..core.errors import TerrellaError
 from ..core.policy import Policy, Random
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import Practice, train_policy
 from ..measure.statistics import Figure, mean_interval
+from .beside import check_alike, open_real
 from .named import Device, Environment, load_named
 from .say import Json, result
 
@@ -58,15 +61,18 @@ def policy(
     if tried.episodes < 1:
         raise TerrellaError("--episodes is a whole number from 1 up.")
     inside = environment.open(world) if library.is_truth(world) else load_named(world, device)
-    outside = None if tried.real is None else environment.open(tried.real)
+    outside = None if tried.real is None else open_real(tried.real, environment, inside.spec)
+    if outside is not None:
+        check_alike(inside.spec, outside.spec)
     with progress.shown("practising") as report:
         facts = train_policy(inside, world, out, config, report, recording)
     if outside is None:
         facts["play"] = f"terrella train policy --in {world} --out {out} --real ENVIRONMENT says what it is worth"
         return result(facts, json)
     figures = tried_out(out, inside, outside, tried.episodes, config.seed)
-    lines = told(figures, inside, outside, facts)
     plain = {name: asdict(figure) for name, figure in figures.items()}
+    practised = f"{facts['practised_steps']:,} steps of practice in {facts['minutes']:.1f} minutes"
+    lines = [verdict(figures, outside), *told(figures, inside), practised]
     result({"verdict": lines[0], **plain, **facts}, json, "\n".join([*lines, f"the policy: {facts['policy']}"]))
 
 
@@ -74,32 +80,36 @@ def tried_out(out: Path, inside: World, outside: World, episodes: int, seed: int
     """The policy's returns in the environment, those of chance from the same starts, what it is better by, start by start, and what
     a learned world promised."""
     steps = outside.spec.max_episode_steps or STEPS
-    actor = Actor.load(out, outside.spec)
 
-    def returns(world: World, policy: Policy, what: str) -> torch.Tensor:
+    def returns(world: World, policy: Policy, what: str, sees: Sequence[str] = ()) -> torch.Tensor:
         with progress.shown(what) as report:
-            sees = [name for name in actor.sees if name in world.spec.channels]
-            played: Played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
+            played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
         return torch.tensor([one.reward for one in played.episodes])
 
-    mine = returns(outside, actor, "acting")
+    actor = actor_of(out, outside.spec, inside)
+    sees = [name for name in seen_by(actor, outside.spec) if name in outside.spec.channels]
+    mine = returns(outside, actor, "acting", sees)
     floor = returns(outside, Random(outside.spec), "acting at random")
     found = {"return": mine, "at random": floor, "better by": mine - floor}
     if inside.spec.observes:
-        found["promised"] = returns(inside, Actor.load(out, inside.spec), "dreaming")
+        dreamer = Actor.load(out, inside.spec)
+        found["promised"] = returns(inside, dreamer, "dreaming", dreamer.sees)
     return {name: mean_interval(values, make_rng(seed)) for name, values in found.items()}
 
 
-def told(figures: Mapping[str, Figure], inside: World, outside: World, facts: Mapping[str, Any]) -> list[str]:
-    """What came of it, for people: the verdict first."""
+def verdict(figures: Mapping[str, Figure], outside: World) -> str:
+    """What came of it, in a sentence."""
     better, name = figures["better by"], outside.spec.name
     if better.low > 0:
-        verdict = f"It acts better than chance in {name}, by {better}."
-    elif better.high < 0:
-        verdict = f"It acts worse than chance in {name}, by {better}: the world it practised in misleads it."
-    else:
-        verdict = f"It is not seen to act better than chance in {name}: by {better}."
-    lines = [verdict, f"return {figures['return']}; at random from the same starts {figures['at random']}"]
+        return f"It acts better than chance in {name}, by {better}."
+    if better.high < 0:
+        return f"It acts worse than chance in {name}, by {better}: the world that it practised in misleads it."
+    return f"It is not seen to act better than chance in {name}: by {better}."
+
+
+def told(figures: Mapping[str, Figure], inside: World) -> list[str]:
+    """The figures, for people."""
+    lines = [f"return {figures['return']}; at random from the same starts {figures['at random']}"]
     if "promised" in figures:
         lines.append(f"in {inside.spec.name} itself, where it practised: {figures['promised']}")
-    return [*lines, f"{facts['practised_steps']:,} steps of practice in {facts['minutes']:.1f} minutes"]
+    return lines

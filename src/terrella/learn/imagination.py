@@ -28,7 +28,7 @@ from .trainer import Now
 
 MOST_STARTS = 8192  # states of a recording in which dreams begin
 CONTEXT = 2  # rows before them that the world is shown
-USUAL = 16, 64  # episodes and steps of random play that say how large numbers are, where there is no recording
+USUAL = 16, 32  # episodes and steps of random play that say how large numbers are, where there is no recording
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,74 @@
+"""terrella train policy and learn --practise: what they say, and that they go on where they were stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from terrella.cli import main, practising
+from terrella.data import Dataset
+
+SHORT = ["--steps", "2", "--batch", "8", "--horizon", "4", "--hidden", "8", "--episodes", "2"]
+
+
+def test_a_policy_practises_in_a_simulator_and_is_tried_there(tmp_path, capsys) -> None:
+    asked = ["train", "policy", "--in", "gym:CartPole-v1", "--out", str(tmp_path / "run")]
+    assert main([*asked, *SHORT, "--real", "gym:CartPole-v1", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "chance in gym:CartPole-v1" in told["verdict"] or "chance in CartPole" in told["verdict"]
+    assert told["return"]["count"] == 2 and told["practised_steps"] == 64
+    assert (tmp_path / "run" / "policy" / "policy.json").is_file()
+    assert main([*asked, *SHORT, "--real", "gym:Pendulum-v1"]) == 2
+    assert "takes actions in" in capsys.readouterr().err
+
+
+def test_what_cannot_be_practised_is_said_in_a_sentence(tmp_path, capsys) -> None:
+    (tmp_path / "file").write_text("")
+    asked = ["train", "policy", "--in", "gym:CartPole-v1", "--out", str(tmp_path / "file" / "run"), *SHORT]
+    assert main(asked) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert main(["learn", "gym:CartPole-v1", "--practise", "--out", str(tmp_path)]) == 2
+    assert "holds something else" in capsys.readouterr().err
+
+
+def test_rounds_of_practice_go_on_where_they_were_stopped(tmp_path, capsys, monkeypatch) -> None:
+    for name, value in {"ROUNDS": 2, "TRIED": 2, "FEWEST": 100}.items():
+        monkeypatch.setattr(practising, name, value)
+    asked = ["learn", "gym:CartPole-v1", "--practise", "--minutes", "1000", "--frames", "300", "--json"]
+    asked += ["--out", str(tmp_path / "learned")]
+    learn, practise = practising.train_latent, practising.train_policy
+    small = {"steps": 2, "batch": 4, "latent": 4, "rollout": 1, "history": 1}
+
+    def learned(data, out, config, report):
+        return learn(data, out, replace(config, **small), report)
+
+    def practised(world, name, out, config, *more):
+        return practise(world, name, out, replace(config, steps=2, batch=8, horizon=2, hidden=8), *more)
+
+    def stopped(world, name, out, *more):
+        if out.name == "policy-1":
+            raise KeyboardInterrupt
+        return practised(world, name, out, *more)
+
+    monkeypatch.setattr(practising, "train_latent", learned)
+    monkeypatch.setattr(practising, "train_policy", stopped)
+    assert main(asked) == 130
+    rows = Dataset(tmp_path / "learned" / "recording").length
+    monkeypatch.setattr(practising, "train_policy", practised)
+    capsys.readouterr()
+    assert main(asked) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [one["frames"] for one in told["rounds"]][-1] == rows and "chance in" in told["verdict"]
+    notes = json.loads((tmp_path / "learned" / "practise.json").read_text())
+    assert notes["rounds"] == told["rounds"]
+    other = [*asked[:-3], "--seed", "1", *asked[-3:]]
+    assert main(other) == 2 and "begun with other settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--episodes", "0"], ["--steps", "0"]])
+def test_counts_are_whole(options, tmp_path, capsys) -> None:
+    asked = ["train", "policy", "--in", "gym:CartPole-v1", "--out", str(tmp_path / "run")]
+    assert main([*asked, *options]) == 2
+    assert "1 " in capsys.readouterr().err
