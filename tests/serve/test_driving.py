@@ -80,6 +80,17 @@ def test_a_picture_that_is_remembered_is_gone_back_to_with_its_heading():
     assert 0 <= alone.away(timeline._states[0]) < 0.2
 
 
+def test_a_lone_picture_is_walked_to_where_the_world_tells_its_place():
+    class Told(Mapped):
+        def observe(self, observation, prior, rng):
+            known = {"pose": torch.tensor([[1.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])}
+            return super().observe(known if set(observation) == {"rgb"} else observation, prior, rng)
+
+    world = Told()
+    policy = Driving(world, budget_ms=5.0).make({"rgb": torch.zeros(1, 48, 64, 3, dtype=torch.uint8)}).policy
+    assert isinstance(policy, Wayfinder) and policy.place.tolist() == [1.5, 0.0] and policy.heading is not None
+
+
 def test_a_game_that_cannot_be_copied_takes_no_goals():
     driving = Driving(Panorama(forkable=False))
     agents = driving.agents()
