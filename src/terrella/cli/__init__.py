@@ -18,6 +18,7 @@ COMMANDS = {
     "learn": ("learn:learn", "record, train and score a world of an environment, in one go"),
     "play": ("play:play", "play a world in the browser"),
     "plan": ("planning:plan", "plan in a world, act in the real environment"),
+    "evaluate": ("evaluate:evaluate", "judge policies in a world and in the real environment"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),

@@ -53,7 +53,7 @@ def check_alike(world: Spec, real: Spec) -> None:
     for channel in world.observes:
         if channel not in real.channels:
             raise PlanningError(
-                f"{world.name} plans from '{channel}', which {real.name} does not show; it shows {', '.join(real.channels)}."
+                f"{world.name} is told '{channel}', which {real.name} does not show; it shows {', '.join(real.channels)}."
             )
         if real.channels[channel].shape != world.channels[channel].shape:
             raise PlanningError(

@@ -49,7 +49,7 @@ def line_chart(
 
     about = f"{escape(y_label)} against {escape(x_label)}"
     parts = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{about}">']
-    for value in _ticks(bottom, top):
+    for value in round_ticks(bottom, top):
         y = at(lines[0].x[0], value)[1]
         parts.append(f'<path class="grid" d="M{_LEFT} {y}H{width - margin}"/>')
         parts.append(f'<text x="{_LEFT - 6}" y="{y + 4}" text-anchor="end">{value:g}</text>')
@@ -96,7 +96,7 @@ def y_span(values: Sequence[float]) -> tuple[float, float]:
     return low - air, high + air
 
 
-def _ticks(low: float, high: float, about: int = 5) -> list[float]:
+def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
     """Round numbers inside the range."""
     raw = (high - low) / about
     scale = 10 ** math.floor(math.log10(raw))

@@ -1,0 +1,83 @@
+"""Whether two judges rank policies alike: Pearson, Spearman and SIMPLER's mean maximum rank violation, with intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from .statistics import RESAMPLES, Figure, figure_of
+
+LEAST = 3  # policies, below which no ranking is spoken of
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How two judges agree on P policies. mmrv: in shares of what the policies differ by in the second (`scale`)."""
+
+    pearson: Figure
+    spearman: Figure
+    mmrv: Figure
+    scale: float
+
+
+def pearson(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """The linear correlation of scores [..., P]; NaN where either are all the same."""
+    one, other = (scores.double() - scores.double().mean(-1, keepdim=True) for scores in (one, other))
+    spread = one.square().sum(-1).sqrt() * other.square().sum(-1).sqrt()
+    return torch.where(spread > 1e-12, (one * other).sum(-1) / spread.clamp_min(1e-300), torch.nan).clamp(-1, 1)
+
+
+def ranks(scores: torch.Tensor) -> torch.Tensor:
+    """The rank of each of the scores [..., P], from 0 up; equal ones share the mean of theirs."""
+    below = scores[..., None, :] < scores[..., :, None]
+    same = scores[..., None, :] == scores[..., :, None]
+    return below.sum(-1).double() + (same.sum(-1).double() - 1) / 2
+
+
+def spearman(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """The correlation of the ranks of scores [..., P]."""
+    return pearson(ranks(one), ranks(other))
+
+
+def mean_maximum_rank_violation(dream: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
+    """MMRV (Li et al. 2024, SIMPLER): of each policy, the most by which it differs in reality from one that the dream ranks on the
+    other side of it; the mean over the policies [..., P], in the unit of the real scores."""
+    wrong = (dream[..., :, None] > dream[..., None, :]) != (real[..., :, None] > real[..., None, :])
+    apart = (real[..., :, None] - real[..., None, :]).abs().double()
+    return (apart * wrong).amax(-1).mean(-1)
+
+
+def agreement(dream: torch.Tensor, real: torch.Tensor, rng: torch.Generator, scale: float | None = None) -> Agreement:
+    """How the scores [P, N] of P policies in N episodes agree, episode n of all of them having begun alike.
+
+    The 95% intervals are percentiles of a bootstrap over policies and episodes: both are drawn anew, the same episodes for all.
+    Draws in which nothing differs have no correlation and are left out. scale: by which MMRV is divided; by default the range
+    of the real means.
+    """
+    count, episodes = real.shape
+    dream, real = dream.double(), real.double()
+    means = dream.mean(1), real.mean(1)
+    scale = float(means[1].max() - means[1].min()) if scale is None else scale
+    policies = torch.randint(count, (RESAMPLES, count), generator=rng)
+    drawn = torch.randint(episodes, (RESAMPLES, episodes), generator=rng)
+    weights = torch.zeros(RESAMPLES, episodes, dtype=torch.float64)
+    weights.scatter_add_(1, drawn, torch.ones(RESAMPLES, episodes, dtype=torch.float64))
+    again = [(weights @ scores.T / episodes).gather(1, policies) for scores in (dream, real)]
+    figures = [_figure(measure(*means), measure(*again), count) for measure in (pearson, spearman)]
+    violated = [mean_maximum_rank_violation(*each) / (scale or math.nan) for each in (means, again)]
+    return Agreement(figures[0], figures[1], _figure(violated[0], violated[1], count), scale)
+
+
+def halves(scores: torch.Tensor, rng: torch.Generator) -> Agreement | None:
+    """How a judge agrees with itself: every other episode of [P, N] against the others; None for too few."""
+    count = scores.shape[1] // 2
+    return agreement(scores[:, 0 : 2 * count : 2], scores[:, 1 : 2 * count : 2], rng) if count > 1 else None
+
+
+def _figure(value: torch.Tensor, drawn: torch.Tensor, count: int) -> Figure:
+    known = drawn[torch.isfinite(drawn)]
+    if count < LEAST or not bool(torch.isfinite(value)) or len(known) < RESAMPLES // 2:
+        return Figure(float(value) if count >= LEAST else math.nan, math.nan, math.nan, count)
+    return figure_of(value, known, count)

@@ -1,0 +1,131 @@
+"""The page of `terrella evaluate`: the verdict, dream against reality, each policy, and how the dream's error grows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+
+from .judged import CONTROL, DREAM, HELD, RANDOM, REAL, SUCCESS, UNCERTAINTY, Judged, table, verdict
+from .page_parts import COLOURS, QUIET, section, table_of
+from .plot import Line, line_chart, y_span
+from .plot_points import Point, listed, scatter
+from .statistics import Band
+
+_HERE = Path(__file__).parent
+_REAL, _DREAM = COLOURS[1], COLOURS[0]
+
+
+def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
+    """HTML that needs nothing from outside."""
+    style = (_HERE / "page.css").read_text(encoding="utf-8")
+    lines = [line[:1].upper() + line[1:] for line in verdict(judged)]
+    heads, cells = table(judged)
+    found = table_of(list(map(escape, heads)), [[_cell(cell) for cell in line] for line in cells])
+    settings = table_of(["setting", ""], [[escape(str(k)), escape(str(v))] for k, v in facts.items()])
+    words = "".join(f"<li>{escape(line)}</li>" for line in lines[1:])
+    parts = [
+        f"<section><h2>{escape(lines[0])}</h2><ul>{words}</ul></section>",
+        section("Dream against reality", _lead(judged), _scatter(judged)),
+        section(f"The {judged.what} of each policy", "With 95% intervals; the best first.", _listed(judged) + found),
+        section(
+            "Where the dream is wrong",
+            "The dream begins where real episodes did and is given their actions alone: how far it then is from them, in shares of "
+            "each channel's range where it has one. Mean of all policies, with its interval.",
+            _errors(judged),
+        ),
+        section("How this was measured", "", _method(judged) + settings),
+    ]
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1></header>"
+        f"<main>{''.join(parts)}</main></body></html>\n"
+    )
+
+
+def _cell(words: str) -> str:
+    value, _, interval = words.partition(" [")
+    low_high = interval.rstrip("]").replace(", ", " to ")
+    return escape(value) + (f"<small>{escape(low_high)}</small>" if interval else "")
+
+
+def _lead(judged: Judged) -> str:
+    return (
+        f"A point is a policy: its {judged.what} in reality and in the dream, with 95% intervals. On the dotted line both are the "
+        "same; a ranking needs no more than that the points rise. Hollow: the control, in which the dream hears the actions of "
+        "another episode."
+    )
+
+
+def _scatter(judged: Judged) -> str:
+    if judged.dream is None:
+        return ""
+    points = []
+    for name in judged.policies:
+        row = judged.rows[name]
+        points.append(Point(f"{name}, control", row[REAL], row[CONTROL], QUIET, hollow=True))
+        points.append(Point(name, row[REAL], row[DREAM], _DREAM))
+    svg = scatter(points, f"{judged.what} in reality", f"{judged.what} in the dream")
+    return f"<figure>{svg}{_keys({'policy': _DREAM, 'its control': QUIET})}</figure>"
+
+
+def _listed(judged: Judged) -> str:
+    real = judged.dream is not None
+    names = sorted(judged.policies, key=lambda name: -judged.rows[name][REAL if real else DREAM].value)
+    shown = {REAL: _REAL, DREAM: _DREAM} if real else {DREAM: _DREAM}
+    rows = [(name, [(judged.rows[name][arm], colour) for arm, colour in shown.items()]) for name in names]
+    floor = judged.rows.get(RANDOM)
+    guides = [(floor[REAL if real else DREAM].value, QUIET)] if floor else []
+    keys = {**shown, **({"acting at random": QUIET} if floor else {})}
+    label = "share of successes" if judged.what == SUCCESS else judged.what
+    return f'<div class=scroll><div style="min-width:560px">{listed(rows, label, guides)}</div></div>{_keys(keys)}'
+
+
+def _errors(judged: Judged) -> str:
+    boxes = ""
+    for channel, band in judged.curves.items():
+        if channel.endswith(HELD) or len(band.value) < 2:
+            continue
+        held = judged.curves.get(channel + HELD)
+        lines = [_line("the dream", band, _DREAM)] + ([_line("what stands still", held, QUIET, "2 3")] if held else [])
+        span = y_span([0.0, *(v for line in lines for v in (*line.y, *line.low, *line.high))])
+        last = len(band.value) - 1
+        ticks = [(float(2**k), str(2**k)) for k in range(12) if 2**k <= last]
+        told = channel == UNCERTAINTY
+        title = "The uncertainty that the dream tells" if told else f"Error in {channel}"
+        svg = line_chart(lines, ticks, "steps", "expected error" if told else "distance to reality", True, span)
+        keys = _keys({line.label: line.colour for line in lines})
+        boxes += f"<figure><h3>{escape(title)}</h3>{svg}{keys}</figure>"
+    return f"<div class=charts>{boxes}</div>" if boxes else ""
+
+
+def _line(label: str, band: Band, colour: str, dash: str = "") -> Line:
+    steps = list(map(float, range(1, len(band.value))))
+    return Line(label, steps, band.value[1:], band.low[1:], band.high[1:], colour, dash)
+
+
+def _keys(colours: Mapping[str, str]) -> str:
+    keys = "".join(
+        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{colour}" stroke-width="2.5"/></svg>'
+        f"{escape(label)}</span>"
+        for label, colour in colours.items()
+    )
+    return f"<figcaption>{keys}</figcaption>"
+
+
+def _method(judged: Judged) -> str:
+    lines = ["Intervals of single scores: " + ("Wilson's." if judged.what == SUCCESS else "a bootstrap over episodes.")]
+    if judged.dream is not None:
+        scale = "" if judged.what == SUCCESS else ", here in shares of the range of the real scores"
+        lines += [
+            "Each episode of the dream began by observing the first moment of a real one; all policies began from the same starts.",
+            "Pearson and Spearman: the correlation of the mean scores, and of their ranks. MMRV, SIMPLER's mean maximum rank "
+            f"violation: the most by which a policy really differs from one that the dream puts on its other side{scale}; the mean "
+            "of that over policies.",
+            "Their intervals are percentiles of a bootstrap over policies and episodes.",
+            "The control is the same policies, dream and starts, but for one thing: the dream hears the actions that the same "
+            "policy took in another episode, so that they answer to nothing. What it ranks as well needs no dream that obeys.",
+            "The gap is the dream's score less reality's, start by start.",
+        ]
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
