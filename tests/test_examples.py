@@ -28,6 +28,7 @@ def test_no_example_is_forgotten_here():
         "01_random_shooting.py",
         "02_gym_env.py",
         "03_two_cameras.py",
+        "04_controllers.py",
     }
 
 
@@ -49,6 +50,11 @@ def test_one_planner_balances_by_the_truth_and_by_a_learned_world():
 def test_a_world_as_a_gymnasium_environment():
     result = example("02_gym_env.py")["main"]()
     assert result["episodes"] > 10 and 9 < result["mean_return"] < 60
+
+
+def test_controllers_of_ones_own():
+    steps = example("04_controllers.py")["main"](episodes=3)
+    assert steps["balance"] > steps["lean"] and steps["balance"] > steps["random"]
 
 
 def test_a_robot_with_two_cameras_is_recorded(tmp_path):

@@ -14,12 +14,14 @@ LEAST = 3  # policies, below which no ranking is spoken of
 
 @dataclass(frozen=True)
 class Agreement:
-    """How two judges agree on P policies. mmrv: in shares of what the policies differ by in the second (`scale`)."""
+    """How two judges agree on P policies. mmrv: in shares of what the policies differ by in the second (`scale`). chance: how often
+    policies ranked by chance agree as well, by Spearman."""
 
     pearson: Figure
     spearman: Figure
     mmrv: Figure
     scale: float
+    chance: float = math.nan
 
 
 def pearson(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
@@ -67,7 +69,9 @@ def agreement(dream: torch.Tensor, real: torch.Tensor, rng: torch.Generator, sca
     again = [(weights @ scores.T / episodes).gather(1, policies) for scores in (dream, real)]
     figures = [_figure(measure(*means), measure(*again), count) for measure in (pearson, spearman)]
     violated = [mean_maximum_rank_violation(*each) / (scale or math.nan) for each in (means, again)]
-    return Agreement(figures[0], figures[1], _figure(violated[0], violated[1], count), scale)
+    shuffled = means[0][torch.rand(RESAMPLES, count, generator=rng).argsort(-1)]
+    luck = (spearman(shuffled, means[1].expand_as(shuffled)) >= figures[1].value - 1e-9).double().mean()
+    return Agreement(figures[0], figures[1], _figure(violated[0], violated[1], count), scale, float(luck))
 
 
 def halves(scores: torch.Tensor, rng: torch.Generator) -> Agreement | None:

@@ -18,6 +18,7 @@ RETURN, SUCCESS = "return", "success"
 RANDOM = "random"
 HELD, UNCERTAINTY = " of the start", "uncertainty"
 ALIKE = 0.9  # a rank correlation from which two rankings are called the same
+UNLIKELY = 0.05  # how often chance may rank as well
 _POINTS = 1500  # of curves that are correlated
 
 Scores = Mapping[str, Mapping[str, torch.Tensor]]  # arm -> measure -> [N]
@@ -53,7 +54,7 @@ def judge(
     """
     rng = torch.Generator().manual_seed(seed)
     what = SUCCESS if SUCCESS in scores[ranked[0]][DREAM] else RETURN
-    rows = {name: _row(arms, scores.get(RANDOM), what, rng) for name, arms in scores.items()}
+    rows = {name: _row(arms, scores.get(RANDOM), what, seed) for name, arms in scores.items()}
     found = Judged(what, list(ranked), rows)
     arms = {
         arm: [scores[name][arm][what].double() for name in ranked if arm in scores[name]]
@@ -75,19 +76,22 @@ def judge(
     )
 
 
-def _row(arms: Scores, floor: Scores | None, what: str, rng: torch.Generator) -> dict[str, Figure]:
+def _row(arms: Scores, floor: Scores | None, what: str, seed: int) -> dict[str, Figure]:
+    def interval(values: torch.Tensor) -> Figure:  # the same episodes are drawn for all
+        return mean_interval(values, torch.Generator().manual_seed(seed))
+
     row: dict[str, Figure] = {}
     for arm, measures in arms.items():
         for name, values in measures.items():
             values = values.double()
             label = arm if name == what else f"{arm} {name}"
-            known = wilson(int(values.sum()), len(values)) if name == SUCCESS else mean_interval(values, rng)
+            known = wilson(int(values.sum()), len(values)) if name == SUCCESS else interval(values)
             row[label] = known
         if floor is not None and arm in floor and arms is not floor and arm != CONTROL:
             apart = measures[what].double() - floor[arm][what].double()
-            row[f"{arm} over random"] = mean_interval(apart, rng)
+            row[f"{arm} over random"] = interval(apart)
     if REAL in arms:
-        row["gap"] = mean_interval(arms[DREAM][what].double() - arms[REAL][what].double(), rng)
+        row["gap"] = interval(arms[DREAM][what].double() - arms[REAL][what].double())
     return row
 
 
@@ -188,15 +192,15 @@ def _ranking(judged: Judged) -> str:
         return f"The dream cannot tell these {count} policies apart: it gives all the same {judged.what}."
     low, value = said.spearman.low, said.spearman.value
     figure = f"Spearman {told(said.spearman)}"
+    if value >= ALIKE and said.chance > UNLIKELY:
+        return (
+            f"These {count} policies are too few to say whether the dream ranks them as reality does: {figure}, which chance gives "
+            f"{said.chance:.0%} of the time."
+        )
     if said.spearman.high < 0:
         return f"The dream ranks these {count} policies the wrong way round: {figure}."
     if not low > 0:
-        few = value >= ALIKE
-        return (
-            f"These {count} policies are too few to say whether the dream ranks them as reality does: {figure}."
-            if few
-            else f"The dream cannot tell these {count} policies apart as reality does: {figure}."
-        )
+        return f"The dream cannot be seen to tell these {count} policies apart as reality does: {figure}."
     if value >= ALIKE:
         return f"The dream ranks these {count} policies as reality does: {figure}."
     return f"The dream ranks these {count} policies somewhat as reality does: {figure}."
@@ -217,7 +221,7 @@ def _control(judged: Judged) -> str:
     if not math.isfinite(agreed.spearman.value):
         return f"control (the dream hears the actions of another episode): gives all policies the same {judged.what}"
     words = f"control (the dream hears the actions of another episode): {_ranked(agreed)}"
-    if agreed.spearman.value >= judged.dream.spearman.low:
+    if agreed.spearman.value >= ALIKE * judged.dream.spearman.value:
         return f"{words}: these policies are ranked nearly as well without their actions answering to anything"
     return words
 

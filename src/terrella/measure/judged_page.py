@@ -22,7 +22,8 @@ def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
     lines = [line[:1].upper() + line[1:] for line in verdict(judged)]
     heads, cells = table(judged)
     found = table_of(list(map(escape, heads)), [[_cell(cell) for cell in line] for line in cells])
-    settings = table_of(["setting", ""], [[escape(str(k)), escape(str(v))] for k, v in facts.items()])
+    known = {name.replace("_", " "): value for name, value in facts.items() if value is not None}
+    settings = "".join(f"<li>{escape(name)}: {escape(str(value))}</li>" for name, value in known.items())
     words = "".join(f"<li>{escape(line)}</li>" for line in lines[1:])
     parts = [
         f"<section><h2>{escape(lines[0])}</h2><ul>{words}</ul></section>",
@@ -34,7 +35,7 @@ def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
             "each channel's range where it has one. Mean of all policies, with its interval.",
             _errors(judged),
         ),
-        section("How this was measured", "", _method(judged) + settings),
+        section("How this was measured", "", _method(judged) + f"<h3>Settings</h3><ul>{settings}</ul>"),
     ]
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -53,21 +54,20 @@ def _cell(words: str) -> str:
 def _lead(judged: Judged) -> str:
     return (
         f"A point is a policy: its {judged.what} in reality and in the dream, with 95% intervals. On the dotted line both are the "
-        "same; a ranking needs no more than that the points rise. Hollow: the control, in which the dream hears the actions of "
-        "another episode."
+        "same; a ranking needs no more than that the points rise."
     )
 
 
 def _scatter(judged: Judged) -> str:
     if judged.dream is None:
         return ""
-    points = []
-    for name in judged.policies:
-        row = judged.rows[name]
-        points.append(Point(f"{name}, control", row[REAL], row[CONTROL], QUIET, hollow=True))
-        points.append(Point(name, row[REAL], row[DREAM], _DREAM))
-    svg = scatter(points, f"{judged.what} in reality", f"{judged.what} in the dream")
-    return f"<figure>{svg}{_keys({'policy': _DREAM, 'its control': QUIET})}</figure>"
+    boxes = ""
+    for arm, title in ((DREAM, "The dream"), (CONTROL, "The control: the dream hears other actions")):
+        rows = {name: judged.rows[name] for name in judged.policies}
+        points = [Point(name, row[REAL], row[arm], _DREAM if arm == DREAM else QUIET) for name, row in rows.items()]
+        svg = scatter(points, f"{judged.what} in reality", f"{judged.what} in the dream")
+        boxes += f"<figure><h3>{escape(title)}</h3>{svg}</figure>"
+    return f"<div class=charts>{boxes}</div>"
 
 
 def _listed(judged: Judged) -> str:
@@ -77,14 +77,15 @@ def _listed(judged: Judged) -> str:
     rows = [(name, [(judged.rows[name][arm], colour) for arm, colour in shown.items()]) for name in names]
     floor = judged.rows.get(RANDOM)
     guides = [(floor[REAL if real else DREAM].value, QUIET)] if floor else []
-    keys = {**shown, **({"acting at random": QUIET} if floor else {})}
+    keys = {{REAL: "in reality", DREAM: "in the dream"}[arm]: colour for arm, colour in shown.items()}
+    keys |= {"acting at random" + (" in reality" if real else ""): QUIET} if floor else {}
     label = "share of successes" if judged.what == SUCCESS else judged.what
     return f'<div class=scroll><div style="min-width:560px">{listed(rows, label, guides)}</div></div>{_keys(keys)}'
 
 
 def _errors(judged: Judged) -> str:
     boxes = ""
-    for channel, band in judged.curves.items():
+    for channel, band in sorted(judged.curves.items(), key=lambda curve: curve[0] == UNCERTAINTY):
         if channel.endswith(HELD) or len(band.value) < 2:
             continue
         held = judged.curves.get(channel + HELD)

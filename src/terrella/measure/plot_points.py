@@ -16,13 +16,12 @@ _ROW, _WORDS, _WIDE = 26, 190, 860
 
 @dataclass(frozen=True)
 class Point:
-    """A point with intervals both ways; hollow points stand back."""
+    """A point with intervals both ways."""
 
     label: str
     x: Figure
     y: Figure
     colour: str
-    hollow: bool = False
 
 
 def scatter(points: Sequence[Point], x_label: str, y_label: str) -> str:
@@ -43,22 +42,17 @@ def scatter(points: Sequence[Point], x_label: str, y_label: str) -> str:
         parts.append(f'<text x="{x}" y="{_SIDE - _BOTTOM + 17}" text-anchor="middle">{value:,g}</text>')
     (x0, y0), (x1, y1) = at(low, low), at(high, high)
     parts.append(f'<path class="guide" d="M{x0} {y0}L{x1} {y1}"/>')
-    for point in sorted(points, key=lambda point: not point.hollow):
+    for point in points:
         x, y = at(point.x.value, point.y.value)
-        faint = ' opacity="0.6"' if point.hollow else ""
         bars = ""
-        if not point.hollow and math.isfinite(point.x.low):
+        if math.isfinite(point.x.low):
             bars += f"M{at(point.x.low, low)[0]} {y}H{at(point.x.high, low)[0]}"
-        if not point.hollow and math.isfinite(point.y.low):
+        if math.isfinite(point.y.low):
             bars += f"M{x} {at(low, point.y.low)[1]}V{at(low, point.y.high)[1]}"
-        name = f"<title>{escape(point.label)}: {point.x.value:.4g}, {point.y.value:.4g}</title>"
         if bars:
             parts.append(f'<path d="{bars}" stroke="{point.colour}" stroke-width="1.4" opacity="0.7" fill="none"/>')
-        filled = "none" if point.hollow else point.colour
-        parts.append(
-            f'<circle cx="{x}" cy="{y}" r="{3.5 if point.hollow else 4.5}" fill="{filled}" stroke="{point.colour}"{faint}>'
-            f"{name}</circle>"
-        )
+        name = f"<title>{escape(point.label)}: {point.x.value:.4g}, {point.y.value:.4g}</title>"
+        parts.append(f'<circle cx="{x}" cy="{y}" r="4.5" fill="{point.colour}">{name}</circle>')
     parts.append(f'<text x="{_LEFT + across / 2}" y="{_SIDE - 5}" text-anchor="middle">{escape(x_label)}</text>')
     parts.append(f'<text x="{_LEFT + 2}" y="{_TOP - 4}">{escape(y_label)}</text></svg>')
     return "".join(parts)

@@ -1,0 +1,84 @@
+"""`terrella evaluate` from outside: a dream that is reality agrees with it, what was judged is kept, bad input is a sentence."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from tests.cli.tiny import NAME
+
+from terrella.act.judging import Bench
+from terrella.cli import main
+from terrella.cli.evaluate import labels_of
+
+BLIND = NAME.replace("Tiny-v0", "Blind-v0")
+QUICK = ["--steps", "24", "--episodes", "6"]
+RIGHT = [f"constant:2{slips}" for slips in ("", "@0.2", "@0.4", "@0.6", "@0.9")]
+FIVE = [*RIGHT, "constant:0", "--in", BLIND, "--real", BLIND, *QUICK]
+
+
+def evaluated(capsys, *words):
+    assert main(["evaluate", *words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_dream_that_is_reality_agrees_and_what_was_stopped_goes_on(capsys, tmp_path, monkeypatch):
+    whole = evaluated(capsys, *FIVE, "--out", str(tmp_path / "whole"))
+    assert "ranks these 6 policies as reality does" in whole["verdict"][0]
+    assert whole["dream"]["pearson"]["value"] == pytest.approx(1) and whole["dream"]["mmrv"]["value"] == 0
+    assert whole["rows"]["constant:2"]["real"] == whole["rows"]["constant:2"]["dream"]
+    assert "random" in whole["rows"] and "random" not in whole["policies"]
+    assert max(whole["curves"]["observation"]["value"]) < 1e-5
+    assert "<svg" in (tmp_path / "whole" / "evaluate.html").read_text()
+
+    play, played = Bench.play, []
+
+    def stopped(bench, *told):
+        played.append(told)
+        if len(played) == 4:
+            raise KeyboardInterrupt
+        return play(bench, *told)
+
+    monkeypatch.setattr(Bench, "play", stopped)
+    assert main(["evaluate", *FIVE, "--out", str(tmp_path / "part")]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+    part = evaluated(capsys, *FIVE, "--out", str(tmp_path / "part"))
+    assert len(played) == 1 + 7 and part["rows"] == whole["rows"] and part["dream"] == whole["dream"]
+    assert main(["evaluate", *FIVE, "--out", str(tmp_path / "part"), "--seed", "1"]) == 2
+    assert "other settings (seed 0, not 1)" in capsys.readouterr().err
+
+
+def test_one_policy_in_a_world_alone(capsys, tmp_path):
+    words = ["idle", "--in", BLIND, *QUICK, "--out", str(tmp_path)]
+    assert main(["evaluate", *words]) == 0
+    said = capsys.readouterr().out
+    assert "In the dream the best of 1 is idle" in said and "random (floor)" in said
+    assert main(["evaluate", *words, "--real", BLIND]) == 2
+    assert "other settings (real None" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["rondom"], "did you mean 'random'"),
+        (["constant:7"], "takes actions in"),
+        (["idle", "--real", "gym:CartPole-v1"], "they differ"),
+        (["idle", "--success", "won"], "no channel 'won'"),
+        (["idle", "--episodes", "0"], "whole numbers from 1 up"),
+        (["idle", "--goal", "99"], "can never be reached"),
+        (["idle", "--goal", "5", "--within", "3"], "already solved"),
+        (["tests/cli/tiny.py:NAME"], "is no policy"),
+    ],
+)
+def test_what_cannot_be_judged_is_said_in_a_sentence(capsys, tmp_path, words, said):
+    assert main(["evaluate", *words[:1], "--in", BLIND, "--out", str(tmp_path / "new"), *words[1:]]) == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
+    assert not (tmp_path / "new").exists()
+
+
+def test_names_are_short_as_long_as_they_differ():
+    names = ("a/one.py:left", "b/two.py:left@0.5", "runs/actor/", "other/actor", "constant:-1")
+    labels = labels_of(names)
+    assert labels["a/one.py:left"] == "left" and labels["b/two.py:left@0.5"] == "left@0.5"
+    assert labels["runs/actor/"] == "runs/actor/" and labels["constant:-1"] == "constant:-1"
