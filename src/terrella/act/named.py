@@ -71,8 +71,10 @@ class Slipping:
 
 
 def seen_by(policy: Policy, spec: Spec) -> tuple[str, ...]:
-    """The channels that a policy is to be shown: those that it names as its `sees`, or all that a recording would hold."""
-    return tuple(getattr(policy, "sees", spec.recorded))
+    """The channels that a policy is to be shown: those that it names as its `sees`, or all that a recording would hold; what a
+    world need not observe may be missing."""
+    named = tuple(getattr(policy, "sees", spec.recorded))
+    return tuple(name for name in named if name in spec.channels or name not in spec.may_observe)
 
 
 def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:

@@ -155,6 +155,7 @@ def share(figure: Figure) -> str:
 def _number(value: float) -> str:
     if not math.isfinite(value):
         return "unknown"
+    value = 0.0 if abs(value) < 0.005 else value  # no -0.00
     return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:.1f}" if abs(value) >= 9.995 else f"{value:.2f}"
 
 
