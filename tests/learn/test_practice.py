@@ -46,7 +46,7 @@ def slowly(reward, goes_on, value, known, wanted):
                     total += share * reward[t, entry]
                     share *= wanted.discount * goes_on[t, entry]
                 n_step.append(total + share * value[end + 1, entry])
-            mix = wanted.blend
+            mix = wanted.td_lambda
             whole = sum((1 - mix) * mix**n * part for n, part in enumerate(n_step[:-1]))
             found[start, entry] = whole + mix ** (len(n_step) - 1) * n_step[-1]
     return found
@@ -57,14 +57,14 @@ def paid(world, state, policy, steps: int) -> float:
     return float(seen["reward"].sum())
 
 
-@pytest.mark.parametrize("blend", [0.0, 0.7, 1.0])
-def test_lambda_returns_are_what_they_are_defined_to_be(blend: float) -> None:
+@pytest.mark.parametrize("td_lambda", [0.0, 0.7, 1.0])
+def test_lambda_returns_are_what_they_are_defined_to_be(td_lambda: float) -> None:
     rng = make_rng(0)
     reward, value = (torch.randn(n, 6, generator=rng, dtype=torch.float64) for n in (7, 8))
     goes_on = torch.rand(7, 6, generator=rng, dtype=torch.float64)
     goes_on[3, 2] = 0.0
     known = torch.rand(7, 6, generator=rng) > 0.2
-    wanted = Wanted(0.9, blend)
+    wanted = Wanted(0.9, td_lambda)
     fast = lambda_returns(reward, goes_on, value, known, wanted)
     torch.testing.assert_close(fast, slowly(reward, goes_on, value, known, wanted))
 

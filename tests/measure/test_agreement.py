@@ -20,7 +20,12 @@ from terrella.measure.agreement import (
 from terrella.measure.judged import as_dict, judge, table, verdict
 from terrella.measure.judged_page import judged_page
 
-RNG = torch.Generator().manual_seed(0)
+RNG = torch.Generator()
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    RNG.manual_seed(0)
 
 
 def slow_violation(dream, real):

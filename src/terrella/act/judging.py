@@ -133,7 +133,8 @@ class Bench:
     def _kept(self) -> int:
         assert self.real is not None
         pictures = any(len(self.real.spec.channels[name].shape or ()) > 1 for name in self.compared)
-        return (FOLLOWED_PICTURES if pictures else FOLLOWED) if self.compared and self.dream.spec.forkable else 0
+        kept = (FOLLOWED_PICTURES if pictures else FOLLOWED) if self.compared and self.dream.spec.forkable else 0
+        return min(kept, self.dream.spec.max_batch or kept)
 
     def _real_states(self, starts: Starts) -> Iterator[State]:
         assert self.real is not None

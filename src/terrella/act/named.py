@@ -64,8 +64,8 @@ class Slipping:
 
     def act(self, observation: Observation, memory: Any, rng: torch.Generator) -> tuple[torch.Tensor, Any]:
         meant, memory = self.policy.act(observation, memory, rng)
-        meant = torch.as_tensor(meant)
-        other = self.spec.sample_action(len(meant), rng).to(meant)
+        other = self.spec.sample_action(len(meant), rng)
+        meant = torch.as_tensor(meant).to(other)
         slips = torch.rand(len(meant), generator=rng) < self.probability
         return torch.where(slips.view(-1, *[1] * (meant.ndim - 1)), other, meant), memory
 

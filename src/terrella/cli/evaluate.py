@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,7 @@ from ..measure.judged import RANDOM, as_dict, judge, table, verdict
 from ..measure.judged_page import judged_page
 from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
 from .goals import REWARD, read_goal
-from .judged_log import JudgedLog, fingerprint
+from .judged_log import JudgedLog, crc_of, fingerprint
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result
 
@@ -83,6 +83,8 @@ def evaluate(
         case.spec.check_channels(seen_by(case.load(name), case.spec))
     asked = {"in": inside, "world": None if library.is_truth(inside) else fingerprint(library.folder_of(inside))}
     asked |= {"real": real, "goal": goal, "within": within, "success": success, "steps": case.bench.steps, "seed": seed}
+    files = {"goal": goal, "adapter": (environment.adapter or "").rpartition(":")[0] or environment.adapter}
+    asked |= asdict(environment) | {f"{what}'s file": crc_of(file) for what, file in files.items()}
     folder = out or Path("evaluations") / (re.sub(r"[^\w.-]+", "-", inside.strip("/:")) or "world")
     log = JudgedLog(folder, asked, {name: fingerprint(name) for name in every})
     _play(case, log, every, episodes)

@@ -24,11 +24,12 @@ _DIGITS = 6
 
 
 def fingerprint(source: str | Path) -> int | None:
-    """Changes with what lies in a folder, or in the file of a policy of one's own; None for what has no file."""
+    """Changes with the weights in a folder, or with the file of a policy of one's own; None for what has no file. Names of keys
+    and the like, which a page may rewrite, do not count, nor what a training keeps to go on."""
     text = str(source).rpartition("@")[0] if not Path(source).exists() and "@" in str(source) else str(source)
     path = Path(text)
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.suffix in (".json", ".safetensors"))
+        files = sorted(file for file in path.rglob("*.safetensors") if not file.name.startswith("resume-"))
     else:
         module, _, _ = text.rpartition(":")
         files = (
@@ -43,6 +44,11 @@ def fingerprint(source: str | Path) -> int | None:
         if file is not None and file.is_file():
             found = zlib.crc32(file.read_bytes(), found or 0)
     return found
+
+
+def crc_of(file: str | None) -> int | None:
+    """Changes with what a file holds; None where there is none of this name."""
+    return zlib.crc32(Path(file).read_bytes()) if file and Path(file).is_file() else None
 
 
 def _origin(module: str) -> Path | None:

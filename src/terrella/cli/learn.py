@@ -62,6 +62,8 @@ def learn(
     if not 0 < minutes < math.inf or frames < 100:
         raise TerrellaError("--minutes is a time above 0, and --frames are 100 or more.")
     if practise:
+        if any(asdict(controls).values()):
+            raise TerrellaError("--keys, --action-names and --idle are for a person who plays; --practise takes none.")
         return rounds_of_practice(name, environment, minutes, out or folder_for(name), frames, seed, json)
     asked = {"environment": name, "frames": frames, "seed": seed, **asdict(environment), **asdict(controls)}
     plan = Plan(out or folder_for(name), asked, minutes)

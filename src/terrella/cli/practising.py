@@ -88,7 +88,7 @@ def practise(
     name: str, environment: Environment, minutes: float, out: Path, frames: int, seed: int, json: bool
 ) -> None:
     """All rounds that are not over, and what the last policy earned in the environment."""
-    asked = {"environment": name, "frames": frames, "seed": seed, "minutes": minutes, "size": environment.size}
+    asked = {"environment": name, "frames": frames, "seed": seed, "minutes": minutes, **asdict(environment)}
     if frames < FEWEST:
         raise TerrellaError(f"--practise needs --frames of {FEWEST:,} or more.")
     rounds = Rounds(out, asked, minutes)
@@ -117,9 +117,11 @@ def practise(
 
 
 def _round(rounds: Rounds, number: int, name: str, real: World, frames: int, seed: int) -> dict[str, Any]:
-    upto = frames * (number + 1) // ROUNDS
-    with progress.shown("collecting") as report:
-        _collect(rounds, number, real, upto, seed, report)
+    if not rounds.world(
+        number
+    ).exists():  # else enough was collected: the world that is being learned is of those frames
+        with progress.shown("collecting") as report:
+            _collect(rounds, number, real, frames * (number + 1) // ROUNDS, seed, report)
     with progress.shown("learning the world") as report:
         hours = rounds.seconds("learning the world") / 3600
         batch = None if "rgb" in real.spec.channels else BATCH

@@ -74,7 +74,8 @@ class Recorded:
 
 class Continued:
     """Episodes begin where the world has them begin, and go on from batch to batch until they are over or `longest` steps long.
-    They are kept as buffers, so that a run that was stopped goes on with them."""
+    They are kept as buffers, so that a run that was stopped goes on with them. Where states point into an arena, which no buffer
+    holds, each batch begins anew."""
 
     def __init__(self, world: World, batch: int, longest: int, seed: int):
         self.world, self.longest, self.seed = world, longest, seed
@@ -84,6 +85,8 @@ class Continued:
 
     def begin(self, now: Now) -> State:
         state, over = self.held.state(), self.held.age >= self.longest
+        if state.arenas:
+            return self.world.start(len(over), now.noise)
         if over.any():
             fresh = self.world.start(int(over.sum()), now.noise)
             state = state.put(over.nonzero()[:, 0].to(state.device), fresh)

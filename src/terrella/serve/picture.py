@@ -63,7 +63,7 @@ def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS
 
 def strip_of(pictures: torch.Tensor, height: int = 72) -> str:
     """Pictures uint8 [T, H, W, 3] side by side, each at most `height` pixels tall, as a JPEG in base64."""
-    frames = [Image.fromarray(picture.numpy()) for picture in pictures]
+    frames = [Image.fromarray(picture.cpu().numpy()) for picture in pictures]
     scale = min(1.0, height / frames[0].height)
     width, height = (max(1, round(scale * side)) for side in frames[0].size)
     strip, data = Image.new("RGB", (width * len(frames), height)), io.BytesIO()

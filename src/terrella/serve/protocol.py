@@ -91,6 +91,8 @@ def parse_message(data: str | bytes) -> tuple[str, Any]:
     if isinstance(data, bytes):
         if not 0 < len(data) <= MAX_PICTURE:
             raise ProtocolError(f"a picture of {len(data)} bytes came; at most {MAX_PICTURE} are taken.")
+        if data == GOAL_MARK:
+            raise ProtocolError("a goal's picture came without a picture.")
         return ("goal", Goal(picture=data[1:])) if data[:1] == GOAL_MARK else ("picture", data)
     if len(data) > MAX_MESSAGE:
         raise ProtocolError(f"a message of {len(data)} bytes is too long; the limit is {MAX_MESSAGE}.")

@@ -22,11 +22,11 @@ MIDDLE, STEADY = (0.05, 0.95), 0.99  # quantiles between which returns lie, and 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the policy is to be paid for. discount: of a reward a step later; blend: lambda, from 0 (the critic's word after one
+    """What the policy is to be paid for. discount: of a reward a step later; td_lambda: lambda, from 0 (the critic's word after one
     step) to 1 (what came to the end of the dream); entropy: what a nat is worth, in ranges of returns."""
 
     discount: float = 0.99
-    blend: float = 0.95
+    td_lambda: float = 0.95
     entropy: float = 3e-4
 
 
@@ -37,8 +37,8 @@ def lambda_returns(
     12.1). A dream that is no longer `known` counts as far, and its value from there."""
     found, after = [], value[-1]
     for step in range(len(reward) - 1, -1, -1):
-        blend = wanted.blend * known[step]
-        ahead = (1 - blend) * value[step + 1] + blend * after
+        td_lambda = wanted.td_lambda * known[step]
+        ahead = (1 - td_lambda) * value[step + 1] + td_lambda * after
         after = reward[step] + wanted.discount * goes_on[step] * ahead
         found.append(after)
     return torch.stack(found[::-1])
@@ -73,7 +73,7 @@ class Critic(nn.Module):
 
 
 class Range(nn.Module):
-    """How far apart returns lie, 1 at least, followed steadily: a reward's unit does not matter."""
+    """How far apart returns lie, 1 at least, followed steadily: returns that differ by more are measured in it."""
 
     low: torch.Tensor
     high: torch.Tensor

@@ -41,7 +41,7 @@ class Practice:
         batch: Dreams at a time.
         horizon: Steps of a dream.
         discount: Of a reward a step later.
-        blend: Lambda, of the returns: 0 the critic's word after one step, 1 what came to the end of the dream.
+        td_lambda: Lambda, of the returns: 0 the critic's word after one step, 1 what came to the end of the dream.
         entropy: What a nat of chance in the actions is worth, in ranges of returns.
         gradients: Of axes, follow the world's own gradients where it has some. --no-gradients learns from what paid.
         trust: The world's uncertainty at which a dream ends. Default: as the world says that it invents, if it does.
@@ -57,7 +57,7 @@ class Practice:
     batch: int = 256
     horizon: int = 16
     discount: float = 0.99
-    blend: float = 0.95
+    td_lambda: float = 0.95
     entropy: float = 3e-4
     gradients: bool = True
     trust: float | None = None
@@ -98,7 +98,7 @@ def train_policy(
     usual = starts.usual(sees)
     for network in (actor, critic):
         network.to(run.device).eyes.settle(usual)
-    wanted = Wanted(config.discount, config.blend, config.entropy)
+    wanted = Wanted(config.discount, config.td_lambda, config.entropy)
     objective = ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
     if before is not None and not begun:
         load_run(resume_file(before, STAGE), {"actor": actor, "critic": critic, "slow": objective.slow}, {})
@@ -180,5 +180,5 @@ def _check(config: Practice) -> None:
     counts = (config.batch, config.horizon, config.hidden, 1 if config.steps is None else config.steps)
     if any(count < 1 for count in counts) or not (config.minutes is None or config.minutes > 0):
         raise TrainingError("--batch, --horizon, --hidden and --steps are 1 or more, and --minutes is above 0.")
-    if not (0 < config.discount < 1 and 0 <= config.blend <= 1 and config.entropy >= 0):
-        raise TrainingError("--discount is between 0 and 1, --blend from 0 to 1, and --entropy is 0 or more.")
+    if not (0 < config.discount < 1 and 0 <= config.td_lambda <= 1 and config.entropy >= 0):
+        raise TrainingError("--discount is between 0 and 1, --td-lambda from 0 to 1, and --entropy is 0 or more.")

@@ -39,13 +39,14 @@ const controls = new Controls((held, time) => {
 }, $('axes'));
 
 const go = () => { if (status.rewound) link.send({ type: 'branch' }); if (status.paused) link.send({ type: 'resume' }); $('hint').classList.remove('show'); };
+const quiet = () => { controls.release(); controls.axes.rest(); };
 const driver = new DriverView({
-  send: (message) => link.send(message), say: toast, quiet: () => { controls.release(); controls.axes.rest(); }, light: (held) => light([...held, ...controls.held]), axes: controls.axes, go,
+  send: (message) => link.send(message), say: toast, quiet, light: (held) => light([...held, ...controls.held]), axes: controls.axes, go,
 });
 
 const futures = new Futures((on) => views.change({ futures: on }));
 
-const goal = new Goal({ send: (message) => link.send(message), map: views.places, say: toast, go });
+const goal = new Goal({ send: (message) => link.send(message), map: views.places, say: toast, quiet, go });
 const panel = new KeyPanel($('keys-panel'), { changed: () => { sendKeys(); drawKeys(); $('hint').classList.remove('show'); }, pageUse, quiet: () => controls.release() });
 
 function sendKeys() {
@@ -352,7 +353,7 @@ for (const [one, opens, closes] of [[card, 'about', 'card-close'], [panel, 'keys
 }
 learnLayout(() => { if (worlds.length) drawKeys(); });
 
-takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes, asGoal) => link.sendPicture(bytes, asGoal), toast, (x) => goal.dropped(x));
+takePictures($('app'), $('picture'), () => worlds[0]?.cameras[0].size, (bytes, asGoal) => { if (asGoal) quiet(); link.sendPicture(bytes, asGoal); }, toast, (x) => goal.dropped(x));
 controls.bindPad($('stick'), 'stick');
 controls.bindPad($('turn'), 'turn');
 controls.axes.bindMouse($('screens'));

@@ -4,7 +4,7 @@ const $ = (id) => document.getElementById(id);
 const FORGET_M = 0.6;  // a click so near to the goal takes it away
 
 export class Goal {
-  /** send(message); map: the map of places (map.js); say(sentence); go(): play goes on. */
+  /** send(message); map: the map of places (map.js); say(sentence); quiet() lets go of all controls; go(): play goes on. */
   constructor(hooks) {
     Object.assign(this, hooks, { places: false, pictures: false, at: null, shown: '' });
     $('goal-keep').onclick = () => { this.keep(); $('goal-keep').blur(); };
@@ -31,6 +31,7 @@ export class Goal {
     const place = this.places && this.map.place(event.offsetX, event.offsetY);
     if (!place) return;
     const near = this.at && Math.hypot(place[0] - this.at[0], place[1] - this.at[1]) < FORGET_M;
+    if (!near) this.quiet();
     this.send(near ? { type: 'goal' } : { type: 'goal', at: place });
     if (!near) this.go();
   }
