@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -120,3 +121,11 @@ def test_an_echo_begins_again_where_it_ends():
 def test_a_return_that_is_no_number_is_said():
     with pytest.raises(TerrellaError, match="of mine in the dream is no finite number in 1 of 2"):
         check_finite("mine", "the dream", [Episode(reward=1.0), Episode(reward=math.nan)])
+
+
+def test_a_dream_of_few_at_once_follows_as_many():
+    dream = Off()
+    dream.spec = dataclasses.replace(dream.spec, max_batch=4)
+    bench, spec = Bench(dream, Point(), Judge(), 6, 3, ("observation",)), Point().spec
+    chunk = bench.play(lambda: policy_of("random", spec), spec, 0, 10)
+    assert len(chunk.dream) == len(chunk.real) == 10

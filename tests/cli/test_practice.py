@@ -72,3 +72,19 @@ def test_counts_are_whole(options, tmp_path, capsys) -> None:
     asked = ["train", "policy", "--in", "gym:CartPole-v1", "--out", str(tmp_path / "run")]
     assert main([*asked, *options]) == 2
     assert "1 " in capsys.readouterr().err
+
+
+def test_nothing_is_collected_while_the_world_of_what_was_is_learned(tmp_path, monkeypatch) -> None:
+    for name, value in {"ROUNDS": 1, "FEWEST": 100, "SHARES": {**practising.SHARES, "collecting": 0.0}}.items():
+        monkeypatch.setattr(practising, name, value)
+
+    def stopped(data, out, config, report):
+        out.mkdir(exist_ok=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(practising, "train_latent", stopped)
+    asked = ["learn", "gym:CartPole-v1", "--practise", "--frames", "300", "--out", str(tmp_path / "learned")]
+    assert main(asked) == 130
+    collected = Dataset(tmp_path / "learned" / "recording").length
+    assert main(asked) == 130
+    assert 150 <= collected == Dataset(tmp_path / "learned" / "recording").length < 300
