@@ -77,14 +77,14 @@ def test_a_batch_acts_as_its_episodes_do_one_by_one(name: str) -> None:
 def test_draws_come_as_often_as_they_are_likely(name: str) -> None:
     actor = actor_for(SPACES[name])
     one = {at: value.expand(4096, *value.shape[1:]) for at, value in seen(1, make_rng(4)).items()}
-    hands = actor.network(one)
-    drawn = hands.draw(make_rng(5))
-    surprise, entropy = -hands.log_prob(drawn), hands.entropy(drawn)
+    distribution = actor.network(one)
+    drawn = distribution.draw(make_rng(5))
+    surprise, entropy = -distribution.log_prob(drawn), distribution.entropy(drawn)
     if name == "axes":  # the entropy is that of what tanh leaves of the draw
         surprise = surprise + (1 - torch.tanh(drawn).square()).log().sum(1)
     assert abs(float(surprise.mean() - entropy.mean())) < 0.1
-    best = hands.log_prob(hands.likeliest())
-    assert (best >= hands.log_prob(drawn) - 1e-5).all()
+    best = distribution.log_prob(distribution.likeliest())
+    assert (best >= distribution.log_prob(drawn) - 1e-5).all()
 
 
 def test_axes_have_gradients_from_the_action_to_the_network() -> None:

@@ -45,8 +45,8 @@ class Actor:
     def act(self, observation: Observation, memory: None, rng: torch.Generator) -> tuple[torch.Tensor, None]:
         """The actions [B, *action.shape], on the network's device."""
         check_seen(self.network.config, observation)
-        hands = self.network(observation)
-        drawn = hands.likeliest() if self.greedy else hands.draw(rng)
+        distribution = self.network(observation)
+        drawn = distribution.likeliest() if self.greedy else distribution.draw(rng)
         return self.network.config.actions(drawn, self.spec), None
 
     def save(self, folder: str | Path) -> None:

@@ -11,7 +11,7 @@ from torch import nn
 
 from ..core.errors import ActionError, ChannelError, TerrellaError
 from ..core.spec import BUTTONS, CHOICE, Spec, dtype_of, shape_of
-from .hands import Axes, Buttons, Choices, Hands
+from .distributions import ActionDistribution, Axes, Buttons, Choices
 
 AXES = "axes"
 CELLS = 4  # a side: of what is left of a picture
@@ -67,7 +67,7 @@ class ActorConfig:
         """Numbers of which a distribution of actions is made."""
         return {CHOICE: sum(self.counts), BUTTONS: len(self.low), AXES: 2 * len(self.low)}[self.mode]
 
-    def hands(self, found: torch.Tensor) -> Hands:
+    def distribution(self, found: torch.Tensor) -> ActionDistribution:
         """The distribution that [N, outputs] stand for."""
         if self.mode == CHOICE:
             return Choices(self.counts, found)
@@ -164,8 +164,8 @@ class ActorNetwork(nn.Module):
         self.config, self.eyes = config, Eyes(config)
         self.think = perceptron(self.eyes.width, config.hidden, config.layers, config.outputs, gain=0.01)
 
-    def forward(self, seen: Mapping[str, torch.Tensor]) -> Hands:
-        return self.config.hands(self.think(self.eyes(seen)))
+    def forward(self, seen: Mapping[str, torch.Tensor]) -> ActionDistribution:
+        return self.config.distribution(self.think(self.eyes(seen)))
 
 
 def perceptron(into: int, hidden: int, layers: int, out: int, gain: float) -> nn.Sequential:

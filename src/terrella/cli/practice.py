@@ -20,11 +20,9 @@ from ..core.policy import Policy, Random
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import Practice, train_policy
 from ..measure.statistics import Figure, mean_interval
-from .beside import check_alike, open_real
+from .beside import STEPS, check_alike, open_real
 from .named import Device, Environment, load_named
 from .say import Json, result
-
-STEPS = 200  # of an episode, where the environment sets no limit
 
 
 @dataclass(frozen=True)

@@ -121,13 +121,13 @@ class ActorCritic:
         returns = lambda_returns(batch.reward, batch.goes_on, value, batch.known, self.wanted)
         weights, unit = weights_of(batch.goes_on, batch.known), self.range.follow(returns)
         past = {name: seen[:-1].flatten(0, 1).detach() for name, seen in batch.seen.items()}
-        hands, drawn = self.actor(past), batch.drawn.flatten(0, 1)
-        entropy = hands.entropy(drawn.detach()).view_as(weights)
+        distribution, drawn = self.actor(past), batch.drawn.flatten(0, 1)
+        entropy = distribution.entropy(drawn.detach()).view_as(weights)
         if self.gradients:
             worth = returns / unit
         else:
             better = ((returns - value[:-1]) / unit).detach()
-            worth = better * hands.log_prob(drawn).view_as(better)
+            worth = better * distribution.log_prob(drawn).view_as(better)
         share = weights.sum().clamp_min(1.0)
         parts = {
             "reward": (batch.reward.detach() * weights).sum() / share,

@@ -26,10 +26,6 @@ class Choices:
     counts: tuple[int, ...]
     logits: torch.Tensor
 
-    @staticmethod
-    def numbers(counts: tuple[int, ...]) -> int:
-        return sum(counts)
-
     def draw(self, rng: torch.Generator) -> torch.Tensor:
         seeds = chance.seeds(len(self.logits), rng, self.logits.device)
         return torch.stack([chance.choice(seeds, p, _STREAM + n) for n, p in enumerate(self._shares())], 1).float()
@@ -108,4 +104,4 @@ class Axes:
         return 3 * torch.tanh(mean / 3), LEAST + (MOST - LEAST) * torch.sigmoid(raw)
 
 
-Hands = Choices | Buttons | Axes
+ActionDistribution = Choices | Buttons | Axes
