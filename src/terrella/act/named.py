@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ..core.errors import ActionError, TerrellaError
-from ..core.policy import Idle, Policy, Random, Reactive
+from ..core.policy import Constant, Idle, Policy, Random, Reactive
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
@@ -32,23 +32,6 @@ KNOWN = (
 )
 _SETTINGS = {"search": str, "samples": int, "iterations": int, "horizon": int, "block": int, "replan": int}
 _SETTINGS |= {"trust": float, "budget_ms": float}
-
-
-class Constant:
-    """Does one action always."""
-
-    sees = ()
-
-    def __init__(self, action: torch.Tensor):
-        self.action = action
-
-    def begin(self, batch: int, rng: torch.Generator) -> torch.Tensor:
-        return self.action.expand(batch, *self.action.shape)
-
-    def act(
-        self, observation: Observation, memory: torch.Tensor, rng: torch.Generator
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        return memory.clone(), memory
 
 
 class Slipping:

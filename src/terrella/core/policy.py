@@ -86,13 +86,13 @@ class Replay:
         return self.actions[step], memory + 1
 
 
-class Idle:
-    """Does as little as the world's actions allow: the baseline "do nothing"."""
+class Constant:
+    """Does one action always."""
 
     sees = ()
 
-    def __init__(self, spec: Spec):
-        self.action = torch.from_numpy(neutral_action(spec))
+    def __init__(self, action: torch.Tensor):
+        self.action = action
 
     def begin(self, batch: int, rng: torch.Generator) -> torch.Tensor:
         return self.action.expand(batch, *self.action.shape)
@@ -101,6 +101,13 @@ class Idle:
         self, observation: Observation, memory: torch.Tensor, rng: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
         return memory.clone(), memory
+
+
+class Idle(Constant):
+    """Does as little as the world's actions allow: the baseline "do nothing"."""
+
+    def __init__(self, spec: Spec):
+        super().__init__(torch.from_numpy(neutral_action(spec)))
 
 
 class Held(NamedTuple):
