@@ -9,7 +9,17 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from terrella.act.planning import Planner, Revealed, SearchConfig, Wayfinder, distance_to, paced, tells_apart
+from terrella.act.planning import (
+    Destination,
+    Planner,
+    Revealed,
+    SearchConfig,
+    Wayfinder,
+    distance,
+    distance_to,
+    paced,
+    tells_apart,
+)
 from terrella.act.planning.ways import STRIDE_M, ways_to
 from terrella.core import Spec, State, check_world
 from terrella.core.errors import ContractError, ObservationError, PlanningError
@@ -122,3 +132,24 @@ def test_a_search_is_paced_and_knows_whether_there_is_anything_to_plan_for():
     assert tells_apart(world, near, state)
     same = distance_to(world, {"pose": torch.tensor([torch.nan, torch.nan, 0.0, *[torch.nan] * 4])})
     assert not tells_apart(world, same, state)
+
+
+def test_both_quaternions_of_a_rotation_are_as_far_from_a_goal():
+    def turned(heading, sign=1.0):
+        return torch.tensor([[0.0, 0.0, 0.0, sign * math.cos(heading / 2), 0.0, 0.0, sign * math.sin(heading / 2)]])
+
+    for heading in (2.0, 3.1, 3.3, 4.0):  # a barrier at half a turn would keep a planner from turning on
+        for sign in (1, -1):
+            away = float(distance(Yard().spec, {"pose": turned(3.0)}, {"pose": turned(heading, sign)}))
+            assert away == pytest.approx(abs(math.sin((heading - 3.0) / 4)) * 2 / math.sqrt(7), abs=1e-3)
+
+
+def test_a_destination_is_reached_near_it_and_facing_as_it_does():
+    turned = lambda heading: [math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2)]  # noqa: E731
+    goal = Destination(torch.tensor([1.0, 2.0, 0.0, *turned(3.1)]))
+    poses = torch.tensor([[1.3, 2.0, 9.0, *turned(-3.1)], [1.3, 2.0, 0.0, *turned(0.0)], [1.3, 3.0, 0.0, *turned(3.1)]])
+    away = goal.away(poses)
+    assert (away <= goal.near_m).tolist() == [True, False, False]
+    assert float(away[0]) == pytest.approx(0.3) and float(away[2]) > 1
+    nowhere = Destination(torch.tensor([1.0, 2.0, *[torch.nan] * 5]))
+    assert nowhere.heading is None and (nowhere.away(poses) <= 0.5).tolist() == [True, True, False]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,9 +13,10 @@ from .. import library
 from ..act.explorer import Explorer
 from ..act.named import Slipping, seen_by
 from ..act.planning import (
+    STRIDE_S,
+    Destination,
     Planner,
     Revealed,
-    Wayfinder,
     distance,
     distance_to,
     imagined,
@@ -24,17 +24,15 @@ from ..act.planning import (
     paced,
     tells_apart,
 )
-from ..core.errors import PlanningError, TerrellaError
+from ..core.errors import PlanningError
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
 from ..serve.agent import Agent, Agents, Futures
-from ..space.camera import yaw
-from .goals import state_channel
+from .goals import placed, state_channel
 
 _REPLAN_S = 0.06  # of world time, in which a plan is acted on before the next is made
-_STRIDE_S = 0.115  # for which a walker holds a move
-_NEAR_M, _NEAR, _FACING = 0.5, 0.05, 0.35  # metres, shares of a range, and radians within which a goal is reached
+_NEAR = 0.05  # of a range, within which a goal is reached
 _SHOWN = ("pose", "keyframes")  # beside what a planner's world observes: what ways are found by
 
 
@@ -122,7 +120,7 @@ class Driving:
             raise PlanningError(
                 f"{self.played.spec.name} can neither be copied nor was learned: nobody can plan in it."
             )
-        goal = self._placed(goal)
+        goal = placed(goal, self.learned or self.played)
         if "pose" in goal and "pose" in self.played.spec.channels:
             return self._walking(world, goal["pose"][0])
         source, told = self.learned or self.played, [name for name in goal if name == _vector(self.played.spec)]
@@ -141,33 +139,18 @@ class Driving:
 
     def _walking(self, world: World, pose: torch.Tensor) -> Agent:
         """Who walks to a pose [7], of which NaN may be any."""
-        asked = torch.full((7,), torch.nan)
-        asked[:2] = pose[:2]
-        cost = distance_to(world, {"pose": asked})
-        config, _ = paced(world, cost, self._first(world), self.budget_ms, max(1, round(_STRIDE_S / world.spec.dt_s)))
+        goal = Destination(pose)
+        cost = goal.cost(world)
+        block = max(1, round(STRIDE_S / world.spec.dt_s))
+        config, _ = paced(world, cost, self._first(world), self.budget_ms, block)
         planner = Planner(world, cost, config)
-        heading = float(yaw(pose)) if bool(torch.isfinite(pose).all()) else None
-        way = Wayfinder(planner, (float(pose[0]), float(pose[1])), heading)
 
         def away(state: State) -> float:
-            now = self.played.render(state, ("pose",))["pose"][0].cpu()
-            far = float((now[:2] - asked[:2]).norm())
-            off = 0.0 if heading is None else abs(math.remainder(float(yaw(now)) - heading, math.tau))
-            return far if far > _NEAR_M or off < _FACING else _NEAR_M + 0.1 * off
+            return float(goal.away(self.played.render(state, ("pose",))["pose"].cpu())[0])
 
         futures = self._futures(planner)
         shown = futures and (lambda memory: futures([memory[0].thought]))
-        return Agent("a walker", way, self.see, away, _NEAR_M, "m", shown)
-
-    def _placed(self, goal: Observation) -> Observation:
-        """A lone picture with the pose from which the world believes it to be taken, where it can say that."""
-        source = self.learned or self.played
-        if set(goal) != {"rgb"} or not {"rgb", "pose"} <= set(source.spec.channels):
-            return goal
-        try:
-            return {**goal, **source.render(source.observe(goal, None, make_rng(0)), ("pose",))}
-        except TerrellaError:
-            return goal
+        return Agent("a walker", goal.walker(planner), self.see, away, goal.near_m, "m", shown)
 
     def _first(self, world: World) -> State:
         """A state in which episodes begin, to time the world with."""

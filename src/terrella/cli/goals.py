@@ -10,6 +10,7 @@ import torch
 
 from ..core.errors import ObservationError, PlanningError, TerrellaError
 from ..core.spec import Spec, kind_of
+from ..core.world import Observation, World, make_rng
 
 REWARD = "reward"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
@@ -31,6 +32,16 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
         return {"rgb": _picture(Path(text), spec, "rgb")}
     channel = state_channel(spec)
     return {channel: _value(text, channel, spec)}
+
+
+def placed(goal: Observation, world: World) -> Observation:
+    """A lone picture [1, ...] with the pose from which the world believes it to be taken, where it can say that; else the goal."""
+    if set(goal) != {"rgb"} or not {"rgb", "pose"} <= set(world.spec.channels):
+        return goal
+    try:
+        return {**goal, **world.render(world.observe(goal, None, make_rng(0)), ("pose",))}
+    except TerrellaError:
+        return goal
 
 
 def state_channel(spec: Spec) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,8 @@ from tyro.conf import Positional, arg
 
 from .. import library, progress
 from ..act.planning import (
+    NEAR_M,
+    Destination,
     Episode,
     Judge,
     Planner,
@@ -27,7 +30,8 @@ from ..act.planning import (
     play,
 )
 from ..core.errors import PlanningError, TerrellaError
-from ..core.policy import Random
+from ..core.policy import Policy, Random
+from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data.storage.durable import write_json
 from ..measure.acted import compute_chart, film, film_strip, plan_page
@@ -37,7 +41,9 @@ from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
 from .goals import REWARD, read_goal
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result, say
+from .walking import WALK_S, Walks, is_recording, search_of, views_of
 
+WITHIN = 0.05  # unless it is said
 DOUBLINGS = 5  # of the curve of success against compute
 Kind = Literal["icem", "cem", "mppi", "gradient", "tree", "random"]
 Milliseconds = Annotated[
@@ -90,6 +96,11 @@ class _Case:
     episodes: int
     steps: int
     seed: int
+    walks: Walks | None = None
+
+    @property
+    def within(self) -> float:
+        return self.walks.within_m if self.walks else self.judge.within
 
     def planner(self, searching: Searching) -> Planner:
         spec, trust = self.world.spec, searching.trust
@@ -98,22 +109,56 @@ class _Case:
         cost = distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(spec)
         return Planner(self.world, cost, searching.config, trust, replan=searching.replan)
 
-    def played(self, policy, what: str, keep: tuple[str, ...] = ()) -> Played:
+    def walker(self, searching: Searching, goal: Destination) -> Policy:
+        """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
+        cost = goal.cost(self.world)
+        return goal.walker(Planner(self.world, cost, searching.config, searching.trust, replan=searching.replan))
+
+    def planned(self, searching: Searching, what: str, keep: tuple[str, ...] = ()) -> Played:
+        """Episodes of the planner."""
+        policy = partial(self.walker, searching) if self.walks else self.planner(searching)
+        return self._played(policy, what, _seen_by(self), keep)
+
+    def floor(self) -> Played:
+        """Episodes of acting at random, from the same starts."""
+        policy = Random(self.real.spec)
+        return self._played((lambda goal: policy) if self.walks else policy, "acting at random", ())
+
+    def _played(self, policy, what: str, sees: tuple[str, ...], keep: tuple[str, ...] = ()) -> Played:
         with progress.shown(what) as report:
-            told = (self.episodes, self.steps, self.seed, self.judge, _seen_by(self), keep, 1 if keep else 0, report)
+            if self.walks:
+                return self.walks.played(self.real, policy, self.episodes, self.steps, self.seed, sees, keep, report)
+            told = (self.episodes, self.steps, self.seed, self.judge, sees, keep, 1 if keep else 0, report)
             return play(self.real, policy, *told)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What is to be reached, and when it is.
+
+    Args:
+        goal: A picture's file, numbers of the state (0.5,_,0 with _ for any; --goal=-1,0 where the first is negative),
+            CHANNEL=VALUE, or reward; in worlds with places the folder of a recording: each episode walks to one of its views.
+        within: The distance at which a goal is reached: numbers count in shares of their range, pictures of full brightness;
+            default 0.05. Of places, metres; default 0.5.
+        apart: Metres from an episode's start, at least, of a recording's view that it walks to.
+        success: A channel of the environment that is above 0 where an episode has succeeded (done), in place of --within.
+    """
+
+    goal: str = REWARD
+    within: float | None = None
+    apart: float = 5.0
+    success: str | None = None
 
 
 def plan(
     name: Positional[str],
     environment: Environment,
     searching: Searching,
-    goal: str = REWARD,
+    aim: Aim,
     real: str | None = None,
     episodes: int = 10,
     steps: int | None = None,
-    within: float = 0.05,
-    success: str | None = None,
     curve: bool = False,
     out: Path | None = None,
     device: Device = "auto",
@@ -126,23 +171,19 @@ def plan(
 
     Args:
         name: The world to plan in: what `terrella list` shows, the path of a checkpoint, or a simulator itself (gym:CartPole-v1).
-        goal: A picture's file, numbers of the state (0.5,_,0 with _ for any; --goal=-1,0 where the first is negative),
-            CHANNEL=VALUE, or reward.
         real: The environment to act in (gym:CartPole-v1); without one, the world itself.
-        steps: Of an episode at most; default: the environment's own limit, or 200.
-        within: The distance at which a goal is reached: numbers count in shares of their range, pictures of full brightness.
-        success: A channel of the environment that is above 0 where an episode has succeeded (done), in place of --within.
+        steps: Of an episode at most; default: the environment's own limit, or 200, for who walks as many as are 30 s.
         curve: Also play with half, a quarter ... of the samples: does thinking longer help?
         out: Folder for the page, the film and plan.json; default: plans/ and the world's name.
     """
-    case = _opened(name, environment, searching, goal, real, episodes, steps, within, success, device, seed)
+    case = _opened(name, environment, searching, aim, real, episodes, steps, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
     keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
-    mine = case.played(case.planner(searching), "planning", keep)
-    floor = case.played(Random(case.real.spec), "acting at random")
+    mine = case.planned(case.searching, "planning", keep)
+    floor = case.floor()
     points = _curve(case, mine) if curve else []
-    about = {"world": name, "real": real or name, "goal": goal}
-    asked = {key: value for key, value in asdict(searching).items() if value is not None}
+    about = {"world": name, "real": real or name, **asdict(aim), "within": case.within}
+    asked = {key: value for key, value in asdict(case.searching).items() if value is not None}
     facts = {
         **about,
         **asked,
@@ -163,10 +204,12 @@ def _report(
 ) -> tuple[list[str], dict[str, Any]]:
     """Writes the page and the film; what came of it in words, and all of it."""
     arms = {"planner": _figures(mine, case.seed), "random": _figures(floor, case.seed)}
-    what = "success" if case.judge.judges else "return"
+    what = "success" if "success" in arms["planner"] else "return"
     curve = [(steps, figures[what]) for steps, figures in points]
     lines = _lines(case, mine, arms, curve)
-    divergence, picture, filmed = _filmed(case, mine.episodes[0], folder)
+    divergence, picture, filmed = _filmed(
+        case, next((one for one in mine.episodes if one.seen), mine.episodes[0]), folder
+    )
     chart = compute_chart(curve, arms["random"][what], what) if curve else ""
     page = plan_page(f"{facts['world']}: {facts['goal']}", lines, arms, chart, picture, filmed, facts)
     (folder / "plan.html").write_text(page, encoding="utf-8")
@@ -182,30 +225,47 @@ def _report(
     }
 
 
-def _opened(name, environment, searching, goal, real, episodes, steps, within, success, device, seed) -> _Case:
+def _opened(name, environment, searching, aim, real, episodes, steps, device, seed) -> _Case:
     """The worlds by their names, held to each other; a sentence for what does not fit."""
-    if episodes < 1 or (steps is not None and steps < 1) or not within > 0:
-        raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
+    apart_m, within = aim.apart, aim.within
+    if episodes < 1 or (steps is not None and steps < 1) or not (within is None or within > 0) or not apart_m >= 0:
+        raise TerrellaError(
+            "--episodes and --steps are whole numbers from 1 up, --within is above 0, and --apart is 0 or more."
+        )
     truth = library.is_truth(name)
     world = Revealed(open_copied(name, environment)) if truth else load_named(name, device_of(device))
     if not world.spec.observes:
         raise PlanningError(f"{name} observes nothing, so nobody can tell it where the episode stands.")
     acted = world if real in (None, name) else open_real(real, environment, world.spec)
     check_alike(world.spec, acted.spec)
-    wanted = read_goal(goal, world.spec)
-    if success and success not in acted.spec.channels:
-        raise PlanningError(f"{acted.spec.name} has no channel '{success}'; it has {', '.join(acted.spec.channels)}.")
-    judged = {} if success or any(at not in acted.spec.channels for at in wanted) else wanted
-    if wanted and not judged and not success:
+    if aim.success and aim.success not in acted.spec.channels:
         raise PlanningError(
-            f"{acted.spec.name} does not show {', '.join(wanted)}, so nobody can tell whether the goal is reached: name a "
-            "channel that can with --success."
+            f"{acted.spec.name} has no channel '{aim.success}'; it has {', '.join(acted.spec.channels)}."
         )
-    judge = Judge({at: value[None] for at, value in judged.items()}, within, success or "")
+    wanted = {} if is_recording(aim.goal) else read_goal(aim.goal, world.spec)
+    views = None if aim.success else views_of(aim.goal, wanted, world, acted.spec)
+    if views is not None:
+        searching = replace(searching, **search_of(world.spec)) if searching == Searching() else searching
+        walks = Walks(views, apart_m, within or NEAR_M)
+        limit = steps or acted.spec.max_episode_steps or round(WALK_S / acted.spec.dt_s)
+        case = _Case(world, acted, wanted, Judge(), searching, episodes, limit, seed, walks)
+        case.walker(searching, Destination(views[0]))
+        return case
+    judge = _judge(aim, wanted, acted.spec)
     limit = steps or acted.spec.max_episode_steps or STEPS
     case = _Case(world, acted, wanted, judge, searching, episodes, limit, seed)
     case.planner(searching)  # what does not fit is said before anything is played
     return case
+
+
+def _judge(aim: Aim, wanted: Mapping[str, torch.Tensor], real: Spec) -> Judge:
+    judged = {} if aim.success or any(at not in real.channels for at in wanted) else wanted
+    if wanted and not judged and not aim.success:
+        raise PlanningError(
+            f"{real.name} does not show {', '.join(wanted)}, so nobody can tell whether the goal is reached: name a "
+            "channel that can with --success."
+        )
+    return Judge({at: value[None] for at, value in judged.items()}, aim.within or WITHIN, aim.success or "")
 
 
 def _seen_by(case: _Case) -> tuple[str, ...]:
@@ -252,7 +312,7 @@ def _curve(case: _Case, mine: Played) -> list[tuple[float, dict[str, Figure]]]:
         if samples < 2:
             continue
         searching = replace(case.searching, samples=samples)
-        played = case.played(case.planner(searching), f"planning with {samples} samples") if halvings else mine
+        played = case.planned(searching, f"planning with {samples} samples") if halvings else mine
         figures = _figures(played, case.seed)
         points.append((figures["steps imagined"].value, figures))
     return points
@@ -269,16 +329,18 @@ def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], 
     gained = f"{planner['return']}; at random {floor['return']}"
     if "reward" in case.real.spec.channels:
         lines.append(f"return {gained}")
-    took = planner["ms a decision"]
-    imagined = planner["steps imagined"].value
-    lines.append(
-        f"a decision takes {took.value:.0f} ms (95% within {took.high:.0f}) for {imagined:,.0f} imagined steps"
-    )
+    lost = sum(not one.steps for one in mine.episodes)
+    if lost:
+        lines.append(f"to {lost} of the goals no way was known")
+    if took := planner.get("ms a decision"):
+        imagined = f"{planner['steps imagined'].value:,.0f} imagined steps"
+        lines.append(f"a decision takes {took.value:.0f} ms (95% within {took.high:.0f}) for {imagined}")
     if mine.skipped:
         lines.append(f"{mine.skipped} starts were already solved and left out")
-    if case.goal and planner.get("success") and not planner["success"].value:
+    if (case.goal or case.walks) and planner.get("success") and not planner["success"].value:
         nearest = min(one.nearest for one in mine.episodes)
-        away = f"; the nearest that it came is {nearest:.3g} (asked: {case.judge.within:g})" if case.judge.goal else ""
+        measured = case.judge.goal or case.walks
+        away = f"; the nearest that it came is {nearest:.3g} (asked: {case.within:g})" if measured else ""
         best = min(one.best_cost for one in mine.episodes)
         lines.append(
             f"the goal was never reached{away}; the best plan in the world cost {best:.3g}: it may be impossible"

@@ -8,8 +8,8 @@ from .planner import Decision, Planner, Thought
 from .revealed import Revealed
 from .searches import Found, Hints, SearchConfig, search
 from .task import Task
-from .ways import Wayfinder
+from .ways import NEAR_M, STRIDE_S, Destination, Wayfinder
 
 __all__ = ["Cost", "Decision", "Episode", "Found", "Hints", "Judge", "Planner", "Played", "Revealed", "SearchConfig"]
 __all__ += ["Task", "Thought", "distance", "distance_to", "negative_reward", "paced", "play", "play_from", "search"]
-__all__ += ["Imagined", "Wayfinder", "imagined", "tells_apart"]
+__all__ += ["NEAR_M", "STRIDE_S", "Destination", "Imagined", "Wayfinder", "imagined", "tells_apart"]

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 from ...core.errors import ObservationError, PlanningError
-from ...core.spec import Spec
+from ...core.spec import Spec, kind_of
 from ...core.world import Observation, World, make_rng
 
 LATENT = "latent"  # the channel in which a world compares pictures, where it has one
@@ -78,12 +78,15 @@ def distance_to(
 def distance(spec: Spec, goal: Observation, seen: Observation) -> torch.Tensor:
     """The mean over the channels of `goal` [B or 1, ...] of the root mean square difference of what is seen, [B, N, ...] or
     [B, ...]: float [B, N] or [B]. Pictures count in shares of full brightness, numbers with bounds in shares of their range,
-    others as they are; NaN in a goal counts as met."""
+    others as they are; NaN in a goal counts as met. Of the two quaternions of a pose's rotation the nearer one counts."""
     total = []
     for name, wanted in goal.items():
         now = seen[name].float()
         wanted, lead = wanted.to(now.device).float(), now.ndim - wanted.ndim + 1  # 2 where there are candidates
         wanted = wanted[:, None] if lead == 2 else wanted
+        if kind_of(name) == "pose":
+            away = (now * wanted)[..., 3:].nansum(-1, keepdim=True) < 0
+            now = torch.cat([now[..., :3], torch.where(away, -now[..., 3:], now[..., 3:])], -1)
         asked = ~torch.isnan(wanted)
         apart = torch.where(asked, (now - wanted) / scale_of(spec.channels[name]).to(now.device), 0.0)
         apart, asked = (each[..., None].flatten(lead) for each in (apart, asked))

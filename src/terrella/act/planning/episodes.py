@@ -11,10 +11,12 @@ import torch
 
 from ...core.errors import PlanningError
 from ...core.policy import Policy, act
+from ...core.spec import Spec
 from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import distance
 from .planner import Decision, Thought
+from .ways import Walk
 
 MOST_SKIPPED = 20  # starts that are already solved, for each episode that is asked for
 
@@ -24,11 +26,13 @@ class Judge:
     """When an episode has succeeded: where `channel` is above 0, or else within `within` of the goal (costs.distance).
 
     goal: channel -> [1, ...]. With neither a goal nor a channel nothing is judged, and an episode has its return alone.
+    apart: how far what is seen is from the goal, as costs.distance.
     """
 
     goal: Observation = field(default_factory=dict)
     within: float = 0.05
     channel: str = ""
+    apart: Callable[[Spec, Observation, Observation], torch.Tensor] = distance
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -52,7 +56,7 @@ class Judge:
         """The distance to the goal [B]; NaN without one."""
         if not self.goal:
             return torch.full((len(next(iter(seen.values()))),), torch.nan)
-        return distance(world.spec, self.goal, seen).cpu()
+        return self.apart(world.spec, self.goal, seen).cpu()
 
 
 @dataclass
@@ -216,6 +220,7 @@ def _decided(episode: Episode, action: torch.Tensor, ms: float, memory: Any, ent
     """Writes down an action, and the decision behind it if that is a new one."""
     episode.actions.append(action.cpu())
     thought = memory[entry] if isinstance(memory, list) else None
+    thought = thought.thought if isinstance(thought, Walk) else thought
     if not isinstance(thought, Thought) or thought.decision is None:
         episode.ms.append(ms)
     elif thought.decision is not episode.decision:

@@ -10,9 +10,13 @@ import numpy as np
 import torch
 
 from ...core.errors import PlanningError
-from ...core.world import Observation
+from ...core.world import Observation, World
+from ...space.camera import yaw
+from .costs import Cost, distance_to
 from .planner import Planner, Thought
 
+NEAR_M, FACING = 0.5, 0.35  # metres, and radians of heading, within which a place is reached
+STRIDE_S = 0.115  # for which a walker holds a move
 STRIDE_M = 1.6  # between two known places that lie on one way; walls seldom stand between such
 CELL_M = 0.4  # places nearer to each other are one
 _STUCK_STEPS, _STUCK_M = 45, 0.35  # who has not come further than this in so many steps tries another way
@@ -112,8 +116,7 @@ class Wayfinder:
 
     def _led(self, walk: Walk, observation: Observation, entry: int) -> Walk:
         """The walk with the next place as its planner's goal."""
-        now = observation["pose"][entry].double().cpu()
-        here = now[:2].numpy()
+        here = observation["pose"][entry, :2].double().cpu().numpy()
         walk = self._noted(walk, here)
         if walk.ways is None or walk.step % _ANEW_STEPS == 0 or not len(walk.ways.places):
             known = self._known(observation, walk, entry)
@@ -125,11 +128,7 @@ class Wayfinder:
         pose = torch.full_like(walk.thought.goal["pose"], torch.nan)
         pose[0, :2] = torch.from_numpy(target).to(pose)
         if self.heading is not None and left < _TURNS_M:
-            half = torch.tensor([self.heading / 2], dtype=torch.float64)
-            turned = torch.cat(
-                [half.cos(), half.sin()]
-            )  # of two quaternions for one heading that which is nearer to now
-            pose[0, [3, 6]] = (turned * (1 if float(turned @ now[[3, 6]]) >= 0 else -1)).to(pose)
+            pose[0, 3], pose[0, 6] = math.cos(self.heading / 2), math.sin(self.heading / 2)
         thought = replace(walk.thought, goal={**walk.thought.goal, "pose": pose})
         return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
 
@@ -150,3 +149,37 @@ class Wayfinder:
         if walk.step - walk.noted < _STUCK_STEPS or walk.next is None:
             return walk
         return replace(walk, ways=None, avoided=(*walk.avoided, walk.next), noted=walk.step)
+
+
+@dataclass(frozen=True)
+class Destination:
+    """Where to walk: a `pose` [7]: its first two numbers, metres, are the place, its rotation the heading, unless that is NaN. It
+    is reached within `near_m` metres and FACING radians."""
+
+    pose: torch.Tensor
+    near_m: float = NEAR_M
+
+    @property
+    def place(self) -> tuple[float, float]:
+        return float(self.pose[0]), float(self.pose[1])
+
+    @property
+    def heading(self) -> float | None:
+        return float(yaw(self.pose)) if bool(torch.isfinite(self.pose[3:]).all()) else None
+
+    def cost(self, world: World) -> Cost:
+        """For the walker's planner: the distance to the place."""
+        asked = torch.full((7,), torch.nan)
+        asked[:2] = self.pose[:2]
+        return distance_to(world, {"pose": asked})
+
+    def walker(self, planner: Planner) -> Wayfinder:
+        return Wayfinder(planner, self.place, self.heading)
+
+    def away(self, pose: torch.Tensor) -> torch.Tensor:
+        """How many metres [B] poses [B, 7] are away; who is near and faces elsewhere is a little more than `near_m` away."""
+        far = (pose[:, :2] - self.pose[:2].to(pose)).norm(dim=1)
+        if self.heading is None:
+            return far
+        off = torch.remainder(yaw(pose) - self.heading + math.pi, math.tau).sub(math.pi).abs()
+        return torch.where((far > self.near_m) | (off < FACING), far, self.near_m + 0.1 * off)
