@@ -109,6 +109,12 @@ def test_a_walker_goes_round_a_wall_that_its_planner_does_not_see_past(shown):
     assert math.dist(trace[-1], (4.0, 0.0)) < 0.4 and max(y for _, y in trace) > 2.9
 
 
+def test_who_is_off_all_ways_goes_to_the_nearest_place_that_lies_on_one():
+    alone = np.array([[-4.0, 0.0]])  # as the first place that a camera remembers of a room nobody was in
+    target, left = ways_to(np.array([4.0, 0.0]), np.concatenate([KNOWN, alone])).target(alone[0], np.array([4.0, 0.0]))
+    assert target.tolist() == [0.0, 0.0] and math.isfinite(left)
+
+
 def test_a_place_that_nobody_knows_is_refused_in_a_sentence():
     with pytest.raises(PlanningError, match="no way to that place is known"):
         walk((20.0, 20.0))

@@ -30,8 +30,10 @@ class Recognises(Mapped):
 def test_poses_and_recognised_pictures_are_places_and_other_goals_are_not():
     world, picture = Recognises(), {"rgb": torch.zeros(48, 64, 3, dtype=torch.uint8)}
     assert views_of("reward", {}, world, world.spec) is None
-    assert views_of("pose=1,0", {"pose": torch.tensor([1.0, 0.0, *ANY])}, world, world.spec)[0, :2].tolist() == [1, 0]
-    assert views_of("a.png", picture, world, world.spec)[0, 0] == 1.5
+    at = views_of("pose=1,0", {"pose": torch.tensor([1.0, 0.0, *ANY])}, world, world.spec)
+    assert at is not None and at[0, :2].tolist() == [1, 0]
+    seen = views_of("a.png", picture, world, world.spec)
+    assert seen is not None and seen[0, 0] == 1.5
     assert views_of("a.png", picture, Panorama(), Panorama().spec) is None, "no places are known there"
     world.x = 1000.0
     with pytest.raises(ObservationError, match="does not recognise where a.png was taken"):
@@ -42,7 +44,7 @@ def test_views_of_a_recording_are_goals_where_the_world_has_been(tmp_path):
     world, folder = Mapped(), tmp_path / "views"
     record(world, Random(world.spec, (4, 8)), folder, 60, make_rng(0))
     views = views_of(str(folder), {}, world, world.spec)
-    assert views.shape[1] == 7 and 1 < len(views) <= 60
+    assert views is not None and views.shape[1] == 7 and 1 < len(views) <= 60
     with pytest.raises(PlanningError, match="knows no places"):
         views_of(str(folder), {}, Panorama(), Panorama().spec)
 

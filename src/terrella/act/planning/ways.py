@@ -40,12 +40,13 @@ class Ways:
         if straight <= STRIDE_M or not len(self.places):
             return goal, straight
         away = np.linalg.norm(self.places - here, axis=1)
-        near = away <= STRIDE_M
-        if not (near & np.isfinite(self.left_m)).any():
-            near = away <= away.min() + 1e-6  # off all ways: to the nearest place
-        total = np.where(near, away + self.left_m, np.inf)
-        if not np.isfinite(total).any():
+        leads = np.isfinite(self.left_m)
+        if not leads.any():
             return goal, math.inf
+        near = leads & (away <= STRIDE_M)
+        if not near.any():
+            near = leads & (away <= away[leads].min() + 1e-6)  # off all ways: to the nearest place on one
+        total = np.where(near, away + self.left_m, np.inf)
         at = int(total.argmin())
         left = float(total[at])
         while self.onward[at] >= 0 and away[self.onward[at]] <= STRIDE_M:
