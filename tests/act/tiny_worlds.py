@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from terrella.core.arena import Arena
 from terrella.core.spec import DONE, REWARD, Spec
 from terrella.core.state import State
 
@@ -70,6 +71,25 @@ class Broken(Point):
 
     def shown(self, state, name):
         return torch.full((state.batch,), torch.nan) if name == "reward" else super().shown(state, name)
+
+
+class Recalls(Point):
+    """Pays for being where its episode began, which it keeps in an arena."""
+
+    def __init__(self):
+        super().__init__()
+        self.arena = Arena({"home": (torch.float32, (2,))})
+
+    def start(self, batch, rng):
+        at = super().start(batch, rng)["at"]
+        return State({"at": at, "rows": self.arena.keep({"home": at})[:, None]}, {"rows": self.arena})
+
+    def imagine(self, state, action, rng):
+        return state.replace(at=super().imagine(state, action, rng)["at"])
+
+    def shown(self, state, name):
+        home = self.arena.read("home")[state["rows"][:, 0]]
+        return -(state["at"] - home).abs().sum(1) if name == "reward" else super().shown(state, name)
 
 
 class Grid(_Tiny):

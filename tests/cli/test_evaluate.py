@@ -77,6 +77,18 @@ def test_what_cannot_be_judged_is_said_in_a_sentence(capsys, tmp_path, words, sa
     assert not (tmp_path / "new").exists()
 
 
+def test_a_policy_that_gives_no_actions_is_said_in_a_sentence(capsys, tmp_path):
+    file, asked = tmp_path / "broken.py", ["--in", BLIND, "--out", str(tmp_path / "new")]
+    file.write_text(
+        "import torch\nnan = lambda seen, rng: torch.full((len(seen['observation']),), torch.nan)\n"
+        "wide = lambda seen, rng: torch.zeros(len(seen['observation']), 3)\n"
+    )
+    for name, said in (("nan", "not a finite number"), ("wide", "action of shape (6, 3) where")):
+        assert main(["evaluate", f"{file}:{name}", *asked, *QUICK]) == 2
+        error = capsys.readouterr().err
+        assert said in error and f"broken.py:{name}: " in error and error.count("\n") == 1
+
+
 def test_names_are_short_as_long_as_they_differ():
     names = ("a/one.py:left", "b/two.py:left@0.5", "runs/actor/", "other/actor", "constant:-1")
     labels = labels_of(names)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gymnasium import spaces
-from tests.act.tiny_worlds import Grid, Point
+from tests.act.tiny_worlds import Grid, Point, Recalls
 from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.act.actor import Actor
@@ -121,7 +121,7 @@ def test_choices_are_learned_from_what_pays(tmp_path) -> None:
 
 def test_a_stopped_run_goes_on_exactly(tmp_path) -> None:
     config = replace(QUICK, steps=16, batch=8, hidden=8)
-    for name, world in (("point", Point()), ("grid", Grid())):
+    for name, world in (("point", Point()), ("grid", Grid()), ("recalls", Recalls())):
         goes_on_exactly(
             lambda out, world=world: train_policy(world, "toy", out, config, quiet),
             tmp_path / name / "whole",

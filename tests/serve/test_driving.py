@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from terrella.act.planning import Wayfinder
+from terrella.act.planning import Wayfinder, pace, searches
 from terrella.cli.driving import Driving
 from terrella.core.errors import TerrellaError
 from terrella.core.world import make_rng
@@ -15,7 +18,15 @@ from terrella.serve.timeline import Timeline
 from .mapped import Mapped
 from .panorama import Panorama
 
-PATIENT_MS = 500.0  # so that no machine is too slow
+PATIENT_MS = 50.0
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """A clock by which whatever is timed takes a millisecond."""
+    ticks = itertools.count()
+    for module in (pace, searches):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: 1e-3 * next(ticks)))
 
 
 class Dull(Panorama):

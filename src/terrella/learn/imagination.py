@@ -75,18 +75,19 @@ class Recorded:
 class Continued:
     """Episodes begin where the world has them begin, and go on from batch to batch until they are over or `longest` steps long.
     They are kept as buffers, so that a run that was stopped goes on with them. Where states point into an arena, which no buffer
-    holds, each batch begins anew."""
+    holds, each batch begins anew and nothing is kept."""
 
     def __init__(self, world: World, batch: int, longest: int, seed: int):
         self.world, self.longest, self.seed = world, longest, seed
         state = world.start(batch, make_rng(seed))
         self.held = _Held(state, np.random.default_rng(seed).integers(longest, size=batch))
-        self.modules = {"episodes": self.held}
+        self.anew = bool(state.arenas)
+        self.modules = {} if self.anew else {"episodes": self.held}
 
     def begin(self, now: Now) -> State:
+        if self.anew:
+            return self.world.start(len(self.held.age), now.noise)
         state, over = self.held.state(), self.held.age >= self.longest
-        if state.arenas:
-            return self.world.start(len(over), now.noise)
         if over.any():
             fresh = self.world.start(int(over.sum()), now.noise)
             state = state.put(over.nonzero()[:, 0].to(state.device), fresh)
@@ -94,6 +95,8 @@ class Continued:
         return state
 
     def end(self, state: State, steps: int, now: Now) -> None:
+        if self.anew:
+            return
         over = self.world.render(state, ("done",))["done"] if "done" in self.world.spec.channels else None
         self.held.hold(state)
         self.held.age += steps
@@ -117,14 +120,13 @@ class _Held(nn.Module):
 
     def __init__(self, state: State, age: np.ndarray):
         super().__init__()
-        self.names, self.arenas = tuple(state), state.arenas
+        self.names = tuple(state)
         self.register_buffer("age", torch.from_numpy(age.astype(np.int64)))
         for number, name in enumerate(self.names):
             self.register_buffer(f"tensor{number}", state[name].clone())
 
     def state(self) -> State:
-        tensors = {name: getattr(self, f"tensor{number}") for number, name in enumerate(self.names)}
-        return State(tensors, self.arenas)
+        return State({name: getattr(self, f"tensor{number}") for number, name in enumerate(self.names)})
 
     def hold(self, state: State) -> None:
         for number, name in enumerate(self.names):
