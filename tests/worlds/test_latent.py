@@ -168,6 +168,14 @@ def test_latents_stay_within_bounds_however_long_it_goes_on():
     assert world.spec.channels["latent"].contains(state["window"][0, -1].numpy())
 
 
+def test_a_spread_beyond_all_that_was_seen_tells_of_a_larger_error():
+    network = made().network
+    network.spread.copy_(torch.linspace(0, 4, len(network.spread)))
+    network.error.copy_(torch.linspace(0, 0.2, len(network.error)))
+    found = network.expected(torch.tensor([0.0, 2.0, 4.0, 8.0, 12.0, 100.0]))
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.1, 0.2, 0.4, 0.6, 1.0]))
+
+
 def test_uncertainty_rises_with_the_spread_and_is_none_of_what_was_seen():
     world, rng = made(), make_rng(0)
     network = world.network
