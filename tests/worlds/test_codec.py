@@ -107,6 +107,16 @@ def test_what_the_mosaic_does_not_know_is_not_fetched_from_it():
     assert torch.equal(seen.sources[:, -1, :, SIZE[0] // 2 :], seen.sources[:, 0, :, SIZE[0] // 2 :])
 
 
+def test_what_lies_outside_of_the_picture_is_as_the_mosaic_knows_it():
+    made, frames = codec(wild=False), pictures(1)
+    mosaic = torch.full((1, 4, 3 * SIZE[0], 4 * SIZE[1]), 200, dtype=torch.uint8)
+    seen = made.seen(frames, mosaic, torch.tensor([1]))  # all goes two pixels to the right
+    choices, features = made.choices(seen, torch.zeros(1, 36 + 2 * SLOTS))
+    share = choices.softmax(1)[0]
+    assert not share[1, :, :2].any() and (share[1, :, 2:] > 0.5).all()
+    assert like(made.drawn(seen, choices, features)[0, :, :, :2], torch.full((3, SIZE[0], 2), 200, dtype=torch.uint8))
+
+
 def test_what_went_on_is_carried_to_where_it_would_go_next():
     made = codec()
     went = torch.rand(1, len(MOVES), *SIZE, generator=make_rng(4))

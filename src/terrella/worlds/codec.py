@@ -172,7 +172,10 @@ class Codec(nn.Module):
         moved = moved + goes * seen.went
         along = seen.move[:, None, None, None].expand_as(scrolls)
         moved = moved.scatter(1, along, torch.logaddexp(moved.gather(1, along), scrolls))
+        beyond = self._beyond(moved.device) & seen.known  # what lies outside of the last frame is as the mosaic knows it
         memory = torch.where(seen.known, memory, UNKNOWN)
+        memory = torch.logaddexp(memory, torch.where(beyond, moved, UNKNOWN).logsumexp(1, keepdim=True))
+        moved = torch.where(beyond, UNKNOWN, moved)
         return torch.cat([moved, others, memory, painted], 1), features
 
     def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
@@ -206,6 +209,13 @@ class Codec(nn.Module):
         else:
             painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
         return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
+
+    def _beyond(self, device: torch.device) -> torch.Tensor:
+        """bool [moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame."""
+        height, width = self.config.size
+        x = torch.arange(width, device=device) - self.moves[:, :1]
+        y = torch.arange(height, device=device) - self.moves[:, 1:]
+        return ((y < 0) | (y >= height))[:, :, None] | ((x < 0) | (x >= width))[:, None]
 
     def _carried(self, went: torch.Tensor) -> torch.Tensor:
         """How well each of the moves explained the last step [B, moves + 1, H, W], at the pixel to which it would lead next."""
