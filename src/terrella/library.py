@@ -72,20 +72,34 @@ def load(
         from .sim.doom import Doom, DoomConfig
 
         return Doom(DoomConfig(scenario=text.partition(":")[2] or GAME.partition(":")[2], **options))
-    if text.startswith("gym:ALE/"):
+    if text.startswith("gym:"):
+        return _open_gymnasium(*_repeated(text), options)
+    return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
+
+
+def _repeated(name: str) -> tuple[str, int]:
+    """gym:ID@N: the id, and for how many steps each action is held."""
+    found = re.fullmatch(r"gym:(.+)@(\d+)", name)
+    if found is None:
+        return name.partition(":")[2], 1
+    if not 1 <= int(found[2]) <= 100:
+        raise TerrellaError(f"{name}: after @ is said for how many steps each action is held, 1 to 100.")
+    return found[1], int(found[2])
+
+
+def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:
+    if env.startswith("ALE/"):
         _require("ale_py", "Atari games need ale-py", "atari")
         from .sim.atari import AtariWorld
 
-        return AtariWorld(text.partition(":")[2], **options)
-    if text.startswith("gym:"):
-        from .sim.gymnasium import GymnasiumWorld
+        return AtariWorld(env, repeat=repeat, **options)
+    from .sim.gymnasium import GymnasiumWorld
 
-        if options.get("forkable") and _over_mujoco(text.partition(":")[2]):
-            from .sim.mujoco import MujocoSnapshots
+    if options.get("forkable") and _over_mujoco(env):
+        from .sim.mujoco import MujocoSnapshots
 
-            options = {"snapshots": MujocoSnapshots, **options}
-        return GymnasiumWorld(text.partition(":")[2], **options)
-    return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
+        options = {"snapshots": MujocoSnapshots, **options}
+    return GymnasiumWorld(env, repeat=repeat, **options)
 
 
 def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:

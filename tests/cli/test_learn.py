@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from terrella.cli import main
+from terrella.cli.learn import _slowed
+from terrella.cli.named import Environment
 from terrella.cli.plan import RECORDING, SCORING, TRAINING, Plan, folder_for
 from terrella.cli.record import explore
 from terrella.core.errors import TerrellaError
@@ -103,6 +105,16 @@ def test_what_cannot_be_learned_is_said_and_leaves_nothing(given, said, tmp_path
     assert main(["learn", *given, "--out", str(tmp_path / "out")]) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("terrella: ")]
     assert said in line and not (tmp_path / "out").exists()
+
+
+def test_of_a_fast_game_every_action_is_held_so_that_it_is_played_in_real_time():
+    assert _slowed("gym:CartPole-v1", Environment()) == "gym:CartPole-v1@2"  # 50 steps a second
+    for name, environment in (
+        ("gym:Pendulum-v1", Environment()),  # 20 steps a second
+        ("gym:CartPole-v1@1", Environment()),
+        ("gym:CartPole-v1", Environment(fps=40)),
+    ):
+        assert _slowed(name, environment) == name
 
 
 def command(out: Path) -> list[str]:

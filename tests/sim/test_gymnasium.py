@@ -61,6 +61,39 @@ def test_a_batch_is_its_entries_side_by_side(name):
     assert together == State.stack(apart)
 
 
+def test_an_action_is_held_for_so_many_steps_of_the_environment():
+    world, env = terrella.load("gym:CartPole-v1@3", rgb=False), plain_env("CartPole-v1", 5)
+    once = GymnasiumWorld("CartPole-v1", rgb=False).spec
+    assert world.spec.name == "gym:CartPole-v1@3" and world.spec.dt_s == pytest.approx(3 * once.dt_s)
+    assert (once.max_episode_steps, world.spec.max_episode_steps) == (500, 167)
+    state, rng = world.start(1, make_rng(5)), make_rng(0)
+    earned = []
+    while not state["done"]:
+        state, rewards, terminated = world.imagine(state, torch.tensor([1]), rng), [], False
+        while len(rewards) < 3 and not terminated:
+            seen, reward, terminated, _, _ = env.step(1)
+            rewards.append(reward)
+        assert np.array_equal(state["observation"][0], seen) and float(state["reward"]) == sum(rewards)
+        assert bool(state["done"]) == terminated
+        earned.append(sum(rewards))
+    assert set(earned) >= {3.0}
+
+
+def test_episodes_in_processes_hold_their_actions_too():
+    world = GymnasiumWorld("CartPole-v1", rgb=False, forkable=False, repeat=2)
+    try:
+        state = world.imagine(world.start(2, make_rng(0)), torch.tensor([0, 1]), make_rng(0))
+        assert world.render(state, ("reward",))["reward"].tolist() == [2.0, 2.0]
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize("count", ["0", "999"])
+def test_an_action_that_is_held_for_no_or_endless_steps_is_refused(count):
+    with pytest.raises(TerrellaError, match="1 to 100"):
+        terrella.load(f"gym:CartPole-v1@{count}")
+
+
 def test_a_state_goes_on_in_another_instance(tmp_path):
     first, second = GymnasiumWorld("MountainCar-v0", rgb=False), GymnasiumWorld("MountainCar-v0", rgb=False)
     action = torch.tensor([2])

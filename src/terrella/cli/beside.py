@@ -50,6 +50,11 @@ def check_alike(world: Spec, real: Spec) -> None:
         raise ActionError(
             f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
         )
+    if not math.isclose(world.dt_s, real.dt_s, rel_tol=0.02):
+        raise PlanningError(
+            f"{world.name} has {1 / world.dt_s:.4g} steps a second, and {real.name} {1 / real.dt_s:.4g}: hold each action for N "
+            "steps with gym:ID@N, or say with --fps how many it has."
+        )
     for channel in world.observes:
         if channel not in real.channels:
             raise PlanningError(

@@ -34,6 +34,7 @@ SAVE_EVERY_S = 30.0
 SMALL = 64 * 96  # pixels of a picture at most, if there are fewer minutes than SOON_MIN: of more it learns too little
 SOON_MIN = 60
 FEW_FRAMES, FEWEST_FRAMES = 600, 100  # so many are recorded if half of the time allows it; fewer teach nothing
+PLAYED, STEADY = 32, 25  # steps a second that a learned world plays on two cores; to which faster ones are brought
 FEW_STEPS = 600  # after which a world has learned next to nothing
 
 
@@ -104,7 +105,12 @@ _DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for
 
 
 def _record(plan: Plan, name: str, controls: Controls, environment: Environment, report: Report) -> dict[str, object]:
-    world = controls.of(_open(name, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
+    opened = plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
+    world = controls.of(_open(opened, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
+    if opened != name:
+        say(
+            f"Each action is held for {opened.rpartition('@')[2]} steps of the game: more are not played in real time ({name}@1)."
+        )
     for line in described(world.spec):
         say(line)
     out, frames = plan.folder / RECORDING, plan.asked["frames"]
@@ -130,6 +136,18 @@ def _record(plan: Plan, name: str, controls: Controls, environment: Environment,
             "with more --minutes goes on recording."
         )
     return looked_at(dataset, world.spec.name)
+
+
+def _slowed(name: str, environment: Environment) -> str:
+    """The environment, each action held for so many of its steps (gym:ID@N) that there are some 25 a second, where there are
+    more than can be played in real time."""
+    if not name.startswith("gym:") or "@" in name or environment.fps:
+        return name
+    world = environment.open(name)
+    rate = 1 / world.spec.dt_s
+    if callable(close := getattr(world, "close", None)):
+        close()
+    return name if rate <= PLAYED else f"{name}@{max(2, round(rate / STEADY))}"
 
 
 def _open(name: str, environment: Environment, most: int) -> World:

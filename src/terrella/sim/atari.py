@@ -39,6 +39,7 @@ class AtariWorld(GymnasiumWorld):
         sticky: float = 0.0,
         noops: int = 30,
         forkable: bool | None = None,
+        repeat: int = 1,
     ):
         if not (0 <= sticky <= 1 and 1 <= frames <= 60 and noops >= 0):
             raise TerrellaError(
@@ -58,7 +59,8 @@ class AtariWorld(GymnasiumWorld):
             forkable=forkable if sticky == 0 else False,
             snapshots=_Savestates,
             info_channels=("lives",),
-            name=f"gym:{game}",
+            name=f"gym:{game}" if repeat == 1 else f"gym:{game}@{repeat}",
+            repeat=repeat,
             adapter=Adapter(action_names=names),
         )
 

@@ -84,6 +84,7 @@ class GymnasiumWorld:
     adapter:  further channels (depth, pose, more cameras) and what actions mean; by default the attribute `terrella` of
               the environment, where it has one.
     dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second, else 0.1.
+    repeat:   steps of the environment in one of the world (action repeat): each action is held for so many, rewards are added up.
     options:  handed to gymnasium.make.
 
     Channels: observation [B, *shape], reward float32 [B], done bool [B] (terminated, or truncated by the environment
@@ -104,11 +105,14 @@ class GymnasiumWorld:
         dt_s: float | None = None,
         name: str = "",
         adapter: Adapter | None = None,
+        repeat: int = 1,
         **options,
     ):
         self._lock = threading.Lock()  # one environment serves all episodes, so only one may move at a time
         self._env, found = build(env, rgb, options)
+        found = found if repeat == 1 else f"{found}@{repeat}"
         self._name, self._size, self._info = name or found, check_size(size), tuple(info_channels)
+        self._repeat = repeat
         check_space(self._env.action_space, self._name)
         drawn = rgb and self._env.render_mode == "rgb_array"
         self._parts = parts_of(self._env.observation_space, self._name, rgb, drawn)
@@ -126,6 +130,7 @@ class GymnasiumWorld:
             "dt_s": dt_s,
             "name": name,
             "adapter": adapter,
+            "repeat": repeat,
         }
         self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
         with explained(self._name, "reset"):
@@ -139,7 +144,7 @@ class GymnasiumWorld:
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
-        self.spec = replace(self.spec, max_episode_steps=limit if limit and limit > 0 else None)
+        self.spec = replace(self.spec, max_episode_steps=-(-limit // repeat) if limit and limit > 0 else None)
 
     def _copied(self, twin: gymnasium.Env, copier: Callable, must: bool) -> None:
         self._snapshots, why = _try_copying(self._env, twin, copier)
@@ -171,9 +176,15 @@ class GymnasiumWorld:
             return self._row(observation, 0.0, False, False, info)
 
     def move(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Steps the one environment: what is seen of it."""
+        """Steps the one environment, `repeat` times or until the episode ends: what is seen of it."""
         with explained(self._name, "stepped"):
-            return self._row(*self._env.step(action))
+            earned = 0.0
+            for _ in range(self._repeat):
+                seen, reward, terminated, truncated, info = self._env.step(action)
+                earned += float(reward)
+                if terminated or truncated:
+                    break
+            return self._row(seen, earned, terminated, truncated, info)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
@@ -324,7 +335,7 @@ class GymnasiumWorld:
             action=self._env.action_space,
             channels=channels,
             observes=(),
-            dt_s=dt_s or told.dt_s,
+            dt_s=(dt_s or told.dt_s) * self._repeat,
             units={name: channel.unit for name, channel in more.channels.items() if channel.unit},
             cameras=more.cameras,
             action_names=told.names,

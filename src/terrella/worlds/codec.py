@@ -172,7 +172,9 @@ class Codec(nn.Module):
         moved = moved + goes * seen.went
         along = seen.move[:, None, None, None].expand_as(scrolls)
         moved = moved.scatter(1, along, torch.logaddexp(moved.gather(1, along), scrolls))
-        beyond = self._beyond(moved.device) & seen.known  # what lies outside of the last frame is as the mosaic knows it
+        beyond = (
+            self._beyond(moved.device) & seen.known
+        )  # what lies outside of the last frame is as the mosaic knows it
         memory = torch.where(seen.known, memory, UNKNOWN)
         memory = torch.logaddexp(memory, torch.where(beyond, moved, UNKNOWN).logsumexp(1, keepdim=True))
         moved = torch.where(beyond, UNKNOWN, moved)
