@@ -24,6 +24,7 @@ from ..core.errors import CheckpointError
 from ..core.spec import Spec
 from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
 from ..space.keyframes import Keyframes
+from . import splat_folder
 from .body import Motion, MotionBody
 from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
@@ -37,6 +38,7 @@ from .objects import Objects, ObjectsConfig
 from .outcome import Constant, ConstantConfig, Outcome, OutcomeConfig
 from .parts import Absent
 from .places import KeyframeScene
+from .splat import SplatWorld
 from .uncertainty import Uncertainty, UncertaintyConfig
 
 KIND, VERSION = "learned", 3
@@ -177,14 +179,18 @@ def load_latent(path: str | Path, device: str = "cpu") -> LatentWorld:
 
 def open_world(
     path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
-) -> LearnedWorld | LatentWorld:
-    """The learned world of a folder, whatever its kind. A latent world has no keyframes to leave out, and no budget for them."""
-    if read_about(Path(path)).get("kind") != LATENT:
+) -> LearnedWorld | LatentWorld | SplatWorld:
+    """The world of a folder, whatever its kind. One that is latent or of Gaussians has no keyframes to leave out, and no budget
+    for them."""
+    about = read_about(Path(path))
+    kind = about.get("kind")
+    if kind not in (LATENT, splat_folder.KIND):
         return load_world(path, memory, device, memory_mb)
     if memory_mb is not None:
-        raise CheckpointError(
-            f"{path} is a latent world, which keeps no pictures of an episode; leave `memory_mb` out."
-        )
+        what = "latent world" if kind == LATENT else "world of Gaussians"
+        raise CheckpointError(f"{path} is a {what}, which keeps no pictures of an episode; leave `memory_mb` out.")
+    if kind == splat_folder.KIND:
+        return splat_folder.load_splat(path, about)  # it is drawn on the CPU, whatever the device
     return load_latent(path, device)
 
 

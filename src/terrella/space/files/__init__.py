@@ -1,0 +1,85 @@
+"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from ...core.errors import DatasetError
+from ..raster import Gaussians
+from ..raster.move import turned
+from . import compressed, ply, spz
+
+# Axes of a file as ours (x forward, y left, z up); "rdf" is x right, y down, z forward, as training code writes PLY.
+AXES = {
+    "rdf": [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
+    "rub": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
+    "flu": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+}
+_USUAL = {".ply": "rdf", ".spz": "rub"}
+
+
+def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
+    """The Gaussians of a .ply (plain or compressed) or .spz (versions 1 to 3); `axes`: those of the file, by default rdf for PLY
+    and rub for SPZ. What is not finite is left out. DatasetError says what is wrong with a file."""
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); give a .ply or .spz file.") from error
+    try:
+        if data[:3] == b"ply":
+            elements = ply.parse(data)
+            found = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
+            usual = "rdf"
+        elif data[:2] == b"\x1f\x8b":
+            found, usual = spz.decode(data), "rub"
+        else:
+            raise ValueError("it begins neither as PLY nor as SPZ of version 1 to 3")
+    except (ValueError, KeyError, OverflowError) as error:
+        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ 3.") from error
+    sound = torch.stack(
+        [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(found).values()]
+    )
+    sound = sound.all(0) & (found.quats.norm(dim=1) > 0)
+    if not sound.any():
+        raise DatasetError(f"{path} has no Gaussian whose numbers are finite; export it again.")
+    return turned(found.at(sound), _axes(axes or usual).T)
+
+
+def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None, kind: str = "") -> None:
+    """Writes a .ply or .spz (version 3); kind "compressed" makes the .ply SuperSplat's. The file is replaced whole."""
+    path = Path(path)
+    if path.suffix.lower() not in _USUAL:
+        raise DatasetError(f"{path}: Gaussians are written as .ply or .spz; give a name that ends so.")
+    there = turned(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
+    if path.suffix.lower() == ".spz":
+        data = spz.encode(there)
+    else:
+        data = compressed.encode(there) if kind == "compressed" else ply.encode(there)
+    replace_whole(path, lambda staged: staged.write_bytes(data))
+
+
+def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """`write` fills a neighbour of `path`, which then takes its place; DatasetError where it cannot be written."""
+    staged = path.with_name(f".{path.name}.new")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(staged)
+        os.replace(staged, path)
+    except OSError as error:
+        raise DatasetError(
+            f"{path} was not written ({error.strerror}); free some space, or choose another place."
+        ) from error
+    finally:
+        staged.unlink(missing_ok=True)
+
+
+def _axes(name: str) -> torch.Tensor:
+    if name not in AXES:
+        raise DatasetError(f"there are no axes '{name}'; they are {', '.join(AXES)}.")
+    return torch.tensor(AXES[name], dtype=torch.float32)

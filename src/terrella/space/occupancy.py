@@ -1,0 +1,123 @@
+"""Which little cubes of a place are solid, and how bodies walk and fly among them: read off its Gaussians.
+
+World frame, metres, z up. A body is an upright round column; its place is where its eye is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from .camera import rotation
+from .raster import Gaussians
+
+MOST_CELLS = 24_000_000
+SOLID = 0.3  # opacity of a Gaussian that stops bodies
+_SAMPLES = 32  # points of a Gaussian that are looked at
+_FEWEST = 6  # of them in a cube make it solid, those of a Gaussian wider than a cube counted for as many cubes
+_PARTS = 6  # short steps into which a long one is cut
+_DEEPEST_M = 8.0  # floors lower than this below the feet are not looked for
+
+
+@dataclass(frozen=True)
+class Body:
+    """radius and height of the eye above the feet; up to which height it steps onto things; headroom above the eye; all metres."""
+
+    radius_m: float = 0.25
+    eye_m: float = 1.6
+    step_m: float = 0.45
+    head_m: float = 0.15
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """solid bool [X, Y, Z] from `origin` [3] on, cubes of `cell_m`; top float32 [X, Y, Z], how high the
+    surface in a solid cube is."""
+
+    origin: torch.Tensor
+    cell_m: float
+    solid: torch.Tensor
+    top: torch.Tensor
+
+    @staticmethod
+    def of(gaussians: Gaussians, cell_m: float = 0.1) -> Occupancy:
+        """The cubes that opaque Gaussians fill, wider ones than asked where the place is very large."""
+        some = gaussians.at(gaussians.opacities > SOLID)
+        if not len(some):
+            return Occupancy(torch.zeros(3), cell_m, torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(1, 1, 1))
+        rng = torch.Generator().manual_seed(0)
+        noise = torch.randn(_SAMPLES, 3, generator=rng)
+        noise = noise * (1.2 / noise.norm(dim=1, keepdim=True).clamp_min(1.2))
+        turn = rotation(torch.cat([torch.zeros_like(some.means), some.quats], 1))
+        points = some.means[:, None] + (noise[None] * some.scales[:, None].clamp_max(1.0)) @ turn.mT
+        edges = torch.tensor([0.001, 0.999])
+        step = max(len(some) // 1_000_000, 1)
+        low, high = torch.quantile(some.means[::step], edges, dim=0)
+        low, high = low - 0.5, high + 0.5
+        cell_m = max(cell_m, float(((high - low).prod() / MOST_CELLS) ** (1 / 3)))
+        size = ((high - low) / cell_m).ceil().long().clamp_min(1)
+        points = points.flatten(0, 1)
+        at = ((points - low) / cell_m).floor().long()
+        inside = ((at >= 0) & (at < size)).all(1)
+        at, points = at[inside], points[inside]
+        flat = (at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2]
+        total = int(size.prod())
+        broad = (
+            (2.4 * some.scales.sort(1).values[:, 1:].clamp_max(1.0) / cell_m).clamp_min(1).prod(1)
+        )  # cubes that it covers
+        weight = broad.repeat_interleave(_SAMPLES)[inside]
+        count = torch.zeros(total).index_add_(0, flat, weight)
+        top = torch.zeros(total).index_add_(0, flat, weight * points[:, 2]) / count.clamp_min(1e-3)
+        shape = tuple(size.tolist())
+        return Occupancy(low, cell_m, (count >= _FEWEST).view(shape), top.view(shape))
+
+    def blocked(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+        """Whether a body at `place` [B, 3] stands in something: bool [B]. What is as low as a step does not count."""
+        angle = torch.arange(8) * (math.pi / 4)
+        ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * body.radius_m, torch.zeros(1, 2)])
+        low, high = -body.eye_m + body.step_m, body.head_m
+        levels = torch.linspace(low, high, max(2, math.ceil((high - low) / self.cell_m) + 1))
+        offset = torch.cat(
+            [ring[:, None].expand(-1, len(levels), 2), levels[None, :, None].expand(len(ring), -1, 1)], 2
+        )
+        cells, inside = self._cells(place[:, None] + offset.flatten(0, 1).to(place))
+        return (self.solid[cells] & inside).any(1)
+
+    def floor(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+        """How high the floor under a body is [B]: the highest surface up to a step above its feet, the mean of what lies around;
+        its feet where there is none."""
+        feet = place[:, 2] - body.eye_m
+        deep = math.ceil((_DEEPEST_M + body.step_m) / self.cell_m)
+        down = body.step_m - torch.arange(deep) * self.cell_m
+        near = torch.tensor([-1.0, 0.0, 1.0]) * self.cell_m
+        offset = torch.stack(torch.meshgrid(near, near, down, indexing="ij"), -1).to(place)  # [3, 3, deep, 3]
+        below = torch.stack([place[:, 0], place[:, 1], feet], 1)
+        cells, inside = self._cells(below[:, None, None, None] + offset)
+        solid = self.solid[cells] & inside
+        first = solid.int().argmax(3, keepdim=True)
+        tops = self.top[cells].gather(3, first)[..., 0]
+        level = torch.where(solid.any(3), tops, torch.nan).flatten(1)
+        middle = level.nanmedian(1, keepdim=True).values
+        near_it = torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
+        return torch.where(near_it.isnan(), feet, near_it)
+
+    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor:
+        """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever
+        stands in something already may leave it."""
+        stuck = self.blocked(place, body)
+        for _ in range(_PARTS):
+            step = wish / _PARTS
+            for axes in ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)):
+                there = place + step * step.new_tensor(axes)
+                free = stuck | ~self.blocked(there, body)
+                place = torch.where(free[:, None], there, place)
+                step = torch.where(free[:, None], step * (1 - step.new_tensor(axes)), step)
+        return place
+
+    def _cells(self, points: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
+        """Indices of the cubes in which points [..., 3] are, and whether they are in the grid."""
+        at = ((points - self.origin) / self.cell_m).floor().long()
+        size = torch.tensor(self.solid.shape)
+        return at.clamp_min(0).minimum(size - 1).unbind(-1), ((at >= 0) & (at < size)).all(-1)

@@ -1,0 +1,188 @@
+"""SplatWorld: a place of Gaussians in which one walks and flies, with floors and walls read off them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from ..core import chance
+from ..core.errors import ObservationError, TerrellaError
+from ..core.spec import POSE, POSE_UNIT, Camera, Spec
+from ..core.state import State
+from ..core.world import Observation
+from ..space.camera import Intrinsics, yaw
+from ..space.occupancy import Body, Occupancy
+from ..space.raster import Drawing, Gaussians, rasterise
+
+BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "UP", "DOWN")
+KEYS = {
+    "KeyW": "MOVE_FORWARD", "KeyS": "MOVE_BACKWARD", "KeyA": "MOVE_LEFT", "KeyD": "MOVE_RIGHT", "ArrowLeft": "TURN_LEFT",
+    "ArrowRight": "TURN_RIGHT", "ArrowUp": "MOVE_FORWARD", "ArrowDown": "MOVE_BACKWARD", "Space": "UP", "KeyC": "DOWN",
+}  # fmt: skip
+# what a button pushes: forward, left, turn to the left, up
+_PUSH = torch.tensor(
+    [[1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1]]
+).float()
+GRAVITY = 9.81  # m/s^2
+OBSERVED, INVENTED = 1, 0  # provenance of a Gaussian
+
+
+@dataclass(frozen=True)
+class SplatConfig:
+    """camera and size of its pictures; dt_s of a step; buttons, some of BUTTONS (without UP nobody flies); pace: m, m, rad and m a
+    step that each push adds (forward, sideways, turning, upward), and keep: the share of each speed that stays; body: who walks."""
+
+    camera: Intrinsics = (0.5, 0.667, 0.5, 0.5)
+    size: tuple[int, int] = (192, 256)
+    dt_s: float = 1 / 30
+    buttons: tuple[str, ...] = BUTTONS
+    pace: tuple[float, float, float, float] = (0.03, 0.025, 0.018, 0.025)
+    keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)
+    body: Body = Body()
+
+
+@final
+class SplatWorld:
+    """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
+
+    rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
+    none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
+    goes UP lifts off; who comes DOWN to the floor walks again.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        gaussians: Gaussians,
+        provenance: torch.Tensor,
+        starts: torch.Tensor,
+        config: SplatConfig | None = None,
+        card: Mapping[str, Any] | None = None,
+    ):
+        self.name, self.gaussians, self.provenance, self.starts = name, gaussians, provenance, starts
+        self.config, self.card = config or SplatConfig(), dict(card or {})
+        self.spec = self._spec()
+
+    def _spec(self) -> Spec:
+        height, width = self.config.size
+        buttons = self.config.buttons
+        return Spec(
+            name=self.name,
+            action=spaces.MultiBinary(len(buttons)),
+            channels={
+                "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+                "depth": spaces.Box(0, np.inf, (height, width), np.float32),
+                "pose": POSE,
+                "ids": spaces.Box(-1, 2**24, (height, width), np.int32),
+                "known": spaces.Box(0, 1, (height, width), np.float32),
+                "uncertainty": spaces.Box(0, 1, (), np.float32),
+            },
+            observes=("pose",),
+            dt_s=self.config.dt_s,
+            units={"depth": "m", "pose": POSE_UNIT},
+            action_names=buttons,
+            keys={k: [float(one == name) for one in buttons] for k, name in KEYS.items() if name in buttons},
+            cameras={"rgb": Camera(self.config.camera, self.config.size)},
+            card={"kind": "splat", **self.card},
+        )
+
+    @cached_property
+    def occupancy(self) -> Occupancy:
+        """What stops bodies."""
+        return Occupancy.of(self.gaussians)
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        """Poses drawn from `starts`."""
+        if batch < 1:
+            raise TerrellaError("start needs a batch of one or more.")
+        seeds = chance.seeds(batch, rng)
+        row = (chance.uniform(seeds) * len(self.starts)).long().clamp_max(len(self.starts) - 1)
+        return self._standing(self.starts[row])
+
+    def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
+        """The eye is where the evidence says; pictures change nothing of the place."""
+        if "pose" not in observation:
+            raise ObservationError(f"{self.name} observes `pose`.")
+        pose = torch.as_tensor(observation["pose"]).float()
+        if pose.ndim != 2 or pose.shape[1] != 7 or not bool(pose.isfinite().all()):
+            raise ObservationError(
+                f"{self.name} observes finite poses [B, 7]; got a tensor of shape {tuple(pose.shape)}."
+            )
+        if prior is None or prior.batch != len(pose):
+            return self._standing(pose)
+        return prior.replace(pose=pose.clone())
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        """One step on: pushed by the buttons, held up by floors, stopped by walls."""
+        action = self.spec.check_action(action, state.batch).float()
+        config, pose = self.config, state["pose"]
+        push = _PUSH[[BUTTONS.index(name) for name in config.buttons]]
+        wish = (action @ push).clamp(-1, 1)
+        speed = state["speed"] * torch.tensor(config.keep) + self._ahead(pose, wish)
+        flying = state["flying"] | (wish[:, 3] > 0)
+        level = torch.cat([speed[:, :2], (speed[:, 3] * flying)[:, None]], 1)
+        place = self.occupancy.moved(pose[:, :3], level, config.body)
+        stand = self.occupancy.floor(place, config.body) + config.body.eye_m
+        falling = torch.where(flying, 0.0, state["falling"] + GRAVITY * config.dt_s**2)
+        flying = flying & ~((wish[:, 3] < 0) & (place[:, 2] <= stand + 0.05))
+        climbed = place[:, 2] + ((stand - place[:, 2]) * 0.3).clamp_max(0.15)
+        walked = torch.where(stand >= place[:, 2] - 0.2, climbed, torch.maximum(stand, place[:, 2] - falling))
+        falling = torch.where(walked <= stand + 0.2, 0.0, falling)
+        z = torch.where(flying, place[:, 2], walked)
+        moved = place[:, :2] - pose[:, :2]
+        gone = torch.where(
+            moved.abs() < 0.5 * speed[:, :2].abs(), moved, speed[:, :2]
+        )  # a wall takes the speed into it
+        speed = torch.cat([gone, speed[:, 2:]], 1)
+        pose = torch.cat([place[:, :2], z[:, None], _yawed(pose[:, 3:], speed[:, 2])], 1)
+        return State({"pose": pose, "speed": speed, "falling": falling, "flying": flying})
+
+    def render(self, state: State, channels: Sequence[str]) -> Observation:
+        """The asked channels; of the rest only `pose` costs no drawing."""
+        self.spec.check_channels(channels)
+        if not set(channels) - {"pose"}:
+            return {name: state[name] for name in channels}
+        with torch.no_grad():
+            seen = rasterise(self.gaussians, state["pose"], self.config.camera, self.config.size)
+        return {name: self._shown(seen, state, name) for name in channels}
+
+    def _shown(self, seen: Drawing, state: State, name: str) -> torch.Tensor:
+        if name == "pose":
+            return state["pose"]
+        if name == "rgb":
+            return (seen.rgb.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+        if name == "depth":
+            return torch.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp_min(0.5), 0.0)
+        if name == "ids":
+            return seen.ids
+        origin = torch.cat([self.provenance, self.provenance.new_zeros(1)]) == OBSERVED  # the last for -1
+        known = seen.alpha.clamp(0, 1) * origin[seen.ids.long()]
+        return known if name == "known" else 1 - known.mean((1, 2))
+
+    def _standing(self, pose: torch.Tensor) -> State:
+        count = len(pose)
+        flying = torch.zeros(count, dtype=torch.bool)
+        return State(
+            {"pose": pose.clone(), "speed": torch.zeros(count, 4), "falling": torch.zeros(count), "flying": flying}
+        )
+
+    def _ahead(self, pose: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
+        """What wishes [B, 4] forward, left, turn, up add to the speeds along world x and y, of turning, and upward."""
+        heading = yaw(pose)
+        c, s = heading.cos(), heading.sin()
+        forward, left, turn, up = (wish * torch.tensor(self.config.pace)).unbind(1)
+        return torch.stack([c * forward - s * left, s * forward + c * left, turn, up], 1)
+
+
+def _yawed(quats: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Quaternions [B, 4] turned by [B] radians about the world's z, of length 1."""
+    c, s = (angle / 2).cos(), (angle / 2).sin()
+    w, x, y, z = quats.unbind(1)
+    turned = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], 1)
+    return turned / turned.norm(dim=1, keepdim=True)

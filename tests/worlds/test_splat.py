@@ -1,0 +1,70 @@
+"""SplatWorld: the laws, walking and flying; worlds from files and back, by the command line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+import terrella
+from terrella.cli import main
+from terrella.core import check_world
+from terrella.core.errors import CheckpointError
+from terrella.space.camera import planar_pose
+from terrella.space.files import read_scene, write_scene
+from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
+from terrella.worlds.splat_folder import save_splat, world_of
+
+from ..space.test_fitting import LENS, SIZE, room
+
+
+def splat() -> SplatWorld:
+    two = torch.full((2,), 2.0)
+    starts = planar_pose(two, two, torch.full((2,), 1.6), torch.tensor([0.0, 2.0]))
+    return SplatWorld("room", room(count=6000), torch.ones(6000, dtype=torch.uint8), starts, SplatConfig(LENS, SIZE))
+
+
+def test_the_laws_hold():
+    assert "a_batch_equals_its_singles" in check_world(splat(), steps=5)
+
+
+def test_one_walks_to_the_wall_flies_and_falls():
+    world, rng = splat(), terrella.make_rng(0)
+    press = lambda *names: torch.tensor([[int(one in names) for one in BUTTONS]], dtype=torch.int8)  # noqa: E731
+    state = world.observe({"pose": world.starts[:1]}, None, rng)
+    for _ in range(60):
+        state = world.imagine(state, press("MOVE_FORWARD"), rng)
+    assert 3.4 < state["pose"][0, 0] < 3.9 and abs(state["pose"][0, 2] - 1.6) < 0.2
+    for _ in range(8):
+        state = world.imagine(state, press("UP"), rng)
+    assert state["flying"] and state["pose"][0, 2] > 1.8
+    for _ in range(60):
+        state = world.imagine(state, press("DOWN"), rng)
+    assert not state["flying"] and abs(state["pose"][0, 2] - 1.6) < 0.2
+    seen = world.render(state, ("known", "uncertainty", "ids"))
+    assert seen["known"].mean() > 0.9 and seen["uncertainty"] < 0.1 and seen["ids"].max() < 6000
+
+
+def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
+    write_scene(room(), tmp_path / "room.ply")
+    assert (
+        main(["space", "import", str(tmp_path / "room.ply"), "--out", str(tmp_path / "w"), "--size", "24", "32"]) == 0
+    )
+    world = terrella.load(tmp_path / "w")
+    assert "states_are_values" in check_world(world)
+    x, y, z = world.render(world.start(1, terrella.make_rng(0)), ("pose",))["pose"][0, :3].tolist()
+    assert 0.2 < x < 3.8 and 0.2 < y < 3.8 and 1.4 < z < 1.8  # inside, on its feet
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "out.spz"), "--json"]) == 0
+    assert json.loads("{" + capsys.readouterr().out.partition("{")[2])["gaussians"] == 1500
+    assert len(read_scene(tmp_path / "out.spz")) == 1500
+    (tmp_path / "bad.ply").write_bytes(b"ply\n")
+    assert main(["space", "import", str(tmp_path / "bad.ply"), "--out", str(tmp_path / "b")]) == 2
+    assert not (tmp_path / "b").exists()
+
+
+def test_damaged_folders_are_refused(tmp_path):
+    save_splat(world_of(room(count=600), "room", {}, SplatConfig(LENS, SIZE)), tmp_path)
+    (tmp_path / "scene.safetensors").write_bytes(b"no")
+    with pytest.raises(CheckpointError, match="damaged"):
+        terrella.load(tmp_path)
