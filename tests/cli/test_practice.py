@@ -88,3 +88,10 @@ def test_nothing_is_collected_while_the_world_of_what_was_is_learned(tmp_path, m
     collected = Dataset(tmp_path / "learned" / "recording").length
     assert main(asked) == 130
     assert 150 <= collected == Dataset(tmp_path / "learned" / "recording").length < 300
+
+
+def test_the_policy_that_earned_most_is_gone_on_from() -> None:
+    earned = lambda *returns: [{"return": value} for value in returns]  # noqa: E731
+    assert practising._best(earned(-1213.0)) == 0, "the explorer's round has a policy that nobody has tried"
+    assert practising._best(earned(-100.0, -217.0)) == 0, "what the explorer earned is no policy's"
+    assert practising._best(earned(-1213.0, -217.0, -170.0, -368.0)) == 1

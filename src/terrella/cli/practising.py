@@ -1,13 +1,14 @@
 """`terrella learn --practise`: collect, learn the world, practise in it, and again, each time by the policy that came of it.
 
 Every stage goes on where it was stopped, and what is over is noted in a file, so the same command goes on from anywhere.
+A round's practice begins with the policy that has earned most so far; of that and the last, the better one is the result.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,24 +100,32 @@ def practise(
     for number in range(len(done), ROUNDS):
         say(f"Round {number + 1} of {ROUNDS}, in {out}.")
         try:
-            before = done[-1]["frames"] if done else 0
-            done.append(
-                _round(rounds, number, name, real, frames, seed) | {"return": _earned(rounds.recording, before)}
-            )
+            done.append(_round(rounds, done, name, real, frames, seed))
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(str(stop) or "stopped; the same command goes on from there.") from stop
         rounds.note(done)
         say(_line(done[-1]))
-    last = rounds.policy(ROUNDS - 1)
-    world = library.load(rounds.world(ROUNDS - 1))
-    figures = tried_out(last, world, real, TRIED, seed)
+    tried = {}
+    for number in dict.fromkeys((ROUNDS - 1, _best(done))):
+        world = library.load(rounds.world(number))
+        tried[number] = world, tried_out(rounds.policy(number), world, real, TRIED, seed)
+    number = max(tried, key=lambda number: tried[number][1]["return"].value)
+    (world, figures), policy = tried[number], rounds.policy(number)
     facts = {"verdict": verdict(figures, real), **{at: asdict(figure) for at, figure in figures.items()}}
-    where = f"the policy: {last}; the world that it practised in: {rounds.world(ROUNDS - 1)}"
+    where = f"the policy: {policy}; the world that it practised in: {rounds.world(number)}"
     lines = [facts["verdict"], *map(_line, done), *told(figures, world), where]
-    result({**facts, "rounds": done, "policy": str(last)}, json, "\n".join(lines))
+    result({**facts, "rounds": done, "policy": str(policy)}, json, "\n".join(lines))
 
 
-def _round(rounds: Rounds, number: int, name: str, real: World, frames: int, seed: int) -> dict[str, Any]:
+def _best(done: Sequence[Mapping[str, Any]]) -> int:
+    """The round whose policy earned most when it collected, which is in the round after it; the first where none has yet."""
+    return max(range(1, len(done)), key=lambda number: done[number]["return"], default=1) - 1
+
+
+def _round(
+    rounds: Rounds, done: Sequence[Mapping[str, Any]], name: str, real: World, frames: int, seed: int
+) -> dict[str, Any]:
+    number = len(done)
     if not rounds.world(
         number
     ).exists():  # else enough was collected: the world that is being learned is of those frames
@@ -129,13 +138,14 @@ def _round(rounds: Rounds, number: int, name: str, real: World, frames: int, see
             rounds.folder.name, steps=ENDLESS, hours=hours, batch=batch, seed=seed, save_every_s=SAVE_EVERY_S
         )
         train_latent(rounds.recording, rounds.world(number), config, report)
-    world = library.load(rounds.world(number))
+    world, before = library.load(rounds.world(number)), done[-1]["frames"] if done else 0
+    found = {"frames": Dataset(rounds.recording).length, "return": _earned(rounds.recording, before)}
     with progress.shown("practising") as report:
         config = Practice(minutes=rounds.seconds("practising") / 60, batch=BATCH, seed=seed, save_every_s=SAVE_EVERY_S)
         alike = number and "latent" not in seen_unless_said(world.spec)  # another world's latents mean something else
-        earlier = rounds.policy(number - 1) if alike else None
+        earlier = rounds.policy(_best([*done, found])) if alike else None
         facts = train_policy(world, name, rounds.policy(number), config, report, rounds.recording, earlier)
-    return {"frames": Dataset(rounds.recording).length, "steps": facts["step"]}
+    return {**found, "steps": facts["step"]}
 
 
 def _collect(rounds: Rounds, number: int, real: World, upto: int, seed: int, report: Callable[..., None]) -> None:

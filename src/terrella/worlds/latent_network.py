@@ -225,8 +225,8 @@ class LatentNetwork(nn.Module):
         return (self.decoder(latent) * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
 
     def expected(self, spread: torch.Tensor) -> torch.Tensor:
-        """The error [B] that is usual at this spread [B] of the ensemble, linear between the knots; at a larger spread than any that
-        was seen in proportion to the last, 1 at most."""
+        """The error [B] that is usual at this spread [B] of the ensemble, linear between the knots; at a larger spread than any
+        seen, in proportion to the last, 1 at most."""
         at = torch.searchsorted(self.spread, spread.contiguous()).clamp(1, KNOTS - 1)
         low, high = self.spread[at - 1], self.spread[at]
         share = ((spread - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
