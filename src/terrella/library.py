@@ -39,21 +39,31 @@ def load(
     remember: bool = False,
     estimator: str | Path | None = None,
     memory_mb: float | None = None,
+    randomise: str | Path | None = None,
     **options: Any,
 ) -> World:
     """Opens a world.
 
     name:    a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment
-             ("gym:CartPole-v1"), or the path of a checkpoint folder or of a training run.
+             ("gym:CartPole-v1"), a robot in MuJoCo ("mujoco:go1", "mujoco:FILE.xml"), or the path of a checkpoint folder or of
+             a training run.
     options: for a learned world what its `load` takes (memory=False, device="cuda") and fast=True (ONNX Runtime or a
              compiled graph where that is faster here: worlds/fast.py), for the game the fields of
-             DoomConfig (size=(192, 256)), for Gymnasium what GymnasiumWorld takes (with forkable=True MuJoCo's are copied, too).
+             DoomConfig (size=(192, 256)), for MuJoCo what MujocoWorld takes, for Gymnasium what GymnasiumWorld
+             takes (with forkable=True MuJoCo's are copied, too).
     remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `estimator`, a file that
              `terrella train estimator` wrote or a world that has one, gives pose and depth where the world does not (to give one
              asks to remember).
+    randomise: a TOML or JSON file of distributions, of which each episode draws (sim/randomised.py).
     memory_mb: the budget in MiB of what an episode remembers; as its world was saved, or 16.
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
+    if randomise is not None:
+        from .sim import randomised
+
+        drawn = randomised.read(randomise)
+        same: dict[str, Any] = {"remember": remember, "estimator": estimator, "memory_mb": memory_mb, **options}
+        return randomised.Randomised(load(name, **same), drawn)
     if remember or estimator is not None:
         from .space import remembering
 
@@ -72,6 +82,11 @@ def load(
         from .sim.doom import Doom, DoomConfig
 
         return Doom(DoomConfig(scenario=text.partition(":")[2] or GAME.partition(":")[2], **options))
+    if text.startswith("mujoco:"):
+        _require("mujoco", "MuJoCo's worlds need mujoco", "mujoco")
+        from .sim.mujoco_world import MujocoWorld
+
+        return MujocoWorld(text.partition(":")[2], **options)
     if text.startswith("gym:"):
         return _open_gymnasium(*_repeated(text), options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
@@ -135,7 +150,7 @@ def load_adapter(source: str) -> Adapter:
 
 def is_truth(name: str | Path) -> bool:
     """Whether the name is that of a game or an environment, not of a learned world."""
-    return str(name).partition(":")[0] in ("doom", "gym")
+    return str(name).partition(":")[0] in ("doom", "gym", "mujoco")
 
 
 def folder_of(name: str | Path) -> Path:
@@ -151,7 +166,7 @@ def folder_of(name: str | Path) -> Path:
     likest = environment or did_you_mean(text, [*bundled, GAME]) or "."
     raise TerrellaError(
         f"There is no world '{text}'{likest} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
-        "environment gym:CartPole-v1; or give the path of a checkpoint folder."
+        "environment gym:CartPole-v1, a robot mujoco:go1; or give the path of a checkpoint folder."
     )
 
 
@@ -171,6 +186,9 @@ def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
         entries.append(Entry(GAME, "game", {"what": "ViZDoom with Freedoom's art: the game that doom-maze learned"}))
     entries.append(Entry("gym:Islet-v0", "game", {"what": "a walk over an island, a small game of our own"}))
     entries.append(Entry("gym:CartPole-v1", "game", {"what": "any Gymnasium environment, by its id"}))
+    if find_spec("mujoco"):
+        what = "a quadruped; also g1, yam, ant, humanoid, hopper, reacher, or any MJCF or URDF: mujoco:FILE.xml"
+        entries.append(Entry("mujoco:go1", "game", {"what": what}))
     for folder in map(Path, folders):
         if not folder.is_dir():
             raise TerrellaError(f"{folder} is not a folder; give one that holds checkpoints (each has a world.json).")

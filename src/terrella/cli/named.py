@@ -81,17 +81,20 @@ class Environment:
         size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
         fps: Steps a second of a Gymnasium environment; default: as it says, or 10.
         adapter: A Python file (FILE.py or FILE.py:NAME) with an Adapter that says where depth, poses and more are found.
+        randomise: A TOML or JSON file of distributions, of which each episode draws masses, friction, delay and more.
     """
 
     size: tuple[int, int] | None = None
     fps: float | None = None
     adapter: str | None = None
+    randomise: str | None = None
 
     def open(self, name: str, forkable: bool = False, rgb: bool = True) -> World:
         """The world of this name, as was said. `forkable`: an environment that can be copied, or TerrellaError. `rgb`: with
         pictures."""
         from .. import library
         from ..core.errors import TerrellaError
+        from ..sim import randomised
 
         if self.fps is not None and not 0 < self.fps < 10_000:
             raise TerrellaError(
@@ -102,9 +105,19 @@ class Environment:
         options: dict[str, Any] = {"size": self.size} if self.size else {}
         options |= {"dt_s": 1 / self.fps} if self.fps else {}
         options |= {"adapter": library.load_adapter(self.adapter)} if self.adapter else {}
+        if self.randomise is not None:
+            world: World = replace(self, randomise=None).open(name, forkable, rgb)
+            return randomised.Randomised(world, randomised.read(self.randomise))
+        if name.startswith("mujoco:"):
+            if self.adapter:
+                raise TerrellaError("a MuJoCo model says itself what it shows; leave --adapter out.")
+            if "dt_s" in options:
+                options["control_s"] = options.pop("dt_s")
+            options |= {} if rgb else {"cameras": ()}
+            return library.load(name, **options)
         if options and not name.startswith("gym:"):
             raise TerrellaError(
-                "--size, --fps and --adapter are for Gymnasium environments; other worlds are as they are."
+                "--size, --fps and --adapter are for environments and MuJoCo; other worlds are as they are."
             )
         if forkable:
             options["forkable"] = True

@@ -24,6 +24,7 @@ def play(
     remember: bool = False,
     estimator: str | None = None,
     memory_mb: float | None = None,
+    randomise: Path | None = None,
     agent: str = "",
     agent_ms: float = 30.0,
     policy: Literal["explore", "random"] | None = None,
@@ -47,6 +48,7 @@ def play(
         remember: Add a spatial memory to a world that has none.
         estimator: Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one.
         memory_mb: Size limit of the spatial memory in MiB; default: as the world was saved, or 16.
+        randomise: A TOML or JSON file of distributions, of which each episode draws masses, friction, delay and more.
         agent: Who drives when the page lets it: plan, explorer, random, the folder of a learned policy, MODULE:NAME; default: a
             planner where there is a reward to plan for, else the explorer. Goals that are set on the page are always planned for.
         agent_ms: Milliseconds that a planner may take for a decision.
@@ -63,7 +65,9 @@ def play(
         raise TerrellaError("--policy and --agent both say who drives; give one of them.")
     if not agent_ms > 0:
         raise TerrellaError("--agent-ms is a time above 0.")
-    learned = load_named(name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb)
+    learned = load_named(
+        name, device, memory, fast, remember=remember, estimator=estimator, memory_mb=memory_mb, randomise=randomise
+    )
     worlds = [learned]
     picture = _first_picture(image, learned) if image is not None else None
     if compare and picture is not None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -18,9 +18,10 @@ from ...core.world import World
 from ...data import Dataset
 from ..imagination import Continued, Imagination, Recorded, check_practised, recorded_starts
 from ..objectives.actor_critic import ActorCritic, Critic, Wanted
+from ..objectives.ppo import Ppo
 from ..recording import Recording
 from ..run_folder import load_run, resume_file
-from ..trainer import Report, Run, Trainer
+from ..trainer import Objective, Report, Run, Trainer
 
 STAGE = "practice"
 UNLESS_SAID_MIN = 5.0
@@ -38,11 +39,14 @@ class Practice:
             observation.
         minutes: Minutes of practice, earlier runs included. Default: 5, unless --steps are said.
         steps: Steps of training, each on a batch of dreams.
-        batch: Dreams at a time.
-        horizon: Steps of a dream.
+        method: "ppo" makes several passes over each batch (objectives/ppo.py), "actor-critic" one (objectives/actor_critic.py).
+            Default: ppo in a simulator that steps worlds together, as mujoco: does, else actor-critic.
+        batch: Dreams at a time. Default: 256.
+        horizon: Steps of a dream. Default: 16, of ppo 24.
         discount: Of a reward a step later.
         td_lambda: Lambda, of the returns: 0 the critic's word after one step, 1 what came to the end of the dream.
-        entropy: What a nat of chance in the actions is worth, in ranges of returns.
+        entropy: What a nat of chance in the actions is worth, in ranges of returns (of ppo, in their deviations). Default: 3e-4,
+            of ppo 2e-3.
         gradients: Of axes, follow the world's own gradients where it has some. --no-gradients learns from what paid.
         trust: The world's uncertainty at which a dream ends. Default: as the world says that it invents, if it does.
         hidden: Width of the networks' layers.
@@ -54,11 +58,12 @@ class Practice:
     sees: tuple[str, ...] = ()
     minutes: float | None = None
     steps: int | None = None
-    batch: int = 256
-    horizon: int = 16
+    method: Literal["actor-critic", "ppo"] | None = None
+    batch: int | None = None
+    horizon: int | None = None
     discount: float = 0.99
     td_lambda: float = 0.95
-    entropy: float = 3e-4
+    entropy: float | None = None
     gradients: bool = True
     trust: float | None = None
     hidden: int = 128
@@ -67,11 +72,25 @@ class Practice:
     seed: int = 0
 
 
+@dataclass(frozen=True)
+class Settled(Practice):
+    """The same with what was not said: as actor-critic needs it, or PPO."""
+
+    batch: int = 256
+    horizon: int = 16
+    entropy: float = 3e-4
+
+    @staticmethod
+    def of(config: Practice, ppo: bool) -> Settled:
+        said = {name: value for name, value in asdict(config).items() if value is not None}
+        return Settled(**({"horizon": 24, "entropy": 2e-3} if ppo else {}) | said)
+
+
 def train_policy(
     world: World,
     name: str,
     out: str | Path,
-    config: Practice,
+    said: Practice,
     report: Report,
     recording: str | Path | None = None,
     before: Path | None = None,
@@ -81,8 +100,10 @@ def train_policy(
     recording: where dreams begin; without one, at the world's own starts. before: the folder of an earlier run, whose networks a
     new one begins with. ChannelError and TrainingError for what cannot be.
     """
-    _check(config)
     spec, out = world.spec, Path(out)
+    ppo = (said.method or ("ppo" if spec.card.get("together") else "actor-critic")) == "ppo"
+    config = Settled.of(said, ppo)
+    _check(config)
     check_practised(spec)
     sees = config.sees or seen_unless_said(spec)
     torch.manual_seed(config.seed)
@@ -94,14 +115,19 @@ def train_policy(
     begun = run.found(STAGE) is not None
     starts = _starts(world, config, recording, report)
     trust = config.trust if config.trust is not None else _invents(spec)
-    gradients = config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
+    gradients = not ppo and config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
     usual = starts.usual(sees)
     for network in (actor, critic):
         network.to(run.device).eyes.settle(usual)
     wanted = Wanted(config.discount, config.td_lambda, config.entropy)
-    objective = ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
+    objective: Objective = (
+        Ppo(actor, critic, wanted, config.learning_rate, starts.modules)
+        if ppo
+        else ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
+    )
     if before is not None and not begun:
-        load_run(resume_file(before, STAGE), {"actor": actor, "critic": critic, "slow": objective.slow}, {})
+        networks = {name: one for name, one in objective.modules.items() if name in ("actor", "critic", "slow")}
+        load_run(resume_file(before, STAGE), networks, {})
     feed = Imagination(world, actor, starts, config.horizon, gradients, trust)
     trainer = Trainer(run, STAGE, feed, objective, config.steps or ENDLESS)
     minutes = config.minutes or (math.inf if config.steps else UNLESS_SAID_MIN)
@@ -135,7 +161,7 @@ def device_of(world: World) -> torch.device:
     return getattr(world, "device", torch.device("cpu"))
 
 
-def _starts(world: World, config: Practice, recording: str | Path | None, report: Report) -> Recorded | Continued:
+def _starts(world: World, config: Settled, recording: str | Path | None, report: Report) -> Recorded | Continued:
     if recording is None:
         longest = LONGEST if world.spec.observes else world.spec.max_episode_steps or 1000
         return Continued(world, config.batch, max(longest, config.horizon), config.seed)
@@ -156,7 +182,7 @@ def _invents(spec: Spec) -> float | None:
     return float(level) if isinstance(level, int | float) else None
 
 
-def _card(trainer: Trainer, name: str, spec: Spec, config: Practice) -> dict[str, Any]:
+def _card(trainer: Trainer, name: str, spec: Spec, config: Settled) -> dict[str, Any]:
     steps = trainer.taken
     return {
         "what": f"A policy that practised in {spec.name}",
@@ -176,7 +202,7 @@ def _writable(out: Path) -> None:
         raise TrainingError(f"{out} cannot be written ({why}); give another --out.") from error
 
 
-def _check(config: Practice) -> None:
+def _check(config: Settled) -> None:
     counts = (config.batch, config.horizon, config.hidden, 1 if config.steps is None else config.steps)
     if any(count < 1 for count in counts) or not (config.minutes is None or config.minutes > 0):
         raise TrainingError("--batch, --horizon, --hidden and --steps are 1 or more, and --minutes is above 0.")

@@ -1,0 +1,124 @@
+"""MJCF and URDF files as MuJoCo models that can be driven and seen: what a file leaves out (servos, a floor, a camera) is added."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+if "MUJOCO_GL" not in os.environ and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ["MUJOCO_GL"] = (
+        "egl"  # which mujoco reads when it is imported: without a display its own choice cannot draw
+    )
+
+import mujoco
+import numpy as np
+
+from ..core.errors import TerrellaError
+
+SERVO_HZ, SERVO_DAMPING = (
+    3.0,
+    1.0,
+)  # natural frequency and damping ratio of the servos that a file without actuators gets
+FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
+_REACH = {True: 1.0, False: float(np.pi)}  # of a servo of a joint without limits: slides in m, hinges in rad
+
+
+def read(path: str | Path) -> mujoco.MjSpec:
+    """The MjSpec of an MJCF or URDF file. TerrellaError, one sentence, where it is missing or broken: it names element and line."""
+    path = Path(path)
+    if not path.is_file():
+        raise TerrellaError(f"there is no file {path}; give an MJCF (.xml) or a URDF (.urdf).")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, RuntimeError) as error:
+        raise TerrellaError(f"{path} cannot be read: {_sentence(error)}") from error
+
+
+def compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+    """The model of a spec; TerrellaError, one sentence, for what cannot be: it names the element, or the file that is missing."""
+    try:
+        return spec.compile()
+    except (ValueError, RuntimeError) as error:
+        raise TerrellaError(f"{name} cannot be built: {_sentence(error)}") from error
+
+
+def bare(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> mujoco.MjModel:
+    """The same model without what is only looked at, which is small and steps faster; as it is where that changes the physics."""
+    small = spec.copy()
+    small.compiler.discardvisual = True
+    try:
+        found = compiled(small, name)
+    except TerrellaError:
+        return model
+    same = found.nbody == model.nbody and found.nq == model.nq and np.allclose(found.body_mass, model.body_mass)
+    return found if same and found.nsensordata == model.nsensordata else model
+
+
+def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
+    """Adds to `spec` what it lacks: a position servo for each joint where there is no actuator at all, a floor where the world is
+    empty, a camera that sees the whole."""
+    spec.compiler.discardvisual = False  # which URDF files ask for
+    if not spec.actuators and any(joint.type not in (FREE, BALL) for joint in spec.joints):
+        add_servos(spec, compiled(spec.copy(), name))
+    if not spec.worldbody.geoms and not spec.hfields:
+        add_floor(spec)
+    if not spec.cameras:
+        _add_camera(spec, compiled(spec.copy(), name))
+    return spec
+
+
+def add_floor(spec: mujoco.MjSpec) -> None:
+    """A chequered plane at height 0, named "floor"."""
+    texture = spec.add_texture(
+        name="terrella_floor", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.25, 0.3, 0.35], rgb2=[0.4, 0.45, 0.5], width=64, height=64,
+    )  # fmt: skip
+    material = spec.add_material(name="terrella_floor", texrepeat=[1, 1], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="terrella_floor"
+    )
+    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.2, -1], castshadow=False)
+
+
+def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """A position servo for each hinge and slide, as stiff as its inertia asks for."""
+    for joint in spec.joints:
+        if joint.type in (FREE, BALL):
+            continue
+        at = model.joint(joint.name).id if joint.name else joint.id
+        inertia = max(float(model.dof_M0[model.jnt_dofadr[at]]), 1e-6)
+        stiff = inertia * (2 * np.pi * SERVO_HZ) ** 2
+        servo = spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True
+        )
+        servo.set_to_position(stiff, kv=2 * SERVO_DAMPING * float(np.sqrt(stiff * inertia)))
+        reach = _REACH[joint.type == SLIDE]
+        limited = bool(model.jnt_limited[at])
+        servo.ctrlrange = model.jnt_range[at] if limited else [-reach, reach]
+
+
+def _add_camera(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """A camera named "view" that sees the whole model, and goes along with a body that moves freely."""
+    free = next((joint.parent for joint in spec.joints if joint.type == FREE), None)
+    far = 1.6 * max(float(model.stat.extent), 0.1)
+    forward, right = np.array([-0.7, -0.55, -0.45]), np.array([-0.55, 0.7, 0.0])
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    axes = [*right, *np.cross(right, forward)]
+    if free is None:
+        camera = spec.worldbody.add_camera(name="view", pos=model.stat.center - far * forward)
+    else:
+        mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+        camera = free.add_camera(name="view", pos=-far * forward, mode=mode)
+    camera.alt.type, camera.alt.xyaxes = mujoco.mjtOrientation.mjORIENTATION_XYAXES, axes
+
+
+def _sentence(error: Exception) -> str:
+    """MuJoCo's words on one line."""
+    words = " ".join(str(error).replace("XML Error:", "").replace("Error:", "").split()).rstrip(".")
+    return f"{words or type(error).__name__}; mend the file."

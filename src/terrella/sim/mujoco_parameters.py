@@ -1,0 +1,159 @@
+"""What may differ from world to world of one MuJoCo model: masses, friction, gravity, ...; and the models that come of it."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..core.errors import TerrellaError
+from ..similar import did_you_mean
+
+Model = Any  # mujoco.MjModel
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a world. nominal: as the file has it; low, high: within which the physics stays sound; unit: "x" where it
+    multiplies what the file says. change(model, file, value) sets it in a copy of the file's model."""
+
+    nominal: float
+    low: float
+    high: float
+    unit: str
+    what: str
+    change: Callable[[Model, Model, float], None]
+    seen: bool = False  # it changes pictures alone
+
+
+def _scaled(*fields: str, low: float, high: float, what: str) -> Parameter:
+    def change(model: Model, file: Model, value: float) -> None:
+        for name in fields:
+            getattr(model, name)[:] = value * getattr(file, name)
+
+    return Parameter(1.0, low, high, "x", what, change)
+
+
+def _sliding(model: Model, file: Model, value: float) -> None:
+    """The coefficient of the floor and of whatever touches it (MuJoCo takes the larger of two)."""
+    model.geom_friction[:, 0] = value
+
+
+def _gravity(model: Model, file: Model, value: float) -> None:
+    model.opt.gravity[2] = -value
+
+
+def _gains(model: Model, file: Model, value: float) -> None:
+    """Of servos: force = kp (ctrl - q) - kv v, of which kp is scaled; of motors: their gear."""
+    servo = file.actuator_biasprm[:, 1] < 0
+    model.actuator_gainprm[:, 0] = value * file.actuator_gainprm[:, 0]
+    model.actuator_biasprm[:, 1] = np.where(servo, value, 1.0) * file.actuator_biasprm[:, 1]
+
+
+def _one_mass(at: int) -> Parameter:
+    def change(model: Model, file: Model, value: float) -> None:
+        model.body_mass[at] = value * model.body_mass[at]
+        model.body_inertia[at] = value * model.body_inertia[at]
+
+    return Parameter(1.0, 0.2, 5.0, "x", "mass and inertia of this body", change)
+
+
+def _camera(field: str, axis: int | None, reach: float, unit: str, what: str) -> Parameter:
+    def change(model: Model, file: Model, value: float) -> None:
+        if axis is None:
+            getattr(model, field)[:] = value * getattr(file, field)
+        else:
+            getattr(model, field)[:, axis] = getattr(file, field)[:, axis] + value
+
+    nominal, low, high = (1.0, 0.3, 1.8) if axis is None else (0.0, -reach, reach)
+    return Parameter(nominal, low, high, unit, what, change, True)
+
+
+def _light(model: Model, file: Model, value: float) -> None:
+    model.light_diffuse[:] = np.clip(value * file.light_diffuse, 0, 1)
+    model.vis.headlight.diffuse[:] = np.clip(value * file.vis.headlight.diffuse, 0, 1)
+    model.vis.headlight.ambient[:] = np.clip(value * file.vis.headlight.ambient, 0, 1)
+
+
+def _colour(axis: int) -> Parameter:
+    def change(model: Model, file: Model, value: float) -> None:
+        for field in ("geom_rgba", "mat_rgba"):
+            getattr(model, field)[:, axis] = np.clip(getattr(file, field)[:, axis] + value, 0, 1)
+
+    return Parameter(0.0, -1.0, 1.0, "", "added to this share of all colours", change, True)
+
+
+def parameters_of(model: Model) -> Mapping[str, Parameter]:
+    """What may be changed of a model, by name; `mass.NAME` is that of one body."""
+    gravity = -float(model.opt.gravity[2])
+    found = {
+        "mass": _scaled("body_mass", "body_inertia", low=0.3, high=3.0, what="mass and inertia of all bodies"),
+        "inertia": _scaled("body_inertia", low=0.5, high=2.0, what="inertia of all bodies, their mass as it is"),
+        "friction": Parameter(float(model.geom_friction[:, 0].max(initial=1.0)), 0.05, 3.0, "", "sliding friction", _sliding),
+        "gravity": Parameter(gravity, 0.0, 30.0, "m/s²", "downwards", _gravity),
+        "damping": _scaled("dof_damping", low=0.0, high=10.0, what="damping of the joints"),
+        "armature": _scaled("dof_armature", low=0.2, high=5.0, what="rotor inertia of the joints"),
+        "joint_friction": _scaled("dof_frictionloss", low=0.0, high=10.0, what="dry friction of the joints"),
+        "gain": Parameter(1.0, 0.3, 2.0, "x", "gain of the servos, or force of the motors", _gains),
+        "strength": _scaled("actuator_forcerange", low=0.1, high=2.0, what="limit of the actuators' forces"),
+        "camera.x": _camera("cam_pos", 0, 1.0, "m", "moved along its body's x"),
+        "camera.y": _camera("cam_pos", 1, 1.0, "m", "moved along its body's y"),
+        "camera.z": _camera("cam_pos", 2, 1.0, "m", "moved along its body's z"),
+        "camera.fov": _camera("cam_fovy", None, 0.0, "x", "field of view"),
+        "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
+        "red": _colour(0), "green": _colour(1), "blue": _colour(2),
+    }  # fmt: skip
+    bodies = {model.body(at).name: at for at in range(1, model.nbody) if model.body_mass[at] > 0}
+    return found | {f"mass.{name}": _one_mass(at) for name, at in bodies.items() if name}
+
+
+def checked(known: Mapping[str, Parameter], names: Sequence[str]) -> None:
+    """TerrellaError for names that there are not."""
+    for name in names:
+        if name not in known:
+            plain = [one for one in known if not one.startswith("mass.")]
+            likest = did_you_mean(name, known) or "."
+            raise TerrellaError(
+                f"there is no parameter '{name}'{likest} There are {', '.join(plain)}, and mass.BODY for each body."
+            )
+
+
+class Models:
+    """Models of the worlds of a batch: one for each row of values, made once and kept while it is used."""
+
+    def __init__(self, file: Model, changes: Sequence[Parameter]):
+        self.file, self.changes = file, tuple(changes)
+        self._made: OrderedDict[bytes, Model] = OrderedDict()
+        self._data = mujoco.MjData(file)
+
+    def of(self, values: np.ndarray) -> list[Model]:
+        """values: float64 [B, parameters]; the models stay as they are for as long as somebody holds them."""
+        if not self.changes:
+            return [self.file] * len(values)
+        found = []
+        for row in values:
+            key = row.tobytes()
+            model = self._made.get(key)
+            if model is None:
+                model = self._made[key] = self.changed(copy.copy(self.file), row)
+            else:
+                self._made.move_to_end(key)
+            found.append(model)
+        while len(self._made) > 2 * len(values) + 64:
+            self._made.popitem(last=False)
+        return found
+
+    def changed(self, model: Model, row: np.ndarray) -> Model:
+        """The model with the values of one world, and what MuJoCo derives from them."""
+        for change, value in zip(self.changes, row.tolist()):
+            change.change(model, self.file, value)
+        mujoco.mj_setConst(model, self._data)
+        return model

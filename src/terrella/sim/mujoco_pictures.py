@@ -1,0 +1,109 @@
+"""Pictures, depth, segmentation and poses of MuJoCo worlds: one renderer, made when the first picture is asked for."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations
+
+from __future__ import annotations
+
+import atexit
+import copy
+import math
+import os
+import sys
+import weakref
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from ..core.errors import TerrellaError
+from ..core.spec import Camera
+from .mujoco_parameters import Models, Parameter
+
+_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # left out: they cost most of the time
+HINT = "set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts, and install libegl1 or libosmesa6"
+
+
+def lens(model: mujoco.MjModel, name: str, size: tuple[int, int], pose: str) -> Camera:
+    """The pinhole of a camera of the model, for pictures of `size` (height, width)."""
+    focal = 0.5 / math.tan(math.radians(float(model.camera(name).fovy[0])) / 2)
+    return Camera((focal * size[0] / size[1], focal, 0.5, 0.5), size, pose)
+
+
+class Pictures:
+    """Draws worlds of one model. `changes` are those of its parameters that are seen, by their column."""
+
+    def __init__(self, model: mujoco.MjModel, changes: Mapping[int, Parameter], size: tuple[int, int]):
+        self.size, self._columns = size, list(changes)
+        self._models = Models(copy.copy(model), tuple(changes.values()))
+        self._model = model
+        model.vis.global_.offheight = max(size[0], int(model.vis.global_.offheight))
+        model.vis.global_.offwidth = max(size[1], int(model.vis.global_.offwidth))
+        if max(size) <= 128:
+            model.vis.quality.offsamples = 0  # small pictures are drawn three times as fast without
+        self._data = mujoco.MjData(model)
+        self._renderer: mujoco.Renderer | None = None
+
+    def put(self, physics: np.ndarray, row: np.ndarray) -> None:
+        """Stands at a world: its state, and its values of the parameters."""
+        if self._columns:
+            self._models.changed(self._model, row[self._columns])
+        mujoco.mj_setState(self._model, self._data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        for derive in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
+            derive(self._model, self._data)
+
+    def pose(self, camera: str) -> np.ndarray:
+        """x, y, z and quaternion w, x, y, z of T_world_cam: float32 [7]. MuJoCo's cameras look along -z, with y up."""
+        at = self._data.camera(camera)
+        right, up, back = at.xmat.reshape(3, 3).T
+        turn = np.empty(4)
+        mujoco.mju_mat2Quat(turn, np.stack([-back, -right, up], 1).ravel())
+        return np.concatenate([at.xpos, turn]).astype(np.float32)
+
+    def draw(self, camera: str, kind: str) -> np.ndarray:
+        """rgb: uint8 [H, W, 3]; depth: float32 [H, W], m along the optical axis; segmentation: int32 [H, W], the body or -1."""
+        renderer = self._drawer()
+        if kind == "depth":
+            renderer.enable_depth_rendering()
+        elif kind == "segmentation":
+            renderer.enable_segmentation_rendering()
+        renderer.update_scene(self._data, camera)
+        for flag in _PLAIN:
+            renderer.scene.flags[flag] = 0
+        try:
+            seen = renderer.render()
+        finally:
+            renderer.disable_depth_rendering()
+            renderer.disable_segmentation_rendering()
+        if kind != "segmentation":
+            return seen
+        geoms = np.where(seen[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), seen[..., 0], -1)
+        return np.where(geoms >= 0, self._model.geom_bodyid[geoms], -1).astype(np.int32)
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _drawer(self) -> mujoco.Renderer:
+        if self._renderer is None:
+            if _blind():
+                raise TerrellaError(f"MuJoCo cannot draw without a display: {HINT}.")
+            try:
+                self._renderer = mujoco.Renderer(self._model, *self.size)
+                atexit.register(_closed, weakref.ref(self))  # at the exit itself it is too late
+            except Exception as error:
+                first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+                raise TerrellaError(f"MuJoCo cannot draw without a display ({first}): {HINT}.") from error
+        return self._renderer
+
+
+def _blind() -> bool:
+    """Whether MuJoCo would draw with GLFW and there is no display: it was imported before anybody chose EGL."""
+    return mujoco.GLContext.__module__ == "mujoco.glfw" and sys.platform == "linux" and not os.environ.get("DISPLAY")
+
+
+def _closed(pictures: weakref.ref[Pictures]) -> None:
+    held = pictures()
+    if held is not None:
+        held.close()

@@ -1,0 +1,199 @@
+"""Robots that are ready to use: files that lie inside wheels, with servos, a pose to start from and a task."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from ..core.errors import TerrellaError
+from ..similar import did_you_mean
+from .mujoco_model import FREE, add_floor, mujoco, read
+from .mujoco_tasks import Free, Reach, Task, VelocityTracking
+
+ZOO = "mjlab/asset_zoo/robots/"
+GYMNASIUM = "gymnasium/envs/mujoco/assets/"
+_INSTALL = {  # mjlab itself pins another mujoco, and only its files are wanted
+    "mjlab": "pip install --no-deps mjlab==1.6.0",
+    "gymnasium": "pip install gymnasium",
+}
+
+
+@dataclass(frozen=True)
+class Servo:
+    """Position servos of joints. stiffness in N m/rad (N/m of slides), damping in N m s/rad, limit in N m, armature in kg m²;
+    reach: how far from the pose at rest a command may be, rad (m)."""
+
+    stiffness: float
+    damping: float
+    limit: float
+    armature: float
+    reach: float
+
+
+@dataclass(frozen=True)
+class Robot:
+    """file: inside a wheel, PACKAGE/PATH; servos: by pattern of a joint's name, the first that fits; height: of the free body at
+    rest, m; pose: of the joints at rest, by pattern; touching: geoms that collide, by pattern, all where it is ""; adds: what the
+    spec gets besides; step_s, control_s: seconds of a step of physics and of control."""
+
+    file: str
+    what: str
+    task: Task = field(default_factory=Free)
+    servos: Mapping[str, Servo] = field(default_factory=dict)
+    height: float | None = None
+    pose: Mapping[str, float] = field(default_factory=dict)
+    touching: str = ""
+    adds: Callable[[mujoco.MjSpec], None] = lambda spec: None
+    step_s: float | None = None
+    control_s: float = 0.02
+    max_steps: int | None = None
+
+    def spec(self, name: str) -> mujoco.MjSpec:
+        """The robot's file with what is added to it. TerrellaError where the wheel is not installed."""
+        spec = read(path_of(self.file, name))
+        if self.step_s is not None:
+            spec.option.timestep = self.step_s
+        if self.touching:
+            self._touch(spec)
+        if self.servos:
+            for joint in spec.joints:
+                self._drive(spec, joint)
+        if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
+            add_floor(spec)
+            if self.touching:
+                spec.geom("floor").contype, spec.geom("floor").conaffinity = 1, 0
+        self.adds(spec)
+        return spec
+
+    def rest(self, joint: str) -> float:
+        """The angle (or way) of a joint at rest."""
+        return next((value for pattern, value in self.pose.items() if re.fullmatch(pattern, joint)), 0.0)
+
+    def _touch(self, spec: mujoco.MjSpec) -> None:
+        """Only the named geoms collide, and only with the floor."""
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity = (
+                0,
+                int(bool(geom.name) and re.fullmatch(self.touching, geom.name) is not None),
+            )
+            if geom.conaffinity:
+                geom.condim, geom.priority, geom.friction = 3, 1, [0.8, 0.02, 0.01]
+
+    def _drive(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
+        servo = next((one for pattern, one in self.servos.items() if re.fullmatch(pattern, joint.name)), None)
+        if servo is None or joint.type == FREE:
+            return
+        joint.armature = servo.armature
+        made = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made.set_to_position(servo.stiffness, kv=servo.damping)
+        made.forcelimited, made.forcerange = True, [-servo.limit, servo.limit]
+        rest = self.rest(joint.name)
+        made.ctrllimited, made.ctrlrange = True, [rest - servo.reach, rest + servo.reach]
+
+
+def _feet(*sites: str) -> Callable[[mujoco.MjSpec], None]:
+    """Force sensors, in N, of the geoms that lie within these sites."""
+
+    def add(spec: mujoco.MjSpec) -> None:
+        for site in sites:
+            spec.site(site).size = [0.03] * 3  # a little larger than the foot: what touches is inside
+            spec.add_sensor(
+                name=f"foot_{site}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+            )
+
+    return add
+
+
+def _hand(site: str) -> Callable[[mujoco.MjSpec], None]:
+    def add(spec: mujoco.MjSpec) -> None:
+        spec.add_sensor(
+            name="hand", type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+        )
+
+    return add
+
+
+_LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)
+_BODY = Servo(100.0, 5.0, 88.0, 0.01, 0.6)
+ROBOTS: Mapping[str, Robot] = {
+    "go1": Robot(
+        ZOO + "unitree_go1/xmls/go1.xml",
+        "Unitree Go1, a quadruped that follows a commanded velocity",
+        VelocityTracking(),
+        {".*_calf_joint": Servo(35.0, 1.0, 35.5, 0.0091, 0.7), ".*_thigh_joint": Servo(35.0, 1.0, 23.7, 0.004, 0.7), ".*": _LEG},
+        0.29,
+        {".*R_hip_joint": 0.1, ".*L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8},
+        r".*_foot_collision|(trunk|head)_collision|.*_thigh_collision1",
+        _feet("FR", "FL", "RR", "RL"),
+        0.005,
+        max_steps=1000,
+    ),
+    "g1": Robot(
+        ZOO + "unitree_g1/xmls/g1.xml",
+        "Unitree G1, a humanoid that follows a commanded velocity",
+        VelocityTracking(forward=(0.2, 0.8)),
+        {
+            ".*(hip|knee).*": Servo(100.0, 5.0, 88.0, 0.01, 0.7),
+            ".*ankle.*": Servo(40.0, 2.0, 50.0, 0.007, 0.5),
+            ".*waist.*": _BODY,
+            ".*": Servo(20.0, 1.5, 25.0, 0.0036, 0.7),
+        },
+        0.76,
+        {
+            ".*_hip_pitch_joint": -0.312, ".*_knee_joint": 0.669, ".*_ankle_pitch_joint": -0.363, ".*_elbow_joint": 0.6,
+            "left_shoulder_roll_joint": 0.2, ".*_shoulder_pitch_joint": 0.2, "right_shoulder_roll_joint": -0.2,
+        },
+        r".*foot\d_collision|.*(torso|pelvis|head).*collision",
+        step_s=0.005,
+        max_steps=1000,
+    ),
+    "yam": Robot(
+        ZOO + "i2rt_yam/xmls/yam.xml",
+        "I2RT YAM, an arm with a gripper that reaches for a point",
+        Reach(),
+        {
+            "joint[123]": Servo(40.0, 8.0, 28.0, 0.032, 1.5),
+            "joint[456]": Servo(5.0, 0.6, 10.0, 0.0018, 1.5),
+            "left_finger": Servo(110.0, 35.0, 30.0, 2.6, 0.018),
+        },
+        pose={"joint2": 1.047, "joint3": 1.05, "joint4": -0.9, "left_finger": 0.018, "right_finger": -0.018},
+        adds=_hand("grasp_site"),
+        max_steps=200,
+    ),
+    "ant": Robot(
+        GYMNASIUM + "ant.xml", "Gymnasium's ant, four legs with motors", VelocityTracking(fallen=(1.5, 0.35)), max_steps=1000
+    ),
+    "humanoid": Robot(
+        GYMNASIUM + "humanoid.xml", "Gymnasium's humanoid, with motors", VelocityTracking(fallen=(1.2, 0.6)), max_steps=1000
+    ),
+    "hopper": Robot(GYMNASIUM + "hopper.xml", "Gymnasium's hopper, one leg in a plane"),
+    "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),
+}  # fmt: skip
+
+
+def path_of(file: str, name: str) -> Path:
+    """Where a file of a wheel lies, without importing the package. TerrellaError that tells how to install it."""
+    package, _, inside = file.partition("/")
+    found = find_spec(package)
+    if found is None or not found.submodule_search_locations:
+        raise TerrellaError(f"the robot '{name}' lies in the package {package}: {_INSTALL[package]}.")
+    path = Path(next(iter(found.submodule_search_locations))) / inside
+    if not path.is_file():
+        raise TerrellaError(f"the installed {package} has no {inside}; {_INSTALL[package]}.")
+    return path
+
+
+def robot_of(name: str) -> Robot:
+    """A ready robot by its name; TerrellaError where there is none."""
+    if name not in ROBOTS:
+        likest = did_you_mean(name, ROBOTS) or "."
+        raise TerrellaError(
+            f"there is no robot '{name}'{likest} There are {', '.join(ROBOTS)}, or give a file: mujoco:FILE.xml."
+        )
+    return ROBOTS[name]

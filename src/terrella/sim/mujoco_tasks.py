@@ -1,0 +1,207 @@
+"""What is wanted of a MuJoCo robot: reward, the end of an episode and what a policy sees, for whole batches at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from ..core import chance
+
+Tensors = Mapping[str, torch.Tensor]
+_START, _GOAL = 1, 2  # streams of chance
+
+
+@dataclass(frozen=True)
+class Body:
+    """What a task knows of the robot. qpos, qvel: slices of the state's columns; home: qpos [nq] and ctrl [nu] at rest; low, high:
+    [nu] of the controls; sensors: name -> slice of the sensors' columns; step_s: seconds of a control step."""
+
+    qpos: slice
+    qvel: slice
+    home: torch.Tensor
+    rest: torch.Tensor
+    low: torch.Tensor
+    high: torch.Tensor
+    sensors: Mapping[str, slice]
+    step_s: float
+
+
+class Task(Protocol):
+    """`begin` changes the starts [B, nq], [B, nv] and gives tensors of its own for the state; `judge` gives reward [B], fallen bool
+    [B] and its tensors after a step; `channels` says what `see` shows."""
+
+    rewards: bool
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]: ...
+    def begin(
+        self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> dict[str, torch.Tensor]: ...
+    def judge(
+        self, body: Body, before: Tensors, after: Tensors
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]: ...
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor: ...
+
+
+class Free:
+    """Nothing is wanted: the robot is as its file says, and its observation is all of its state."""
+
+    rewards = False
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        width = (
+            len(body.home) + body.qvel.stop - body.qvel.start + sum(at.stop - at.start for at in body.sensors.values())
+        )
+        return {"observation": (numbers(width), "")}
+
+    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {}
+
+    def judge(
+        self, body: Body, before: Tensors, after: Tensors
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        batch = len(after["physics"])
+        return torch.zeros(batch), torch.zeros(batch, dtype=torch.bool), {}
+
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+        physics = state["physics"]
+        return torch.cat([physics[:, body.qpos], physics[:, body.qvel], state["sensors"]], 1).float()
+
+
+@dataclass(frozen=True)
+class VelocityTracking:
+    """A body that moves freely follows a commanded velocity (Rudin et al. 2021, "Learning to walk in minutes"): `command` is
+    forward and sideways in m/s and turning in rad/s, in the body's frame, drawn evenly within the limits when an episode begins.
+
+    fallen: tilt of the body in rad, and share of its height at rest, at which the episode is over. noise: of the joints at first.
+    """
+
+    rewards = True
+    forward: tuple[float, float] = (0.3, 1.0)
+    sideways: tuple[float, float] = (0.0, 0.0)
+    turning: tuple[float, float] = (-0.5, 0.5)
+    fallen: tuple[float, float] = (1.0, 0.55)
+    noise: float = 0.1
+    weights: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "alive": 0.4, "velocity": 1.5, "slow": 0.5, "turning": 0.75, "bounce": 0.5, "roll": 0.02, "tilt": 1.0, "jerk": 0.03,
+            "pose": 0.05,
+        }
+    )  # fmt: skip
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        return {
+            "observation": (
+                numbers(12 + len(body.home) - 7 + body.qvel.stop - body.qvel.start - 6 + len(body.rest)),
+                "",
+            ),
+            "command": (numbers(3), "m/s, m/s, rad/s"),
+            "velocity": (numbers(3), "m/s, m/s, rad/s"),
+        }
+
+    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+        joints = qpos.shape[1] - 7
+        drawn = 2 * chance.uniform(seeds, (joints + qvel.shape[1] + 1,), _START).double() - 1
+        qpos[:, 7:] += self.noise * drawn[:, :joints]
+        qvel += self.noise * drawn[:, joints:-1]
+        half = torch.pi / 2 * drawn[:, -1]
+        turned = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
+        qpos[:, 3:7] = multiplied(turned, qpos[:, 3:7])
+        limits = torch.tensor([self.forward, self.sideways, self.turning])
+        command = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * chance.uniform(seeds, (3,), _GOAL)
+        return {"command": command}
+
+    def judge(
+        self, body: Body, before: Tensors, after: Tensors
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        physics, command, weights = after["physics"], after["command"], self.weights
+        qpos, (velocity, spin, up) = physics[:, body.qpos], motion(body, physics)
+        missed = (velocity[:, :2] - command[:, :2]).square().sum(1)
+        turned = (spin[:, 2] - command[:, 2]).square()
+        span = (body.high - body.low) / 2
+        jerk = ((after["ctrl"] - before["ctrl"]) / span).square().sum(1)
+        reward = (
+            weights["alive"] + weights["velocity"] * torch.exp(-missed / 0.25) - weights["slow"] * missed.sqrt()
+            + weights["turning"] * torch.exp(-turned / 0.25)
+            - weights["bounce"] * velocity[:, 2].square() - weights["roll"] * spin[:, :2].square().sum(1)
+            - weights["tilt"] * up[:, :2].square().sum(1) - weights["jerk"] * jerk
+            - weights["pose"] * (qpos[:, 7:] - body.home[7:]).square().sum(1)
+        )  # fmt: skip
+        tilt, height = self.fallen
+        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * body.home[2])
+        return reward.clamp_min(0.0).float(), fallen, {"command": command}
+
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+        if name == "command":
+            return state["command"]
+        velocity, spin, up = motion(body, state["physics"])
+        if name == "velocity":
+            return torch.cat([velocity[:, :2], spin[:, 2:]], 1).float()
+        qpos, qvel = state["physics"][:, body.qpos], state["physics"][:, body.qvel]
+        meant = (state["ctrl"] - body.rest) / ((body.high - body.low) / 2)
+        away = qpos[:, 7:] - body.home[7:]
+        return torch.cat([velocity, spin, up, state["command"], away, 0.1 * qvel[:, 6:], meant], 1).float()
+
+
+@dataclass(frozen=True)
+class Reach:
+    """A hand goes to a point, drawn evenly in a box in front of the arm when an episode begins; reward: minus the distance in m."""
+
+    rewards = True
+    hand: str = "hand"
+    low: tuple[float, float, float] = (0.2, -0.2, 0.1)
+    high: tuple[float, float, float] = (0.45, 0.2, 0.4)
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        width = len(body.home) + body.qvel.stop - body.qvel.start + 6
+        return {"observation": (numbers(width), ""), "goal": (numbers(3), "m"), "hand": (numbers(3), "m")}
+
+    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+        low, high = torch.tensor(self.low), torch.tensor(self.high)
+        return {"goal": low + (high - low) * chance.uniform(seeds, (3,), _GOAL)}
+
+    def judge(
+        self, body: Body, before: Tensors, after: Tensors
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        away = (after["sensors"][:, body.sensors[self.hand]] - after["goal"]).norm(dim=1)
+        return -away.float(), torch.zeros(len(away), dtype=torch.bool), {"goal": after["goal"]}
+
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+        hand = state["sensors"][:, body.sensors[self.hand]]
+        if name != "observation":
+            return state["goal"] if name == "goal" else hand.float()
+        physics, goal = state["physics"], state["goal"]
+        return torch.cat([physics[:, body.qpos], physics[:, body.qvel], goal, hand - goal], 1).float()
+
+
+def motion(body: Body, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Velocity in m/s, spin in rad/s and the direction of up, each [B, 3] in the frame of the body that moves freely."""
+    turn, velocity = physics[:, body.qpos][:, 3:7], physics[:, body.qvel]
+    up = torch.zeros_like(velocity[:, :3])
+    up[:, 2] = 1
+    back = turn * torch.tensor([1.0, -1, -1, -1], dtype=turn.dtype)
+    return rotated(back, velocity[:, :3]), velocity[:, 3:6], rotated(back, up)
+
+
+def rotated(turn: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """[B, 3] vectors turned by quaternions w, x, y, z [B, 4]."""
+    w, axis = turn[:, :1], turn[:, 1:]
+    twice = 2 * torch.linalg.cross(axis, vector)
+    return vector + w * twice + torch.linalg.cross(axis, twice)
+
+
+def multiplied(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """The turn `other`, then `one`: quaternions w, x, y, z [B, 4]."""
+    w = one[:, :1] * other[:, :1] - (one[:, 1:] * other[:, 1:]).sum(1, keepdim=True)
+    axis = one[:, :1] * other[:, 1:] + other[:, :1] * one[:, 1:] + torch.linalg.cross(one[:, 1:], other[:, 1:])
+    return torch.cat([w, axis], 1)
+
+
+def numbers(*shape: int) -> spaces.Box:
+    """A space of float32 numbers without limits."""
+    limit: Any = np.inf
+    return spaces.Box(-limit, limit, shape, np.float32)

@@ -1,0 +1,340 @@
+"""MujocoWorld: thousands of worlds of one MuJoCo model in one State, stepped together by `mujoco.rollout` on threads of the CPU."""
+
+# pyright: reportAttributeAccessIssue=false
+# mujoco is a compiled module without declarations
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import warnings
+from collections.abc import Mapping, Sequence
+from copy import copy
+from pathlib import Path
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from ..core import chance
+from ..core.errors import ObservationError, TerrellaError
+from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
+from ..core.state import State
+from .mujoco_model import BALL, FREE, SLIDE, bare, compiled, complete, mujoco, read
+from .mujoco_parameters import checked, parameters_of
+from .mujoco_pictures import Pictures, lens
+from .mujoco_robots import Robot, robot_of
+from .mujoco_stepping import Stepper
+from .mujoco_tasks import Body, Free, Task, numbers
+
+FILES = (".xml", ".mjcf", ".urdf")
+FASTEST = 1e4  # m/s or rad/s: a world that moves faster is unstable
+MOST_DUMPS = 8
+DRAWN = ("rgb", "depth", "segmentation")
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+class MujocoWorld:
+    """`MujocoWorld("go1")`, a robot that is ready to use (sim/mujoco_robots.py), or `MujocoWorld("FILE.xml")`, an MJCF or URDF.
+
+    task:       what is wanted (sim/mujoco_tasks.py); default: the robot's own, of a file nothing.
+    control_s:  seconds of a control step, of which physics takes as many of its own as fit.
+    size:       (height, width) of pictures.
+    cameras:    names of cameras of the model, the first is `rgb`, others `rgb.NAME`; default: the first that there is; () for none.
+    depth, segmentation: show these beside each rgb.
+    threads:    that step worlds; default: as many as there are processors for this process.
+    parameters: names of `parameters_of` that each world has values of its own of: `state["parameters"]` [B, n].
+    dumps:      folder for states that led to an unstable simulation; default: terrella-unstable in the folder of temporary files.
+
+    Actions are the actuators' controls, in their units. Channels: observation, qpos, qvel, sensor.NAME for each sensor, contacts
+    (N on each body, of the normal forces on it), reward, done, those of the task, and of each camera rgb, pose and what is asked
+    for. After `done` a world stands still with reward 0. Chance comes from `rng` at `start` alone.
+    State (tensors of rows): physics [B, n] float64 is MuJoCo's full physics state, time first, then qpos, qvel, act; warmstart
+    [B, nv] of the solver; ctrl [B, nu] of the last step; sensors; done; reward; what the task keeps.
+    TerrellaError, a sentence, for files that are missing or broken. Where a simulation is unstable, that world ends, a
+    warning says so, and the state before is saved with its action: imagine(state, state["action"], rng) repeats it.
+    """
+
+    def __init__(
+        self,
+        name: str | Path | Robot,
+        *,
+        task: Task | None = None,
+        control_s: float | None = None,
+        size: tuple[int, int] = (96, 128),
+        cameras: Sequence[str] | None = None,
+        depth: bool = False,
+        segmentation: bool = False,
+        threads: int | None = None,
+        parameters: Sequence[str] = (),
+        dumps: str | Path | None = None,
+    ):
+        label = name.file if isinstance(name, Robot) else str(name)
+        robot = name if isinstance(name, Robot) else None if label.endswith(FILES) else robot_of(label)
+        spec = complete(read(label) if robot is None else robot.spec(label), label)
+        self._seen = compiled(spec, label)
+        self.file = bare(spec, self._seen, label)
+        self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it would begin anew in silence
+        self.name = f"mujoco:{label}"
+        self._steps = max(1, round((control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
+        self._threads = (
+            threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        )
+        self._dumps, self._dumped = Path(dumps or Path(tempfile.gettempdir()) / "terrella-unstable"), 0
+        self._home = _home(self.file, robot)
+        self.task: Task = task or (robot.task if robot else Free())
+        self.body = _body(self.file, self._home, self._steps)
+        self._cameras = _cameras(self._seen, cameras)
+        self._kinds = ("rgb", *(kind for kind, asked in (("depth", depth), ("segmentation", segmentation)) if asked))
+        self._size, self._limit = (int(size[0]), int(size[1])), robot.max_steps if robot else None
+        self.parameters = parameters_of(self._seen)
+        self._what = robot.what if robot else f"the model {Path(label).name}"
+        self._lock = threading.Lock()
+        self._vary(tuple(parameters))
+
+    def _vary(self, names: Sequence[str]) -> None:
+        """Lets worlds differ by these parameters, and makes what steps and draws them."""
+        checked(self.parameters, names)
+        self.varied, changes = tuple(names), [self.parameters[name] for name in names]
+        seen = {at: one for at, one in enumerate(changes) if one.seen}
+        self._stepper = Stepper(self.file, {at: one for at, one in enumerate(changes) if not one.seen}, self._threads)
+        self._pictures = Pictures(copy(self._seen), seen, self._size)
+        self.spec = self._describe()
+
+    def varying(self, names: Sequence[str]) -> MujocoWorld:
+        """The same world, in which these parameters differ from world to world: see `adjusted`."""
+        other = copy(self)
+        other._lock, other._dumped = threading.Lock(), 0
+        other._vary(tuple(names))
+        return other
+
+    def adjusted(self, state: State, values: torch.Tensor) -> State:
+        """The state with values [B, n] of the parameters that vary. TerrellaError for values that are not safe."""
+        for at, name in enumerate(self.varied):
+            one, column = self.parameters[name], values[:, at]
+            if not ((column >= one.low) & (column <= one.high)).all():
+                raise TerrellaError(
+                    f"the parameter '{name}' of {self.name} stays within {one.low:g} to {one.high:g} {one.unit}; got "
+                    f"{float(column.min()):g} to {float(column.max()):g}."
+                )
+        return state.replace(parameters=values.double())
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        """`batch` worlds at rest, changed as the task has it."""
+        if batch < 1:
+            raise TerrellaError("start needs a batch of one or more.")
+        body, seeds = self.body, chance.seeds(batch, rng)
+        physics = torch.zeros(batch, mujoco.mj_stateSize(self.file, _FULL), dtype=torch.float64)
+        qpos, qvel = body.home.repeat(batch, 1), torch.zeros(batch, self.file.nv, dtype=torch.float64)
+        kept = self.task.begin(body, seeds, qpos, qvel)
+        physics[:, body.qpos], physics[:, body.qvel] = qpos, qvel
+        ctrl = body.rest.repeat(batch, 1)
+        nominal = torch.tensor([self.parameters[name].nominal for name in self.varied], dtype=torch.float64)
+        values = nominal.repeat(batch, 1)
+        none = torch.zeros(batch, self.file.nv, dtype=torch.float64)
+        _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # what is sensed before the first step
+        held = {"physics": physics, "warmstart": none, "ctrl": ctrl, "sensors": sensors, **kept}
+        held |= {"parameters": values} if self.varied else {}
+        return State({**held, "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool)})
+
+    def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
+        """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
+        if observation:
+            raise ObservationError(f"{self.name} is a simulator and takes no evidence; pass an empty mapping.")
+        return prior if prior is not None else self.start(1, rng)
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        """One control step of all worlds that are not done."""
+        if "physics" not in state or state["physics"].shape[1] != mujoco.mj_stateSize(self.file, _FULL):
+            raise TerrellaError(f"this is not a state of {self.name}: {state}.")
+        ctrl = self.spec.check_action(action, state.batch).double()
+        done = state["done"]
+        if done.all():
+            return state.replace(reward=torch.zeros(state.batch))
+        if done.any():
+            live = (~done).nonzero()[:, 0]
+            return state.replace(reward=torch.zeros(state.batch)).put(live, self._moved(state.at(live), ctrl[live]))
+        return self._moved(state, ctrl)
+
+    def _moved(self, state: State, ctrl: torch.Tensor) -> State:
+        values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
+        with self._lock:
+            moved = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
+        physics, sensors, warmstart = moved
+        wild = ~(physics.isfinite().all(1) & (physics[:, self.body.qvel].abs() < FASTEST).all(1))
+        if wild.any():
+            self._dump(state.at(wild.nonzero()[:, 0]), ctrl[wild])
+            keep = {"physics": state["physics"], "sensors": state["sensors"], "warmstart": state["warmstart"]}
+            physics, sensors, warmstart = (
+                torch.where(wild[:, None], keep[name], one) for name, one in zip(keep, (physics, sensors, warmstart))
+            )
+        after = {"physics": physics, "sensors": sensors, "warmstart": warmstart, "ctrl": ctrl}
+        reward, fallen, kept = self.task.judge(self.body, state, {**dict(state.items()), **after})
+        return state.replace(**after, **kept, reward=reward.masked_fill(wild, 0.0), done=fallen | wild)
+
+    def _dump(self, state: State, ctrl: torch.Tensor) -> None:
+        """Saves the states before a simulation became unstable, with the actions; says so."""
+        self._dumped += 1
+        if self._dumped > MOST_DUMPS:
+            return
+        self._dumps.mkdir(parents=True, exist_ok=True)
+        stem = "".join(letter if letter.isalnum() else "-" for letter in self.name)
+        file = self._dumps / f"{stem}-{os.getpid()}-{self._dumped}.safetensors"
+        state.replace(action=ctrl.float()).save(file)
+        warnings.warn(
+            f"{state.batch} worlds of {self.name} became unstable at {float(state['physics'][0, 0]):.2f} s and have ended; the "
+            f"states before and their actions are in {file}: make the timestep smaller or servos weaker.",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+    def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
+        self.spec.check_channels(channels)
+        drawn = [name for name in channels if kind_of(name) in (*DRAWN, "pose", "contacts")]
+        found = self._drawn(state, drawn) if drawn else {}
+        return {name: found[name] if name in found else self._read(state, name) for name in channels}
+
+    def close(self) -> None:
+        self._pictures.close()
+        self._stepper.close()
+
+    def _read(self, state: State, name: str) -> torch.Tensor:
+        if name in ("reward", "done"):
+            return state[name]
+        if name in ("qpos", "qvel"):
+            return state["physics"][:, getattr(self.body, name)].float()
+        if kind_of(name) == "sensor":
+            return state["sensors"][:, self.body.sensors[suffix_of(name)]].float()
+        return self.task.see(self.body, state, name)
+
+    def _drawn(self, state: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
+        """What is worked out world by world: pictures, poses, contacts."""
+        found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
+        values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
+        looked = any(kind_of(name) != "contacts" for name in names)
+        with self._lock:
+            for row, control, value in zip(physics, ctrl, values):
+                if looked:
+                    self._pictures.put(row, value)
+                for name in names:
+                    kind, camera = kind_of(name), suffix_of(name) or (self._cameras or [""])[0]
+                    if kind == "contacts":
+                        found[name].append(self._stepper.contacts(row, control, value))
+                    else:
+                        found[name].append(
+                            self._pictures.pose(camera) if kind == "pose" else self._pictures.draw(camera, kind)
+                        )
+        return {name: torch.from_numpy(np.stack(rows)) for name, rows in found.items()}
+
+    def _describe(self) -> Spec:
+        model, body = self.file, self.body
+        suffix = {camera: f".{camera}" if at else "" for at, camera in enumerate(self._cameras)}
+        height, width = self._size
+        spaces_of = {
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": spaces.Box(0, np.inf, (height, width), np.float32),
+            "segmentation": spaces.Box(-1, model.nbody, (height, width), np.int32),
+        }
+        told = self.task.channels(body)
+        channels = {name: space for name, (space, _) in told.items()}
+        units = {name: unit for name, (_, unit) in told.items() if unit}
+        channels |= {"qpos": numbers(model.nq), "qvel": numbers(model.nv)}
+        channels |= {f"sensor.{name}": numbers(at.stop - at.start) for name, at in body.sensors.items()}
+        channels |= {"contacts": numbers(model.nbody), "done": DONE}
+        channels |= {"reward": REWARD} if self.task.rewards else {}
+        for end in suffix.values():
+            channels |= {f"{kind}{end}": spaces_of[kind] for kind in self._kinds} | {f"pose{end}": POSE}
+            units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
+        return Spec(
+            name=self.name,
+            action=spaces.Box(body.low.numpy().astype(np.float32), body.high.numpy().astype(np.float32), dtype=np.float32),
+            channels=channels,
+            observes=(),
+            dt_s=self._steps * float(model.opt.timestep),
+            units=units | {"contacts": "N"},
+            action_names=tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
+            action_units=tuple(_unit(model, at) for at in range(model.nu)),
+            action_mode=_mode(model),
+            cameras={f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()},
+            max_episode_steps=self._limit,
+            card={
+                "what": self._what, "kind": "simulator", "physics": _told(model, self._steps), "varied": list(self.varied),
+                "together": True,
+            },
+            idle=tuple(body.rest.float().tolist()),
+        )  # fmt: skip
+
+
+def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.ndarray]:
+    """qpos [nq] and ctrl [nu] at rest: the robot's pose, the file's first keyframe, or as it is built."""
+    qpos, ctrl = (model.key_qpos[0], model.key_ctrl[0]) if model.nkey else (model.qpos0, np.zeros(model.nu))
+    qpos, ctrl = qpos.copy(), ctrl.copy()
+    if robot is not None and robot.pose:
+        for at in range(model.njnt):
+            if model.jnt_type[at] not in (int(FREE), int(BALL)):
+                qpos[model.jnt_qposadr[at]] = robot.rest(model.joint(at).name)
+    if robot is not None and robot.height is not None:
+        qpos[2] = robot.height
+    servo = (model.actuator_biasprm[:, 1] < 0) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
+    for at in np.flatnonzero(servo):
+        if not model.nkey:
+            ctrl[at] = qpos[model.jnt_qposadr[model.actuator_trnid[at, 0]]]
+    return qpos, ctrl
+
+
+def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> Body:
+    limited = model.actuator_ctrllimited.astype(bool)
+    low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
+    high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
+    rest = np.clip(home[1], low, high)
+    ends = 1 + model.nq, 1 + model.nq + model.nv
+    sensors = {
+        model.sensor(at).name or f"sensor{at + 1}": slice(
+            int(model.sensor_adr[at]), int(model.sensor_adr[at] + model.sensor_dim[at])
+        )
+        for at in range(model.nsensor)
+    }
+    plain = (torch.from_numpy(np.asarray(part, np.float64)) for part in (home[0], rest, low, high))
+    at_home, at_rest, lowest, highest = plain
+    return Body(
+        slice(1, ends[0]), slice(*ends), at_home, at_rest, lowest, highest, sensors, steps * float(model.opt.timestep)
+    )
+
+
+def _cameras(model: mujoco.MjModel, asked: Sequence[str] | None) -> list[str]:
+    known = [model.camera(at).name for at in range(model.ncam) if model.camera(at).name]
+    strangers = sorted(set(asked or ()) - set(known))
+    if strangers:
+        raise TerrellaError(f"there is no camera {', '.join(strangers)}; there are {', '.join(known)}.")
+    return known[:1] if asked is None else list(asked)
+
+
+def _unit(model: mujoco.MjModel, at: int) -> str:
+    """Of a control: rad, rad/s or N m of hinges, m, m/s or N of slides; "" of what has no unit of its own."""
+    joint = model.actuator_trnid[at, 0]
+    if model.actuator_trntype[at] != int(mujoco.mjtTrn.mjTRN_JOINT):
+        return ""
+    slides = model.jnt_type[joint] == int(SLIDE)
+    position, velocity = model.actuator_biasprm[at, 1] < 0, model.actuator_biasprm[at, 2] < 0
+    if position or velocity:
+        return ("m" if slides else "rad") + ("" if position else "/s")
+    gear = abs(float(model.actuator_gear[at, 0] * model.actuator_gainprm[at, 0]))
+    force = "N" if slides else "N m"
+    return force if gear == 1 else f"{gear:g} {force}"
+
+
+def _mode(model: mujoco.MjModel) -> str:
+    servo = model.actuator_biasprm[:, 1] < 0
+    if model.nu and servo.all():
+        return "position"
+    return "axes" if servo.any() or (model.actuator_biasprm[:, 2] < 0).any() else "torque"
+
+
+def _told(model: mujoco.MjModel, steps: int) -> str:
+    """What a figure of speed means: step, decimation, integrator, solver, cone."""
+    integrator = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    solver, cone = mujoco.mjtSolver(model.opt.solver).name, mujoco.mjtCone(model.opt.cone).name
+    kinds = f"{integrator}, {solver.removeprefix('mjSOL_')}, {cone.removeprefix('mjCONE_')} cone"
+    return f"steps of {1e3 * model.opt.timestep:g} ms, {steps} a control step, {kinds}".lower()

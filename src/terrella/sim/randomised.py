@@ -1,0 +1,237 @@
+"""Randomised: a World around a World, in which every episode draws what the world is like: masses, friction, delay, light, ..."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from ..core import chance
+from ..core.errors import TerrellaError
+from ..core.spec import Spec, dtype_of, kind_of, neutral_action
+from ..core.state import State
+from ..core.world import World
+from ..similar import did_you_mean
+
+PARAMETERS = "parameters"  # the channel of what an episode drew
+DELAY, NOISE, MOST_DELAY = "delay", "noise.", 50
+_HELD, _SEEDS = "randomised.", "randomised.seeds"
+_DRAW, _SENSED = 101, 131  # streams of chance
+KINDS = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0, "constant": 1}
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """kind and its numbers: uniform low, high; loguniform low, high; normal mean, deviation (cut at three of them); choice of
+    these; constant."""
+
+    kind: str
+    numbers: tuple[float, ...]
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Between which all draws lie."""
+        if self.kind == "normal":
+            mean, deviation = self.numbers
+            return mean - 3 * deviation, mean + 3 * deviation
+        return min(self.numbers), max(self.numbers)
+
+    def draw(self, seeds: torch.Tensor, stream: int) -> torch.Tensor:
+        """float64 [B], one for each seed."""
+        low, high = self.limits
+        if self.kind == "normal":
+            mean, deviation = self.numbers
+            return (mean + deviation * chance.normal(seeds, (), stream).double()).clamp(low, high)
+        even = chance.uniform(seeds, (), stream).double()
+        if self.kind == "choice":
+            return torch.tensor(self.numbers, dtype=torch.float64)[(even * len(self.numbers)).long()]
+        if self.kind == "loguniform":
+            return (math.log(low) + (math.log(high) - math.log(low)) * even).exp()
+        return low + (high - low) * even
+
+
+def read(file: str | Path) -> dict[str, Distribution]:
+    """The distributions that a TOML or JSON file declares, as in
+
+        friction = {uniform = [0.4, 1.25]}
+        "mass.trunk" = {uniform = [0.8, 1.3]}
+        delay = {choice = [0, 1, 2]}
+        "noise.observation" = {constant = 0.02}
+
+    TerrellaError, a sentence, for what cannot be read."""
+    file = Path(file)
+    try:
+        text = file.read_text(encoding="utf-8")
+        told = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise TerrellaError(
+            f"{file} cannot be read ({error.strerror}); give a TOML or JSON file of distributions."
+        ) from error
+    except ValueError as error:
+        raise TerrellaError(f"{file} is no TOML or JSON: {error}.") from error
+    if not isinstance(told, dict):
+        raise TerrellaError(
+            f"{file} declares one distribution per parameter, as in friction = {{uniform = [0.4, 1.25]}}."
+        )
+    return {name: _distribution(name, one) for name, one in _flat(told)}
+
+
+def _flat(told: Mapping, before: str = "") -> list[tuple[str, Any]]:
+    """[mass] trunk = ... is "mass.trunk" = ..."""
+    found = []
+    for name, value in told.items():
+        inner = (
+            isinstance(value, dict) and not set(value) & set(KINDS) and all(isinstance(v, dict) for v in value.values())
+        )
+        found += _flat(value, f"{before}{name}.") if inner and value else [(before + name, value)]
+    return found
+
+
+def _distribution(name: str, told: Any) -> Distribution:
+    if isinstance(told, int | float) and not isinstance(told, bool):
+        told = {"constant": told}
+    if not isinstance(told, dict) or len(told) != 1 or next(iter(told)) not in KINDS:
+        raise TerrellaError(f"'{name}' is one of {', '.join(KINDS)}, as in {{uniform = [0.8, 1.2]}}; got {told}.")
+    kind, given = next(iter(told.items()))
+    given = given if isinstance(given, list) else [given]
+    plain = all(isinstance(one, int | float) and not isinstance(one, bool) and math.isfinite(one) for one in given)
+    count = KINDS[kind]
+    if not given or not plain or (count and len(given) != count):
+        raise TerrellaError(f"'{name}': {kind} takes {count or 'one or more'} numbers; got {given}.")
+    found = Distribution(kind, tuple(float(one) for one in given))
+    ordered = kind not in ("uniform", "loguniform") or given[0] <= given[1]
+    if not ordered or (kind == "loguniform" and given[0] <= 0) or (kind == "normal" and given[1] < 0):
+        raise TerrellaError(f"'{name}': {kind} of {given} is no range; give the smaller first, above 0 of a logarithm.")
+    return found
+
+
+class Randomised:
+    """`Randomised(world, {"friction": Distribution("uniform", (0.4, 1.25))})`: each start draws values of its own.
+
+    Of a world that has `parameters` and the methods `varying(names)` and `adjusted(state, values)`, as MujocoWorld, any of them; of
+    every world whose states are values besides: `delay`, steps by which
+    actions come late (a whole number up to 50), and `noise.CHANNEL`, the deviation of normal noise on a channel of float numbers,
+    which is part of what is seen, not of the truth. The channel `parameters` shows what the episode drew, in the order of
+    spec.card["randomised"]. TerrellaError where a parameter is not there, or where a range leaves what is safe.
+    """
+
+    def __init__(self, world: World, distributions: Mapping[str, Distribution]):
+        spec = world.spec
+        if not spec.forkable or PARAMETERS in spec.channels:
+            raise TerrellaError(
+                f"{spec.name} cannot be randomised: its states are no values, or it is randomised already."
+            )
+        if not distributions:
+            raise TerrellaError("the file declares no distribution; say one, as in friction = {uniform = [0.4, 1.25]}.")
+        known: Mapping[str, Any] = getattr(world, "parameters", {})
+        _check(spec, known, distributions)
+        self.distributions = dict(distributions)
+        self._own = [name for name in distributions if name in known]
+        adjustable: Any = world
+        self.world: World = adjustable.varying(self._own) if self._own else world
+        self._noisy = [name.removeprefix(NOISE) for name in distributions if name.startswith(NOISE)]
+        late = distributions.get(DELAY)
+        self._latest = int(late.limits[1]) if late else 0
+        names = tuple(distributions)
+        told = {name: {one.kind: list(one.numbers)} for name, one in distributions.items()}
+        shown = spaces.Box(-np.inf, np.inf, (len(names),), np.float32)
+        self.spec = replace(
+            self.world.spec,
+            channels={**spec.channels, PARAMETERS: shown},
+            card={**self.world.spec.card, "randomised": told},
+            differentiable=False,
+        )
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        return self._drew(self.world.start(batch, rng), rng)
+
+    def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
+        found = self.world.observe(observation, prior, rng)
+        return self._drew(found, rng) if prior is None else found.replace(**_held(prior))
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        action, held = self.spec.check_action(action, state.batch), _held(state)
+        if self._latest:
+            queue = torch.cat([state[f"{_HELD}queue"], action[:, None]], 1)
+            late = self._drawn(state, DELAY).round().long()
+            action, held[f"{_HELD}queue"] = queue[torch.arange(state.batch), self._latest - late], queue[:, 1:]
+        if self._noisy:
+            held[_SEEDS] = chance.seeds(state.batch, rng)
+        return self.world.imagine(state, action, rng).replace(**held)
+
+    def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
+        self.spec.check_channels(channels)
+        seen = dict(self.world.render(state, [name for name in channels if name != PARAMETERS]))
+        for name in self._noisy:
+            if name in seen:
+                noise = chance.normal(state[_SEEDS], seen[name].shape[1:], _SENSED + self._noisy.index(name))
+                size = self._drawn(state, NOISE + name).view(-1, *[1] * (noise.ndim - 1))
+                seen[name] = (seen[name] + size.float() * noise).to(seen[name].dtype)
+        if PARAMETERS in channels:
+            seen[PARAMETERS] = state[f"{_HELD}drawn"].float()
+        return {name: seen[name] for name in channels}
+
+    def close(self) -> None:
+        close = getattr(self.world, "close", None)
+        if close is not None:
+            close()
+
+    def _drew(self, state: State, rng: torch.Generator) -> State:
+        """The state with what its episodes drew."""
+        seeds, names = chance.seeds(state.batch, rng), list(self.distributions)
+        drawn = torch.stack([one.draw(seeds, _DRAW + at) for at, one in enumerate(self.distributions.values())], 1)
+        if self._own:
+            adjustable: Any = self.world
+            state = adjustable.adjusted(state, drawn[:, [names.index(name) for name in self._own]])
+        held = {f"{_HELD}drawn": drawn, _SEEDS: seeds}
+        if self._latest:
+            rest = torch.from_numpy(neutral_action(self.spec))
+            held[f"{_HELD}queue"] = rest.expand(state.batch, self._latest, *rest.shape).clone()
+        return state.replace(**held)
+
+    def _drawn(self, state: State, name: str) -> torch.Tensor:
+        return state[f"{_HELD}drawn"][:, list(self.distributions).index(name)]
+
+
+def _held(state: State) -> dict[str, torch.Tensor]:
+    return {name: state[name] for name in state if name.startswith(_HELD)}
+
+
+def _check(spec: Spec, known: Mapping[str, Any], distributions: Mapping[str, Distribution]) -> None:
+    """TerrellaError, a sentence, for what cannot be randomised, or not so far."""
+    for name, one in distributions.items():
+        low, high = one.limits
+        if name == DELAY:
+            whole = one.kind in ("choice", "constant") and all(number == int(number) for number in one.numbers)
+            if not whole or low < 0 or high > MOST_DELAY:
+                raise TerrellaError(f"'{DELAY}' is a choice of whole steps from 0 to {MOST_DELAY}; got {one.numbers}.")
+        elif name.startswith(NOISE):
+            channel = name.removeprefix(NOISE)
+            spec.check_channels((channel,))
+            if dtype_of(spec.channels[channel]).kind != "f" or kind_of(channel) in ("pose", "reward") or low < 0:
+                raise TerrellaError(
+                    f"'{name}': noise has a deviation of 0 or more, on a channel of float numbers that is sensed."
+                )
+        elif name in known:
+            safe = known[name]
+            if low < safe.low or high > safe.high:
+                raise TerrellaError(
+                    f"'{name}' of {spec.name} cannot be randomised safely from {low:g} to {high:g}: the physics stays sound within "
+                    f"{safe.low:g} to {safe.high:g} {safe.unit}."
+                )
+        else:
+            others = (DELAY, *(f"{NOISE}{channel}" for channel in spec.channels), *known)
+            plain = [other for other in known if not other.startswith("mass.")]
+            own = f" {', '.join(plain)}, mass.BODY," if plain else ""
+            raise TerrellaError(
+                f"{spec.name} has no parameter '{name}'{did_you_mean(name, others) or '.'} "
+                f"There are{own} {DELAY} and {NOISE}CHANNEL."
+            )

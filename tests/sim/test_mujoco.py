@@ -1,0 +1,180 @@
+"""MuJoCo's worlds: values that batch, fork, differ and repeat; files that lack something or are broken; what ends in infinity."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from terrella.core import State, check_world, make_rng
+from terrella.core.errors import TerrellaError
+from terrella.library import load
+
+if find_spec("mujoco") is None:
+    pytest.skip("mujoco is not installed: pip install 'terrella[mujoco]'", allow_module_level=True)
+
+ARM = """<mujoco><option timestep="0.004"/><worldbody>
+ <light pos="0 0 3"/><geom name="ground" type="plane" size="2 2 .1"/>
+ <camera name="eye" pos="0 -2 1" xyaxes="1 0 0 0 0.4 0.9"/><camera name="top" pos="0 0 3"/>
+ <body name="arm" pos="0 0 .5"><joint name="swing" axis="0 1 0" range="-2 2" limited="true" damping=".1"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .4" size=".08" rgba="1 0 0 1"/><site name="tip" pos="0 0 .4"/></body>
+ <body name="ball" pos=".6 0 .2"><freejoint/><geom name="ball" size=".1" rgba="0 1 0 1"/></body>
+</worldbody><sensor><framepos name="tip" objtype="site" objname="tip"/></sensor></mujoco>"""
+
+URDF = """<robot name="x"><link name="a"><inertial><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="b"><inertial>
+<origin xyz="0 0 .2"/><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="swing" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="2" effort="20" velocity="3"/></joint></robot>"""
+
+BLIND = {"size": (24, 32)}
+
+
+@pytest.fixture
+def arm(tmp_path) -> Path:
+    (tmp_path / "arm.xml").write_text(ARM)
+    return tmp_path / "arm.xml"
+
+
+def drawn_or_skipped(world):
+    """The world, where it can be drawn here."""
+    try:
+        world.render(world.start(1, make_rng(0)), ("rgb",))
+    except TerrellaError as error:
+        pytest.skip(str(error))
+    return world
+
+
+def test_the_contract_holds_with_pictures_from_several_cameras(arm):
+    options = {
+        "cameras": ("eye", "top"),
+        "depth": True,
+        "segmentation": True,
+        "parameters": ("mass.ball", "camera.x", "red"),
+    }
+    world = drawn_or_skipped(load(f"mujoco:{arm}", **BLIND, **options))
+    assert "a_batch_equals_its_singles" in check_world(world, steps=8)
+    assert {"rgb", "rgb.top", "depth.top", "segmentation.top", "pose.top"} <= set(world.spec.channels)
+    seen = world.render(world.start(1, make_rng(0)), ("depth.top", "segmentation", "pose.top"))
+    arm_and_ball = set(seen["segmentation"].unique().tolist())
+    assert {0, 1, 2} <= arm_and_ball  # bodies: the world, the arm, the ball
+    assert seen["depth.top"].min() > 1.5 and seen["pose.top"][0, :3].tolist() == [0, 0, 3]
+    world.close()
+
+
+@pytest.mark.parametrize("name", ["ant", "hopper"])
+def test_robots_that_come_with_gymnasium(name):
+    world = load(f"mujoco:{name}", **BLIND)
+    drawn_or_skipped(world)
+    assert "states_can_be_saved" in check_world(world, steps=5)
+
+
+@pytest.mark.parametrize("name", ["go1", "g1", "yam"])
+def test_robots_of_a_zoo_that_may_be_installed(name):
+    if find_spec("mjlab") is None:
+        with pytest.raises(TerrellaError, match="pip install --no-deps mjlab"):
+            load(f"mujoco:{name}")
+        return
+    world, rng = load(f"mujoco:{name}"), make_rng(0)
+    state = world.start(4, rng)
+    for _ in range(20):
+        state = world.imagine(state, torch.tensor(world.spec.idle).expand(4, -1), rng)
+    assert not state["done"].any() and world.spec.action_units[0] == "rad"
+
+
+def test_a_large_batch_is_its_entries_and_threads_do_not_matter(arm):
+    one, many = load(f"mujoco:{arm}", threads=1), load(f"mujoco:{arm}", threads=3)
+    states = one.start(64, make_rng(1))
+    for step in range(5):
+        actions = one.spec.sample_action(64, make_rng(step))
+        together, apart = one.imagine(states, actions, make_rng(0)), many.imagine(states, actions, make_rng(0))
+        assert together == apart  # bit for bit
+        alone = one.imagine(states.at([7]), actions[7:8], make_rng(0))
+        assert torch.allclose(alone["physics"], together["physics"][7:8], atol=1e-9)
+        states = together
+
+
+def test_worlds_of_one_batch_differ_by_their_parameters(arm):
+    world = load(f"mujoco:{arm}").varying(("gravity", "mass.ball", "gain"))
+    state = world.start(3, make_rng(0))
+    assert state["parameters"][0].tolist() == pytest.approx([9.81, 1, 1])
+    values = torch.tensor([[9.81, 1, 1], [0, 1, 1], [9.81, 3, 0.5]])
+    state, still = world.adjusted(state, values), torch.zeros(3, 1)
+    for _ in range(5):
+        state = world.imagine(state, still, make_rng(0))
+    fallen = state["physics"][:, 1:].gather(1, torch.full((3, 1), 3))[:, 0]  # the ball's height
+    assert fallen[1] == pytest.approx(0.2) and fallen[0] < 0.2 - 0.01
+    assert world.imagine(state.at([2]), still[:1], make_rng(0))["parameters"].tolist() == [values[2].tolist()]
+    with pytest.raises(TerrellaError, match="'gravity'.*0 to 30"):
+        world.adjusted(state, torch.tensor([[-5.0, 1, 1]]))
+    with pytest.raises(TerrellaError, match="no parameter 'gravty'; did you mean 'gravity'"):
+        world.varying(("gravty",))
+
+
+def test_a_urdf_gets_servos_a_camera_and_a_floor(tmp_path):
+    (tmp_path / "x.urdf").write_text(URDF)
+    world, rng = load(f"mujoco:{tmp_path / 'x.urdf'}"), make_rng(0)
+    spec = world.spec
+    assert (spec.action_names, spec.action_units, spec.action_mode) == (("swing",), ("rad",), "position")
+    assert spec.action.low.tolist() == [-1] and spec.action.high.tolist() == [2] and "rgb" in spec.channels
+    state = world.start(1, rng)
+    for _ in range(100):
+        state = world.imagine(state, torch.tensor([[0.5]]), rng)
+    assert float(world.render(state, ("qpos",))["qpos"]) == pytest.approx(0.5, abs=0.1)  # the servo holds it there
+
+
+BROKEN = {
+    "<mujoco><worldbody>\n<geom size='.1' foo='3'/></worldbody></mujoco>": "'foo' Element 'geom', line 2",
+    "<mujoco><worldbody><body>\n<freejoint/></body></worldbody></mujoco>": "mass and inertia .* line 1",
+    "<mujoco><asset><mesh name='m' file='gone.stl'/></asset></mujoco>": "gone.stl",
+    "<mujoco><worldbody></mujoco>": "(?i)mismatched",
+    "": "empty",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", BROKEN)
+def test_broken_files_are_told_in_a_sentence(text, tmp_path):
+    (tmp_path / "x.xml").write_text(text)
+    with pytest.raises(TerrellaError, match=BROKEN[text]) as found:
+        load(f"mujoco:{tmp_path / 'x.xml'}")
+    assert "\n" not in str(found.value)
+
+
+def test_names_that_there_are_not(arm):
+    for name, words in (("gone.xml", "no file"), ("ants", "did you mean 'ant'")):
+        with pytest.raises(TerrellaError, match=words):
+            load(f"mujoco:{name}")
+    with pytest.raises(TerrellaError, match="no camera side; there are eye, top"):
+        load(f"mujoco:{arm}", cameras=("side",))
+
+
+def test_an_unstable_world_ends_and_can_be_repeated(tmp_path):
+    (tmp_path / "wild.xml").write_text(
+        '<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".01"/></body></worldbody>'
+        '<actuator><motor joint="j" gear="1e12" ctrlrange="-1 1"/></actuator></mujoco>'
+    )
+    world, rng = load(f"mujoco:{tmp_path / 'wild.xml'}", dumps=tmp_path / "dumps"), make_rng(0)
+    state = world.start(3, rng)
+    with pytest.warns(RuntimeWarning, match="1 worlds of .* became unstable at 0.00 s"):
+        state = world.imagine(state, torch.tensor([[0.0], [1.0], [0.0]]), rng)
+    assert state["done"].tolist() == [False, True, False] and state["physics"].isfinite().all()
+    assert world.imagine(state, torch.zeros(3, 1), rng)["done"].tolist() == [False, True, False]
+    (dump,) = (tmp_path / "dumps").iterdir()
+    before = State.load(dump)
+    with pytest.warns(RuntimeWarning, match="unstable"):
+        assert world.imagine(before, before["action"], rng)["done"].tolist() == [True]
+
+
+def test_a_robot_that_falls_is_done_and_velocity_is_paid():
+    world, rng = load("mujoco:ant"), make_rng(0)
+    state = world.start(2, rng)
+    command = torch.tensor([[0.0, 0, 0], [3.0, 0, 0]])
+    state = world.imagine(state.replace(command=command), torch.zeros(2, 8), rng)
+    assert state["reward"][0] > state["reward"][1]  # who stands still obeys the first command
+    over = state["physics"].clone()
+    over[:, 4:8] = torch.tensor([0.0, 1, 0, 0], dtype=torch.float64)  # on its back
+    assert world.imagine(state.replace(physics=over), torch.zeros(2, 8), rng)["done"].all()
+    assert np.isfinite(world.spec.action_limits).all()

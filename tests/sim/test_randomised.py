@@ -1,0 +1,108 @@
+"""Randomised worlds: draws are seeded, within their limits, shown, and safe; actions come late; noise is seen and not true."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from terrella.core import check_world, make_rng
+from terrella.core.errors import TerrellaError
+from terrella.library import load
+from terrella.sim.randomised import Distribution, Randomised, read
+
+FILE = """
+"noise.qpos" = {constant = 0.05}
+delay = {choice = [0, 2]}
+friction = {uniform = [0.4, 1.25]}
+[mass]
+torso = {loguniform = [0.5, 2.0]}
+"""
+
+needs_mujoco = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "x.toml").write_text(FILE)
+    return tmp_path / "x.toml"
+
+
+def test_draws_lie_within_their_limits_and_follow_their_kind():
+    seeds = torch.arange(4000)
+    for kind, numbers, mean in (
+        ("uniform", (2, 4), 3),
+        ("loguniform", (1, 100), 99 / 4.605),
+        ("normal", (5, 1), 5),
+        ("choice", (0, 1, 5), 2),
+        ("constant", (7,), 7),
+    ):
+        one = Distribution(kind, tuple(map(float, numbers)))
+        drawn = one.draw(seeds, 3)
+        assert drawn.min() >= one.limits[0] and drawn.max() <= one.limits[1]
+        assert drawn.mean() == pytest.approx(mean, rel=0.06)
+
+
+@needs_mujoco
+def test_each_episode_draws_and_shows_what_it_drew(file):
+    world = load("mujoco:ant", randomise=file)
+    assert list(world.spec.card["randomised"]) == ["noise.qpos", "delay", "friction", "mass.torso"]
+    one, same = (world.start(32, make_rng(5)) for _ in range(2))
+    drawn = world.render(one, ("parameters",))["parameters"]
+    assert torch.equal(drawn, world.render(same, ("parameters",))["parameters"])
+    assert len(drawn[:, 2].unique()) == 32 and set(drawn[:, 1].tolist()) == {0, 2}
+    after = world.imagine(one, torch.zeros(32, 8), make_rng(0))
+    assert torch.equal(world.render(after, ("parameters",))["parameters"], drawn)  # of the episode, not of the step
+    assert torch.allclose(one["parameters"].float(), drawn[:, 2:])
+    seen, true = world.render(after, ("qpos",))["qpos"], world.world.render(after, ("qpos",))["qpos"]
+    assert (seen - true).std() == pytest.approx(0.05, rel=0.2)
+
+
+@needs_mujoco
+def test_the_contract_holds_around_mujoco(tmp_path):
+    (tmp_path / "x.json").write_text('{"gravity": {"uniform": [5, 10]}, "delay": 1, "noise.qvel": 0.1}')
+    assert "a_batch_equals_its_singles" in check_world(
+        load("mujoco:ant", randomise=tmp_path / "x.json", cameras=()), steps=4
+    )
+
+
+def test_actions_come_late_in_any_world():
+    plain = load("gym:Pendulum-v1", rgb=False)
+    late = Randomised(plain, {"delay": Distribution("constant", (2.0,))})
+    state, true = late.start(1, make_rng(0)), None
+    actions = [torch.tensor([[value]]) for value in (2.0, -2.0, 1.0)]
+    for action in actions:
+        state = late.imagine(state, action, make_rng(1))
+    true = plain.start(1, make_rng(0))
+    for action in (torch.zeros(1, 1), torch.zeros(1, 1), actions[0]):
+        true = plain.imagine(true, action, make_rng(1))
+    assert torch.equal(
+        late.render(state, ("observation",))["observation"], plain.render(true, ("observation",))["observation"]
+    )
+
+
+UNSOUND = {
+    "friction = {uniform = [0.0, 9.0]}": "cannot be randomised safely from 0 to 9.*within 0.05 to 3",
+    "frictoin = {uniform = [0.4, 1]}": "no parameter 'frictoin'; did you mean 'friction'",
+    "mass = {uniform = [1.2, 0.8]}": "smaller first",
+    "mass = {even = [1, 2]}": "is one of uniform",
+    "mass = {uniform = [1]}": "takes 2 numbers",
+    "delay = {uniform = [0, 3]}": "whole steps",
+    '"noise.done" = 0.1': "float numbers",
+    "mass": "no TOML",
+    "": "declares no distribution",
+}
+
+
+@needs_mujoco
+@pytest.mark.parametrize("text", UNSOUND)
+def test_what_cannot_be_is_said(text, tmp_path):
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(TerrellaError, match=UNSOUND[text]):
+        load("mujoco:ant", randomise=tmp_path / "x.toml")
+
+
+def test_files_are_read(file):
+    found = read(file)
+    assert found["mass.torso"] == Distribution("loguniform", (0.5, 2.0)) and found["noise.qpos"].kind == "constant"
