@@ -7,13 +7,14 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test test-all test-portable test-lerobot check format bench clean
+.PHONY: help play test test-all test-portable test-lerobot judge check format bench clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
 	@echo "make test-all  the same with the slow sweeps (damaged files, many seeds)"
 	@echo "make test-portable  run the numeric tests as a plain processor would: no wide vectors, one thread"
 	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
+	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (about half an hour)"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
@@ -43,6 +44,9 @@ test-lerobot: $(VENV)/.ready-dev
 	@python=$$(sh tests/lerobot_setup.sh .venv-lerobot); \
 	TERRELLA_LEROBOT_PYTHON=$$python $(BIN)/python -m pytest -rs tests/data/test_lerobot.py
 
+judge:
+	@python=$$(sh benchmarks/judge_setup.sh .venv-judge) && OMP_NUM_THREADS=1 $$python -W ignore benchmarks/judge.py $(ARGS)
+
 check: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -57,7 +61,7 @@ bench: $(VENV)/.ready-dev
 	$(BIN)/python benchmarks/play.py $(ARGS)
 
 clean:
-	rm -rf $(VENV) .venv-lerobot .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-lerobot .venv-judge .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "Terrella needs Python 3.11, 3.12 or 3.13: install one, or run make PYTHON=/path/to/it." >&2; exit 1; }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ import torch
 from tests.learn.stopping import goes_on_exactly, quiet
 
 import terrella
-from terrella.core import check_world
+from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
+from terrella.core.rollouts import advanced
 from terrella.data import Recorder
-from terrella.learn.latent_validation import effective_rank, linear_probe
+from terrella.learn.latent_validation import effective_rank, encoded, folded, linear_probe
 from terrella.learn.objectives.latent_prediction import sigreg
 from terrella.learn.recipes.latent import LatentTraining, train_latent
+from terrella.learn.recording import Recording
 
 from ..data.layouts import layout_of
 
@@ -69,6 +72,20 @@ def run(vectors, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     facts = train_latent(vectors, out, QUICK, quiet)
     return out, facts
+
+
+def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
+    train_latent(vectors, tmp_path, replace(QUICK, rollout=5), quiet)
+    world = terrella.load(tmp_path)
+    assert world.spec.leap == 5
+    data = Recording.open(vectors, (64, 64), quiet, needs=("action",))
+    rows = data.within(2, 5, acted=True)
+    state = folded(world, data, rows, 2)
+    acts = torch.stack([data.played(world.spec, rows + step) for step in range(5)], 1)
+    ended = advanced(world, state, acts, make_rng(0))["window"][:, -1]
+    truth = encoded(world, data, rows + 5)
+    error, still = ((found - truth).square().mean() for found in (ended, state["window"][:, -1]))
+    assert error < 0.6 * still
 
 
 def test_it_foretells_and_does_not_collapse(run):

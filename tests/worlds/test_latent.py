@@ -11,6 +11,7 @@ import torch
 import terrella
 from terrella.core import check_world, make_rng, rollout
 from terrella.core.errors import ActionError, CheckpointError, ObservationError
+from terrella.core.rollouts import advanced
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_latent, load_world, save_keys, save_latent
 from terrella.worlds.latent import LatentWorld
@@ -40,6 +41,7 @@ KINDS = {
     "a recording without pictures": {"size": None},
     "a recording without vectors": {"vectors": ()},
     "no history": {"history": 1},
+    "leaps": {"leap": 4},
 }
 
 
@@ -150,6 +152,25 @@ def test_what_is_over_stands_still_and_pays_nothing():
     after = world.imagine(state, world.spec.sample_action(2, rng), rng)
     assert torch.equal(after["window"][0], state["window"][0]) and float(after["reward"][0]) == 0
     assert not torch.equal(after["window"][1], state["window"][1]) and bool(after["done"][0])
+
+
+@pytest.mark.parametrize("history", [1, 3])
+def test_a_leap_is_of_its_own_episode_keeps_the_last_actions_and_leaves_what_is_over(history):
+    world, rng = made(leap=2, history=history), make_rng(0)
+    torch.nn.init.normal_(world.network.leaper.leave, std=0.2)
+    state, actions = world.start(3, rng), torch.rand(3, 2, 2)
+    state = state.replace(done=torch.tensor([False, False, True]))
+    after = world.leap(state, actions, rng)
+    for entry in range(2):
+        alone = world.leap(state.at(entry), actions[entry : entry + 1], rng)
+        for name in after:
+            assert torch.allclose(after[name][entry : entry + 1], alone[name], atol=1e-5), name
+    assert torch.equal(after["window"][2], state["window"][2]) and (after["window"][0] != state["window"][0]).any()
+    kept = world.controls.encode(actions[0])[2 - min(2, history - 1) :]
+    assert torch.allclose(after["actions"][0, -len(kept) :] if len(kept) else kept, kept)
+    whole = advanced(world, state, torch.cat([actions, actions, actions[:, :1]], 1), rng)
+    slow = world.imagine(world.leap(after, actions, rng), actions[:, 0], rng)
+    assert torch.equal(whole["window"], slow["window"])
 
 
 def test_a_thousand_episodes_are_no_loop_and_a_state_is_small():

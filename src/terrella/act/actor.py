@@ -11,6 +11,7 @@ from typing import Any, final
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from ..core.errors import CheckpointError
 from ..core.spec import Spec
@@ -20,7 +21,7 @@ from .actor_network import ActorConfig, ActorNetwork, check_seen
 KIND, VERSION = "actor", 1
 POLICY_FILE, WEIGHTS_FILE = "policy.json", "weights.safetensors"
 RUN = "policy"  # the folder of the policy in that of a training run
-_DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError
+DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError
 
 
 @final
@@ -51,22 +52,8 @@ class Actor:
 
     def save(self, folder: str | Path) -> None:
         """Writes the folder, each file whole; CheckpointError where it cannot be written."""
-        folder = Path(folder)
-        config = self.network.config
-        told = {"kind": KIND, "version": VERSION, "config": asdict(config), "card": self.card}
-        weights = {name: value.detach().cpu().clone().contiguous() for name, value in self.network.state_dict().items()}
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            partial = folder / f"{WEIGHTS_FILE}.partial"
-            save_file(weights, partial)
-            partial.replace(folder / WEIGHTS_FILE)
-            partial = folder / f"{POLICY_FILE}.partial"
-            partial.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-            partial.replace(folder / POLICY_FILE)
-        except (OSError, SafetensorError) as error:
-            raise CheckpointError(
-                f"the policy cannot be written to {folder} ({error}); free some space, or choose another folder."
-            ) from error
+        told = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
+        write_policy(folder, told, self.network)
 
     @staticmethod
     def load(folder: str | Path, spec: Spec, greedy: bool = True) -> Actor:
@@ -82,10 +69,28 @@ class Actor:
         try:
             network = ActorNetwork(ActorConfig(**{name: _tuple(value) for name, value in told["config"].items()}))
             network.load_state_dict(load_file(folder / WEIGHTS_FILE))
-        except _DAMAGE as error:
+        except DAMAGE as error:
             why = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise CheckpointError(f"{folder} is damaged or incomplete ({why}); copy or train it again.") from error
         return Actor(network.eval().requires_grad_(False), spec, greedy, told.get("card"))
+
+
+def write_policy(folder: str | Path, told: Mapping[str, Any], network: nn.Module) -> None:
+    """policy.json and the weights, each file whole; CheckpointError where they cannot be written."""
+    folder = Path(folder)
+    weights = {name: value.detach().cpu().clone().contiguous() for name, value in network.state_dict().items()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        partial = folder / f"{WEIGHTS_FILE}.partial"
+        save_file(weights, partial)
+        partial.replace(folder / WEIGHTS_FILE)
+        partial = folder / f"{POLICY_FILE}.partial"
+        partial.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        partial.replace(folder / POLICY_FILE)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"the policy cannot be written to {folder} ({error}); free some space, or choose another folder."
+        ) from error
 
 
 def policy_folder(folder: str | Path) -> Path:

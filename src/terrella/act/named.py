@@ -21,7 +21,9 @@ from ..core.policy import Constant, Idle, Policy, Random, Reactive
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
+from .actor import policy_folder, read_policy
 from .explorer import Explorer
+from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
 from .through import actor_of
@@ -75,6 +77,13 @@ def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | No
     return Slipping(_plain(text, spec, world, cost), probability, spec)
 
 
+def proposing(name: str, world: World) -> Policy:
+    """A policy whose plans a search in `world` tries as well, by its name; one for goals is told the search's own."""
+    if Path(name).is_dir() and read_policy(policy_folder(name)).get("kind") == KIND:
+        return GoalActor.load(name, world.spec, varied=True)
+    return policy_of(name, world.spec, world)
+
+
 def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Policy:
     head, colon, rest = name.partition(":")
     simple: dict[str, Callable[[Spec], Policy]] = {"random": Random, "idle": Idle, "explorer": Explorer}
@@ -89,7 +98,7 @@ def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Pol
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
-        return actor_of(name, spec, world)
+        return actor_of(name, spec, world, cost)
     likest = did_you_mean(name, [*simple, "constant", "plan"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{likest} There are: {KNOWN}.")
 

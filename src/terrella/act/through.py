@@ -7,12 +7,14 @@ from typing import final
 
 import torch
 
-from ..core.errors import ChannelError
+from ..core.errors import ChannelError, PlanningError
 from ..core.policy import Policy
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
-from .actor import Actor
+from .actor import Actor, policy_folder, read_policy
+from .goal_network import KIND, GoalActor
+from .planning import Cost, Reaching
 
 
 @final
@@ -33,9 +35,15 @@ class Through:
         return action, self.world.imagine(state, action, rng)
 
 
-def actor_of(folder: str | Path, spec: Spec, world: World | None = None) -> Policy:
+def actor_of(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
     """The learned policy of a folder, for the actions of `spec`; where it sees what that does not show but `world` does, through
-    the world. ActionError or ChannelError where it does not fit."""
+    the world; one for goals, towards the goal of `cost`. ActionError, ChannelError or PlanningError where it does not fit."""
+    if read_policy(policy_folder(folder)).get("kind") == KIND:
+        if world is None or cost is None:
+            raise PlanningError(
+                f"{folder} is a policy for goals: it needs the world that it was learned in, and a goal."
+            )
+        return Reaching(world, GoalActor.load(folder, world.spec), cost)
     try:
         return Actor.load(folder, spec)
     except ChannelError:

@@ -24,6 +24,7 @@ COMMANDS = {
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
     "train policy": ("practice:policy", "let a policy practise in a world alone"),
+    "train goals": ("train:goals", "learn to reach goals in a latent world, without a search"),
     "train estimator": ("train:estimator", "learn to estimate depth and camera motion from pictures"),
     "train uncertainty": ("train:uncertainty", "add an estimator and an uncertainty to a trained world"),
     "train objects": ("train:objects", "learn what moving objects do, from another recording"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -15,8 +16,10 @@ from PIL import Image
 from tyro.conf import Positional, arg
 
 from .. import library, progress
+from ..act.named import policy_of, proposing
 from ..act.planning import (
     NEAR_M,
+    Cost,
     Destination,
     Episode,
     Judge,
@@ -65,6 +68,8 @@ class Searching:
         replan: Moves that are done before the next plan is made.
         cost: Of a goal: sum (sooner is better), last (the end of the horizon alone) or least (its best moment).
         trust: The world's uncertainty at which a plan ends; unless said, that from which it invents, if it tells one.
+        proposal: A policy whose plans are tried as well: a folder of `train goals`, or another policy's name.
+        agent: A policy that acts in place of the search, by the same names.
     """
 
     search: Kind = "icem"
@@ -75,6 +80,8 @@ class Searching:
     replan: int = 1
     cost: Literal["sum", "last", "least"] = "sum"
     trust: float | None = None
+    proposal: str | None = None
+    agent: str | None = None
     budget_ms: Milliseconds = None
 
     @property
@@ -102,12 +109,16 @@ class _Case:
     def within(self) -> float:
         return self.walks.within_m if self.walks else self.judge.within
 
+    def cost(self, searching: Searching) -> Cost:
+        return distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(self.world.spec)
+
     def planner(self, searching: Searching) -> Planner:
         spec, trust = self.world.spec, searching.trust
         if trust is None and isinstance(spec.card.get("uncertainty"), dict) and (levels := uncertainty_levels(spec)):
             trust = levels[1]
-        cost = distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(spec)
-        return Planner(self.world, cost, searching.config, trust, replan=searching.replan)
+        told = searching.proposal
+        proposal = None if told is None else proposing(told, self.world)
+        return Planner(self.world, self.cost(searching), searching.config, trust, proposal, replan=searching.replan)
 
     def walker(self, searching: Searching, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
@@ -116,7 +127,12 @@ class _Case:
 
     def planned(self, searching: Searching, what: str, keep: tuple[str, ...] = ()) -> Played:
         """Episodes of the planner."""
-        policy = partial(self.walker, searching) if self.walks else self.planner(searching)
+        if searching.agent and self.walks:
+            raise TerrellaError("who walks to places plans the way; leave --agent out.")
+        if searching.agent:
+            policy = policy_of(searching.agent, self.real.spec, self.world, self.cost(searching))
+        else:
+            policy = partial(self.walker, searching) if self.walks else self.planner(searching)
         return self._played(policy, what, _seen_by(self), keep)
 
     def floor(self) -> Played:
@@ -179,9 +195,9 @@ def plan(
     case = _opened(name, environment, searching, aim, real, episodes, steps, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
     keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
-    mine = case.planned(case.searching, "planning", keep)
+    mine = case.planned(case.searching, "acting" if searching.agent else "planning", keep)
     floor = case.floor()
-    points = _curve(case, mine) if curve else []
+    points = _curve(case, mine) if curve and not searching.agent else []
     about = {"world": name, "real": real or name, **asdict(aim), "within": case.within}
     asked = {key: value for key, value in asdict(case.searching).items() if value is not None}
     facts = {
@@ -285,8 +301,9 @@ def _figures(played: Played, seed: int) -> dict[str, Figure]:
         figures["success"] = wilson(sum(bool(one.success) for one in episodes), count)
     figures["return"] = mean_interval(torch.tensor([one.reward for one in episodes]), make_rng(seed))
     figures["steps"] = mean_interval(torch.tensor([float(one.steps) for one in episodes]), make_rng(seed))
-    if imagined:
+    if ms:
         figures["ms a decision"] = _middle(ms)
+    if imagined:
         figures["steps imagined"] = _middle(imagined)
     return figures
 
@@ -333,8 +350,8 @@ def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], 
     if lost:
         lines.append(f"to {lost} of the goals no way was known")
     if took := planner.get("ms a decision"):
-        imagined = f"{planner['steps imagined'].value:,.0f} imagined steps"
-        lines.append(f"a decision takes {took.value:.0f} ms (95% within {took.high:.0f}) for {imagined}")
+        imagined = f" for {planner['steps imagined'].value:,.0f} imagined steps" if "steps imagined" in planner else ""
+        lines.append(f"a decision takes {took.value:.0f} ms (95% within {took.high:.0f}){imagined}")
     if mine.skipped:
         lines.append(f"{mine.skipped} starts were already solved and left out")
     if (case.goal or case.walks) and planner.get("success") and not planner["success"].value:
@@ -342,9 +359,8 @@ def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], 
         measured = case.judge.goal or case.walks
         away = f"; the nearest that it came is {nearest:.3g} (asked: {case.within:g})" if measured else ""
         best = min(one.best_cost for one in mine.episodes)
-        lines.append(
-            f"the goal was never reached{away}; the best plan in the world cost {best:.3g}: it may be impossible"
-        )
+        cost = f"; the best plan in the world cost {best:.3g}" if math.isfinite(best) else ""
+        lines.append(f"the goal was never reached{away}{cost}: it may be impossible")
     lines += [f"{steps:>10,.0f} imagined steps: {figure}" for steps, figure in points]
     if case.searching.budget_ms is not None:
         lines.append("planned by the clock: another run may differ")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from .. import progress
+from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining, train_latent
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
 from ..learn.recipes.parts import (
@@ -23,7 +25,7 @@ from ..learn.trainer import device_named
 from ..library import folder_of
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
-from .named import Device
+from .named import Device, load_named
 from .say import Json, result
 
 
@@ -46,6 +48,26 @@ def latent(data: Positional[str], out: str, config: LatentTraining, json: Json =
         out: Folder of the run: the world, a log, validation.json, and pictures of truth and prediction.
     """
     _shown(lambda report: train_latent(data, out, config, report), json, run=out)
+
+
+def goals(
+    world: Annotated[str, arg(name="in")],
+    recording: Annotated[str, arg(name="from")],
+    out: str,
+    config: GoalTraining,
+    device: Device = "auto",
+    json: Json = False,
+) -> None:
+    """Train a policy that reaches goals in a latent world at once, without a search: whatever an episode came to was a goal that
+    its actions reached. Takes a minute or two; the same command continues.
+
+    Args:
+        world: The latent world, a run of `train latent`.
+        recording: The recording that it was learned of.
+        out: Folder of the run; the policy is in OUT/policy: for `terrella plan --agent OUT` or `--proposal OUT`.
+    """
+    inside = load_named(world, device)
+    _shown(lambda report: train_goals(inside, world, recording, out, config, report), json, run=out)
 
 
 def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: Json = False) -> None:

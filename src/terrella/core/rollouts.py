@@ -11,7 +11,20 @@ import torch
 from .policy import Policy, Replay, act
 from .spec import shape_of
 from .state import State
-from .world import World
+from .world import Leaping, World
+
+
+def advanced(world: World, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
+    """The state after actions [B, T, *action.shape], in leaps as far as the world has them: of it the channel `latent` counts."""
+    at, steps = 0, actions.shape[1]
+    while at < steps:
+        if world.spec.leap and steps - at >= world.spec.leap and isinstance(world, Leaping):
+            state = world.leap(state, actions[:, at : at + world.spec.leap], rng)
+            at += world.spec.leap
+        else:
+            state = world.imagine(state, actions[:, at], rng)
+            at += 1
+    return state
 
 
 @dataclass(frozen=True)

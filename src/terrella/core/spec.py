@@ -101,6 +101,7 @@ class Spec:
     differentiable: True where gradients flow from the channels through `imagine` to the action.
     card:         free facts for people: training data, hardware, scores.
     idle:         the flat action that does nothing, where there is one and neither its name nor its mode says which.
+    leap:         steps that the world's `leap` takes at once (core/world.py); 0 where it has none.
     """
 
     name: str
@@ -122,6 +123,7 @@ class Spec:
     card: Mapping[str, object] = field(default_factory=dict)
     may_observe: tuple[str, ...] = ()
     idle: tuple[float, ...] = ()
+    leap: int = 0
 
     def __post_init__(self):
         if not self.action_mode:

@@ -48,6 +48,16 @@ class World(Protocol):
         ...
 
 
+@runtime_checkable
+class Leaping(World, Protocol):
+    """A world whose `spec.leap` is above 0."""
+
+    def leap(self, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
+        """The state `spec.leap` steps later, at once, under actions [B, leap, *action.shape]. Only the channel `latent` of it
+        counts: what was paid on the way is not told."""
+        ...
+
+
 def make_rng(seed: int, device: str = "cpu") -> torch.Generator:
     """A generator to hand to the verbs."""
     return torch.Generator(device=device).manual_seed(seed)

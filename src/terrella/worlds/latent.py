@@ -78,6 +78,7 @@ class LatentWorld:
             max_episode_steps=about.max_episode_steps,
             differentiable=about.controls.kind == AXES,
             card=card,
+            leap=config.leap,
         )
 
     # -- the verbs ----------------------------------------------------------------------------------------------------
@@ -133,6 +134,17 @@ class LatentWorld:
             for name, now in after.items()
         }
         return state.replace(**kept, done=still | (found.done > 0))
+
+    def leap(self, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
+        """`Spec.leap` steps at once, under actions [B, leap, *action.shape]. Latents alone go on: reward, end and uncertainty stay
+        as they are. What is over stands still."""
+        flat = self.spec.check_action(actions.flatten(0, 1), actions.shape[0] * actions.shape[1]).to(self.device)
+        taken = self.controls.encode(flat).unflatten(0, actions.shape[:2])
+        past = torch.cat([state["actions"], taken], 1)
+        still = state["done"].view(-1, 1, 1)
+        window = torch.where(still, state["window"], self.network.leap(state["window"], past))
+        kept = past[:, past.shape[1] - state["actions"].shape[1] :]
+        return state.replace(window=window, actions=torch.where(still, state["actions"], kept))
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)

@@ -21,7 +21,8 @@ class LatentConfig:
     """actions: numbers in an action; rewards: values between which a reward is told apart, ascending; vectors: (name, width) of
     the channels of numbers, all of which are predicted; size: (height, width) of the pictures, multiples of 16, None without;
     sees_pictures, sees_vectors: which of them are evidence; latent: its width; history: last latents and actions that the
-    predictor sees; hidden: width of its layers; members: predictors of the ensemble."""
+    predictor sees; hidden: width of its layers; members: predictors of the ensemble; leap: steps that a leap takes at once, 0
+    without."""
 
     actions: int
     rewards: tuple[float, ...] = (0.0, 1.0)
@@ -33,6 +34,7 @@ class LatentConfig:
     history: int = 3
     hidden: int = 192
     members: int = 3
+    leap: int = 0
 
     @property
     def width(self) -> int:
@@ -175,6 +177,8 @@ class LatentNetwork(nn.Module):
             }
         )
         self.decoder = Decoder(latent, config.size) if config.size else nn.Identity()
+        acted = (config.history - 1 + config.leap) * config.actions
+        self.leaper = Ensemble(1, window + acted, hidden, window) if config.leap else nn.Identity()
         self.register_buffer("mean", torch.zeros(config.width))
         self.register_buffer("scale", torch.ones(config.width))
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
@@ -202,6 +206,11 @@ class LatentNetwork(nn.Module):
         """The next latent as each member has it [members, B, D], after actions [B, K, A], the newest last."""
         found = window[:, -1] + self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
         return found.clamp(-FARTHEST, FARTHEST)
+
+    def leap(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """The window [B, K, D] `config.leap` steps later, at once, after actions [B, K - 1 + leap, A], the newest last."""
+        found = self.leaper(torch.cat([window.flatten(1), actions.flatten(1)], 1))[0].view_as(window)
+        return (window[:, -1:] + found).clamp(-FARTHEST, FARTHEST)
 
     def numbers(self, window: torch.Tensor) -> torch.Tensor:
         """The vectors that are read off a window, scaled: [B, width]."""

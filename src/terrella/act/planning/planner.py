@@ -58,7 +58,8 @@ class Planner:
     cost:     what futures cost (costs.py). config: how to search (searches.py).
     trust:    the horizon ends where half of the candidates pass this value of the channel `uncertainty`; None: never.
     proposal: a policy for the same actions whose `proposals` plans, rolled out in the world, are tried as well; the channels
-              that it sees are `sees`, by default all that a recording of the world would hold.
+              that it sees are `sees`, by default its own or all that a recording of the world would hold; the goal is among
+              them, as `goal.` and its channel.
     replan:   moves of a plan that are done before the next is made.
 
     Its memory is a list with a Thought for each episode. The same seed gives the same actions, and a batch those of its episodes
@@ -92,7 +93,8 @@ class Planner:
         spec.check_channels(cost.channels)
         self.world, self.cost, self.config, self.moves = world, cost, config, moves_of(spec)
         self._trust, self._proposal, self._proposals, self._replan = trust, proposal, proposals, replan
-        self._sees = tuple(spec.recorded if sees is None else sees)
+        named = getattr(proposal, "sees", spec.recorded) if sees is None else sees
+        self._sees = tuple(name for name in named if name in spec.channels)
 
     @property
     def sees(self) -> tuple[str, ...]:
@@ -189,11 +191,14 @@ class Planner:
         for entry, thought in enumerate(thoughts):
             rng = make_rng(later(thought.seed, 4 * thought.step + _PROPOSE))
             ahead, taken = state.at(entry).fork(self._proposals), []
+            goal = {
+                f"goal.{name}": value.expand(self._proposals, *value.shape[1:]) for name, value in thought.goal.items()
+            }
             try:
                 assert self._proposal is not None
                 memory: Any = self._proposal.begin(self._proposals, rng)
                 for _ in range(self.config.horizon):
-                    seen = self.world.render(ahead, self._sees)
+                    seen = {**self.world.render(ahead, self._sees), **goal}
                     action, memory = act(self._proposal, seen, memory, self._proposals, self.world.spec, rng)
                     action = self.world.spec.check_action(action, self._proposals)
                     taken.append(action)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from ...core.errors import PlanningError
+from ...core.rollouts import advanced
 from ...core.state import State
 from ...core.world import Observation, World, make_rng
-from .costs import Cost
+from .costs import LATENT, Cost
 from .moves import Moves
 
 _GOLDEN, _SEEDS = 0x9E3779B97F4A7C15, 2**63
@@ -61,6 +62,8 @@ class Task:
         more = ("done",) if self.cost.until_done and "done" in self.world.spec.channels else ()
         doubt = ("uncertainty",) if self.trust is not None else ()
         self._channels = tuple(dict.fromkeys((*self.cost.channels, *more, *doubt)))
+        leap = self.world.spec.leap
+        self._leaps = bool(leap) and self.block % leap == 0 and self.cost.over == "last" and self._channels == (LATENT,)
         self._count = 0
 
     @property
@@ -95,6 +98,13 @@ class Task:
         [B, N], and the share [B] of candidates that the world still knows. `alive`: who had not ended before."""
         actions = self.moves.actions(codes).flatten(0, 1).to(state.device)
         total = sure = None
+        if self._leaps:
+            held = actions[:, None].expand(-1, self.block, *actions.shape[1:])
+            self._count, self.spent = self._count + 1, self.spent + candidates * self.block
+            state = advanced(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
+            flat = self.world.render(state, self._channels)
+            seen = {name: tensor.unflatten(0, (-1, candidates)) for name, tensor in flat.items()}
+            return state, self.cost.of_step(seen, self.goal).cpu(), alive, None
         for _ in range(self.block):
             state = self._imagined(state, actions, candidates)
             flat = self.world.render(state, self._channels)

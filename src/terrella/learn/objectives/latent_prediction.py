@@ -77,7 +77,12 @@ class LatentPrediction:
     def __init__(self, network: LatentNetwork, controls: Controls, learning_rate: float, steps: int):
         self.network, self.controls, self.steps = network, controls, steps
         self.modules = {"network": network}
-        trained = (network.encoder, network.predictor, network.heads)
+        trained = (
+            network.encoder,
+            network.predictor,
+            network.heads,
+            *([network.leaper] if network.config.leap else []),
+        )
         self.learners = {"latent": adamw(trained, warmed(learning_rate, 100, 0.02))}
         if network.config.size:
             self.learners["decoder"] = adamw((network.decoder,), warmed(learning_rate, 100, 0.02))
@@ -87,6 +92,8 @@ class LatentPrediction:
         latents = self._encoded(batch, now)
         windows, foretold, away = self._rolled(latents, batch, now)
         parts = {"prediction": away, "sigreg": self._regular(latents, now)}
+        if config.leap:
+            parts["leap"] = self._leapt(latents, batch, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
         parts |= self._read(real, torch.stack(windows, 1), torch.stack(foretold, 1), latents, batch)
         shares = {
@@ -137,6 +144,18 @@ class LatentPrediction:
             window, past = torch.cat([window[:, 1:], foretold[-1][:, None]], 1), actions[:, 1:]
         windows.append(window)
         return windows, foretold, away / self.steps
+
+    def _leapt(self, latents: torch.Tensor, batch: LatentClips, now: Now) -> torch.Tensor:
+        """How far a leap from one row of each clip is from the truth."""
+        network, config = self.network, self.network.config
+        long = config.history + config.leap
+        at = int(now.rng.integers(latents.shape[1] - long + 1))
+        spans, acts = latents[:, at : at + long], batch.actions[:, at : at + long - 1]
+        lone = torch.from_numpy(now.rng.random((len(spans), 1, 1)) < LONE).to(now.device)
+        first = config.history - 1
+        window = torch.where(lone, spans[:, first : first + 1], spans[:, : config.history])
+        acts = torch.cat([torch.where(lone, 0.0, acts[:, :first]), acts[:, first:]], 1)
+        return (network.leap(window, acts) - spans[:, config.leap :]).square().mean()
 
     def _regular(self, latents: torch.Tensor, now: Now) -> torch.Tensor:
         flat = latents.flatten(0, 1)

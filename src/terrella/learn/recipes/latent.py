@@ -31,6 +31,7 @@ STAGE = "latent"
 SIDE, COARSE = 64, 16  # pixels: of the larger side at most, and what sides are multiples of
 WIDEST = 512  # numbers of a channel that is a vector
 STARTS = 64
+LEAP = 5  # steps at once, unless it is said
 NOT_NUMBERS = (
     "rgb",
     "depth",
@@ -59,6 +60,8 @@ class LatentTraining:
         latent: Width of the latent. Default: 32, and with pictures 64.
         history: Last latents and actions that the predictor sees.
         rollout: Steps that are predicted one from another. Default: 12, and with pictures 6; fewer where episodes are short.
+        leap: Steps that a leap takes at once, for planners that hold or try moves of so many; 0 learns none. Default: 5, where
+            the rollout has room for it.
         steps: Training steps. Training ends after these or after `hours`. Default: 4000, and with pictures 2500.
         hours: Hours of training, earlier runs included.
         batch: Clips per step. Default: 128, and with pictures 32.
@@ -76,6 +79,7 @@ class LatentTraining:
     latent: int | None = None
     history: int = 3
     rollout: int | None = None
+    leap: int | None = None
     steps: int | None = None
     hours: float = 24.0
     batch: int | None = None
@@ -104,7 +108,7 @@ def train_latent(data: str | Path, out: str | Path, config: LatentTraining, repo
 def _check(config: LatentTraining) -> None:
     if config.size and any(side < COARSE or side % COARSE for side in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of {COARSE}.")
-    counts = (config.latent, config.rollout, config.steps, config.batch, config.history)
+    counts = (config.latent, config.rollout, config.steps, config.batch, config.history, config.leap or None)
     if any(count is not None and count < 1 for count in counts) or (config.batch or 2) < 2 or config.history > 16:
         raise TrainingError(
             "--latent, --rollout and --steps are 1 or more, --history is 1 to 16, and a --batch has 2 clips or more."
@@ -147,8 +151,8 @@ class _Learned:
         self.run, self.recording, self.config = run, recording, config
         assert recording.controls is not None  # see WHY
         self.controls = recording.controls
+        self.sees_pictures = recording.cache.rgb is not None and config.pictures
         shape = self._shape()
-        self.sees_pictures = shape.pictured
         self.network = LatentNetwork(shape).to(run.device)
         arrays = [self._array(name) for name, _ in shape.vectors]
         rows = np.flatnonzero(recording.usable)
@@ -177,7 +181,14 @@ class _Learned:
             sees_vectors=config.vectors,
             latent=config.latent or (64 if pictured else 32),
             history=config.history,
+            leap=self._leap(),
         )
+
+    def _leap(self) -> int:
+        rollout, asked = self._rollout(), self.config.leap
+        if asked is not None and asked > rollout:
+            raise TrainingError(f"--leap {asked} needs a --rollout of as many steps or more; it is {rollout}.")
+        return asked if asked is not None else LEAP if rollout >= LEAP else 0
 
     def _rollout(self) -> int:
         """Steps of a rollout: as many as are asked for, or as leave nine tenths of the clips that a single step would have."""

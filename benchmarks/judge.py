@@ -1,0 +1,168 @@
+"""stable-worldmodel's own harness judges planners in a latent world that `terrella train latent` learned of TwoRoom's pictures.
+
+    make judge                                                       # all of it, in an environment of its own
+    make judge ARGS="--starts 400 --seeds 5 --arms reaching"         # more starts, some of the arms
+
+It records TwoRoom's own noisy expert, trains a world and a goal-conditioned policy on pictures and actions alone, and plays starts
+of other episodes. A table in Markdown, success with Wilson's interval: by the published protocol (50 starts, a goal 25 steps ahead
+in the recording, 50 steps, CEM of 300 plans in 30 rounds), and with starts whose goal is not already reached. What stands there
+already (a recording, a run) is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import judge_world as two_room
+import numpy as np
+import torch
+from stable_worldmodel import PlanConfig
+from stable_worldmodel.policy import BasePolicy, RandomPolicy, WorldModelPolicy
+from stable_worldmodel.solver import CEMSolver
+
+import terrella
+from terrella.act.goal_network import GoalActor
+from terrella.act.planning import Cost, CostModel, Planner, Reaching, SearchConfig, distance_to
+from terrella.core import World
+from terrella.measure.statistics import wilson
+
+OFFSET, BUDGET, BLOCK, HORIZON = 25, 50, 5, 5
+PUBLISHED = "LeWM 87, DINO-WM 100, a random floor of about 26 (the papers' own training and starts)"
+
+
+def command(*words: str) -> float:
+    """A command of terrella's, as a user types it; the processor seconds that it took."""
+    print("$ terrella", *words, flush=True)
+    began = np.array(_times())
+    subprocess.run([str(Path(sys.executable).with_name("terrella")), *words], check=True)
+    return float((np.array(_times()) - began).sum())
+
+
+def _times() -> tuple[float, float]:
+    import resource
+
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime, used.ru_stime
+
+
+def prepared(folder: Path, episodes: int, seed: int, steps: list[str]) -> tuple[World, GoalActor, dict[str, float]]:
+    """The recording, the world and the policy of a seed; made where they are missing. And the processor seconds of training."""
+    recording, run, goals, notes = (folder / f"{name}-{seed}" for name in ("recording", "world", "goals", "cost.json"))
+    spent = json.loads(notes.read_text()) if notes.exists() else {}
+    if not (recording / "meta" / "info.json").exists():
+        with two_room.Recorded(recording) as writer:
+            two_room.collect(writer, episodes, 1000 * seed)
+    if not (run / "world" / "world.json").exists():
+        words = ("train", "latent", str(recording), "--out", str(run), "--seed", str(seed), *steps)
+        spent["world"] = command(*words)
+    if not (goals / "policy" / "policy.json").exists():
+        words = ("--in", str(run), "--from", str(recording), "--out", str(goals), "--seed", str(seed))
+        spent["goals"] = command("train", "goals", *words)
+    notes.write_text(json.dumps(spent))
+    world = terrella.load(run)
+    return world, GoalActor.load(goals, world.spec), spent
+
+
+def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], BasePolicy]]:
+    """Who is judged, by name."""
+
+    def cem() -> BasePolicy:
+        solver = CEMSolver(CostModel(world), batch_size=1, num_samples=300, n_steps=30, topk=30, seed=seed)
+        return WorldModelPolicy(solver, PlanConfig(HORIZON, HORIZON, action_block=BLOCK, warm_start=True))
+
+    def ours(make: Callable[[Cost], Any]) -> Callable[[], BasePolicy]:
+        return lambda: two_room.Acting(lambda goals: make(distance_to(world, {"rgb": goals}, "last")), seed)
+
+    varied = GoalActor(actor.network, world.spec, varied=True)
+    config = SearchConfig("icem", samples=64, iterations=5, horizon=HORIZON, block=BLOCK)
+    short = SearchConfig("icem", samples=16, iterations=2, horizon=HORIZON, block=BLOCK)
+    return {
+        "random": lambda: RandomPolicy(seed),
+        "reaching": ours(lambda cost: Reaching(world, actor, cost)),
+        "icem": ours(lambda cost: Planner(world, cost, config)),
+        "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied)),
+        "cem 300x30": cem,
+    }
+
+
+def judged(held: two_room.Held, policy: BasePolicy, count: int, seed: int, unsolved: bool) -> dict[str, Any]:
+    """Success over `count` starts, of all and of those whose goal is in the other room, and the milliseconds of a decision."""
+    starts = held.starts(OFFSET, count, seed, unsolved)
+    began = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        reached = two_room.evaluated(policy, held, starts, OFFSET, BUDGET)
+    other = held.crossing(*starts, OFFSET)
+    ms = float(np.median(getattr(policy, "ms", [np.nan])))
+    return {
+        "reached": int(reached.sum()),
+        "of": count,
+        "crossed": int(reached[other].sum()),
+        "crossings": int(other.sum()),
+        "ms": None if np.isnan(ms) else round(ms, 2),
+        "processor_s": round(time.process_time() - began, 1),
+    }
+
+
+def _share(reached: int, count: int) -> str:
+    if not count:
+        return "-"
+    found = wilson(reached, count)
+    return f"{100 * found.value:.1f} [{100 * found.low:.1f}, {100 * found.high:.1f}]"
+
+
+def line(name: str, rows: list[dict[str, Any]]) -> str:
+    """A row of the table: all seeds together."""
+    total = {key: sum(row[key] for row in rows) for key in ("reached", "of", "crossed", "crossings")}
+    ms = [row["ms"] for row in rows if row["ms"] is not None]
+    shares = ", ".join(f"{100 * row['reached'] / row['of']:.1f}" for row in rows)
+    taken = f"{np.median(ms):.1f}" if ms else ""
+    whole, crossed = _share(total["reached"], total["of"]), _share(total["crossed"], total["crossings"])
+    return f"| {name} | {whole} | {shares} | {crossed} of {total['crossings']} | {taken} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("judged"))
+    parser.add_argument("--episodes", type=int, default=300, help="of the expert, that are recorded to learn from")
+    parser.add_argument(
+        "--held", type=int, default=200, help="further episodes of the expert, whose rows are starts and goals"
+    )
+    parser.add_argument("--starts", type=int, default=50)
+    parser.add_argument("--seeds", type=int, default=1, help="of starts and of what policies draw; all in one world")
+    parser.add_argument("--arms", nargs="*", default=["random", "reaching", "icem", "icem+reaching", "cem 300x30"])
+    parser.add_argument("--train", nargs="*", default=[], help="further words for `terrella train latent`, without --")
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    more = [f"--{word}" if number % 2 == 0 else word for number, word in enumerate(asked.train)]
+    world, actor, spent = prepared(asked.out, asked.episodes, 0, more)
+    with two_room.Held() as held:
+        two_room.collect(held, asked.held, 777_000)
+    print(
+        f"Training took {', '.join(f'{name} {s / 60:.1f}' for name, s in spent.items())} processor minutes.", flush=True
+    )
+    found: dict[str, dict[str, list]] = {}
+    for kind, unsolved in (("published protocol", False), ("unsolved starts", True)):
+        print(f"\n{kind}: a goal {OFFSET} steps ahead, {BUDGET} steps; published: {PUBLISHED}\n")
+        print("| | success % | by seed | of those in the other room | ms a decision |\n| --- | --- | --- | --- | --- |")
+        for name in asked.arms:
+            rows = [
+                judged(held, arms(world, actor, seed)[name](), asked.starts, 42 + seed, unsolved)
+                for seed in range(asked.seeds)
+            ]
+            found.setdefault(kind, {})[name] = rows
+            print(line(name, rows), flush=True)
+            (asked.out / "judge.json").write_text(json.dumps({"spent_s": spent, **found}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""A goal-conditioned policy over latents: from where one is, where one would be and how soon, to the action (inverse dynamics over
+many steps, learned with hindsight goals)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from ..core.errors import ChannelError, CheckpointError
+from ..core.spec import Spec, shape_of
+from ..core.world import Observation
+from .actor import DAMAGE, WEIGHTS_FILE, policy_folder, read_policy, write_policy
+from .actor_network import ActorConfig, perceptron
+from .distributions import ActionDistribution
+
+KIND, VERSION = "goal-actor", 1
+LATENT, GOAL = "latent", "goal.latent"
+BRISK = (0.4, 1.4)  # of the steps that are asked for, where plans are to differ
+
+
+@dataclass(frozen=True)
+class GoalConfig:
+    """latent: its width; actor: the actions; farthest: steps to a goal at most; hidden, layers: of both perceptrons."""
+
+    latent: int
+    actor: ActorConfig
+    farthest: int = 50
+    hidden: int = 256
+    layers: int = 3
+
+    @staticmethod
+    def of(spec: Spec, farthest: int = 50, hidden: int = 256) -> GoalConfig:
+        """For a world with the channel `latent`; ChannelError for others."""
+        return GoalConfig(shape_of(latent_space(spec))[0], ActorConfig.of(spec, (LATENT,)), farthest, hidden)
+
+
+def latent_space(spec: Spec) -> Any:
+    """The channel in which goals are told; ChannelError for a world without it."""
+    if LATENT not in spec.channels:
+        raise ChannelError(
+            f"goals are told in latents, and {spec.name} has none (only {', '.join(spec.channels)}): `terrella train latent` "
+            "learns a world with latents."
+        )
+    return spec.channels[LATENT]
+
+
+class GoalNetwork(nn.Module):
+    """Two perceptrons: the action, and the steps that it takes."""
+
+    def __init__(self, config: GoalConfig):
+        super().__init__()
+        self.config = config
+        both = 2 * config.latent
+        self.act = perceptron(both + 1, config.hidden, config.layers, config.actor.outputs, gain=0.1)
+        self.far = perceptron(both, config.hidden, config.layers, 1, gain=0.1)
+
+    def forward(self, latent: torch.Tensor, goal: torch.Tensor, steps: torch.Tensor) -> ActionDistribution:
+        """Of the actions from latents [N, D] that are at goals [N, D] after `steps` [N]."""
+        share = steps.clamp(1, self.config.farthest).log() / math.log(self.config.farthest)
+        return self.config.actor.distribution(self.act(torch.cat([latent, goal - latent, share[:, None]], 1)))
+
+    def steps(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        """How many steps [N] it takes who is quick, 1 or more."""
+        share = self.far(torch.cat([latent, goal - latent], 1))[:, 0]
+        return (share.clamp(0, 1) * math.log(self.config.farthest)).exp()
+
+
+@final
+class GoalActor:
+    """A Policy that sees `latent` and `goal.latent`, for the actions of `spec`; ActionError or ChannelError for others.
+
+    varied: each episode asks for the goal sooner or later than is usual, so that a planner has different plans to choose from.
+    """
+
+    sees = (LATENT, GOAL)
+
+    def __init__(self, network: GoalNetwork, spec: Spec, varied: bool = False, card: dict | None = None):
+        width = shape_of(latent_space(spec))[0]
+        network.config.actor.check(spec)
+        if width != network.config.latent:
+            raise ChannelError(
+                f"the policy is for latents of {network.config.latent} numbers; {spec.name} has {width}."
+            )
+        self.network, self.spec, self.varied, self.card = network, spec, varied, dict(card or {})
+
+    def begin(self, batch: int, rng: torch.Generator) -> torch.Tensor:
+        """How the steps that are asked for are changed, [B]."""
+        low, high = BRISK
+        return low + (high - low) * torch.rand(batch, generator=rng) if self.varied else torch.ones(batch)
+
+    @torch.no_grad()
+    def act(
+        self, observation: Observation, memory: torch.Tensor, rng: torch.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        latent, goal = observation[LATENT], observation[GOAL]
+        goal = goal.to(latent).expand(len(latent), -1)
+        steps = self.network.steps(latent, goal) * memory.to(latent)
+        config = self.network.config.actor
+        return config.actions(self.network(latent, goal, steps).likeliest(), self.spec), memory
+
+    def save(self, folder: str | Path) -> None:
+        """Writes the folder, each file whole; CheckpointError where it cannot be written."""
+        told = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
+        write_policy(folder, told, self.network)
+
+    @staticmethod
+    def load(folder: str | Path, spec: Spec, varied: bool = False) -> GoalActor:
+        """What `save` wrote, from its folder or that of the training run. CheckpointError for what is damaged, ActionError or
+        ChannelError where it does not fit the world of `spec`."""
+        folder = policy_folder(folder)
+        told = read_policy(folder)
+        try:
+            config = dict(told["config"])
+            actor = ActorConfig(**{name: _tuple(value) for name, value in config.pop("actor").items()})
+            network = GoalNetwork(GoalConfig(actor=actor, **config))
+            network.load_state_dict(load_file(folder / WEIGHTS_FILE))
+        except DAMAGE as error:
+            raise CheckpointError(f"{folder} is damaged or incomplete ({error}); copy or train it again.") from error
+        return GoalActor(network.eval().requires_grad_(False), spec, varied, told.get("card"))
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(map(_tuple, value)) if isinstance(value, list) else value

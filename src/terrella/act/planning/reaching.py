@@ -1,0 +1,45 @@
+"""Reaching: a goal-conditioned policy in place of a search: it acts at once, as far as it has learned to."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+
+from ...core.errors import PlanningError
+from ...core.state import State
+from ...core.world import Observation, World
+from ..goal_network import GOAL, LATENT, GoalActor
+from .costs import Cost
+
+_GOAL, _MEMORY = "reaching.goal", "reaching.memory"
+
+
+@final
+class Reaching:
+    """The world folds what is seen into its latent, the policy acts from that towards the goal of `cost`, which is a latent (see
+    `distance_to`). Its memory is the world's state, with the goal. PlanningError for other goals."""
+
+    def __init__(self, world: World, actor: GoalActor, cost: Cost):
+        if set(cost.goal) != {LATENT}:
+            told = ", ".join(cost.goal) or "the reward"
+            raise PlanningError(
+                f"a goal-conditioned policy reaches what {world.spec.name} can observe whole "
+                f"({', '.join(world.spec.observes)}), and the goal is {told}."
+            )
+        self.world, self.actor, self.cost = world, actor, cost
+        self.sees = (*world.spec.observes, *world.spec.may_observe)
+
+    def begin(self, batch: int, rng: torch.Generator) -> State:
+        goal = torch.cat([self.cost.goal_of(entry, batch)[LATENT] for entry in range(batch)])
+        return State({_GOAL: goal, _MEMORY: self.actor.begin(batch, rng)})
+
+    def act(self, observation: Observation, memory: State, rng: torch.Generator) -> tuple[torch.Tensor, State]:
+        kept = {name: memory[name] for name in (_GOAL, _MEMORY)}
+        before = {name: tensor for name, tensor in memory.items() if name not in kept}
+        evidence = {name: observation[name] for name in self.sees if name in observation}
+        state = self.world.observe(evidence, State(before, memory.arenas) if before else None, rng)
+        seen = {**self.world.render(state, (LATENT,)), GOAL: kept[_GOAL]}
+        action, _ = self.actor.act(seen, kept[_MEMORY], rng)
+        after = self.world.imagine(state, action, rng)
+        return action, State({**after, **kept}, after.arenas)

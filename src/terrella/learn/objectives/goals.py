@@ -1,0 +1,73 @@
+"""Goals in hindsight: whatever an episode came to was a goal that it reached, by the actions that it took (HER, Andrychowicz et al.
+2017; GCSL, Ghosh et al. 2019)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ...act.distributions import Axes
+from ...act.goal_network import GoalNetwork
+from ..trainer import Loss, Now, adamw, warmed
+
+QUICK = 0.2  # the quantile of the steps that hindsight found: how long who is quick takes
+
+
+@dataclass(frozen=True)
+class Hindsight:
+    """N moves: latents [N, D], the goals [N, D] to which they led after steps [N], and actions [N, A] as networks have them."""
+
+    latent: torch.Tensor
+    goal: torch.Tensor
+    steps: torch.Tensor
+    action: torch.Tensor
+
+
+class Trajectories:
+    """Latents [R, D] and encoded actions [R, A] of a recording. ends [R]: the last row of each row's episode; rows: those with a
+    valid action, from which moves are drawn, with goals up to `farthest` steps later."""
+
+    def __init__(self, latents: torch.Tensor, actions: torch.Tensor, ends: np.ndarray, rows: np.ndarray, farthest: int):
+        self.latents, self.actions, self.ends, self.farthest = latents, actions, ends, farthest
+        self.rows = rows[ends[rows] > rows]
+
+    def drawn(self, count: int, rng: np.random.Generator, steps: int | None = None) -> Hindsight:
+        """`count` moves; steps to the goal even in what the episode leaves, half of the time in its logarithm; or so many."""
+        rows = self.rows if steps is None else self.rows[self.ends[self.rows] - self.rows >= steps]
+        picked = rng.choice(rows, count)
+        most = np.minimum(self.ends[picked] - picked, self.farthest)
+        even, share = rng.random(count) < 0.5, rng.random(count)
+        ahead = np.where(even, 1 + np.floor(share * most), np.floor((most + 1) ** share)).astype(np.int64).clip(1, most)
+        ahead = ahead if steps is None else np.full(count, steps)
+        start, end = torch.from_numpy(picked), torch.from_numpy(picked + ahead)
+        return Hindsight(self.latents[start], self.latents[end], torch.from_numpy(ahead).float(), self.actions[start])
+
+
+class GoalReaching:
+    """The action that led to the goal, and a low quantile of the steps that it took (Koenker & Bassett 1978)."""
+
+    def __init__(self, network: GoalNetwork, learning_rate: float):
+        self.network = network
+        self.modules = {"network": network}
+        self.learners = {"goals": adamw((network,), warmed(learning_rate, 100, 0.02))}
+
+    def losses(self, batch: Hindsight, now: Now) -> Iterator[Loss]:
+        found = self.network(batch.latent, batch.goal, batch.steps)
+        action = action_error(found, batch.action, self.network.config.actor.counts)
+        scale = math.log(self.network.config.farthest)
+        short = (batch.steps.log() - self.network.steps(batch.latent, batch.goal).log()) / scale
+        steps = torch.maximum(QUICK * short, (QUICK - 1) * short).mean()
+        yield Loss("goals", action + steps, {"action": action, "steps": steps})
+
+
+def action_error(found, action: torch.Tensor, counts: tuple[int, ...]) -> torch.Tensor:
+    """How far the likeliest is from actions [N, A] as networks have them: of axes the square, of the rest in nats."""
+    if isinstance(found, Axes):
+        return (torch.tanh(found.likeliest()) - action).square().mean()
+    if action.shape[1] != len(counts):  # one-hot
+        action = torch.stack([part.argmax(1) for part in action.split(list(counts), 1)], 1).float()
+    return -found.log_prob(action).mean()
