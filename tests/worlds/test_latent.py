@@ -189,6 +189,15 @@ def test_latents_stay_within_bounds_however_long_it_goes_on():
     assert world.spec.channels["latent"].contains(state["window"][0, -1].numpy())
 
 
+def test_one_number_is_shown_as_the_game_shows_it_and_a_state_of_one_stays_a_list():
+    world = made(vectors=(("health", 1), ("observation", 1)), size=None)
+    shown = world.render(world.start(3, make_rng(0)), ("health", "observation"))
+    assert shown["health"].shape == (3,) and shown["observation"].shape == (3, 1)
+    assert world.spec.channels["health"].shape == () and world.spec.channels["observation"].shape == (1,)
+    again = world.observe(shown, None, make_rng(0))
+    assert world.render(again, ("health",))["health"].shape == (3,)
+
+
 def test_a_spread_beyond_all_that_was_seen_tells_of_a_larger_error():
     network = made().network
     network.spread.copy_(torch.linspace(0, 4, len(network.spread)))

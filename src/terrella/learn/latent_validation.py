@@ -98,7 +98,7 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
             shown = world.render(state, tuple(began))
             for name in began:
                 really, scale = _vector(recording, name, rows + step), _scale(world, name)
-                vectors[name, arm, step] = (shown[name].cpu() - really) / scale
+                vectors[name, arm, step] = (shown[name].cpu().reshape(really.shape) - really) / scale
                 vectors[name, ARMS[2], step] = (began[name] - really) / scale
     return OpenLoop(tuple(fitting), latent, vectors, spread)
 

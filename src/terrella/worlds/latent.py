@@ -55,7 +55,8 @@ class LatentWorld:
         shows: dict[str, spaces.Space] = {"latent": free}
         shows |= {"rgb": spaces.Box(0, 255, (*config.size, 3), np.uint8)} if config.size else {}
         for name, width in config.vectors:
-            shows[name] = POSE if kind_of(name) == "pose" else spaces.Box(-np.inf, np.inf, (width,), np.float32)
+            shape = () if _lone(name, width) else (width,)
+            shows[name] = POSE if kind_of(name) == "pose" else spaces.Box(-np.inf, np.inf, shape, np.float32)
         unit = spaces.Box(0, 1, (), np.float32)
         shows |= {"reward": REWARD, "done": DONE, "done_probability": unit, "uncertainty": unit}
         poses = {name: POSE_UNIT for name in shows if kind_of(name) == "pose"}
@@ -185,7 +186,8 @@ class LatentWorld:
         flat = network.numbers(state["window"]) * network.scale + network.mean
         vectors = network.config.vectors
         parts = dict(zip((name for name, _ in vectors), flat.split([width for _, width in vectors], 1)))
-        return {name: _posed(part) if kind_of(name) == "pose" else part for name, part in parts.items()}
+        shown = {name: _posed(part) if kind_of(name) == "pose" else part for name, part in parts.items()}
+        return {name: part[:, 0] if _lone(name, part.shape[1]) else part for name, part in shown.items()}
 
     def _shown(self, state: State, name: str) -> torch.Tensor:
         if name == "latent":
@@ -195,6 +197,11 @@ class LatentWorld:
         if name == "uncertainty":
             return self.network.expected(state["spread"])
         return state[name]
+
+
+def _lone(name: str, width: int) -> bool:
+    """Whether a channel is one number, such as the player's health: recordings hold lists of one, for want of anything less."""
+    return width == 1 and kind_of(name) not in ("observation", "state")
 
 
 def _posed(pose: torch.Tensor) -> torch.Tensor:
