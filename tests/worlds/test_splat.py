@@ -29,6 +29,14 @@ def test_the_laws_hold():
     assert "a_batch_equals_its_singles" in check_world(splat(), steps=5)
 
 
+def test_it_is_an_environment():
+    env = terrella.as_env(splat(), num_envs=2, seed=0, max_steps=3)
+    assert env.reset()[0].shape == (2, *SIZE, 3)
+    for _ in range(3):
+        pictures, _, _, truncated, _ = env.step(env.action_space.sample())
+    assert truncated.all() and pictures.std() > 5
+
+
 def test_one_walks_to_the_wall_flies_and_falls():
     world, rng = splat(), terrella.make_rng(0)
     press = lambda *names: torch.tensor([[int(one in names) for one in BUTTONS]], dtype=torch.int8)  # noqa: E731

@@ -35,6 +35,7 @@ COMMANDS = {
     "space fit": ("space:fit", "make a place of Gaussians of a recording with depth and poses"),
     "space import": ("space:import_", "make a world of a file of Gaussians (.ply, .spz)"),
     "space export": ("space:export", "write a world's Gaussians for other tools"),
+    "space edit": ("space:edit", "move, turn, scale, recolour, duplicate or delete a part of a place; undo"),
     "list": ("worlds:list_worlds", "show the worlds at hand"),
     "convert-world": ("worlds:convert_world", "convert a world that an earlier release saved"),
     "data doctor": ("data:doctor", "look for faults in a recording, and repair them"),

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
 from .. import progress
 from ..learn.recipes.splat import SplatFit, fit_splat
 from ..library import folder_of
+from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, write_scene
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
-from ..worlds.splat_folder import save_splat, world_of
+from ..worlds.splat_folder import read_edits, save_splat, world_of, write_edits
 from .say import Json, result
 
 Axes = Literal["rdf", "rub", "flu"]
@@ -90,6 +91,63 @@ def export(
     write_scene(opened.gaussians, file, axes, "compressed" if compressed else "")
     facts = {"gaussians": len(opened.gaussians), "bytes": file.stat().st_size, "file": str(file)}
     result(facts, json)
+
+
+def edit(
+    world: Positional[str],
+    box: tuple[float, float, float, float, float, float] | None = None,
+    sphere: tuple[float, float, float, float] | None = None,
+    plane: tuple[float, float, float, float] | None = None,
+    move: tuple[float, float, float] | None = None,
+    duplicate: tuple[float, float, float] | None = None,
+    turn: float | None = None,
+    scale: float | None = None,
+    recolour: tuple[float, float, float] | None = None,
+    delete: bool = False,
+    undo: bool = False,
+    json: Json = False,
+) -> None:
+    """Change a part of a world of Gaussians. Each edit is a line of its world.edits.jsonl; the scene itself stays as it was.
+
+    Args:
+        world: The folder of the world, or the run that made it.
+        box: What lies between two corners (x y z x y z, metres). Without a selection: all.
+        sphere: What lies around a place (x y z radius).
+        plane: What lies before a plane (a b c d: a x + b y + c z > d).
+        move: By so many metres (x y z).
+        duplicate: A second one, so many metres away (x y z).
+        turn: By so many degrees about its middle, to the left.
+        scale: By a factor about its middle.
+        recolour: To one colour (red green blue, 0 to 1).
+        delete: Take it away.
+        undo: Take the last edit back.
+    """
+    from ..core.errors import TerrellaError
+
+    folder, opened = folder_of(world), open_splat(world)
+    edits = read_edits(folder)
+    places = {name: list(given) for name, given in (("box", box), ("sphere", sphere), ("plane", plane)) if given}
+    asked: dict[str, Any] = {
+        "move": move, "duplicate": duplicate, "turn": turn, "scale": scale, "recolour": recolour, "delete": delete or None,
+    }  # fmt: skip
+    deeds = [name for name, value in asked.items() if value is not None]
+    if len(places) > 1 or len(deeds) + undo != 1:
+        raise TerrellaError(
+            "an edit is of one place (--box, --sphere or --plane) and does one thing (--move, --delete, ...)."
+        )
+    if undo and not edits:
+        raise TerrellaError(f"{world} has no edit to undo.")
+    if undo:
+        edits = edits[:-1]
+    else:
+        new: dict[str, Any] = {"select": places or {"all": True}, "do": deeds[0]}
+        name = DEEDS[deeds[0]][0]
+        if name:
+            new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
+        edited(opened.gaussians, [new])  # refuses what cannot be done
+        edits = [*edits, new]
+    write_edits(folder, edits)
+    result({"edits": len(edits), "gaussians": len(open_splat(world).gaussians)}, json)
 
 
 def open_splat(name: str) -> SplatWorld:

@@ -1,4 +1,4 @@
-"""A SplatWorld on disk: a folder of world.json, scene.safetensors and README.md; and one made of a file of another tool."""
+"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl and README.md; one made of a file."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from ..core.errors import CheckpointError
+from ..core.errors import CheckpointError, ContractError
 from ..space.camera import planar_pose
+from ..space.edits import Edit, edited
 from ..space.files import replace_whole
 from ..space.occupancy import Body
 from ..space.raster import Gaussians
-from .splat import OBSERVED, SplatConfig, SplatWorld
+from .splat import INVENTED, OBSERVED, SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
-WORLD_FILE, SCENE_FILE = "world.json", "scene.safetensors"
+WORLD_FILE, SCENE_FILE, EDITS_FILE = "world.json", "scene.safetensors", "world.edits.jsonl"
 
 
 def save_splat(world: SplatWorld, path: str | Path) -> None:
-    """Writes the folder; each file is replaced whole."""
+    """Writes the folder; each file is replaced whole. Edits of a scene that was there before are forgotten."""
     path = Path(path)
     about = {
         "kind": KIND, "version": VERSION, "name": world.name, "config": asdict(world.config), "card": dict(world.card),
     }  # fmt: skip
     tensors = {**vars(world.gaussians), "provenance": world.provenance, "starts": world.starts}
     whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
+    (path / EDITS_FILE).unlink(missing_ok=True)
     replace_whole(path / SCENE_FILE, lambda file: save_file(whole, file))
     lines = (
         f"# {world.name}\n\nA place of {len(world.gaussians):,} Gaussians: `terrella play {path.name}` walks in it.\n"
@@ -53,9 +55,23 @@ def load_splat(path: str | Path, about: dict[str, Any]) -> SplatWorld:
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
         if len(provenance) != len(tensors["means"]) or starts.ndim != 2 or starts.shape[1] != 7 or not len(starts):
             raise ValueError("its parts do not fit one another")
-        return SplatWorld(str(about["name"]), Gaussians(**tensors), provenance, starts, config, dict(about["card"]))
-    except (OSError, SafetensorError, LookupError, TypeError, ValueError) as error:
+        scene, origin = edited(Gaussians(**tensors), read_edits(path))
+        provenance = torch.where(origin < 0, INVENTED, provenance[origin]).to(torch.uint8)
+        return SplatWorld(str(about["name"]), scene, provenance, starts, config, dict(about["card"]))
+    except (OSError, SafetensorError, LookupError, TypeError, ValueError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
+
+
+def read_edits(path: Path) -> list[Edit]:
+    """The edits of a world, the oldest first; ValueError for a line that is no JSON."""
+    file = path / EDITS_FILE
+    return [json.loads(line) for line in file.read_text().splitlines() if line.strip()] if file.exists() else []
+
+
+def write_edits(path: Path, edits: list[Edit]) -> None:
+    """Replaces the edits of a world, a line each."""
+    text = "".join(json.dumps(edit) + "\n" for edit in edits)
+    replace_whole(path / EDITS_FILE, lambda file: file.write_text(text))
 
 
 def world_of(gaussians: Gaussians, name: str, card: dict[str, Any], config: SplatConfig) -> SplatWorld:

@@ -1,0 +1,70 @@
+"""Edits of a place: what they change, what they leave, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from terrella.cli import main
+from terrella.core.errors import ContractError
+from terrella.library import load
+from terrella.space.edits import edited
+from terrella.worlds.splat import SplatConfig, SplatWorld
+from terrella.worlds.splat_folder import save_splat, world_of
+
+from .test_fitting import LENS, SIZE, room
+from .test_raster import cloud, parts
+
+BOX = {"box": [3.0, -9, -9, 9, 9, 9]}
+
+
+def test_what_is_not_selected_stays():
+    scene = cloud(60)
+    chosen = scene.means[:, 0] >= 3
+    for deed in ({"do": "move", "by": [1, 0, 0]}, {"do": "turn", "degrees": 30}, {"do": "scale", "factor": 2},
+                 {"do": "recolour", "colour": [1, 0, 0]}, {"do": "delete"}):  # fmt: skip
+        after, origin = edited(scene, [{"select": BOX, **deed}])
+        kept = origin >= 0
+        assert torch.equal(origin[kept], (~chosen).nonzero()[:, 0])
+        assert all(torch.equal(a[kept], b[~chosen]) for a, b in zip(parts(after), parts(scene)))
+        assert len(after) == (60 - int(chosen.sum()) if deed["do"] == "delete" else 60)
+
+
+def test_there_and_back_is_nothing():
+    scene = cloud(60, 2)
+    for there, back in (({"do": "move", "by": [1, 2, 0]}, {"do": "move", "by": [-1, -2, 0]}),
+                        ({"do": "turn", "degrees": 70}, {"do": "turn", "degrees": -70})):  # fmt: skip
+        moved, _ = edited(scene, [{"select": {"all": True}, **there}])
+        after, _ = edited(moved, [{"select": {"all": True}, **back}])
+        offset = after.means - scene.means
+        assert not torch.allclose(moved.means, scene.means, atol=0.1)
+        assert (offset - offset.mean(0)).abs().max() < 1e-4  # a turn's middle is that of what is turned
+        assert torch.allclose(after.sh, scene.sh, atol=1e-4) and torch.allclose(after.scales, scene.scales)
+    both, origin = edited(scene, [{"select": BOX, "do": "duplicate", "by": [0, 5, 0]}])
+    assert len(both) == 60 + int((origin < 0).sum()) and torch.equal(both.means[:60], scene.means)
+
+
+@pytest.mark.parametrize("edit", [
+    {"select": {"ring": [1]}, "do": "delete"}, {"select": BOX, "do": "paint"}, {"select": {"box": [1, 2]}, "do": "delete"},
+    {"select": {"sphere": [99, 99, 99, 1]}, "do": "delete"}, {"select": BOX, "do": "move", "by": "far"},
+    {"select": BOX, "do": "scale", "factor": -1}, {"select": BOX, "do": "move", "by": [0, 0, float("nan")]}, {"do": "delete"},
+])  # fmt: skip
+def test_what_is_no_edit(edit):
+    with pytest.raises(ContractError):
+        edited(cloud(60), [edit])
+
+
+def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
+    save_splat(world_of(room(count=800), "room", {}, SplatConfig(LENS, SIZE)), tmp_path / "w")
+    place = str(tmp_path / "w")
+    assert main(["space", "edit", place, "--sphere", "0", "2", "1", "0.8", "--delete"]) == 0
+    assert main(["space", "edit", place, "--box", "3", "0", "0", "5", "4", "3", "--recolour", "1", "0", "0"]) == 0
+    world = load(place)
+    assert isinstance(world, SplatWorld) and len(world.gaussians) < 800
+    assert 0 < (world.provenance == 0).sum() < len(world.gaussians)
+    assert len((tmp_path / "w" / "world.edits.jsonl").read_text().splitlines()) == 2
+    assert main(["space", "edit", place, "--sphere", "90", "2", "1", "0.8", "--delete"]) == 2
+    assert main(["space", "edit", place, "--undo"]) == 0 and main(["space", "edit", place, "--undo"]) == 0
+    assert main(["space", "edit", place, "--undo"]) == 2
+    world = load(place)
+    assert isinstance(world, SplatWorld) and len(world.gaussians) == 800 and (world.provenance == 1).all()
