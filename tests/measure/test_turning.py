@@ -14,7 +14,7 @@ from panorama import SHORT, STEP_M, TURN_RAD, Panorama, card_of, exam_of, look, 
 
 from terrella.core import Spec, State, check_world, make_rng
 from terrella.measure import CLIPS, Exam, ExamConfig, clips_from_cache, examine, verdict
-from terrella.measure.turning import turns
+from terrella.measure.turning import scrolls, turns
 
 KINDS = {
     "buttons": spaces.MultiBinary(3),
@@ -96,6 +96,56 @@ def test_a_world_that_takes_no_pose_is_asked_to_turn_by_its_own_actions():
     (back,) = [row for row in card.rows if row.probe == "memory" and "again" not in row.what]
     assert back.what == "turning by +c and -c, 60 steps" and back.motion == "predicted"
     assert "90 degrees away" in back.note and "memory" not in {one.probe for one in card.missing}
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A flat strip of noise that scrolls by three pixels a step, to the right with b, to the left with c; what is scrolled back to
+    is darker by `fades`."""
+
+    fades: int = 0
+
+    @property
+    def spec(self) -> Spec:
+        shows = {"rgb": spaces.Box(0, 255, (24, 32, 3), np.uint8), "mosaic": spaces.Box(0, 255, (72, 128, 4), np.uint8)}
+        return Spec("strip", spaces.MultiBinary(3), shows, ("rgb",), 0.1, action_names=("a", "b", "c"))
+
+    def start(self, batch: int, rng: torch.Generator) -> State:
+        return State({"at": torch.zeros(batch, dtype=torch.int64), "age": torch.zeros(batch, dtype=torch.int64)})
+
+    def observe(self, observation, prior: State | None, rng: torch.Generator) -> State:
+        return prior or self.start(len(observation["rgb"]), rng)
+
+    def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
+        return State({"at": state["at"] + 3 * (action[:, 1].long() - action[:, 2].long()), "age": state["age"] + 1})
+
+    def render(self, state: State, channels) -> dict[str, torch.Tensor]:
+        wide = torch.randint(100, 256, (24, 400, 3), dtype=torch.uint8, generator=make_rng(7))
+        seen = torch.stack([wide[:, 200 - at : 232 - at] for at in state["at"].tolist()])
+        return {"rgb": seen - self.fades * (state["age"] > 30).to(torch.uint8)[:, None, None, None]}
+
+
+def test_the_actions_that_scroll_a_flat_world_and_undo_each_other_are_found():
+    found = scrolls(Strip(), some_clips(2), make_rng(0))
+    assert found is not None
+    one, other, name, speed = found
+    assert (one.tolist(), other.tolist(), name) == ([0, 1, 0], [0, 0, 1], "b and c") and speed == pytest.approx(3)
+
+    class Frozen(Strip):
+        def imagine(self, state, action, rng):
+            return state
+
+    assert scrolls(Frozen(), some_clips(2), make_rng(0)) is None
+
+
+@pytest.mark.parametrize("fades, worst, best", [(0, 60, 99), (20, 20, 25)])
+def test_a_flat_world_is_asked_to_scroll_away_and_back(fades, worst, best):
+    config = ExamConfig((1, 8), (8,), **{**SHORT, "drop": (1, 8), "closure_walk": 40, "closure_clips": 2})
+    clips = [replace(clip, channels={"rgb": clip.channels["rgb"]}) for clip in some_clips(2)]
+    card = examine(Exam({"a": Strip(fades)}, {CLIPS: {"recorded": clips}}, config))
+    back, again = [row for row in card.rows if row.probe == "memory"]
+    assert back.what == "scrolling by b and c, 40 steps" and not back.void
+    assert worst <= back.figure.value <= best
 
 
 @dataclass(frozen=True)

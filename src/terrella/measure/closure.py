@@ -19,7 +19,7 @@ from .fidelity import psnr
 from .roll import Results, Tick, fold_context, poses_at
 from .scorecard import PREDICTED, TRUE, Picture, Report, Row, words_of
 from .statistics import mean_interval
-from .turning import turns
+from .turning import scrolls, turns
 from .work import UNSEEN, Unit
 
 STATIC_DB = 20.0  # a far view this like the first one means that the picture hardly changed at all
@@ -105,15 +105,19 @@ def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick
 
 
 def ways_of(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[Way, Sequence[Clip]]]:
-    """Along poses where the world takes them, else by actions that undo each other."""
+    """Along poses where the world takes them, else by actions that undo each other: that turn, or scroll."""
     config, clips = exam.config, clips[: exam.config.closure_clips]
     if exam.follows_poses(world):
         ways = [(yaw_way(far, config.closure_step_deg), clips) for far in config.closure_deg]
         afoot = walkers(clips, config.closure_walk) if config.closure_walk else []
         return ways + ([(walk_way(config.closure_walk), afoot)] if afoot else [])
-    found = _turns(exam, world) if config.closure_deg else None
+    found = _turns(exam, world)
     if found is None:
-        return []
+        aside = _scrolls(exam, world)
+        if aside is None:
+            return []
+        one, other, name, _ = aside
+        return [(turn_way(one, other, f"scrolling by {name}, {config.closure_walk} steps", config.closure_walk), clips)]
     left, right, name, speed = found
     halves = {far: min(100, max(5, round(math.radians(far) / speed))) for far in config.closure_deg}
     return [
@@ -188,7 +192,17 @@ def _words(arm: str, rows: Sequence[Row]) -> str:
     )
 
 
+def _scrolls(exam: Exam, world: World):
+    """Of worlds that are flat and have a mosaic, where the score has time for it."""
+    if "mosaic" not in world.spec.channels or not exam.config.closure_walk:
+        return None
+    clips = next(iter(exam.places.values()))[: exam.config.closure_clips]
+    return exam.once(f"scrolls {id(world)}", lambda: scrolls(world, clips, exam.rng(2)))
+
+
 def _turns(exam: Exam, world: World):
+    if not exam.config.closure_deg:
+        return None
     clips = next(iter(exam.places.values()))
     return exam.once(f"turns {id(world)}", lambda: turns(world, clips, exam.rng(2)))
 
@@ -198,7 +212,9 @@ def _missing(exam: Exam, world: World) -> str:
         return "needs rgb"
     if exam.follows_poses(world):
         return ""
-    return "" if _turns(exam, world) else "needs actions that turn a camera whose pose is shown or recorded"
+    if _turns(exam, world) or _scrolls(exam, world):
+        return ""
+    return "needs actions that turn a camera whose pose is shown or recorded, or that scroll the picture and undo each other"
 
 
 def walkers(clips: Sequence[Clip], steps: int) -> list[Clip]:

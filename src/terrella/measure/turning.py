@@ -1,9 +1,10 @@
-"""Which actions turn the camera: found by trying them, or in what was recorded, never by their names."""
+"""Which actions turn the camera, or scroll the picture: found by trying them, or in what was recorded, never by their names."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -12,10 +13,12 @@ from gymnasium import spaces
 from ..core.spec import Spec
 from ..core.world import World
 from ..space.camera import yaw
+from ..space.matching import scrolled
 from .clips import Clip
 from .roll import fold_context
 
 TRIED, TURNS_RAD = 4, math.radians(0.2)  # steps that an action is tried for; what turns less in a step does not turn
+REACH, SCROLLS = 8, 0.5  # pixels that a picture may go in a step, either way; what goes less does not scroll
 
 
 def turns(
@@ -40,6 +43,30 @@ def turns(
     if speed < TURNS_RAD:
         return None
     return candidates[left][1], candidates[right][1], f"{candidates[left][0]} and {candidates[right][0]}", speed
+
+
+def scrolls(
+    world: World, clips: Sequence[Clip], rng: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor, str, float] | None:
+    """Two actions that scroll the picture one way and back, their name, and pixels a step; None where no two do. Each is tried in
+    this world, which shows `rgb`, from each of the clips; the steps that scroll furthest count, for some are blocked."""
+    candidates = _candidates(world.spec)
+    span = range(-REACH, REACH + 1)
+    moves = torch.tensor(sorted(((x, y) for x in span for y in span), key=lambda move: abs(move[0]) + abs(move[1])))
+    first, went = fold_context(world, clips, rng), []
+    for _, action in candidates:
+        state, frames = first, []
+        for step in range(TRIED + 1):
+            state = state if step == 0 else world.imagine(state, action.expand(len(clips), *action.shape), rng)
+            frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
+        steps = torch.stack([moves[scrolled(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0) / TRIED
+        went.append(steps[steps.abs().sum(1).argmax()])
+    best = None
+    for a, b in combinations(range(len(went)), 2):
+        speed = min(float(went[a].norm()), float(went[b].norm()))
+        if speed >= SCROLLS and (went[a] + went[b]).norm() <= 0.5 * speed and (best is None or speed > best[3]):
+            best = candidates[a][1], candidates[b][1], f"{candidates[a][0]} and {candidates[b][0]}", speed
+    return best
 
 
 def _candidates(spec: Spec) -> list[tuple[str, torch.Tensor]]:
