@@ -81,7 +81,7 @@ class ActorConfig:
         else:
             values = drawn + low
         kind = torch.from_numpy(np.zeros(0, dtype_of(spec.action))).dtype
-        return values.to(kind).reshape(len(drawn), *self.shape)
+        return values.to(kind).reshape(-1, *self.shape)
 
     def check(self, spec: Spec) -> None:
         """ActionError or ChannelError where this is a policy for other actions, or one that sees what is not there."""

@@ -31,6 +31,7 @@ COMMANDS = {
     "train latent-actions": ("train:latent_actions", "learn actions from pictures alone"),
     "train distil": ("train:few_steps", "make a slow world draw a frame in one or two steps"),
     "train dreams": ("train:dreams", "go on training a world on its own rollouts"),
+    "export policy": ("export:policy", "write a learned policy as an ONNX file that runs without PyTorch"),
     "score": ("score:score", "compare a world's predictions with a recording"),
     "space fit": ("space:fit", "make a place of Gaussians of a recording with depth and poses"),
     "space import": ("space:import_", "make a world of a file of Gaussians (.ply, .spz)"),

@@ -16,6 +16,7 @@ if "MUJOCO_GL" not in os.environ and sys.platform == "linux" and not os.environ.
 
 import mujoco
 import numpy as np
+from mujoco import rollout as rollout
 
 from ..core.errors import TerrellaError
 

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from ..core.errors import TerrellaError
 from ..similar import did_you_mean
+from .mujoco_model import mujoco
 
 Model = Any  # mujoco.MjModel
 

@@ -13,11 +13,11 @@ import sys
 import weakref
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 
 from ..core.errors import TerrellaError
 from ..core.spec import Camera
+from .mujoco_model import mujoco
 from .mujoco_parameters import Models, Parameter
 
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # left out: they cost most of the time

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 import torch
-from mujoco import rollout
 
+from .mujoco_model import mujoco, rollout
 from .mujoco_parameters import Models, Parameter
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -1,0 +1,28 @@
+"""The commands `terrella export ...`: what was learned, as files for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from .. import library
+from .say import Json, result
+
+
+def policy(name: Positional[Path], world: str, out: Path, json: Json = False) -> None:
+    """Write a learned policy as one ONNX file, with normalisation and action limits inside: it runs without PyTorch.
+
+    Args:
+        name: The folder of the policy, or of its training run.
+        world: A world with the actions that it gives, as the one that it practised in (mujoco:go1).
+        out: The file, NAME.onnx.
+    """
+    from ..act.actor import Actor
+    from ..act.onnx_file import write_onnx
+
+    spec = library.load(world).spec
+    inputs = write_onnx(Actor.load(name, spec), out)
+    facts = {"file": str(out), "inputs": inputs, "outputs": {"action": [-1, *(spec.action.shape or ())]}}
+    facts |= {"action_names": list(spec.action_names), "action_units": list(spec.action_units), "control_s": spec.dt_s}
+    result(facts, json)

@@ -1,0 +1,79 @@
+"""PPO learns what pays in a small world, as exactly as it is seeded, and stops before a policy moves far."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.act.actor import Actor
+from terrella.act.actor_network import ActorConfig, ActorNetwork
+from terrella.act.onnx_file import write_onnx
+from terrella.core import Spec, State, make_rng, rollout
+from terrella.core.spec import REWARD
+from terrella.learn.recipes.policy import Practice, train_policy
+
+
+class Hold:
+    """A point that is paid for lying near 0."""
+
+    spec = Spec(
+        name="hold",
+        action=spaces.Box(-1, 1, (1,), np.float32),
+        channels={"at": spaces.Box(-np.inf, np.inf, (1,), np.float32), "reward": REWARD},
+        observes=("at",),
+        dt_s=0.1,
+    )
+
+    def start(self, batch, rng):
+        return self._state(2 * torch.rand(batch, 1, generator=rng) - 1)
+
+    def observe(self, observation, prior, rng):
+        return self._state(observation["at"])
+
+    def imagine(self, state, action, rng):
+        return self._state(state["at"] + 0.5 * self.spec.check_action(action, state.batch))
+
+    def render(self, state, channels):
+        return {name: state[name] for name in channels}
+
+    def _state(self, at):
+        return State({"at": at, "reward": 1 - at.abs()[:, 0]})
+
+
+def paid(policy, world) -> float:
+    rng = make_rng(9)
+    return float(
+        rollout(world, world.start(64, rng), policy, rng, ("at", "reward"), 10).observations["reward"][1:].mean()
+    )
+
+
+def test_it_learns_what_pays_and_goes_on_exactly(tmp_path):
+    world, quiet = Hold(), lambda *_: None
+    config = Practice(method="ppo", steps=20, batch=64, horizon=8, hidden=32, learning_rate=3e-3)
+    facts = train_policy(world, "hold", tmp_path / "run", config, quiet)
+    learned = Actor.load(tmp_path / "run", world.spec)
+    untaught = Actor(type(learned.network)(learned.network.config), world.spec)
+    assert facts["step"] == 20 and paid(learned, world) > 0.8 > paid(untaught, world)
+    again = train_policy(world, "hold", tmp_path / "again", config, quiet)
+    assert again["practised_steps"] == 20 * 64 * 8
+    weights = (Actor.load(tmp_path / name, world.spec).network.state_dict() for name in ("run", "again"))
+    assert all(torch.equal(a, b) for a, b in zip(*(one.values() for one in weights)))
+
+
+def test_it_is_exported_with_its_normalisation(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'terrella[fast]'")
+    pytest.importorskip("onnx", reason="pip install 'terrella[fast]'")
+    network = ActorNetwork(ActorConfig.of(Hold.spec, ("at",), hidden=16))
+    network.eyes.settle({"at": 3 + 2 * torch.randn(100, 1, generator=make_rng(0))})
+    with torch.no_grad():
+        network.think[-1].weight.mul_(100)
+    actor = Actor(network.eval(), Hold.spec)
+    assert write_onnx(actor, tmp_path / "policy.onnx") == {"at": [-1, 1]}
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    at = torch.linspace(-4, 9, 7)[:, None]
+    (action,) = session.run(None, {"at": at.numpy()})
+    assert (
+        np.allclose(action, actor.act({"at": at}, None, make_rng(0))[0].detach(), atol=1e-4) and np.ptp(action) > 0.01
+    )
