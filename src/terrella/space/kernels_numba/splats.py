@@ -192,6 +192,15 @@ def _directed(n, y, steep, gc, many, x0, x1, x2, sh, g_sh):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _summed(grads, i, g):
+    """The gradients g[0:10] of splat i over all threads."""
+    for c in range(10):
+        g[c] = 0
+        for t in range(len(grads)):
+            g[c] += grads[t, i, c]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def project_back(first, last, grads, splats, which, means, quats, scales, sh, place, rot, lens, panorama, g_means, g_quats,
                  g_scales, g_opacities, g_sh):  # fmt: skip
     """Adds to the gradients of the Gaussians what those of their splats `first` to `last` say: grads [threads, V, 10], of
@@ -200,10 +209,7 @@ def project_back(first, last, grads, splats, which, means, quats, scales, sh, pl
     y, steep = np.empty(16, np.float32), np.empty((16, 3), np.float32)
     g, gj, gc = np.empty(10, np.float32), np.empty(6, np.float32), np.empty(3, np.float32)
     for i in range(first, last):
-        for c in range(10):
-            g[c] = 0
-            for t in range(len(grads)):
-                g[c] += grads[t, i, c]
+        _summed(grads, i, g)
         n = which[i]
         x0, x1, x2 = means[n, 0] - place[0], means[n, 1] - place[1], means[n, 2] - place[2]
         d = rot[0, 0] * x0 + rot[1, 0] * x1 + rot[2, 0] * x2

@@ -221,8 +221,7 @@ def paint_back(first, step, splats, starts, items, ends, around, picture, g_pict
                     q = base + dx * (lean + a * dx)
                     s = q * _EIGHTH
                     e = _ONE + s * (_E1 + s * (_E2 + s * (_E3 + s * (_E4 + s * _E5))))
-                    e = e * e
-                    e = e * e
+                    e = (e * e) * (e * e)
                     e = e * e
                     alpha = min(o * e, OPAQUE) if q <= most else _ZERO
                     left = row[x]
