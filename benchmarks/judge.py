@@ -88,8 +88,8 @@ def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], Ba
     return {
         "random": lambda: RandomPolicy(seed),
         "reaching": ours(lambda cost: Reaching(world, actor, cost)),
-        "icem": ours(lambda cost: Planner(world, cost, config)),
-        "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied)),
+        "icem": ours(lambda cost: Planner(world, cost, config, replan=HORIZON)),
+        "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied, replan=HORIZON)),
         "cem 300x30": cem,
     }
 
