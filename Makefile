@@ -14,7 +14,7 @@ help:
 	@echo "make test-all  the same with the slow sweeps (damaged files, many seeds)"
 	@echo "make test-portable  run the numeric tests as a plain processor would: no wide vectors, one thread"
 	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
-	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (about half an hour)"
+	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (it trains for some six minutes of one core first)"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"

@@ -65,7 +65,18 @@ def prepared(folder: Path, episodes: int, seed: int, steps: list[str]) -> tuple[
         words = ("train", "latent", str(recording), "--out", str(run), "--seed", str(seed), *steps)
         spent["world"] = command(*words)
     if not (goals / "policy" / "policy.json").exists():
-        words = ("--in", str(run), "--from", str(recording), "--out", str(goals), "--seed", str(seed))
+        words = (
+            "--in",
+            str(run),
+            "--from",
+            str(recording),
+            "--out",
+            str(goals),
+            "--seed",
+            str(seed),
+            "--steps",
+            "1000",
+        )
         spent["goals"] = command("train", "goals", *words)
     notes.write_text(json.dumps(spent))
     world = terrella.load(run)
@@ -89,6 +100,7 @@ def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], Ba
         "random": lambda: RandomPolicy(seed),
         "reaching": ours(lambda cost: Reaching(world, actor, cost)),
         "icem": ours(lambda cost: Planner(world, cost, config, replan=HORIZON)),
+        "icem anew": ours(lambda cost: Planner(world, cost, config)),
         "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied, replan=HORIZON)),
         "cem 300x30": cem,
     }
@@ -138,8 +150,12 @@ def main() -> None:
     )
     parser.add_argument("--starts", type=int, default=50)
     parser.add_argument("--seeds", type=int, default=1, help="of starts and of what policies draw; all in one world")
-    parser.add_argument("--arms", nargs="*", default=["random", "reaching", "icem", "icem+reaching", "cem 300x30"])
-    parser.add_argument("--train", nargs="*", default=[], help="further words for `terrella train latent`, without --")
+    parser.add_argument(
+        "--arms", nargs="*", default=["random", "reaching", "icem", "icem anew", "icem+reaching", "cem 300x30"]
+    )
+    parser.add_argument(
+        "--train", nargs="*", default=["steps", "1200"], help="words for `terrella train latent`, without --"
+    )
     asked = parser.parse_args()
     torch.set_num_threads(1)
     asked.out.mkdir(parents=True, exist_ok=True)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tests.act.tiny_worlds import Point
 from tests.worlds.test_latent import CHOICES, STEERING, made
 
 from terrella.act.goal_network import GoalActor, GoalConfig, GoalNetwork
-from terrella.act.planning import ActionModel, CostModel, Planner, SearchConfig, distance_to
+from terrella.act.planning import ActionModel, CostModel, Judge, Planner, SearchConfig, distance_to
+from terrella.cli.planning import Searching, _Case
 from terrella.core import make_rng
 from terrella.core.errors import PlanningError
 
@@ -75,3 +78,12 @@ def test_worlds_that_others_cannot_plan_in_are_refused():
     for world in (Point(), made(CHOICES, **SEEN), made(STEERING, sees_pictures=False)):
         with pytest.raises(PlanningError, match="sees no pictures alone"):
             CostModel(world)
+
+
+def test_the_command_leaps_too():
+    world = made(STEERING, leap=2, **SEEN)
+    world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.1, "invents": 0.5}})
+    for cost, leaps in (("last", True), ("sum", False)):
+        searching = Searching(search="cem", samples=4, iterations=2, horizon=3, block=2, cost=cost)
+        case = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0)
+        assert (case.planner(searching).trust is None) == leaps

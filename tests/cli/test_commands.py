@@ -23,14 +23,14 @@ from terrella.worlds.folder import load_world, save_world
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --practise --seed --size",
+    "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --practise --randomise --seed --size",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --fps --frames --human --idle --json --keys --live-mcap --out --pictures --port "
-    "--seed --size",
+    "--randomise --seed --size",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
-    "--memory-mb --no-memory --policy --port --record --remember --seed --token --truth",
-    "plan": "--adapter --block --budget-ms --cost --curve --device --episodes --fps --goal --horizon --iterations --json "
-    "--out --real --replan --samples --search --seed --size --steps --success --trust --within",
+    "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth",
+    "plan": "--adapter --agent --apart --block --budget-ms --cost --curve --device --episodes --fps --goal --horizon --iterations --json "
+    "--out --proposal --randomise --real --replan --samples --search --seed --size --steps --success --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

@@ -100,8 +100,12 @@ def test_of_a_batch_those_off_known_ground_alone_are_drawn(monkeypatch):
     for waited in after[1:]:
         again = world.imagine(again, action, rng)
         world.render(again, ("rgb",))
-        for name in world.spec.channels:
-            assert torch.equal(world.render(again, (name,))[name], world.render(waited, (name,))[name]), name
+        for name, space in world.spec.channels.items():
+            one, other = (world.render(each, (name,))[name].double() for each in (again, waited))
+            rounding = (
+                1.0 if space.dtype == np.uint8 else 1e-4
+            )  # some processors sum a batch otherwise than its entries
+            assert torch.allclose(one, other, rtol=1e-4, atol=rounding), name
 
 
 def test_of_equally_trusted_keyframes_the_recorded_one_comes_first():

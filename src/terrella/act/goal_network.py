@@ -66,9 +66,12 @@ class GoalNetwork(nn.Module):
         return self.config.actor.distribution(self.act(torch.cat([latent, goal - latent, share[:, None]], 1)))
 
     def steps(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-        """How many steps [N] it takes who is quick, 1 or more."""
-        share = self.far(torch.cat([latent, goal - latent], 1))[:, 0]
-        return (share.clamp(0, 1) * math.log(self.config.farthest)).exp()
+        """How many steps [N] it takes who is quick, 1 to the farthest."""
+        return (self.share(latent, goal).clamp(0, 1) * math.log(self.config.farthest)).exp()
+
+    def share(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        """Their logarithm [N] in shares of that of the farthest, as it was learned: it may leave 0..1."""
+        return self.far(torch.cat([latent, goal - latent], 1))[:, 0]
 
 
 @final

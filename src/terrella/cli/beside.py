@@ -51,9 +51,14 @@ def check_alike(world: Spec, real: Spec) -> None:
             f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
         )
     if not math.isclose(world.dt_s, real.dt_s, rel_tol=0.02):
+        held = round(world.dt_s / real.dt_s)
+        hint = (
+            f"; {real.name}@{held} holds each action for {held} of its steps"
+            if real.name.startswith("gym:") and held > 1
+            else ""
+        )
         raise PlanningError(
-            f"{world.name} has {1 / world.dt_s:.4g} steps a second, and {real.name} {1 / real.dt_s:.4g}: hold each action for N "
-            "steps with gym:ID@N, or say with --fps how many it has."
+            f"{world.name} has {1 / world.dt_s:.4g} steps a second, and {real.name} {1 / real.dt_s:.4g}{hint or ': they differ'}."
         )
     for channel in world.observes:
         if channel not in real.channels:

@@ -14,7 +14,7 @@ def policy(name: Positional[Path], world: str, out: Path, json: Json = False) ->
     """Write a learned policy as one ONNX file, with normalisation and action limits inside: it runs without PyTorch.
 
     Args:
-        name: The folder of the policy, or of its training run.
+        name: The folder of the policy, or of its training run. Policies for goals (`terrella train goals`) have no such file yet.
         world: A world with the actions that it gives, as the one that it practised in (mujoco:go1).
         out: The file, NAME.onnx.
     """

@@ -108,8 +108,9 @@ def _record(plan: Plan, name: str, controls: Controls, environment: Environment,
     opened = plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
     world = controls.of(_open(opened, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
     if opened != name:
+        held = opened.rpartition("@")[2]
         say(
-            f"Each action is held for {opened.rpartition('@')[2]} steps of the game: more are not played in real time ({name}@1)."
+            f"Each action is held for {held} steps of the game, which has more than are played in real time; {name}@1 takes all."
         )
     for line in described(world.spec):
         say(line)

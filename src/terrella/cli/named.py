@@ -79,7 +79,7 @@ class Environment:
 
     Args:
         size: Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64.
-        fps: Steps a second of a Gymnasium environment; default: as it says, or 10.
+        fps: Steps a second of a Gymnasium environment, before gym:ID@N holds actions; default: as it says, or 10.
         adapter: A Python file (FILE.py or FILE.py:NAME) with an Adapter that says where depth, poses and more are found.
         randomise: A TOML or JSON file of distributions, of which each episode draws masses, friction, delay and more.
     """

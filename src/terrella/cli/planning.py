@@ -113,12 +113,20 @@ class _Case:
         return distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(self.world.spec)
 
     def planner(self, searching: Searching) -> Planner:
-        spec, trust = self.world.spec, searching.trust
-        if trust is None and isinstance(spec.card.get("uncertainty"), dict) and (levels := uncertainty_levels(spec)):
+        spec, trust, config = self.world.spec, searching.trust, searching.config
+        leaps = (
+            bool(spec.leap) and config.block % spec.leap == 0 and searching.cost == "last"
+        )  # they say no uncertainty
+        if (
+            trust is None
+            and not leaps
+            and isinstance(spec.card.get("uncertainty"), dict)
+            and (levels := uncertainty_levels(spec))
+        ):
             trust = levels[1]
         told = searching.proposal
         proposal = None if told is None else proposing(told, self.world)
-        return Planner(self.world, self.cost(searching), searching.config, trust, proposal, replan=searching.replan)
+        return Planner(self.world, self.cost(searching), config, trust, proposal, replan=searching.replan)
 
     def walker(self, searching: Searching, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
@@ -263,6 +271,8 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
     if views is not None:
         searching = replace(searching, **search_of(world.spec)) if searching == Searching() else searching
         walks = Walks(views, apart_m, within or NEAR_M)
+        if len(views) > 1 and apart_m <= walks.within_m:
+            raise TerrellaError(f"--apart is more than the {walks.within_m:g} m within which a view is reached.")
         limit = steps or acted.spec.max_episode_steps or round(WALK_S / acted.spec.dt_s)
         case = _Case(world, acted, wanted, Judge(), searching, episodes, limit, seed, walks)
         case.walker(searching, Destination(views[0]))

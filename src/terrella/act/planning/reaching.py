@@ -32,7 +32,7 @@ class Reaching:
 
     def begin(self, batch: int, rng: torch.Generator) -> State:
         goal = torch.cat([self.cost.goal_of(entry, batch)[LATENT] for entry in range(batch)])
-        return State({_GOAL: goal, _MEMORY: self.actor.begin(batch, rng)})
+        return State({_GOAL: goal, _MEMORY: self.actor.begin(batch, rng).to(goal.device)})
 
     def act(self, observation: Observation, memory: State, rng: torch.Generator) -> tuple[torch.Tensor, State]:
         kept = {name: memory[name] for name in (_GOAL, _MEMORY)}

@@ -100,7 +100,7 @@ class Task:
         total = sure = None
         if self._leaps:
             held = actions[:, None].expand(-1, self.block, *actions.shape[1:])
-            self._count, self.spent = self._count + 1, self.spent + candidates * self.block
+            self._count, self.spent = self._count + 1, self.spent + candidates * (self.block // self.world.spec.leap)
             state = advanced(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
             flat = self.world.render(state, self._channels)
             seen = {name: tensor.unflatten(0, (-1, candidates)) for name, tensor in flat.items()}

@@ -15,6 +15,11 @@ from ...space.camera import yaw
 from .costs import Cost, distance_to
 from .planner import Planner, Thought
 
+
+class NoWay(PlanningError):
+    """No way to a place is known."""
+
+
 NEAR_M, FACING = 0.5, 0.35  # metres, and radians of heading, within which a place is reached
 STRIDE_S = 0.115  # for which a walker holds a move
 STRIDE_M = 1.6  # between two known places that lie on one way; walls seldom stand between such
@@ -125,7 +130,7 @@ class Wayfinder:
         assert walk.ways is not None
         target, left = walk.ways.target(here, self.place)
         if not math.isfinite(left):
-            raise PlanningError("no way to that place is known; choose one near where somebody has been.")
+            raise NoWay("no way to that place is known; choose one near where somebody has been.")
         pose = torch.full_like(walk.thought.goal["pose"], torch.nan)
         pose[0, :2] = torch.from_numpy(target).to(pose)
         if self.heading is not None and left < _TURNS_M:

@@ -44,7 +44,8 @@ class Trajectories:
         ahead = np.where(even, 1 + np.floor(share * most), np.floor((most + 1) ** share)).astype(np.int64).clip(1, most)
         ahead = ahead if steps is None else np.full(count, steps)
         start, end = torch.from_numpy(picked), torch.from_numpy(picked + ahead)
-        return Hindsight(self.latents[start], self.latents[end], torch.from_numpy(ahead).float(), self.actions[start])
+        after = torch.from_numpy(ahead).float().to(self.latents.device)
+        return Hindsight(self.latents[start], self.latents[end], after, self.actions[start])
 
 
 class GoalReaching:
@@ -59,7 +60,7 @@ class GoalReaching:
         found = self.network(batch.latent, batch.goal, batch.steps)
         action = action_error(found, batch.action, self.network.config.actor.counts)
         scale = math.log(self.network.config.farthest)
-        short = (batch.steps.log() - self.network.steps(batch.latent, batch.goal).log()) / scale
+        short = batch.steps.log() / scale - self.network.share(batch.latent, batch.goal)
         steps = torch.maximum(QUICK * short, (QUICK - 1) * short).mean()
         yield Loss("goals", action + steps, {"action": action, "steps": steps})
 
