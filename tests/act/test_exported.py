@@ -80,10 +80,13 @@ def test_worlds_that_others_cannot_plan_in_are_refused():
             CostModel(world)
 
 
-def test_the_command_leaps_too():
-    world = made(STEERING, leap=2, **SEEN)
+def test_the_command_leaps_too_unless_it_is_told_when_to_trust():
+    world, rng, leapt = made(STEERING, leap=2, **SEEN), make_rng(0), []
     world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.1, "invents": 0.5}})
-    for cost, leaps in (("last", True), ("sum", False)):
-        searching = Searching(search="cem", samples=4, iterations=2, horizon=3, block=2, cost=cost)
-        case = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0)
-        assert (case.planner(searching).trust is None) == leaps
+    world.leap, inner = lambda *given: leapt.append(1) or inner(*given), world.leap
+    for trust in (None, 0.5):
+        searching = Searching("cem", samples=4, iterations=2, horizon=3, block=2, cost="last", trust=trust)
+        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0).planner(searching)
+        leapt.clear()
+        planner.act({"rgb": info(1)["pixels"][0, :1]}, planner.begin(1, rng), rng)
+        assert bool(leapt) == (trust is None)
