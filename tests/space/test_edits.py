@@ -23,8 +23,8 @@ def test_what_is_not_selected_stays():
     chosen = scene.means[:, 0] >= 3
     for deed in ({"do": "move", "by": [1, 0, 0]}, {"do": "turn", "degrees": 30}, {"do": "scale", "factor": 2},
                  {"do": "recolour", "colour": [1, 0, 0]}, {"do": "delete"}):  # fmt: skip
-        after, origin = edited(scene, [{"select": BOX, **deed}])
-        kept = origin >= 0
+        done = edited(scene, [{"select": BOX, **deed}])
+        after, origin, kept = done.gaussians, done.origin, done.origin >= 0
         assert torch.equal(origin[kept], (~chosen).nonzero()[:, 0])
         assert all(torch.equal(a[kept], b[~chosen]) for a, b in zip(parts(after), parts(scene)))
         assert len(after) == (60 - int(chosen.sum()) if deed["do"] == "delete" else 60)
@@ -34,19 +34,36 @@ def test_there_and_back_is_nothing():
     scene = cloud(60, 2)
     for there, back in (({"do": "move", "by": [1, 2, 0]}, {"do": "move", "by": [-1, -2, 0]}),
                         ({"do": "turn", "degrees": 70}, {"do": "turn", "degrees": -70})):  # fmt: skip
-        moved, _ = edited(scene, [{"select": {"all": True}, **there}])
-        after, _ = edited(moved, [{"select": {"all": True}, **back}])
+        moved = edited(scene, [{"select": {"all": True}, **there}]).gaussians
+        after = edited(moved, [{"select": {"all": True}, **back}]).gaussians
         offset = after.means - scene.means
         assert not torch.allclose(moved.means, scene.means, atol=0.1)
         assert (offset - offset.mean(0)).abs().max() < 1e-4  # a turn's middle is that of what is turned
         assert torch.allclose(after.sh, scene.sh, atol=1e-4) and torch.allclose(after.scales, scene.scales)
-    both, origin = edited(scene, [{"select": BOX, "do": "duplicate", "by": [0, 5, 0]}])
-    assert len(both) == 60 + int((origin < 0).sum()) and torch.equal(both.means[:60], scene.means)
+    both = edited(scene, [{"select": BOX, "do": "duplicate", "by": [0, 5, 0]}])
+    assert len(both.gaussians) == 60 + int((both.origin < 0).sum())
+    assert torch.equal(both.gaussians.means[:60], scene.means)
+
+
+def test_objects_and_brushes_are_selected():
+    scene, objects = cloud(60), torch.arange(60, dtype=torch.int32) % 3
+    twice = edited(scene, [{"select": {"object": 2}, "do": "duplicate", "by": [0, 0, 9]}], objects)
+    assert (twice.objects == 3).sum() == 20 and torch.equal(twice.objects[:60], objects)
+    less = edited(scene, [{"select": {"object": 2}, "do": "delete"}], objects)
+    assert len(less.gaussians) == 40 and not (less.objects == 2).any()
+    dabs = [[*scene.means[k].tolist(), 0.01] for k in (3, 5)]
+    apart = edited(scene, [{"select": {"sphere": dab}, "do": "recolour", "colour": [1, 0, 0]} for dab in dabs])
+    brush = edited(scene, [{"select": {"brush": sum(dabs, [])}, "do": "recolour", "colour": [1, 0, 0]}])
+    assert set((brush.origin < 0).nonzero()[:, 0].tolist()) == {58, 59} and len(brush.gaussians) == 60
+    assert sorted(brush.gaussians.means[58:, 0].tolist()) == sorted(apart.gaussians.means[58:, 0].tolist())
+    with pytest.raises(ContractError):
+        edited(scene, [{"select": {"object": 0}, "do": "delete"}], objects)
 
 
 @pytest.mark.parametrize("edit", [
     {"select": {"ring": [1]}, "do": "delete"}, {"select": BOX, "do": "paint"}, {"select": {"box": [1, 2]}, "do": "delete"},
     {"select": {"sphere": [99, 99, 99, 1]}, "do": "delete"}, {"select": BOX, "do": "move", "by": "far"},
+    {"select": {"brush": [1, 2, 3]}, "do": "delete"}, {"select": {"brush": [1, 2, 3, 1, 4]}, "do": "delete"},
     {"select": BOX, "do": "scale", "factor": -1}, {"select": BOX, "do": "move", "by": [0, 0, float("nan")]}, {"do": "delete"},
 ])  # fmt: skip
 def test_what_is_no_edit(edit):
@@ -64,6 +81,18 @@ def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
     assert 0 < (world.provenance == 0).sum() < len(world.gaussians)
     assert len((tmp_path / "w" / "world.edits.jsonl").read_text().splitlines()) == 2
     assert main(["space", "edit", place, "--sphere", "90", "2", "1", "0.8", "--delete"]) == 2
+    assert main(["space", "edit", place, "--redo"]) == 2
+    before = load(place)
+    assert main(["space", "edit", place, "--undo"]) == 0 and main(["space", "edit", place, "--undo"]) == 0
+    (tmp_path / "saved.jsonl").write_text((tmp_path / "w" / "world.undone.jsonl").read_text())
+    assert main(["space", "edit", place, "--redo"]) == 0 and main(["space", "edit", place, "--redo"]) == 0
+    again = load(place)
+    assert isinstance(before, SplatWorld) and isinstance(again, SplatWorld)
+    assert all(torch.equal(a, b) for a, b in zip(parts(before.gaussians), parts(again.gaussians)))
+    assert main(["space", "edit", place, "--replay", str(tmp_path / "saved.jsonl")]) == 0  # in the other order
+    assert len((tmp_path / "w" / "world.edits.jsonl").read_text().splitlines()) == 2
+    (tmp_path / "saved.jsonl").write_text('[1]\n{"select"')
+    assert main(["space", "edit", place, "--replay", str(tmp_path / "saved.jsonl")]) == 2
     assert main(["space", "edit", place, "--undo"]) == 0 and main(["space", "edit", place, "--undo"]) == 0
     assert main(["space", "edit", place, "--undo"]) == 2
     world = load(place)

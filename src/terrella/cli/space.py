@@ -14,7 +14,7 @@ from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, write_scene
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
-from ..worlds.splat_folder import read_edits, save_splat, world_of, write_edits
+from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
 from .say import Json, result
 
 Axes = Literal["rdf", "rub", "flu"]
@@ -98,6 +98,7 @@ def edit(
     box: tuple[float, float, float, float, float, float] | None = None,
     sphere: tuple[float, float, float, float] | None = None,
     plane: tuple[float, float, float, float] | None = None,
+    object: int | None = None,
     move: tuple[float, float, float] | None = None,
     duplicate: tuple[float, float, float] | None = None,
     turn: float | None = None,
@@ -105,6 +106,8 @@ def edit(
     recolour: tuple[float, float, float] | None = None,
     delete: bool = False,
     undo: bool = False,
+    redo: bool = False,
+    replay: Path | None = None,
     json: Json = False,
 ) -> None:
     """Change a part of a world of Gaussians. Each edit is a line of its world.edits.jsonl; the scene itself stays as it was.
@@ -114,6 +117,7 @@ def edit(
         box: What lies between two corners (x y z x y z, metres). Without a selection: all.
         sphere: What lies around a place (x y z radius).
         plane: What lies before a plane (a b c d: a x + b y + c z > d).
+        object: The object of that number (`space view` shows it).
         move: By so many metres (x y z).
         duplicate: A second one, so many metres away (x y z).
         turn: By so many degrees about its middle, to the left.
@@ -121,33 +125,49 @@ def edit(
         recolour: To one colour (red green blue, 0 to 1).
         delete: Take it away.
         undo: Take the last edit back.
+        redo: Do again what was taken back last.
+        replay: Take the edits of this file (one that the page saved) in place of those that the world has.
     """
     from ..core.errors import TerrellaError
 
     folder, opened = folder_of(world), open_splat(world)
-    edits = read_edits(folder)
-    places = {name: list(given) for name, given in (("box", box), ("sphere", sphere), ("plane", plane)) if given}
+    edits, undone = read_edits(folder), read_edits(folder, UNDONE_FILE)
+    given = {"box": box, "sphere": sphere, "plane": plane, "object": object}
+    places = {name: list(v) if isinstance(v, tuple) else v for name, v in given.items() if v is not None}
     asked: dict[str, Any] = {
         "move": move, "duplicate": duplicate, "turn": turn, "scale": scale, "recolour": recolour, "delete": delete or None,
     }  # fmt: skip
     deeds = [name for name, value in asked.items() if value is not None]
-    if len(places) > 1 or len(deeds) + undo != 1:
+    if len(places) > 1 or len(deeds) + undo + redo + (replay is not None) != 1:
         raise TerrellaError(
-            "an edit is of one place (--box, --sphere or --plane) and does one thing (--move, --delete, ...)."
+            "an edit is of one place (--box, --sphere, --plane or --object) and does one thing (--move, --delete, ...)."
         )
-    if undo and not edits:
-        raise TerrellaError(f"{world} has no edit to undo.")
-    if undo:
-        edits = edits[:-1]
+    if undo and not edits or redo and not undone:
+        raise TerrellaError(f"{world} has no edit to {'undo' if undo else 'redo'}.")
+    if replay is not None:
+        write_edits(folder, checked_edits(source_of(folder), read_text(replay)))
+    elif undo:
+        write_edits(folder, edits[:-1], [*undone, edits[-1]])
+    elif redo:
+        write_edits(folder, [*edits, undone[-1]], undone[:-1])
     else:
         new: dict[str, Any] = {"select": places or {"all": True}, "do": deeds[0]}
         name = DEEDS[deeds[0]][0]
         if name:
             new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
-        edited(opened.gaussians, [new])  # refuses what cannot be done
-        edits = [*edits, new]
-    write_edits(folder, edits)
-    result({"edits": len(edits), "gaussians": len(open_splat(world).gaussians)}, json)
+        edited(opened.gaussians, [new], opened.objects)  # refuses what cannot be done
+        write_edits(folder, [*edits, new])
+    result({"edits": len(read_edits(folder)), "gaussians": len(open_splat(world).gaussians)}, json)
+
+
+def read_text(path: Path) -> str:
+    """What a file says; TerrellaError where it cannot be read."""
+    from ..core.errors import TerrellaError
+
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TerrellaError(f"{path} cannot be read ({error}); give a world.edits.jsonl.") from error
 
 
 def open_splat(name: str) -> SplatWorld:

@@ -2,15 +2,19 @@
 
     {"select": {"box": [x0, y0, z0, x1, y1, z1]}, "do": "move", "by": [dx, dy, dz]}
 
-select: box; sphere [x, y, z, radius]; plane [a, b, c, d], where a x + b y + c z > d; all true. do: move or duplicate (by, metres);
-turn (degrees about the vertical through the middle); scale (factor, about the middle); recolour (colour, 0 to 1); delete.
+select: box; sphere [x, y, z, radius]; brush [x, y, z, radius, x, y, z, radius, ...], where one went over it with spheres; plane
+[a, b, c, d], where a x + b y + c z > d; object, its number; all true. do: move or duplicate (by, metres); turn (degrees about the
+vertical through the middle); scale (factor, about the middle); recolour (colour, 0 to 1); delete.
+
+The page edits with the same language (serve/web/place/edits.js). Both compute places in double precision and keep them in
+single, so that they choose the same Gaussians.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -20,46 +24,67 @@ from .raster import Gaussians, join
 from .raster.gaussians import plain_sh
 from .raster.move import turned
 
-SELECTIONS = {"box": 6, "sphere": 4, "plane": 4, "all": 1}  # and how many numbers each takes
+SELECTIONS = {"box": 6, "sphere": 4, "brush": 4, "plane": 4, "object": 1, "all": 1}  # and how many numbers each takes
 DEEDS = {
     "move": ("by", 3), "duplicate": ("by", 3), "turn": ("degrees", 1), "scale": ("factor", 1), "recolour": ("colour", 3),
     "delete": ("", 0),
 }  # fmt: skip
+MOST_DABS = 10_000  # spheres of a brush
 Edit = Mapping[str, Any]
 
 
-def edited(gaussians: Gaussians, edits: Sequence[Edit]) -> tuple[Gaussians, torch.Tensor]:
-    """The Gaussians after the edits, and which of the first ones each still is: int64 [N], -1 for those that an edit made or
-    changed. ContractError for what is no edit."""
+@dataclass(frozen=True)
+class Edited:
+    """The Gaussians after edits; origin int64 [N], which of the first ones each still is, -1 for those that an edit made or
+    changed; objects int32 [N], the number of the object that each belongs to, 0 for none. A duplicate is a new object."""
+
+    gaussians: Gaussians
+    origin: torch.Tensor
+    objects: torch.Tensor
+
+
+def edited(gaussians: Gaussians, edits: Sequence[Edit], objects: torch.Tensor | None = None) -> Edited:
+    """Edits done one after another; objects int32 [N], by default none. ContractError for what is no edit."""
     origin = torch.arange(len(gaussians))
+    objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
     for edit in edits:
-        chosen = selected(gaussians, edit)
-        done = _done(gaussians.at(chosen), edit)
+        chosen = selected(gaussians, edit, objects)
+        done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
         if edit["do"] == "duplicate":
+            belong = torch.full_like(belong, int(objects.max()) + 1)
             chosen = torch.zeros_like(chosen)  # what was duplicated stays, too
         gaussians = join([gaussians.at(~chosen), done])
         origin = torch.cat([origin[~chosen], origin.new_full((len(done),), -1)])
-    return gaussians, origin
+        objects = torch.cat([objects[~chosen], belong[: len(done)]])
+    return Edited(gaussians, origin, objects)
 
 
-def selected(gaussians: Gaussians, edit: Edit) -> torch.Tensor:
+def selected(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:
     """Which Gaussians an edit is about: bool [N]; ContractError where it is about none, or not understood."""
     chosen = edit.get("select")
     if not isinstance(chosen, Mapping) or len(chosen) != 1 or next(iter(chosen)) not in SELECTIONS:
         raise ContractError(f"an edit selects one of {', '.join(SELECTIONS)}; got {chosen!r}.")
     kind, given = next(iter(chosen.items()))
-    numbers, means = _numbers(given, SELECTIONS[kind], kind), gaussians.means
+    count = SELECTIONS[kind]
+    if kind == "brush" and isinstance(given, Sequence) and 4 <= len(given) <= 4 * MOST_DABS:
+        count = len(given) // 4 * 4
+    numbers, means = _numbers(given, count, kind).double(), gaussians.means.double()
     if kind == "all":
         inside = torch.ones(len(means), dtype=torch.bool)
     elif kind == "box":
         low, high = numbers[:3].minimum(numbers[3:]), numbers[:3].maximum(numbers[3:])
         inside = ((means >= low) & (means <= high)).all(1)
-    elif kind == "sphere":
-        inside = (means - numbers[:3]).norm(dim=1) <= numbers[3]
+    elif kind in ("sphere", "brush"):
+        inside = torch.zeros(len(means), dtype=torch.bool)
+        for dab in numbers.view(-1, 4):
+            inside |= (means - dab[:3]).square().sum(1) <= dab[3] * dab[3]
+    elif kind == "object":
+        inside = (objects == int(numbers[0])) & (objects > 0)
     else:
         inside = means @ numbers[:3] > numbers[3]
     if not inside.any():
-        raise ContractError(f"nothing lies in the {kind} {given}; choose another place.")
+        shown = given if kind != "brush" else f"of {count // 4} spheres"
+        raise ContractError(f"nothing lies in the {kind} {shown}; choose another place.")
     return inside
 
 
@@ -68,18 +93,21 @@ def _done(some: Gaussians, edit: Edit) -> Gaussians:
     if deed not in DEEDS:
         raise ContractError(f"an edit does one of {', '.join(DEEDS)}; got {deed!r}.")
     name, count = DEEDS[deed]
-    numbers, still = _numbers(edit.get(name), count, name), torch.eye(3)
-    middle = (some.means.amin(0) + some.means.amax(0)) / 2
+    numbers, means = _numbers(edit.get(name), count, name), some.means.double()
+    middle = (means.amin(0) + means.amax(0)) / 2
     if deed in ("move", "duplicate"):
-        return replace(some, means=some.means + numbers)
+        return replace(some, means=(means + numbers.double()).float())
     if deed == "turn":
         c, s = math.cos(math.radians(float(numbers))), math.sin(math.radians(float(numbers)))
+        x, y, z = (means - middle).unbind(1)
+        around = torch.stack([c * x - s * y, s * x + c * y, z], 1) + middle
         rot = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        return turned(some, rot, 1.0, middle - rot @ middle)
+        return replace(turned(some, rot), means=around.float())
     if deed == "scale":
         if not float(numbers) > 0:
             raise ContractError("a place is scaled by a factor above 0.")
-        return turned(some, still, float(numbers), middle * (1 - float(numbers)))
+        grown = turned(some, torch.eye(3), float(numbers))
+        return replace(grown, means=((means - middle) * float(numbers) + middle).float())
     if deed == "recolour":
         return replace(some, sh=torch.cat([plain_sh(numbers.expand(len(some), 3)), 0 * some.sh[:, 1:]], 1))
     return some.at(torch.zeros(len(some), dtype=torch.bool))
@@ -90,5 +118,5 @@ def _numbers(given: Any, count: int, name: str) -> torch.Tensor:
     listed = [given] if isinstance(given, int | float) else given
     fits = isinstance(listed, Sequence) and not isinstance(listed, str) and len(listed) == count
     if count and not (fits and all(isinstance(one, int | float) and math.isfinite(one) for one in listed)):
-        raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r}.")
+        raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r:.80}.")
     return torch.tensor(listed if count else [], dtype=torch.float32)

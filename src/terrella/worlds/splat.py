@@ -50,6 +50,7 @@ class SplatConfig:
 @final
 class SplatWorld:
     """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
+    `objects`, int32 [N], says which object each belongs to (0: none); `card["objects"]` may list the names of 1, 2, ...
 
     rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
     none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
@@ -64,9 +65,11 @@ class SplatWorld:
         starts: torch.Tensor,
         config: SplatConfig | None = None,
         card: Mapping[str, Any] | None = None,
+        objects: torch.Tensor | None = None,
     ):
         self.name, self.gaussians, self.provenance, self.starts = name, gaussians, provenance, starts
         self.config, self.card = config or SplatConfig(), dict(card or {})
+        self.objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
         self.spec = self._spec()
 
     def _spec(self) -> Spec:

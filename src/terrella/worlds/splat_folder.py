@@ -1,8 +1,10 @@
-"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl and README.md; one made of a file."""
+"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md; one made
+of a file."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,8 @@ from ..space.raster import Gaussians
 from .splat import INVENTED, OBSERVED, SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
-WORLD_FILE, SCENE_FILE, EDITS_FILE = "world.json", "scene.safetensors", "world.edits.jsonl"
+WORLD_FILE, SCENE_FILE = "world.json", "scene.safetensors"
+EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # those in force; those taken back, the newest last
 
 
 def save_splat(world: SplatWorld, path: str | Path) -> None:
@@ -29,9 +32,15 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
     about = {
         "kind": KIND, "version": VERSION, "name": world.name, "config": asdict(world.config), "card": dict(world.card),
     }  # fmt: skip
-    tensors = {**vars(world.gaussians), "provenance": world.provenance, "starts": world.starts}
+    tensors = {
+        **vars(world.gaussians),
+        "provenance": world.provenance,
+        "starts": world.starts,
+        "objects": world.objects,
+    }
     whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
-    (path / EDITS_FILE).unlink(missing_ok=True)
+    for name in (EDITS_FILE, UNDONE_FILE):
+        (path / name).unlink(missing_ok=True)
     replace_whole(path / SCENE_FILE, lambda file: save_file(whole, file))
     lines = (
         f"# {world.name}\n\nA place of {len(world.gaussians):,} Gaussians: `terrella play {path.name}` walks in it.\n"
@@ -40,8 +49,9 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
     replace_whole(path / WORLD_FILE, lambda file: file.write_text(json.dumps(about, indent=1) + "\n"))
 
 
-def load_splat(path: str | Path, about: dict[str, Any]) -> SplatWorld:
-    """Reads what `save_splat` wrote; `about`: what its world.json says. CheckpointError where it is foreign or damaged."""
+def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | None = None) -> SplatWorld:
+    """Reads what `save_splat` wrote; `about`: what its world.json says; `edits` instead of its own. CheckpointError where it is
+    foreign or damaged."""
     path = Path(path)
     if about.get("version") != VERSION:
         raise CheckpointError(
@@ -55,23 +65,50 @@ def load_splat(path: str | Path, about: dict[str, Any]) -> SplatWorld:
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
         if len(provenance) != len(tensors["means"]) or starts.ndim != 2 or starts.shape[1] != 7 or not len(starts):
             raise ValueError("its parts do not fit one another")
-        scene, origin = edited(Gaussians(**tensors), read_edits(path))
-        provenance = torch.where(origin < 0, INVENTED, provenance[origin]).to(torch.uint8)
-        return SplatWorld(str(about["name"]), scene, provenance, starts, config, dict(about["card"]))
+        objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
+        after = edited(Gaussians(**tensors), read_edits(path) if edits is None else edits, objects)
+        provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
+        return SplatWorld(
+            str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects
+        )
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 
 
-def read_edits(path: Path) -> list[Edit]:
-    """The edits of a world, the oldest first; ValueError for a line that is no JSON."""
-    file = path / EDITS_FILE
-    return [json.loads(line) for line in file.read_text().splitlines() if line.strip()] if file.exists() else []
+def source_of(path: str | Path) -> SplatWorld:
+    """The world as it was before all edits."""
+    try:
+        about = json.loads((Path(path) / WORLD_FILE).read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is no world of Gaussians ({error}); give the folder that holds one.") from error
+    return load_splat(path, about, [])
 
 
-def write_edits(path: Path, edits: list[Edit]) -> None:
-    """Replaces the edits of a world, a line each."""
-    text = "".join(json.dumps(edit) + "\n" for edit in edits)
-    replace_whole(path / EDITS_FILE, lambda file: file.write_text(text))
+def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
+    """The edits of a world (those taken back: `file=UNDONE_FILE`), the oldest first; ValueError for a line that is no JSON."""
+    return parse_edits((path / file).read_text()) if (path / file).exists() else []
+
+
+def parse_edits(text: str) -> list[Edit]:
+    """Edits of lines of JSON; ValueError for a line that is none."""
+    return [json.loads(line) for line in text.splitlines() if line.strip()]
+
+
+def checked_edits(source: SplatWorld, text: str) -> list[Edit]:
+    """The edits of a text of lines of JSON, after they were tried on `source`; ContractError where they do not fit it."""
+    try:
+        edits = parse_edits(text)
+        edited(source.gaussians, edits, source.objects)
+    except (ValueError, AttributeError) as error:
+        raise ContractError(f"these are no edits ({error}); give the lines of a world.edits.jsonl.") from error
+    return edits
+
+
+def write_edits(path: Path, edits: Sequence[Edit], undone: Sequence[Edit] = ()) -> None:
+    """Replaces the edits of a world, and those that were taken back."""
+    for name, lines in ((UNDONE_FILE, undone), (EDITS_FILE, edits)):
+        text = "".join(json.dumps(edit) + "\n" for edit in lines)
+        replace_whole(path / name, lambda file, text=text: file.write_text(text))
 
 
 def world_of(gaussians: Gaussians, name: str, card: dict[str, Any], config: SplatConfig) -> SplatWorld:
