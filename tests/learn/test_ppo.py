@@ -11,7 +11,9 @@ from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork
 from terrella.act.onnx_file import write_onnx
 from terrella.core import Spec, State, make_rng, rollout
+from terrella.core.errors import TerrellaError
 from terrella.core.spec import REWARD
+from terrella.learn.growth import Growth
 from terrella.learn.recipes.policy import Practice, train_policy
 
 
@@ -77,3 +79,35 @@ def test_it_is_exported_with_its_normalisation(tmp_path):
     assert (
         np.allclose(action, actor.act({"at": at}, None, make_rng(0))[0].detach(), atol=1e-4) and np.ptp(action) > 0.01
     )
+
+
+def test_ranges_grow_while_the_policy_copes_and_wait_where_it_does_not():
+    world = Hold()
+    world.scale = 1.0
+    growth = Growth(world)
+    growth.set()
+    assert world.scale == 0.0
+    for reward in [0.0] * 10 + [1.0] * 60:
+        growth.follow(torch.full((3,), reward))
+    growth.set()
+    grown = world.scale
+    assert 0.5 < grown <= 1.0
+    for _ in range(40):
+        growth.follow(torch.zeros(3))
+    stopped = float(growth.scale)
+    growth.follow(torch.zeros(3))
+    assert float(growth.scale) == stopped
+
+
+def test_a_run_with_growing_ranges_goes_on_exactly(tmp_path):
+    class Scaled(Hold):
+        scale = 1.0
+
+    config, quiet = (
+        Practice(method="ppo", steps=30, batch=16, horizon=4, hidden=16, learning_rate=3e-3),
+        lambda *_: None,
+    )
+    facts = train_policy(Scaled(), "hold", tmp_path / "run", config, quiet, growing=Scaled())
+    assert 0 < facts["ranges_grown_to"] <= 1
+    with pytest.raises(TerrellaError, match="growing"):
+        train_policy(Scaled(), "hold", tmp_path / "run", config, quiet)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 
-from terrella.core import check_world, make_rng
+from terrella.core import Spec, State, check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.library import load
 from terrella.sim.randomised import Distribution, Randomised, read
@@ -106,3 +108,52 @@ def test_what_cannot_be_is_said(text, tmp_path):
 def test_files_are_read(file):
     found = read(file)
     assert found["mass.torso"] == Distribution("loguniform", (0.5, 2.0)) and found["noise.qpos"].kind == "constant"
+
+
+class Slider:
+    """A world that is as far along as its last action says."""
+
+    spec = Spec(
+        name="slider",
+        action=spaces.Box(-1, 1, (1,), np.float32),
+        channels={"at": spaces.Box(-1, 1, (1,), np.float32)},
+        observes=(),
+        dt_s=0.1,
+    )
+
+    def start(self, batch, rng):
+        return State({"at": torch.zeros(batch, 1)})
+
+    def observe(self, observation, prior, rng):
+        return prior or self.start(1, rng)
+
+    def imagine(self, state, action, rng):
+        return State({"at": self.spec.check_action(action, state.batch)})
+
+    def render(self, state, channels):
+        return {name: state[name] for name in channels}
+
+
+def test_backlash_follows_only_when_its_play_is_used_up():
+    world, rng = Randomised(Slider(), {"backlash": Distribution("constant", (0.4,))}), make_rng(0)
+    state, seen = world.start(1, rng), []
+    for asked in (0.1, 0.5, 0.4, 0.2, -0.2):
+        state = world.imagine(state, torch.tensor([[asked]]), rng)
+        seen.append(round(float(world.render(state, ("at",))["at"]), 4))
+    assert seen == [0.0, 0.3, 0.3, 0.3, 0.0]
+    with pytest.raises(TerrellaError, match="axes"):
+        Randomised(load("gym:CartPole-v1", forkable=True, rgb=False), {"backlash": Distribution("constant", (0.1,))})
+
+
+@needs_mujoco
+def test_the_scale_goes_from_the_nominal_world_to_the_whole_range():
+    told = {"gravity": Distribution("constant", (4.81,)), "delay": Distribution("constant", (4.0,))}
+    world = Randomised(load("mujoco:arm", cameras=()), told)
+    for scale, drawn in ((0.0, (9.81, 0.0)), (0.5, (7.31, 2.0)), (1.0, (4.81, 4.0))):
+        world.scale = scale
+        found = world.render(world.start(2, make_rng(0)), ("parameters",))["parameters"]
+        assert torch.allclose(found, torch.tensor(drawn).expand(2, 2), atol=1e-5)
+    told["backlash"] = Distribution("constant", (0.1,))
+    check_world(Randomised(load("mujoco:arm", cameras=()), told))
+    with pytest.raises(TerrellaError, match="from 0 to 1"):
+        Randomised(load("mujoco:arm", cameras=()), told, scale=2.0)

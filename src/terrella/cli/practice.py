@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import torch
 from tyro.conf import arg
@@ -18,6 +18,7 @@ from ..act.through import actor_of
 from ..core.errors import TerrellaError
 from ..core.policy import Policy, Random
 from ..core.world import World, make_rng
+from ..learn.growth import Scaled
 from ..learn.recipes.policy import Practice, train_policy
 from ..measure.statistics import Figure, mean_interval
 from .beside import STEPS, check_alike, open_real
@@ -45,6 +46,7 @@ def policy(
     environment: Environment,
     tried: Real,
     recording: Annotated[str | None, arg(name="from")] = None,
+    grow: bool = False,
     device: Device = "auto",
     json: Json = False,
 ) -> None:
@@ -55,15 +57,22 @@ def policy(
         world: The world to practise in: what `terrella list` shows, the path of a checkpoint or a run, or a simulator (gym:ID).
         out: Folder of the run: the policy, its checkpoint and a log.
         recording: A recording in whose states practice begins; default: where the world's own episodes do.
+        grow: Let the ranges of --randomise grow by themselves, from nothing to what the file says, while the policy copes.
     """
     if tried.episodes < 1:
         raise TerrellaError("--episodes is a whole number from 1 up.")
+    if grow and environment.randomise is None:
+        raise TerrellaError("--grow lets the ranges of a file grow: say which with --randomise FILE.")
+    if environment.randomise is not None and not library.is_truth(world):
+        raise TerrellaError(f"{world} was learned and is as it is; --randomise is for simulators (mujoco:NAME).")
     inside = environment.open(world) if library.is_truth(world) else load_named(world, device)
     outside = None if tried.real is None else open_real(tried.real, environment, inside.spec)
     if outside is not None:
         check_alike(inside.spec, outside.spec)
     with progress.shown("practising") as report:
-        facts = train_policy(inside, world, out, config, report, recording)
+        facts = train_policy(
+            inside, world, out, config, report, recording, growing=cast(Scaled, inside) if grow else None
+        )
     if outside is None:
         facts["play"] = f"terrella train policy --in {world} --out {out} --real ENVIRONMENT says what it is worth"
         return result(facts, json)

@@ -22,6 +22,7 @@ from ..core.rollouts import rollout
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
+from .growth import Growth
 from .latent_validation import folded
 from .recording import Recording
 from .trainer import Now
@@ -137,20 +138,31 @@ class Imagination:
     """A feed of what `network` does in `world` over `steps` steps from `starts`.
 
     gradients: whether they flow from what came of it to the actions. trust: the uncertainty from which the world no longer knows:
-    a dream counts up to there.
+    a dream counts up to there. growth: how far the world's ranges have grown.
     """
 
     def __init__(
-        self, world: World, network: ActorNetwork, starts: Starts, steps: int, gradients: bool, trust: float | None
+        self,
+        world: World,
+        network: ActorNetwork,
+        starts: Starts,
+        steps: int,
+        gradients: bool,
+        trust: float | None,
+        growth: Growth | None = None,
     ):
         check_practised(world.spec)
         self.world, self.network, self.starts, self.steps = world, network, starts, steps
-        self.gradients, self.trust = gradients, trust
+        self.gradients, self.trust, self.growth = gradients, trust, growth
 
     def batch(self, now: Now) -> Imagined:
+        if self.growth is not None:
+            self.growth.set()
         with nullcontext() if self.gradients else torch.no_grad():
             found, state = self._imagined(self.starts.begin(now), now)
         self.starts.end(state, self.steps, now)
+        if self.growth is not None:
+            self.growth.follow(found.reward)
         return found
 
     def state(self) -> dict:

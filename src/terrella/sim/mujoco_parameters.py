@@ -58,6 +58,12 @@ def _gains(model: Model, file: Model, value: float) -> None:
     model.actuator_biasprm[:, 1] = np.where(servo, value, 1.0) * file.actuator_biasprm[:, 1]
 
 
+def _stiff(model: Model, file: Model, value: float) -> None:
+    """Springs towards where the joint is built, of hinges and slides."""
+    plain = file.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    model.jnt_stiffness[:] = file.jnt_stiffness + value * plain
+
+
 def _one_mass(at: int) -> Parameter:
     def change(model: Model, file: Model, value: float) -> None:
         model.body_mass[at] = value * model.body_mass[at]
@@ -102,6 +108,7 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "damping": _scaled("dof_damping", low=0.0, high=10.0, what="damping of the joints"),
         "armature": _scaled("dof_armature", low=0.2, high=5.0, what="rotor inertia of the joints"),
         "joint_friction": _scaled("dof_frictionloss", low=0.0, high=10.0, what="dry friction of the joints"),
+        "spring": Parameter(0.0, 0.0, 100.0, "N m/rad or N/m", "springs in the joints, towards 0, beside the file's", _stiff),
         "gain": Parameter(1.0, 0.3, 2.0, "x", "gain of the servos, or force of the motors", _gains),
         "strength": _scaled("actuator_forcerange", low=0.1, high=2.0, what="limit of the actuators' forces"),
         "camera.x": _camera("cam_pos", 0, 1.0, "m", "moved along its body's x"),

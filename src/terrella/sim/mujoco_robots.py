@@ -14,10 +14,11 @@ from pathlib import Path
 from ..core.errors import TerrellaError
 from ..similar import did_you_mean
 from .mujoco_model import FREE, add_floor, mujoco, read
-from .mujoco_tasks import Free, Reach, Task, VelocityTracking
+from .mujoco_tasks import Free, Hold, Reach, Task, VelocityTracking
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
+OWN = "terrella/sim/models/"
 _INSTALL = {  # mjlab itself pins another mujoco, and only its files are wanted
     "mjlab": "pip install --no-deps mjlab==1.6.0",
     "gymnasium": "pip install gymnasium",
@@ -173,6 +174,8 @@ ROBOTS: Mapping[str, Robot] = {
         GYMNASIUM + "humanoid.xml", "Gymnasium's humanoid, with motors", VelocityTracking(fallen=(1.2, 0.6)), max_steps=1000
     ),
     "hopper": Robot(GYMNASIUM + "hopper.xml", "Gymnasium's hopper, one leg in a plane"),
+    "arm": Robot(OWN + "arm.xml", "an arm of two joints in a vertical plane that holds its hand at a point", Hold(), max_steps=150),
+    "arm-real": Robot(OWN + "arm_real.xml", "the same arm with another integrator", Hold(), max_steps=150),
     "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),
 }  # fmt: skip
 

@@ -178,6 +178,58 @@ class Reach:
         return torch.cat([physics[:, body.qpos], physics[:, body.qvel], goal, hand - goal], 1).float()
 
 
+@dataclass(frozen=True)
+class Hold:
+    """A hand comes to rest at a point of its plane (x, z), drawn in a ring around the origin when an episode begins, and stays:
+    `success` is 1 from `dwell` steps in a row within `within` m on.
+
+    ring: its radii in m; start: by how much joints and their speeds differ at first, rad and rad/s.
+    """
+
+    rewards = True
+    hand: str = "hand"
+    ring: tuple[float, float] = (0.2, 0.45)
+    within: float = 0.03
+    dwell: int = 25
+    start: tuple[float, float] = (1.5, 0.5)
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        joints = len(body.home)
+        return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
+
+    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+        drawn = chance.uniform(seeds, (qpos.shape[1] + qvel.shape[1],), _START).double()
+        angle, radius = chance.uniform(seeds, (2,), _GOAL).double().unbind(1)
+        qpos += self.start[0] * (2 * drawn[:, : qpos.shape[1]] - 1)
+        qvel += self.start[1] * (2 * drawn[:, qpos.shape[1] :] - 1)
+        low, high = self.ring
+        length, turn = (low**2 + (high**2 - low**2) * radius).sqrt(), 2 * torch.pi * angle
+        goal = torch.stack([length * turn.cos(), length * turn.sin()], 1)
+        return {"goal": goal, "held": torch.zeros(len(goal), dtype=torch.int64)}
+
+    def judge(
+        self, body: Body, before: Tensors, after: Tensors
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        away = self._apart(body, after).norm(dim=1)
+        speed = after["physics"][:, body.qvel].square().sum(1)
+        held = torch.where(away <= self.within, before["held"] + 1, 0)
+        reward = torch.exp(-(away / self.within).square()) - 2 * away - 0.002 * speed
+        return reward.float(), torch.zeros(len(away), dtype=torch.bool), {"goal": after["goal"], "held": held}
+
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+        if name == "success":
+            return (state["held"] >= self.dwell).float()
+        apart = self._apart(body, state)
+        if name == "away":
+            return apart.norm(dim=1).float()
+        qpos, qvel = state["physics"][:, body.qpos], state["physics"][:, body.qvel]
+        return torch.cat([qpos.cos(), qpos.sin(), 0.2 * qvel, state["goal"], 10 * apart], 1).float()
+
+    def _apart(self, body: Body, state: Tensors) -> torch.Tensor:
+        """From the goal to the hand [B, 2], m."""
+        return state["sensors"][:, body.sensors[self.hand]][:, [0, 2]] - state["goal"]
+
+
 def motion(body: Body, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Velocity in m/s, spin in rad/s and the direction of up, each [B, 3] in the frame of the body that moves freely."""
     turn, velocity = physics[:, body.qpos][:, 3:7], physics[:, body.qvel]

@@ -22,7 +22,7 @@ from ..core.world import World
 from ..similar import did_you_mean
 
 PARAMETERS = "parameters"  # the channel of what an episode drew
-DELAY, NOISE, MOST_DELAY = "delay", "noise.", 50
+DELAY, BACKLASH, NOISE, MOST_DELAY = "delay", "backlash", "noise.", 50
 _HELD, _SEEDS = "randomised.", "randomised.seeds"
 _DRAW, _SENSED = 101, 131  # streams of chance
 KINDS = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0, "constant": 1}
@@ -118,12 +118,14 @@ class Randomised:
 
     Of a world that has `parameters` and the methods `varying(names)` and `adjusted(state, values)`, as MujocoWorld, any of them; of
     every world whose states are values besides: `delay`, steps by which
-    actions come late (a whole number up to 50), and `noise.CHANNEL`, the deviation of normal noise on a channel of float numbers,
-    which is part of what is seen, not of the truth. The channel `parameters` shows what the episode drew, in the order of
+    actions come late (a whole number up to 50), `backlash`, the play of axes in units of the action (what acts follows only when
+    what is asked leaves it), and `noise.CHANNEL`, the deviation of normal noise on a channel of float numbers,
+    which is part of what is seen, not of the truth. `scale`, from 0 to 1, draws each parameter towards its nominal value: 0 leaves
+    the world as it is; it may be changed between episodes. The channel `parameters` shows what the episode drew, in the order of
     spec.card["randomised"]. TerrellaError where a parameter is not there, or where a range leaves what is safe.
     """
 
-    def __init__(self, world: World, distributions: Mapping[str, Distribution]):
+    def __init__(self, world: World, distributions: Mapping[str, Distribution], scale: float = 1.0):
         spec = world.spec
         if not spec.forkable or PARAMETERS in spec.channels:
             raise TerrellaError(
@@ -140,6 +142,11 @@ class Randomised:
         self._noisy = [name.removeprefix(NOISE) for name in distributions if name.startswith(NOISE)]
         late = distributions.get(DELAY)
         self._latest = int(late.limits[1]) if late else 0
+        if not 0 <= scale <= 1:
+            raise TerrellaError(f"the scale of what is randomised is from 0 to 1; got {scale:g}.")
+        self.scale = scale
+        nominal = [known[name].nominal if name in known else 0.0 for name in distributions]
+        self._nominal = torch.tensor(nominal, dtype=torch.float64)
         names = tuple(distributions)
         told = {name: {one.kind: list(one.numbers)} for name, one in distributions.items()}
         shown = spaces.Box(-np.inf, np.inf, (len(names),), np.float32)
@@ -163,6 +170,9 @@ class Randomised:
             queue = torch.cat([state[f"{_HELD}queue"], action[:, None]], 1)
             late = self._drawn(state, DELAY).round().long()
             action, held[f"{_HELD}queue"] = queue[torch.arange(state.batch), self._latest - late], queue[:, 1:]
+        if BACKLASH in self.distributions:
+            play = self._drawn(state, BACKLASH).view(-1, *[1] * (action.ndim - 1)).to(action.dtype) / 2
+            action = held[f"{_HELD}followed"] = state[f"{_HELD}followed"].clamp(action - play, action + play)
         if self._noisy:
             held[_SEEDS] = chance.seeds(state.batch, rng)
         return self.world.imagine(state, action, rng).replace(**held)
@@ -188,12 +198,14 @@ class Randomised:
         """The state with what its episodes drew."""
         seeds, names = chance.seeds(state.batch, rng), list(self.distributions)
         drawn = torch.stack([one.draw(seeds, _DRAW + at) for at, one in enumerate(self.distributions.values())], 1)
+        drawn = self._nominal + self.scale * (drawn - self._nominal)
         if self._own:
             adjustable: Any = self.world
             state = adjustable.adjusted(state, drawn[:, [names.index(name) for name in self._own]])
-        held = {f"{_HELD}drawn": drawn, _SEEDS: seeds}
+        held, rest = {f"{_HELD}drawn": drawn, _SEEDS: seeds}, torch.from_numpy(neutral_action(self.spec))
+        if BACKLASH in self.distributions:
+            held[f"{_HELD}followed"] = rest.expand(state.batch, *rest.shape).clone()
         if self._latest:
-            rest = torch.from_numpy(neutral_action(self.spec))
             held[f"{_HELD}queue"] = rest.expand(state.batch, self._latest, *rest.shape).clone()
         return state.replace(**held)
 
@@ -213,6 +225,11 @@ def _check(spec: Spec, known: Mapping[str, Any], distributions: Mapping[str, Dis
             whole = one.kind in ("choice", "constant") and all(number == int(number) for number in one.numbers)
             if not whole or low < 0 or high > MOST_DELAY:
                 raise TerrellaError(f"'{DELAY}' is a choice of whole steps from 0 to {MOST_DELAY}; got {one.numbers}.")
+        elif name == BACKLASH:
+            if dtype_of(spec.action).kind != "f" or low < 0:
+                raise TerrellaError(
+                    f"'{BACKLASH}' is 0 or more, of actions that are axes; {spec.name} takes {spec.action}."
+                )
         elif name.startswith(NOISE):
             channel = name.removeprefix(NOISE)
             spec.check_channels((channel,))
@@ -228,10 +245,10 @@ def _check(spec: Spec, known: Mapping[str, Any], distributions: Mapping[str, Dis
                     f"{safe.low:g} to {safe.high:g} {safe.unit}."
                 )
         else:
-            others = (DELAY, *(f"{NOISE}{channel}" for channel in spec.channels), *known)
+            others = (DELAY, BACKLASH, *(f"{NOISE}{channel}" for channel in spec.channels), *known)
             plain = [other for other in known if not other.startswith("mass.")]
             own = f" {', '.join(plain)}, mass.BODY," if plain else ""
             raise TerrellaError(
                 f"{spec.name} has no parameter '{name}'{did_you_mean(name, others) or '.'} "
-                f"There are{own} {DELAY} and {NOISE}CHANNEL."
+                f"There are{own} {DELAY}, {BACKLASH} and {NOISE}CHANNEL."
             )

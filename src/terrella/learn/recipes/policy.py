@@ -16,6 +16,7 @@ from ...core.errors import ChannelError, TrainingError
 from ...core.spec import BUTTONS, CHOICE, Spec
 from ...core.world import World
 from ...data import Dataset
+from ..growth import Growth, Scaled
 from ..imagination import Continued, Imagination, Recorded, check_practised, recorded_starts
 from ..objectives.actor_critic import ActorCritic, Critic, Wanted
 from ..objectives.ppo import Ppo
@@ -94,11 +95,12 @@ def train_policy(
     report: Report,
     recording: str | Path | None = None,
     before: Path | None = None,
+    growing: Scaled | None = None,
 ) -> dict[str, Any]:
     """Practises in `world`, or goes on with it; the policy lies in `out`/policy from the first save on. Returns its facts.
 
     recording: where dreams begin; without one, at the world's own starts. before: the folder of an earlier run, whose networks a
-    new one begins with. ChannelError and TrainingError for what cannot be.
+    new one begins with. growing: whose ranges grow while the policy copes. ChannelError and TrainingError for what cannot be.
     """
     spec, out = world.spec, Path(out)
     ppo = (said.method or ("ppo" if spec.card.get("together") else "actor-critic")) == "ppo"
@@ -110,7 +112,9 @@ def train_policy(
     shape = ActorConfig.of(spec, sees, config.hidden)
     actor, critic = ActorNetwork(shape), Critic(shape)
     _writable(out)
-    run = Run.of(out, config, report, device_of(world), ("minutes",), practised_in=name, begins_in=str(recording or ""))
+    facts: dict[str, Any] = {"practised_in": name, "begins_in": str(recording or "")}
+    facts |= {} if growing is None else {"growing": True}
+    run = Run.of(out, config, report, device_of(world), ("minutes",), **facts)
     run = replace(run, strip_every_s=config.save_every_s)  # when the policy is written
     begun = run.found(STAGE) is not None
     starts = _starts(world, config, recording, report)
@@ -119,16 +123,18 @@ def train_policy(
     usual = starts.usual(sees)
     for network in (actor, critic):
         network.to(run.device).eyes.settle(usual)
+    growth = None if growing is None else Growth(growing)
+    kept = {**starts.modules, **({} if growth is None else {"growth": growth})}
     wanted = Wanted(config.discount, config.td_lambda, config.entropy)
     objective: Objective = (
-        Ppo(actor, critic, wanted, config.learning_rate, starts.modules)
+        Ppo(actor, critic, wanted, config.learning_rate, kept)
         if ppo
-        else ActorCritic(actor, critic, wanted, config.learning_rate, gradients, starts.modules)
+        else ActorCritic(actor, critic, wanted, config.learning_rate, gradients, kept)
     )
     if before is not None and not begun:
         networks = {name: one for name, one in objective.modules.items() if name in ("actor", "critic", "slow")}
         load_run(resume_file(before, STAGE), networks, {})
-    feed = Imagination(world, actor, starts, config.horizon, gradients, trust)
+    feed = Imagination(world, actor, starts, config.horizon, gradients, trust, growth)
     trainer = Trainer(run, STAGE, feed, objective, config.steps or ENDLESS)
     minutes = config.minutes or (math.inf if config.steps else UNLESS_SAID_MIN)
     trainer.limit_s = 60 * minutes
@@ -140,7 +146,8 @@ def train_policy(
         trainer.train(save)
     finally:
         save()
-    return {**trainer.summary, **_card(trainer, name, spec, config), "policy": str(out / RUN)}
+    grown = {} if growth is None else {"ranges_grown_to": round(float(growth.scale), 2)}
+    return {**trainer.summary, **_card(trainer, name, spec, config), **grown, "policy": str(out / RUN)}
 
 
 def seen_unless_said(spec: Spec) -> tuple[str, ...]:
