@@ -6,6 +6,7 @@ World frame, metres, z up. A body is an upright round column; its place is where
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -107,17 +108,25 @@ class Occupancy:
         """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever
         stands in something already may leave it."""
         stuck = self.blocked(place, body)
-        for _ in range(_PARTS):
-            step = wish / _PARTS
-            for axes in ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)):
-                there = place + step * step.new_tensor(axes)
-                free = stuck | ~self.blocked(there, body)
-                place = torch.where(free[:, None], there, place)
-                step = torch.where(free[:, None], step * (1 - step.new_tensor(axes)), step)
-        return place
+        return slide(lambda there: (self.blocked(there, body) & ~stuck).float(), place, wish)
 
     def _cells(self, points: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
         """Indices of the cubes in which points [..., 3] are, and whether they are in the grid."""
         at = ((points - self.origin) / self.cell_m).floor().long()
         size = torch.tensor(self.solid.shape)
         return at.clamp_min(0).minimum(size - 1).unbind(-1), ((at >= 0) & (at < size)).all(-1)
+
+
+def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
+    """Places [B, 3] moved by `wish` [B, 3] in short steps, none of which goes deeper into anything (`depth` [B] says how deep a
+    place is): the whole step, or along one axis after the other."""
+    here = depth(place)
+    for _ in range(_PARTS):
+        step = wish / _PARTS
+        for axes in ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)):
+            there = place + step * step.new_tensor(axes)
+            deep = depth(there)
+            free = deep <= here
+            place, here = torch.where(free[:, None], there, place), torch.where(free, deep, here)
+            step = torch.where(free[:, None], step * (1 - step.new_tensor(axes)), step)
+    return place

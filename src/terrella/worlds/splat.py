@@ -19,6 +19,7 @@ from ..core.world import Observation
 from ..space.camera import Intrinsics, yaw
 from ..space.occupancy import Body, Occupancy
 from ..space.raster import Drawing, Gaussians, rasterise
+from ..space.solids import Collider, Solids
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "UP", "DOWN")
 KEYS = {
@@ -50,7 +51,8 @@ class SplatConfig:
 @final
 class SplatWorld:
     """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
-    `objects`, int32 [N], says which object each belongs to (0: none); `card["objects"]` may list the names of 1, 2, ...
+    `objects`, int32 [N], says which object each belongs to (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies meet
+    `solids`, boxes float32 [S, 6] (low and high corners), where they are known, and else what the Gaussians fill.
 
     rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
     none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
@@ -66,10 +68,12 @@ class SplatWorld:
         config: SplatConfig | None = None,
         card: Mapping[str, Any] | None = None,
         objects: torch.Tensor | None = None,
+        solids: torch.Tensor | None = None,
     ):
         self.name, self.gaussians, self.provenance, self.starts = name, gaussians, provenance, starts
         self.config, self.card = config or SplatConfig(), dict(card or {})
         self.objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
+        self.solids = torch.zeros(0, 6) if solids is None else solids
         self.spec = self._spec()
 
     def _spec(self) -> Spec:
@@ -97,8 +101,13 @@ class SplatWorld:
 
     @cached_property
     def occupancy(self) -> Occupancy:
-        """What stops bodies."""
+        """What the Gaussians fill."""
         return Occupancy.of(self.gaussians)
+
+    @cached_property
+    def collider(self) -> Collider:
+        """What stops bodies."""
+        return Solids(self.solids) if len(self.solids) else self.occupancy
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Poses drawn from `starts`."""
@@ -130,8 +139,8 @@ class SplatWorld:
         speed = state["speed"] * torch.tensor(config.keep) + self._ahead(pose, wish)
         flying = state["flying"] | (wish[:, 3] > 0)
         level = torch.cat([speed[:, :2], (speed[:, 3] * flying)[:, None]], 1)
-        place = self.occupancy.moved(pose[:, :3], level, config.body)
-        stand = self.occupancy.floor(place, config.body) + config.body.eye_m
+        place = self.collider.moved(pose[:, :3], level, config.body)
+        stand = self.collider.floor(place, config.body) + config.body.eye_m
         falling = torch.where(flying, 0.0, state["falling"] + GRAVITY * config.dt_s**2)
         flying = flying & ~((wish[:, 3] < 0) & (place[:, 2] <= stand + 0.05))
         climbed = place[:, 2] + ((stand - place[:, 2]) * 0.3).clamp_max(0.15)

@@ -37,6 +37,7 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
         "provenance": world.provenance,
         "starts": world.starts,
         "objects": world.objects,
+        "solids": world.solids,
     }
     whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
     for name in (EDITS_FILE, UNDONE_FILE):
@@ -66,11 +67,13 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         if len(provenance) != len(tensors["means"]) or starts.ndim != 2 or starts.shape[1] != 7 or not len(starts):
             raise ValueError("its parts do not fit one another")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
-        after = edited(Gaussians(**tensors), read_edits(path) if edits is None else edits, objects)
+        solids, edits = tensors.pop("solids", None), read_edits(path) if edits is None else edits
+        after = edited(Gaussians(**tensors), edits, objects)
         provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
         return SplatWorld(
-            str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects
-        )
+            str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects,
+            None if edits else solids,  # edits move what they describe: then the Gaussians themselves stop bodies
+        )  # fmt: skip
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 

@@ -1,0 +1,303 @@
+"""Blocks as Gaussians: flat ones laid out in a grid on every side that can be seen, lit as radiosity (Goral et al. 1984) has it.
+
+A light map of texels takes what lamps, windows and the sun send, and what other texels throw back, three times over.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..camera import planar_pose
+from ..kernels_numba import light as kernels
+from ..raster import Gaussians
+from ..raster.gaussians import plain_sh
+from ..views import over_views
+from .blocks import Blocks, blocks_of
+from .looks import FINE, painted
+from .plan import Plan
+
+TEXEL_M = 0.14
+RAYS = 64
+LAMPS = 40  # points that stand for all that shines, and as many more for each further room
+BOUNCES = 3
+SLIM_M = 0.05  # narrower sides of what shines send no light
+SUN = 14.0  # beside a white wall in the open
+OPACITY, OVERLAP = 0.99, 0.7  # of neighbours in a grid: standard deviation in shares of their distance
+FINEST_M, THIN_M = 0.006, 0.0015
+_AXES = ((1, 2), (0, 2), (0, 1))  # the two axes along a side, for each axis across it
+
+
+@dataclass(frozen=True)
+class Built:
+    """A place built of a plan: Gaussians, the object of each int32 [N] (0: the building), names of objects 1, 2, ...; solids
+    float32 [S, 6], boxes that stop bodies; starts [R, 7], a pose on the floor of each room (the height is the floor's)."""
+
+    gaussians: Gaussians
+    objects: torch.Tensor
+    names: tuple[str, ...]
+    solids: torch.Tensor
+    starts: torch.Tensor
+
+
+@dataclass
+class _Grid:
+    """Cells on the sides of blocks: middles [N, 3], side 0..5 of its block [N], block [N], width along both axes [N, 2], and of
+    each side of each block the first cell [6 K] and how many [6 K, 2]."""
+
+    points: np.ndarray
+    sides: np.ndarray
+    blocks: np.ndarray
+    widths: np.ndarray
+    starts: np.ndarray
+    counts: np.ndarray
+
+    @property
+    def normals(self) -> np.ndarray:
+        found = np.zeros_like(self.points)
+        found[np.arange(len(found)), self.sides // 2] = np.where(self.sides % 2, 1.0, -1.0)
+        return found
+
+
+def build(plan: Plan, count: int = 120_000) -> Built:
+    """The place of a plan, of about `count` Gaussians. ContractError for what does not fit. The same plan, the same numbers."""
+    blocks = blocks_of(plan)
+    boxes = np.concatenate([np.asarray(blocks.low), np.asarray(blocks.high)], 1).astype(np.float64)
+    air = np.array([[*low, *high] for low, high in blocks.air])
+    texels = _grid(boxes, np.full(len(boxes), TEXEL_M))
+    bare = _bare(texels, boxes, air)
+    light = _light(plan, blocks, boxes, texels, bare)
+    area = texels.widths.prod(1) * bare
+    fine = np.array([FINE.get(look.material, 1.0) for look in blocks.looks])
+    apart = math.sqrt((area * fine[texels.blocks]).sum() / count)
+    spacing = np.clip(apart / np.sqrt(fine), FINEST_M, 0.3)
+    cells = _some(_grid(boxes, spacing), boxes, air)
+    colours = _brightness(plan, blocks, boxes, cells, texels, bare, light)
+    return Built(
+        _gaussians(cells, colours),
+        torch.from_numpy(np.asarray(blocks.objects, np.int32)[cells.blocks]),
+        tuple(blocks.names),
+        torch.from_numpy(blocks.solids),
+        _starts(plan, blocks),
+    )
+
+
+def _grid(boxes: np.ndarray, spacing: np.ndarray) -> _Grid:
+    """Cells of about `spacing` [K] on all six sides of boxes [K, 6]."""
+    points, sides, owners, widths = [], [], [], []
+    starts, counts, total = np.zeros(6 * len(boxes), np.int64), np.zeros((6 * len(boxes), 2), np.int64), 0
+    for k, box in enumerate(boxes):
+        for side in range(6):
+            axis, (a, b) = side // 2, _AXES[side // 2]
+            size = box[[3 + a, 3 + b]] - box[[a, b]]
+            many = np.maximum(np.ceil(size / spacing[k] - 1e-6).astype(int), 1)
+            step = size / many
+            u = box[a] + step[0] * (np.arange(many[0]) + 0.5)
+            v = box[b] + step[1] * (np.arange(many[1]) + 0.5)
+            place = np.empty((many[0], many[1], 3))
+            place[..., axis] = box[3 + axis] if side % 2 else box[axis]
+            place[..., a], place[..., b] = u[:, None], v[None]
+            points.append(place.reshape(-1, 3))
+            n = len(points[-1])
+            sides.append(np.full(n, side))
+            owners.append(np.full(n, k))
+            widths.append(np.tile(step, (n, 1)))
+            starts[6 * k + side], counts[6 * k + side] = total, many
+            total += n
+    join = np.concatenate
+    return _Grid(join(points), join(sides), join(owners), join(widths), starts, counts)
+
+
+def _bare(grid: _Grid, boxes: np.ndarray, air: np.ndarray) -> np.ndarray:
+    """Which cells have air before them: bool [N]."""
+    front = grid.points + 0.004 * grid.normals
+    free, filled = np.empty(len(front), np.bool_), np.empty(len(front), np.bool_)
+    over_views(len(front), lambda first, last: kernels.in_any(first, last, front, air, 0.0, free))
+    over_views(len(front), lambda first, last: kernels.in_any(first, last, front, boxes, 0.0, filled))
+    return free & ~filled
+
+
+def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray) -> _Grid:
+    """The cells that can be seen."""
+    bare = _bare(grid, boxes, air)
+    return _Grid(grid.points[bare], grid.sides[bare], grid.blocks[bare], grid.widths[bare], grid.starts, grid.counts)
+
+
+def _light(plan: Plan, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
+    """How much light falls on each texel: [T, 3]."""
+    rows = np.flatnonzero(bare)
+    normals = texels.normals[rows]
+    points = texels.points[rows] + 0.003 * normals
+    look = [blocks.looks[k] for k in texels.blocks[rows]]
+    colour = np.array([one.colour for one in look]) ** 2.2
+    shines = np.array([one.glow for one in look]) * (_narrow(texels, boxes)[rows] > SLIM_M)
+    glow = shines[:, None]
+    direct = _direct(plan, blocks, boxes, points, normals, texels.widths[rows].prod(1), glow * colour)
+    found = np.empty((len(rows), RAYS), np.int32)
+    ways, sides = _ways(), texels.sides[rows]
+    over_views(
+        len(rows),
+        lambda first, last: kernels.meet(first, last, points, sides, ways, boxes, texels.starts, texels.counts, found),
+    )
+    at = np.full(len(bare) + 1, -1)
+    at[rows] = np.arange(len(rows))
+    found = at[found]  # the number among the bare, the last for none
+    albedo = np.where(glow > 0, 0.0, 0.9 * colour)
+    light, total = np.zeros((len(bare), 3)), direct
+    for _ in range(BOUNCES):
+        thrown = np.concatenate([albedo * total, np.zeros((1, 3))]).astype(np.float32)
+        light[rows] = thrown[found].mean(1)
+        total = direct + _smooth(texels, bare, light)[rows]
+    light[rows] = total
+    return light
+
+
+def _narrow(grid: _Grid, boxes: np.ndarray) -> np.ndarray:
+    """The shorter edge of the side on which each cell is [N]."""
+    axes = np.array(_AXES)[grid.sides // 2]
+    return (boxes[grid.blocks[:, None], axes + 3] - boxes[grid.blocks[:, None], axes]).min(1)
+
+
+def _smooth(grid: _Grid, bare: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [T, 3], each the mean over itself and its bare neighbours on the same side, twice."""
+    for first, (rows, columns) in zip(grid.starts, grid.counts):
+        part = slice(first, first + rows * columns)
+        open_ = np.pad(bare[part].reshape(rows, columns, 1).astype(float), ((1, 1), (1, 1), (0, 0)))
+        for _ in range(2 if open_.any() else 0):
+            held = np.pad(values[part].reshape(rows, columns, 3), ((1, 1), (1, 1), (0, 0))) * open_
+            total = sum(held[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
+            weight = sum(open_[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
+            values[part] = (total / np.maximum(weight, 1)).reshape(-1, 3)
+    return values
+
+
+def _direct(plan, blocks, boxes, points, normals, areas, glow) -> np.ndarray:
+    """What lamps, panes and the sun send to points [T, 3]; glow [T, 3] says which of them shine."""
+    light = np.zeros((len(points), 3))
+    weight = areas * glow.sum(1)
+    if weight.sum() > 0:
+        rng = np.random.default_rng(plan.seed)
+        many = LAMPS * len(plan.rooms)
+        ends = np.cumsum(weight) / weight.sum()
+        picked = np.minimum(np.searchsorted(ends, (np.arange(many) + rng.random(many)) / many), len(points) - 1)
+        power = glow[picked] * (weight.sum() / many / glow[picked].sum(1))[:, None]
+        given = points, normals, points[picked], power, normals[picked], boxes, light
+        over_views(len(points), lambda first, last: kernels.shine(first, last, *given))
+    return light + _sun(plan, blocks, boxes, points, normals)
+
+
+def _sun(plan: Plan, blocks: Blocks, boxes: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Sunlight through windows and open roofs [T, 3]."""
+    if plan.sun is None:
+        return np.zeros((len(points), 3))
+    heading, height = (math.radians(v) for v in plan.sun)
+    sun = np.array([math.cos(heading) * math.cos(height), math.sin(heading) * math.cos(height), math.sin(height)])
+    clear = np.array([look.material in ("glass", "sky") for look in blocks.looks])
+    lit = np.empty(len(points))
+    over_views(len(points), lambda first, last: kernels.sunlit(first, last, points, normals, sun, boxes, clear, lit))
+    return lit[:, None] * SUN * np.array([1.0, 0.9, 0.72])
+
+
+def _ways() -> np.ndarray:
+    """RAYS directions about z, as dense as their cosine: [R, 3]."""
+    at = (np.arange(RAYS) + 0.5) / RAYS
+    turn = np.arange(RAYS) * (math.pi * (3 - math.sqrt(5)))
+    across = np.sqrt(at)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), np.sqrt(1 - at)], 1)
+
+
+def _brightness(plan, blocks, boxes, cells, texels, bare, light) -> np.ndarray:
+    """Colours [N, 3] of cells as a camera shows them."""
+    own = np.empty((len(cells.points), 3))
+    glow = np.array([look.glow for look in blocks.looks])[cells.blocks]
+    face = 6 * cells.blocks + cells.sides
+    ends = [*np.flatnonzero(np.diff(face, prepend=-1)), len(face)]
+    for first, last in zip(ends, ends[1:]):
+        rows, k, axis = slice(first, last), cells.blocks[first], cells.sides[first] // 2
+        a, b = _AXES[axis]
+        u, v = cells.points[rows, a], cells.points[rows, b]
+        size = boxes[k, 3:] - boxes[k, :3]
+        if axis == 2 and size[1] > size[0]:  # planks run along
+            u, v = v, u
+        own[rows] = painted(blocks.looks[k], u, v, float(cells.widths[first].max()), plan.seed + 31 * int(axis))
+    falls = _between(cells, texels, bare, light, boxes)
+    points = cells.points + 0.003 * cells.normals
+    sun = _sun(plan, blocks, boxes, points, cells.normals)
+    coarse = _between(cells, texels, bare, _texel_sun(plan, blocks, boxes, texels), boxes)
+    falls = np.maximum(falls - coarse, 0) + sun
+    shown = own**2.2 * falls
+    dull = glow == 0
+    middle = np.exp(np.log(np.maximum(falls[dull].mean(1), 1e-4)).mean()) if dull.any() else 1.0
+    shown = shown * (0.62 / middle)
+    mapped = shown * (1 + shown / 9) / (1 + shown * 0.78)  # Reinhard's curve with a white point
+    pictured = np.clip(mapped, 0, 1) ** (1 / 2.2)
+    pictured[~dull] = own[~dull]
+    return pictured
+
+
+def _texel_sun(plan, blocks, boxes, texels) -> np.ndarray:
+    return _sun(plan, blocks, boxes, texels.points + 0.003 * texels.normals, texels.normals)
+
+
+def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Values [T, 3] of bare texels between which cells lie, on the same side of the same block: [N, 3]."""
+    face = 6 * cells.blocks + cells.sides
+    axes = np.array(_AXES)[cells.sides // 2]
+    rows = np.arange(len(face))
+    many, start = texels.counts[face], texels.starts[face]
+    low = boxes[cells.blocks[:, None], axes]
+    size = boxes[cells.blocks[:, None], axes + 3] - low
+    at = (cells.points[rows[:, None], axes] - low) / np.maximum(size, 1e-9) * many - 0.5
+    first = np.floor(at).astype(int)
+    share = at - first
+    total, weight = np.zeros((len(face), 3)), np.zeros(len(face))
+    for i in (0, 1):
+        for j in (0, 1):
+            a, b = (np.clip(first[:, c] + d, 0, many[:, c] - 1) for c, d in ((0, i), (1, j)))
+            texel = start + a * many[:, 1] + b
+            w = (share[:, 0] if i else 1 - share[:, 0]) * (share[:, 1] if j else 1 - share[:, 1]) + 1e-4
+            w = w * bare[texel]
+            total += w[:, None] * values[texel]
+            weight += w
+    near = total / np.maximum(weight, 1e-9)[:, None]
+    lost = weight <= 0
+    if lost.any():  # none of the four is bare: the mean of its block
+        near[lost] = values[bare].mean(0)
+    return near
+
+
+def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:
+    count = len(cells.points)
+    scales = np.full((count, 3), THIN_M)
+    rows = np.arange(count)[:, None]
+    scales[rows, np.array(_AXES)[cells.sides // 2]] = OVERLAP * cells.widths
+    means = cells.points - THIN_M * cells.normals
+    to = lambda part: torch.from_numpy(np.ascontiguousarray(part, np.float32))  # noqa: E731
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    return Gaussians(to(means), quats, to(scales), torch.full((count,), OPACITY), plain_sh(to(colours)))
+
+
+def _starts(plan: Plan, blocks: Blocks) -> torch.Tensor:
+    """Where one begins: as the plan says, or in each room at the free place that looks furthest, along its longer side."""
+    if plan.start is not None:
+        x, y, degrees = plan.start
+        room = next(r for r in plan.rooms if all(r.low[k] <= plan.start[k] <= r.high[k] for k in range(2)))
+        return planar_pose(*(torch.tensor([v]) for v in (x, y, room.at[2], math.radians(degrees))))
+    solids, poses = blocks.solids, []
+    for room in plan.rooms:
+        low, high = np.array(room.low), np.array(room.high)
+        x, y = np.meshgrid(*(np.linspace(low[k] + 0.35, max(high[k] - 0.35, low[k] + 0.36), 40) for k in range(2)))
+        places = np.stack([x.ravel(), y.ravel()], 1)
+        off = np.maximum(np.maximum(solids[None, :, :2] - places[:, None], places[:, None] - solids[None, :, 3:5]), 0)
+        meets = (solids[:, 2] < low[2] + 1.8) & (solids[:, 5] > low[2] + 0.05)
+        room_there = np.where(meets, np.hypot(off[..., 0], off[..., 1]), 9.0).min(1)
+        middle = (low + high)[:2] / 2
+        long = int(high[1] - low[1] > high[0] - low[0])
+        fits = np.minimum(room_there, 0.6) * 4 - np.abs(places[:, 1 - long] - middle[1 - long] - 0.4)
+        best = places[np.argmax(fits - 1.0 * (places[:, long] - low[long]))]
+        heading = math.atan2(middle[1] - best[1], middle[0] - best[0])
+        poses.append(planar_pose(*(torch.tensor([float(v)]) for v in (*best, low[2], heading))))
+    return torch.cat(poses)

@@ -1,0 +1,277 @@
+"""Where things stand in a room that words describe: by walls, in corners, around tables; chance only where words leave a choice."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+from .furniture import kind_of
+
+_SIDES = ("north", "south", "east", "west")
+_FRONT = {"north": "south", "south": "north", "east": "west", "west": "east"}  # who stands at a wall looks away from it
+SLOT_M = 1.2  # of a wall, for each door or window
+CLEAR_M = 0.9  # before doors
+APART_M = 0.7  # between things, so that bodies pass
+_STAIRS_M, _LANDING_M = (
+    (2.2, 1.1, 1.08),
+    1.6,
+)  # stairs that rise to the east along a wall; the length of the platform after them
+Rect = tuple[float, float, float, float]
+
+
+class Asked(Protocol):
+    label: str
+    count: int
+    look: str
+    scale: tuple[float, float, float]
+    side: str
+
+
+def furnished(layout: dict[str, Any], number: int, asked: Sequence[Asked], following: bool, seed: int) -> list[str]:
+    """Puts what is asked for into room `number` of a layout, and a door to the next room; what found no place."""
+    room = layout["rooms"][number]
+    return _Room(layout, room, random.Random(1000 * seed + number)).fill(asked, number > 0, following)
+
+
+class _Room:
+    def __init__(self, layout: dict[str, Any], room: dict[str, Any], rng: random.Random):
+        self.layout, self.room, self.rng = layout, room, rng
+        (self.x0, self.y0, _), (w, d, self.height) = room["at"], room["size"]
+        self.x1, self.y1 = self.x0 + w, self.y0 + d
+        self.taken: list[Rect] = []  # where things stand
+        self.clear: list[Rect] = []  # where nothing may
+        self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
+
+    def fill(self, asked: Sequence[Asked], entered: bool, following: bool) -> list[str]:
+        """Openings first, then what is largest."""
+        middle = (self.y0 + self.y1) / 2
+        if entered:
+            self.clear.append((self.x0, middle - 0.6, self.x0 + CLEAR_M + 0.2, middle + 0.6))
+        else:
+            self.clear.append((self.x0, middle - 0.5, self.x0 + 1.4, middle + 0.5))  # where one begins
+        lost = self._openings([one for one in asked if one.label in ("door", "window")], entered, following)
+        order = {"stairs": 0, "pillar": 1, "middle": 2, "wall": 3, "corner": 4, "hung": 5, "any": 6}
+        rest = [one for one in asked if one.label not in ("door", "window")]
+        rest.sort(
+            key=lambda one: order.get(one.label, order[kind_of(one.label).stands if one.label != "stairs" else "wall"])
+        )
+        for one in rest:
+            done = self._place(one)
+            if done < one.count:
+                lost.append(f"{one.count - done} {one.label}")
+        return lost
+
+    def _openings(self, asked: Sequence[Asked], entered: bool, following: bool) -> list[str]:
+        """Doors and windows, spread evenly over each wall; those for which it is too short."""
+        on: dict[str, list[Asked]] = {side: [] for side in _SIDES}
+        joined = [side for side, there in (("east", following), ("west", entered)) if there]
+        free = [side for side in ("east", "north", "south", "west") if side not in joined]
+        first = following
+        if following:
+            self._door("east", None, next((one.look for one in asked if one.label == "door"), ""))
+        for one in asked:
+            count = one.count - (first and one.label == "door")
+            first = first and one.label != "door"
+            for k in range(count):
+                if one.side in free:
+                    side = one.side
+                elif one.label == "door":
+                    side = next((s for s in free if not any(other.label == "door" for other in on[s])), "north")
+                else:
+                    side = "south" if k < max(int(self._length("south") / (2.1 * one.scale[0])), 1) else "north"
+                on[side].append(one)
+        lost = []
+        for side, several in on.items():
+            fit = several[: max(int(self._length(side) / SLOT_M), 1)]
+            lost += [f"1 {one.label}" for one in several[len(fit) :]]
+            for k, one in enumerate(fit):
+                at = round(self._length(side) * (k + 0.5) / len(fit), 3)
+                if one.label == "door":
+                    self._door(side, at, one.look)
+                else:
+                    self._window(side, at, one, len(fit))
+        return lost
+
+    def _length(self, side: str) -> float:
+        return self.y1 - self.y0 if side in ("east", "west") else self.x1 - self.x0
+
+    def _door(self, side: str, at: float | None, look: str) -> None:
+        one = {
+            "room": self.room["name"],
+            "wall": side,
+            **({"look": look} if look else {}),
+            **({"at": at} if at else {}),
+        }
+        self.layout["doors"].append(one)
+        middle = self._length(side) / 2 if at is None else at
+        self.clear.append(self._before(side, middle - 0.6, middle + 0.6, CLEAR_M + 0.1))
+
+    def _window(self, side: str, at: float, one: Asked, several: int) -> None:
+        width = round(min(1.5 * one.scale[0], self._length(side) / several - 0.3), 2)
+        height = round(min(1.3 * one.scale[2], self.height - 1.1), 2)
+        look = {"look": one.look} if one.look else {}
+        self.layout["windows"].append(
+            {"room": self.room["name"], "wall": side, "at": at, "width": width, "height": height, **look}
+        )
+
+    def _before(self, side: str, low: float, high: float, deep: float) -> Rect:
+        """The floor before a part of a wall."""
+        if side in ("east", "west"):
+            a = (self.x1 - deep, self.x1) if side == "east" else (self.x0, self.x0 + deep)
+            return (a[0], self.y0 + low, a[1], self.y0 + high)
+        b = (self.y1 - deep, self.y1) if side == "north" else (self.y0, self.y0 + deep)
+        return (self.x0 + low, b[0], self.x0 + high, b[1])
+
+    def _place(self, one: Asked) -> int:
+        """How many of them found a place."""
+        if one.label == "stairs":
+            return sum(self._stairs(one) for _ in range(one.count))
+        kind, done = kind_of(one.label), 0
+        size = tuple(round(a * b, 3) for a, b in zip(kind.size, one.scale))
+        height = min(size[2], self.height - (1.35 if kind.stands == "hung" else 0))
+        size = (size[0], size[1], round(height, 3))
+        spots = self._row(one.count, size) if one.label in ("pillar", "rug", "table") and not one.side else []
+        for k in range(one.count):
+            ways = [*spots[k : k + 1], *self._spots(one, kind.stands, size)]
+            for margin in (APART_M, 0.25, 0.02):
+                found = next(
+                    (spot for spot in ways if self._free(self._rect(spot, size), margin, kind.soft, one.label)), None
+                )
+                if found:
+                    break
+            if not found:
+                break
+            self._put(one, kind, size, found)
+            done += 1
+        return done
+
+    def _put(self, one: Asked, kind, size, spot: tuple[float, float, str]) -> None:
+        x, y, facing = spot
+        z = 1.25 if kind.stands == "hung" else 0.0
+        look = {"look": one.look} if one.look else {}
+        entry = {"label": one.label, "at": [round(x, 3), round(y, 3), z], "size": list(size), "facing": facing, **look}
+        self.layout["things"].append(entry)
+        rect = self._rect(spot, size)
+        if not kind.soft:
+            self.taken.append(rect)
+        if one.label in ("table", "desk"):
+            self.tables.append((rect, self._seats(rect, one.label, facing)))
+
+    def _rect(self, spot: tuple[float, float, str], size) -> Rect:
+        x, y, facing = spot
+        w, d = (size[1], size[0]) if facing in ("east", "west") else size[:2]
+        return (x - w / 2, y - d / 2, x + w / 2, y + d / 2)
+
+    def _free(self, rect: Rect, margin: float, soft: bool, label: str) -> bool:
+        inside = (
+            rect[0] >= self.x0 - 1e-6
+            and rect[1] >= self.y0 - 1e-6
+            and rect[2] <= self.x1 + 1e-6
+            and rect[3] <= self.y1 + 1e-6
+        )
+        if soft or not inside:
+            return inside
+        margin = 0.02 if label in ("chair", "pillar") else margin
+        under = [one for one, _ in self.tables] if label == "chair" else []  # chairs stand half under tables
+        return not any(_meet(rect, other, margin) for other in self.taken if other not in under) and not any(
+            _meet(rect, other, 0.0) for other in self.clear
+        )
+
+    def _row(self, count: int, size) -> list[tuple[float, float, str]]:
+        """In the middle, one after the other along the room; pillars in pairs."""
+        pairs = size[2] > 2 and count % 2 == 0
+        many = count // 2 if pairs else count
+        places = []
+        for k in range(many):
+            x = self.x0 + (self.x1 - self.x0) * (k + 1) / (many + 1)
+            for share in (0.27, 0.73) if pairs else (0.5,):
+                places.append((x, self.y0 + (self.y1 - self.y0) * share, "south"))
+        return places
+
+    def _spots(self, one: Asked, stands: str, size) -> Iterator[tuple[float, float, str]]:
+        """Where such a thing may stand, the best first."""
+        if one.label == "chair":
+            for _, seats in self.tables:
+                yield from list(seats)
+        if one.side == "middle":
+            yield ((self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2, "south")
+        if one.side == "corner" or stands == "corner" and not one.side:
+            corners = [(x, y) for x in (self.x0 + size[0] / 2 + 0.05, self.x1 - size[0] / 2 - 0.05)
+                       for y in (self.y0 + size[1] / 2 + 0.05, self.y1 - size[1] / 2 - 0.05)]  # fmt: skip
+            for x, y in self.rng.sample(corners, 4):
+                yield (x, y, "south" if y > (self.y0 + self.y1) / 2 else "north")
+        if stands in ("wall", "hung", "corner") or one.side in _SIDES:
+            sides = [one.side] if one.side in _SIDES else self.rng.sample(_SIDES, 4)
+            for side in sides:
+                yield from self._along(side, size, stands == "hung")
+        if stands in ("middle", "any"):
+            for _ in range(60):
+                x, y = self.rng.uniform(self.x0, self.x1), self.rng.uniform(self.y0, self.y1)
+                yield (x, y, self.rng.choice(_SIDES))
+
+    def _along(self, side: str, size, hung: bool) -> Iterator[tuple[float, float, str]]:
+        """Places at a wall, from its middle outwards, not before its windows where they would hide them."""
+        length, deep = self._length(side), size[1] / 2
+        blocked = [
+            (one["at"] - one["width"] / 2, one["at"] + one["width"] / 2)
+            for one in self.layout["windows"]
+            if one["room"] == self.room["name"] and one["wall"] == side and (hung or size[2] > 0.9)
+        ]
+        steps = max(int((length - size[0]) / 0.15), 0)
+        for k in sorted(range(steps + 1), key=lambda k: abs(k - steps / 2)):
+            at = size[0] / 2 + (length - size[0]) * (k / steps if steps else 0.5)
+            if any(a < at + size[0] / 2 and at - size[0] / 2 < b for a, b in blocked):
+                continue
+            rect = self._before(side, at, at, deep)
+            x = rect[2] if side == "west" else rect[0]
+            y = rect[3] if side == "south" else rect[1]
+            yield (x, y, _FRONT[side])
+
+    def _seats(self, rect: Rect, label: str, facing: str) -> list[tuple[float, float, str]]:
+        """Where chairs stand around a table: along its longer sides, then at its ends; at a desk before its front."""
+        x0, y0, x1, y1 = rect
+        x, y, off = (x0 + x1) / 2, (y0 + y1) / 2, 0.12
+        if label == "desk":
+            return [{"south": (x, y0 - off, "north"), "north": (x, y1 + off, "south"), "east": (x1 + off, y, "west"),
+                     "west": (x0 - off, y, "east")}[facing]]  # fmt: skip
+        spread = (x1 - x0) / 4 if x1 - x0 >= 1.1 else 0.0
+        rows = [(x + s, y0 - off, "north") for s in {-spread, spread}] + [
+            (x + s, y1 + off, "south") for s in {-spread, spread}
+        ]
+        rows.sort(key=lambda one: (one[0], one[1]))
+        return [rows[k] for k in ((0, 3, 1, 2) if len(rows) == 4 else (0, 1))] + [
+            (x0 - off, y, "east"),
+            (x1 + off, y, "west"),
+        ]
+
+    def _stairs(self, one: Asked) -> bool:
+        """Stairs along a wall that rise to the east, up to a platform."""
+        (long, wide, high), landing = _STAIRS_M, _LANDING_M
+        sides = [one.side] if one.side in ("north", "south") else ["north", "south"]
+        for side in sides:
+            for steps in range(20):
+                x = self.x1 - long - landing - steps * (self.x1 - self.x0 - long - landing) / 20
+                y = self.y1 - wide if side == "north" else self.y0
+                rect = (x, y, x + long + landing, y + wide)
+                if x >= self.x0 and self.height > high + 1.4 and self._free(rect, 0.1, False, "stairs"):
+                    look = {"look": one.look} if one.look else {}
+                    at = [round(x, 3), round(y, 3), 0.0]
+                    self.layout["stairs"].append({"at": at, "size": [long, wide, high], "up": "east", **look})
+                    top = [round(x + long + landing / 2, 3), round(y + wide / 2, 3), 0.0]
+                    self.layout["things"].append(
+                        {"label": "platform", "at": top, "size": [landing, wide, high], **look}
+                    )
+                    self.taken.append(rect)
+                    return True
+        return False
+
+
+def _meet(one: Rect, other: Rect, margin: float) -> bool:
+    return (
+        one[0] < other[2] + margin
+        and other[0] < one[2] + margin
+        and one[1] < other[3] + margin
+        and other[1] < one[3] + margin
+    ) and not math.isclose(one[0], one[2])

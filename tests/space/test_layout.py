@@ -1,0 +1,135 @@
+"""Layouts and words: what is understood, what is refused, that everything fits, and that what is built is lit and hides nothing."""
+
+from __future__ import annotations
+
+import json
+import random
+
+import numpy as np
+import pytest
+import torch
+
+from terrella.core.errors import ContractError
+from terrella.space.kernels_numba.light import first_box
+from terrella.space.layout import build, looks, read_plan, understood, words
+from terrella.space.layout.blocks import blocks_of
+from terrella.space.raster import rasterise
+
+ROOM = {"name": "hall", "at": [0, 0], "size": [6, 4, 3]}
+NEXT = {"name": "den", "at": [6.2, 0, 0], "size": [3, 4, 2.6], "walls": "dark red brick"}
+
+
+def test_words_become_a_plan():
+    heard = understood("a long room with two pillars and a red door, then a small blurbly kitchen with three chairs")
+    assert [room.name for room in heard.plan.rooms] == ["room", "kitchen"] and heard.unknown == ("blurbly",)
+    labels = [thing.label for thing in heard.plan.things]
+    assert labels.count("pillar") == 2 and labels.count("chair") == 3 and heard.plan.doors[0].look == "red"
+    assert heard.plan.rooms[0].size[0] > 1.5 * words.ROOMS["room"]["size"][0]
+    blocks_of(heard.plan)
+
+
+def test_words_say_where():
+    plan = understood("a room with a window on the left and a sofa at the far wall in the room with brick walls").plan
+    assert len(plan.rooms) == 1 and plan.rooms[0].walls == "brick"
+    assert plan.windows[0].wall == "north" and plan.things[0].facing == "west"
+
+
+@pytest.mark.parametrize("text", ["", "xyzzy", "the very of", "!!! ???", "wooden red", "12"])
+def test_nothing_understood_is_said(text):
+    with pytest.raises(ContractError, match="names a room or a thing"):
+        understood(text)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_any_words_make_a_place_that_can_be_built(seed):
+    rng = random.Random(seed)
+    some = [
+        *words.ROOMS,
+        *sorted(words._THINGS),
+        *words.SIZES,
+        *looks.COLOURS,
+        *words.NUMBERS,
+        *words.SIDES,
+        "with",
+        "on",
+        "the",
+        "floor",
+    ]
+    heard = understood("room " + " ".join(rng.choice(some) for _ in range(30)), seed)
+    blocks = blocks_of(heard.plan)
+    assert json.loads(json.dumps(heard.layout)) == heard.layout and read_plan(heard.layout) == heard.plan
+    assert (blocks.solids[:, 3:] > blocks.solids[:, :3]).all()
+
+
+def test_the_same_seed_the_same_bytes():
+    text = "a study with a desk, a chair, a lamp and three crates"
+    one, same, other = (understood(text, seed) for seed in (4, 4, 5))
+    assert one.layout == same.layout and one.layout["things"] != other.layout["things"]
+    first, again = build(one.plan, 3000), build(same.plan, 3000)
+    assert all(torch.equal(a, b) for a, b in zip(vars(first.gaussians).values(), vars(again.gaussians).values()))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"rooms": []}, "at least one room"),
+        ({"roms": [ROOM]}, "unknown field 'roms'"),
+        ({"rooms": [{**ROOM, "colour": "red"}]}, "unknown field 'colour'"),
+        ({"rooms": [{"name": "hall", "at": [0, 0]}]}, "lacks 'size'"),
+        ({"rooms": [{**ROOM, "size": [6, -4, 3]}]}, "has the size"),
+        ({"rooms": [{**ROOM, "size": [6, float("nan"), 3]}]}, "finite numbers"),
+        ({"rooms": [{**ROOM, "walls": "frosted"}]}, "unknown word 'frosted'"),
+        ({"rooms": [ROOM, {**NEXT, "at": [5, 0]}]}, "overlap or touch"),
+        ({"rooms": [ROOM, ROOM]}, "two rooms"),
+        ({"rooms": [{**ROOM, "size": [59, 59, 3]}]}, "square metres"),
+        ({"doors": [{"room": "den", "wall": "east"}]}, "there is none"),
+        ({"doors": [{"room": "hall", "wall": "up"}]}, "walls are"),
+        ({"doors": [{"room": "hall", "wall": "east", "width": 5}]}, "does not fit"),
+        ({"doors": [{"room": "hall", "wall": "east"}, {"room": "hall", "wall": "east", "at": 2.5}]}, "overlap"),
+        ({"windows": [{"room": "hall", "wall": "east", "sill": 2.5}]}, "does not fit"),
+        ({"things": [{"label": "table", "at": [20, 2]}]}, "lies in no room"),
+        ({"things": [{"label": "table", "at": [5.9, 2]}]}, "reaches out"),
+        ({"things": [{"label": "table", "at": [2, 2], "size": [1, -1, 1]}]}, "has the size"),
+        ({"things": [{"label": "chair", "at": [2, 2], "facing": "up"}]}, "ways are"),
+        ({"things": 3}, "is a list"),
+        ({"stairs": [{"at": [1, 1], "size": [1, 0.5, 2]}]}, "longer"),
+        ({"start": [50, 0, 0]}, "in no room"),
+    ],
+)  # fmt: skip
+def test_a_layout_that_cannot_be_is_refused(change, says):
+    with pytest.raises(ContractError, match=says):
+        blocks_of(read_plan({"rooms": [ROOM], **change}))
+
+
+def test_doors_join_rooms_or_are_shut(tmp_path):
+    path = tmp_path / "layout.json"
+    path.write_text(
+        json.dumps(
+            {"rooms": [ROOM, NEXT], "doors": [{"room": "hall", "wall": "east"}, {"room": "hall", "wall": "west"}]}
+        )
+    )
+    solids = blocks_of(read_plan(path)).solids.astype(np.float64)
+    through = lambda y, ahead: first_box(3.0, y, 1.5, ahead, 0.0, 0.0, solids, 1e9)[1]  # noqa: E731
+    assert abs(through(2.0, 1.0) - 6.2) < 1e-5 and through(2.0, -1.0) < 3 and abs(through(1.0, 1.0) - 3.0) < 1e-5
+
+
+def test_rays_meet_the_side_that_they_should():
+    boxes = np.array([[1.0, -1, -1, 2, 1, 1], [-3, -1, -1, -2, 1, 1]])
+    assert first_box(0.0, 0, 0, 1.0, 0, 0, boxes, 1e9) == (0, 1.0, 0)
+    assert first_box(0.0, 0, 0, -1.0, 0, 0, boxes, 1e9) == (1, 2.0, 1)
+    assert first_box(0.0, 0, 0, 0, 1.0, 0, boxes, 1e9)[0] == -1
+    assert first_box(1.5, 0, 5.0, 0, 0, -1.0, boxes, 1e9) == (0, 4.0, 5)
+
+
+def test_what_is_built_is_whole_and_lit():
+    heard = understood("a room with two windows, a table, and a bookshelf")
+    place = build(heard.plan, 20_000)
+    assert 12_000 < len(place.gaussians) < 40_000 and place.objects.max() == len(place.names) == 4
+    pose = place.starts.clone()
+    pose[:, 2] += 1.6
+    seen = rasterise(place.gaussians, pose, None, (64, 128))
+    assert seen.alpha.min() > 0.85 and seen.alpha.mean() > 0.98  # no hole anywhere around
+    grey = seen.rgb.mean((0, 1))
+    assert 0.3 < grey.mean() < 0.8 and grey.std() > 0.05
+    low, high = (torch.tensor(v) for v in (heard.plan.rooms[0].low, heard.plan.rooms[0].high))
+    assert ((place.gaussians.means > low - 0.2) & (place.gaussians.means < high + 0.2)).all()

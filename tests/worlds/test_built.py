@@ -1,0 +1,115 @@
+"""Places built of layouts: bodies climb stairs, fall, and enter no wall; folders and commands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+
+from terrella.cli import main
+from terrella.core import check_world, make_rng
+from terrella.space.camera import planar_pose
+from terrella.space.occupancy import Body
+from terrella.space.solids import Solids
+from terrella.worlds.folder import open_world
+
+LAYOUT = {
+    "rooms": [{"name": "hall", "at": [0, 0], "size": [8, 4, 3.4]}, {"name": "den", "at": [8.2, 0], "size": [3, 4, 3]}],
+    "doors": [{"room": "hall", "wall": "east"}],
+    "stairs": [{"at": [2, 3, 0], "size": [2.2, 1, 1.08], "up": "east"}],
+    "things": [{"label": "platform", "at": [5, 3.5], "size": [1.6, 1, 1.08]},
+        {"label": "table", "at": [3, 1.2]}, {"label": "chair", "at": [6.5, 0.4]}],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("built")
+    (path / "layout.json").write_text(json.dumps(LAYOUT))
+    command = [
+        "space",
+        "build",
+        str(path / "layout.json"),
+        "--out",
+        str(path / "w"),
+        "--gaussians",
+        "4000",
+        "--size",
+        "24",
+        "32",
+    ]
+    assert main(command) == 0
+    return path / "w"
+
+
+def walk(world, state, steps, *names):
+    action = torch.tensor([[int(one in names) for one in world.spec.action_names]], dtype=torch.int8).repeat(
+        state.batch, 1
+    )
+    for _ in range(steps):
+        state = world.imagine(state, action, make_rng(0))
+    return state
+
+
+def put(world, x, y, feet, heading):
+    pose = planar_pose(*(torch.tensor([float(v)]) for v in (x, y, feet + world.config.body.eye_m, heading)))
+    return world.observe({"pose": pose}, None, make_rng(0))
+
+
+def test_the_laws_hold(folder):
+    check_world(open_world(folder), steps=4)
+
+
+def test_one_climbs_stairs_and_falls_off_the_platform(folder):
+    world = open_world(folder)
+    eye = world.config.body.eye_m
+    state = walk(world, put(world, 1.2, 3.5, 0, 0.0), 45, "MOVE_FORWARD")
+    assert abs(float(state["pose"][0, 2]) - 1.08 - eye) < 0.03 and 4.2 < state["pose"][0, 0] < 5.9
+    state = walk(world, state, 40, "MOVE_FORWARD")
+    assert abs(float(state["pose"][0, 2]) - eye) < 0.03 and state["pose"][0, 0] > 6
+
+
+def test_one_goes_through_the_door_and_nowhere_else(folder):
+    world = open_world(folder)
+    assert walk(world, put(world, 6.5, 2.0, 0, 0.0), 60, "MOVE_FORWARD")["pose"][0, 0] > 10
+    stopped = walk(world, put(world, 6.5, 3.6, 0, 0.0), 60, "MOVE_FORWARD")["pose"]
+    assert abs(float(stopped[0, 0]) - 7.75) < 0.03
+
+
+def test_nobody_enters_a_wall(folder):
+    world, body, rng = open_world(folder), Body(eye_m=1.65, step_m=0.35), torch.Generator().manual_seed(0)
+    state = world.start(64, make_rng(0))
+    for step in range(60):
+        if step % 6 == 0:
+            action = (torch.rand(64, len(world.spec.action_names), generator=rng) < 0.4).to(torch.int8)
+        state = world.imagine(state, action, make_rng(0))
+    assert Solids(world.solids).depth(state["pose"], body).max() < 0.03
+    assert (state["pose"][:, :3] - world.starts[0, :3]).norm(dim=1).max() > 1
+
+
+def test_solids_are_met_exactly():
+    body, wall = Body(0.25, 1.6, 0.35, 0.15), Solids(torch.tensor([[1.0, -5, 0, 1.1, 5, 3], [-9, -9, -0.1, 9, 9, 0]]))
+    at = torch.tensor([[0.74, 0, 1.6], [0.76, 0, 1.6], [1.05, 0, 1.6], [1.36, 0, 1.6]])
+    assert wall.blocked(at, body).tolist() == [False, True, True, False]
+    assert torch.allclose(wall.depth(at, body)[1:3], torch.tensor([0.01, 0.3]), atol=1e-5)
+    assert wall.floor(at, body).tolist() == [0, 0, 0, 0]
+    assert wall.floor(at + torch.tensor([0, 0, 3.1]), body).tolist() == [0, 0, 3, 0]
+
+
+def test_edits_take_the_collider_from_the_gaussians(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "w")
+    assert len(open_world(copy).solids) and "table" in open_world(copy).card["objects"]
+    assert main(["space", "edit", str(copy), "--object", "3", "--delete"]) == 0
+    assert not len(open_world(copy).solids) and not (open_world(copy).objects == 3).any()
+
+
+def test_the_command_says_what_it_did_not_understand(tmp_path, capsys):
+    assert (
+        main(["space", "build", "--text", "a tiny quux room", "--out", str(tmp_path / "w"), "--gaussians", "1000"]) == 0
+    )
+    assert "not understood: quux" in capsys.readouterr().out and (tmp_path / "w" / "layout.json").exists()
+    for wrong in (["--text", "quux"], [], [str(tmp_path / "none.json")], ["--text", "room", "--gaussians", "3"]):
+        assert main(["space", "build", *wrong, "--out", str(tmp_path / "no")]) != 0
+        assert not (tmp_path / "no").exists() and len(capsys.readouterr().err.splitlines()) == 1
