@@ -168,6 +168,23 @@ def test_an_unstable_world_ends_and_can_be_repeated(tmp_path):
         assert world.imagine(before, before["action"], rng)["done"].tolist() == [True]
 
 
+def test_joints_without_names_get_servos_too(tmp_path):
+    body = '<body><joint/><geom size="0.1"/><body pos="1 0 0"><joint name="joint 1"/><geom size="0.1"/></body></body>'
+    (tmp_path / "x.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    assert load(f"mujoco:{tmp_path / 'x.xml'}", cameras=()).spec.action_names == ("joint 2", "joint 1")
+
+
+def test_what_cannot_be_dumped_does_not_stop_the_others(tmp_path):
+    (tmp_path / "file").write_text("")
+    world, rng = load("mujoco:ant", cameras=(), dumps=tmp_path / "file"), make_rng(0)
+    state = world.start(2, rng)
+    physics = state["physics"].clone()
+    physics[0, world.body.qvel] = 1e9
+    with pytest.warns(RuntimeWarning, match="could not be saved"):
+        after = world.imagine(state.replace(physics=physics), torch.zeros(2, 8), rng)
+    assert after["done"].tolist() == [True, False]
+
+
 def test_a_robot_that_falls_is_done_and_velocity_is_paid():
     world, rng = load("mujoco:ant"), make_rng(0)
     state = world.start(2, rng)

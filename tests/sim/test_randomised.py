@@ -157,3 +157,39 @@ def test_the_scale_goes_from_the_nominal_world_to_the_whole_range():
     check_world(Randomised(load("mujoco:arm", cameras=()), told))
     with pytest.raises(TerrellaError, match="from 0 to 1"):
         Randomised(load("mujoco:arm", cameras=()), told, scale=2.0)
+
+
+@needs_mujoco
+def test_at_a_scale_of_nothing_every_parameter_leaves_the_world_as_it_is():
+    plain = load("mujoco:ant", cameras=())
+    told = {name: Distribution("uniform", (one.low, one.high)) for name, one in plain.parameters.items()}
+    same = Randomised(plain, told, scale=0.0)
+    after = [world.start(1, make_rng(0)) for world in (plain, same)]
+    push = torch.full((1, 8), 0.5)
+    for _ in range(20):
+        after = [world.imagine(state, push, make_rng(1)) for world, state in zip((plain, same), after)]
+    assert torch.allclose(after[0]["physics"], after[1]["physics"], atol=1e-9)
+    assert same.spec.cameras == {}  # lenses differ, so none is told
+
+
+@needs_mujoco
+def test_masses_multiply_in_any_order():
+    from terrella.sim.mujoco_parameters import Models
+
+    world = load("mujoco:ant", cameras=())
+    names = ("mass.torso", "mass", "inertia")
+    at, found = world.file.body("torso").id, []
+    for order in (names, names[::-1]):
+        model = Models(world.file, [world.parameters[name] for name in order]).of(
+            np.array([[{"mass.torso": 3.0, "mass": 2.0, "inertia": 0.5}[name] for name in order]])
+        )[0]
+        found.append(
+            (model.body_mass[at] / world.file.body_mass[at], model.body_inertia[at] / world.file.body_inertia[at])
+        )
+    assert found[0][0] == pytest.approx(6.0) and found[1][0] == pytest.approx(6.0)
+    assert found[0][1] == pytest.approx(3.0) and found[1][1] == pytest.approx(3.0)
+
+
+@needs_mujoco
+def test_parameters_that_would_do_nothing_are_not_offered():
+    assert "strength" not in load("mujoco:ant", cameras=()).parameters  # no actuator of its is limited

@@ -205,7 +205,8 @@ def check_practised(spec: Spec) -> None:
     """ChannelError or ObservationError where nobody can practise in a world, by the hundred episodes and for a reward."""
     if "reward" not in spec.channels:
         raise ChannelError(
-            f"{spec.name} has no channel 'reward', and practice is for a reward; record one and train the world on it."
+            f"{spec.name} has no channel 'reward', and practice is for a reward; record one and train the world on it, "
+            "or give a simulated robot a task that has rewards."
         )
     if not spec.forkable:
         raise ObservationError(

@@ -65,6 +65,7 @@ def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
     empty, a camera that sees the whole."""
     spec.compiler.discardvisual = False  # which URDF files ask for
     if not spec.actuators and any(joint.type not in (FREE, BALL) for joint in spec.joints):
+        _name_joints(spec)
         add_servos(spec, compiled(spec.copy(), name))
     if not spec.worldbody.geoms and not spec.hfields:
         add_floor(spec)
@@ -87,12 +88,21 @@ def add_floor(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.2, -1], castshadow=False)
 
 
+def _name_joints(spec: mujoco.MjSpec) -> None:
+    """Names the joints without one "joint 1", "joint 2", ...: servos and their readers find them by name."""
+    taken, number = {joint.name for joint in spec.joints}, 0
+    for joint in spec.joints:
+        while not joint.name:
+            number += 1
+            joint.name = "" if f"joint {number}" in taken else f"joint {number}"
+
+
 def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """A position servo for each hinge and slide, as stiff as its inertia asks for."""
     for joint in spec.joints:
         if joint.type in (FREE, BALL):
             continue
-        at = model.joint(joint.name).id if joint.name else joint.id
+        at = model.joint(joint.name).id
         inertia = max(float(model.dof_M0[model.jnt_dofadr[at]]), 1e-6)
         stiff = inertia * (2 * np.pi * SERVO_HZ) ** 2
         servo = spec.add_actuator(

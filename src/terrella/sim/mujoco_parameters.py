@@ -23,7 +23,8 @@ Model = Any  # mujoco.MjModel
 @dataclass(frozen=True)
 class Parameter:
     """One number of a world. nominal: as the file has it; low, high: within which the physics stays sound; unit: "x" where it
-    multiplies what the file says. change(model, file, value) sets it in a copy of the file's model."""
+    multiplies what the file says. change(model, file, value) sets it in a fresh copy of the file's model, after whatever else was
+    changed there; what is only seen is set in one model again and again."""
 
     nominal: float
     low: float
@@ -35,16 +36,19 @@ class Parameter:
 
 
 def _scaled(*fields: str, low: float, high: float, what: str) -> Parameter:
+    """Multiplies, whatever else did so before: `mass`, `mass.BODY` and `inertia` go together in any order."""
+
     def change(model: Model, file: Model, value: float) -> None:
         for name in fields:
-            getattr(model, name)[:] = value * getattr(file, name)
+            getattr(model, name)[:] *= value
 
     return Parameter(1.0, low, high, "x", what, change)
 
 
 def _sliding(model: Model, file: Model, value: float) -> None:
-    """The coefficient of the floor and of whatever touches it (MuJoCo takes the larger of two)."""
-    model.geom_friction[:, 0] = value
+    """The coefficients of all geoms and of all pairs that a file tells."""
+    model.geom_friction[:, 0] *= value
+    model.pair_friction[:, :2] *= value
 
 
 def _gravity(model: Model, file: Model, value: float) -> None:
@@ -103,7 +107,7 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
     found = {
         "mass": _scaled("body_mass", "body_inertia", low=0.3, high=3.0, what="mass and inertia of all bodies"),
         "inertia": _scaled("body_inertia", low=0.5, high=2.0, what="inertia of all bodies, their mass as it is"),
-        "friction": Parameter(float(model.geom_friction[:, 0].max(initial=1.0)), 0.05, 3.0, "", "sliding friction", _sliding),
+        "friction": Parameter(1.0, 0.05, 3.0, "x", "sliding friction", _sliding),
         "gravity": Parameter(gravity, 0.0, 30.0, "m/s²", "downwards", _gravity),
         "damping": _scaled("dof_damping", low=0.0, high=10.0, what="damping of the joints"),
         "armature": _scaled("dof_armature", low=0.2, high=5.0, what="rotor inertia of the joints"),
@@ -118,6 +122,13 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
         "red": _colour(0), "green": _colour(1), "blue": _colour(2),
     }  # fmt: skip
+    acts = {
+        "damping": "dof_damping", "armature": "dof_armature", "joint_friction": "dof_frictionloss",
+        "strength": "actuator_forcerange", "gain": "actuator_gainprm",
+    }  # fmt: skip
+    for name, field in acts.items():
+        if not np.any(getattr(model, field)):  # twice nothing is nothing
+            del found[name]
     bodies = {model.body(at).name: at for at in range(1, model.nbody) if model.body_mass[at] > 0}
     return found | {f"mass.{name}": _one_mass(at) for name, at in bodies.items() if name}
 

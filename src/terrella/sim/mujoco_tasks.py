@@ -11,6 +11,7 @@ import torch
 from gymnasium import spaces
 
 from ..core import chance
+from ..core.errors import TerrellaError
 
 Tensors = Mapping[str, torch.Tensor]
 _START, _GOAL = 1, 2  # streams of chance
@@ -94,6 +95,8 @@ class VelocityTracking:
     )  # fmt: skip
 
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        if len(body.home) < 7 or len(body.home) != body.qvel.stop - body.qvel.start + 1:
+            raise TerrellaError("a velocity is tracked by a body that moves freely: its file begins with a free joint.")
         return {
             "observation": (
                 numbers(12 + len(body.home) - 7 + body.qvel.stop - body.qvel.start - 6 + len(body.rest)),
@@ -157,6 +160,7 @@ class Reach:
     high: tuple[float, float, float] = (0.45, 0.2, 0.4)
 
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        _check_hand(body, self.hand)
         width = len(body.home) + body.qvel.stop - body.qvel.start + 6
         return {"observation": (numbers(width), ""), "goal": (numbers(3), "m"), "hand": (numbers(3), "m")}
 
@@ -194,6 +198,7 @@ class Hold:
     start: tuple[float, float] = (1.5, 0.5)
 
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        _check_hand(body, self.hand)
         joints = len(body.home)
         return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
 
@@ -228,6 +233,12 @@ class Hold:
     def _apart(self, body: Body, state: Tensors) -> torch.Tensor:
         """From the goal to the hand [B, 2], m."""
         return state["sensors"][:, body.sensors[self.hand]][:, [0, 2]] - state["goal"]
+
+
+def _check_hand(body: Body, hand: str) -> None:
+    if hand not in body.sensors:
+        there = ", ".join(body.sensors) or "none"
+        raise TerrellaError(f"a hand is found by a sensor (framepos) of the name '{hand}'; the file has {there}.")
 
 
 def motion(body: Body, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import tempfile
 import threading
@@ -45,7 +46,7 @@ class MujocoWorld:
     depth, segmentation: show these beside each rgb.
     threads:    that step worlds; default: as many as there are processors for this process.
     parameters: names of `parameters_of` that each world has values of its own of: `state["parameters"]` [B, n].
-    dumps:      folder for states that led to an unstable simulation; default: terrella-unstable in the folder of temporary files.
+    dumps:      folder for states that led to an unstable simulation; default: terrella-unstable-USER among temporary files.
 
     Actions are the actuators' controls, in their units. Channels: observation, qpos, qvel, sensor.NAME for each sensor, contacts
     (N on each body, of the normal forces on it), reward, done, those of the task, and of each camera rgb, pose and what is asked
@@ -78,10 +79,11 @@ class MujocoWorld:
         self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it would begin anew in silence
         self.name = f"mujoco:{label}"
         self._steps = max(1, round((control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
-        self._threads = (
-            threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._threads = threads or _cores()
+        self._dumps, self._dumped = (
+            Path(dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}"),
+            0,
         )
-        self._dumps, self._dumped = Path(dumps or Path(tempfile.gettempdir()) / "terrella-unstable"), 0
         self._home = _home(self.file, robot)
         self.task: Task = task or (robot.task if robot else Free())
         self.body = _body(self.file, self._home, self._steps)
@@ -178,13 +180,17 @@ class MujocoWorld:
         self._dumped += 1
         if self._dumped > MOST_DUMPS:
             return
-        self._dumps.mkdir(parents=True, exist_ok=True)
         stem = "".join(letter if letter.isalnum() else "-" for letter in self.name)
         file = self._dumps / f"{stem}-{os.getpid()}-{self._dumped}.safetensors"
-        state.replace(action=ctrl.float()).save(file)
+        try:
+            self._dumps.mkdir(parents=True, exist_ok=True)
+            state.replace(action=ctrl.float()).save(file)
+            kept = f"the states before and their actions are in {file}"
+        except OSError as error:
+            kept = f"the states before could not be saved ({error})"
         warnings.warn(
-            f"{state.batch} worlds of {self.name} became unstable at {float(state['physics'][0, 0]):.2f} s and have ended; the "
-            f"states before and their actions are in {file}: make the timestep smaller or servos weaker.",
+            f"{state.batch} worlds of {self.name} became unstable at {float(state['physics'][0, 0]):.2f} s and have ended; {kept}: "
+            "make the timestep smaller or servos weaker.",
             RuntimeWarning,
             stacklevel=4,
         )
@@ -247,6 +253,7 @@ class MujocoWorld:
         for end in suffix.values():
             channels |= {f"{kind}{end}": spaces_of[kind] for kind in self._kinds} | {f"pose{end}": POSE}
             units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
+        cameras = {f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
         return Spec(
             name=self.name,
             action=spaces.Box(body.low.numpy().astype(np.float32), body.high.numpy().astype(np.float32), dtype=np.float32),
@@ -257,7 +264,8 @@ class MujocoWorld:
             action_names=tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
             action_units=tuple(_unit(model, at) for at in range(model.nu)),
             action_mode=_mode(model),
-            cameras={f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()},
+            # Where lenses vary from world to world, none is told: pictures of a false one would mislead whoever trusts it.
+            cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
             card={
                 "what": self._what, "kind": "simulator", "physics": _told(model, self._steps), "varied": list(self.varied),
@@ -265,6 +273,11 @@ class MujocoWorld:
             },
             idle=tuple(body.rest.float().tolist()),
         )  # fmt: skip
+
+
+def _cores() -> int:
+    """Of this machine, those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.ndarray]:

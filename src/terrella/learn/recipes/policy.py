@@ -117,13 +117,15 @@ def train_policy(
     run = Run.of(out, config, report, device_of(world), ("minutes",), **facts)
     run = replace(run, strip_every_s=config.save_every_s)  # when the policy is written
     begun = run.found(STAGE) is not None
+    growth = None if growing is None else Growth(growing)
+    if growth is not None:
+        growth.set()  # the first episodes, too, begin with ranges of nothing
     starts = _starts(world, config, recording, report)
     trust = config.trust if config.trust is not None else _invents(spec)
     gradients = not ppo and config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
     usual = starts.usual(sees)
     for network in (actor, critic):
         network.to(run.device).eyes.settle(usual)
-    growth = None if growing is None else Growth(growing)
     kept = {**starts.modules, **({} if growth is None else {"growth": growth})}
     wanted = Wanted(config.discount, config.td_lambda, config.entropy)
     objective: Objective = (
