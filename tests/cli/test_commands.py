@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from tests.cli.tiny import FAILS
 from tests.worlds.made import place
@@ -25,8 +26,8 @@ from terrella.worlds.folder import load_world, save_world
 OPTIONS = {
     "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --practise --randomise --seed --size",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
-    "record world": "--action-names --adapter --fps --frames --human --idle --json --keys --live-mcap --out --pictures --port "
-    "--randomise --seed --size",
+    "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
+    "--pictures --policy --port --randomise --seed --size --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth",
     "plan": "--adapter --agent --apart --block --budget-ms --cost --curve --device --episodes --fps --goal --horizon --iterations "
@@ -329,6 +330,31 @@ def test_record_then_look(capsys, tmp_path):
     assert json.loads(capsys.readouterr().out)["frames"] == 40
     assert main(["data", "doctor", str(tmp_path / "set"), "--json"]) == 0
     json.loads(capsys.readouterr().out)
+
+
+def test_whole_episodes_of_a_policy_are_recorded_by_workers_and_again(capsys, tmp_path):
+    folder, common = (
+        tmp_path / "set",
+        ["record", "world", "gym:CartPole-v1", "--policy", "constant:1", "--pictures", "none"],
+    )
+    for count in (2, 3):
+        assert main([*common, "--episodes", str(count), "--workers", "1", "--out", str(folder), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["episodes"] == count
+    assert set(np.concatenate([Dataset(folder).episode(at)["action"][:-1].ravel() for at in range(3)])) == {1}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--workers", "0"], "0 workers"),
+        (["--workers", "2", "--human"], "one player"),
+        (["--episodes", "3", "--frames", "9"], "how much"),
+        (["--episodes", "0"], "how much to record"),
+        (["--policy", "explroer"], "did you mean 'explorer'"),
+    ],
+)
+def test_who_plays_and_how_much_is_checked(more, said, capsys, tmp_path):
+    assert said in refusal(["record", "world", "gym:CartPole-v1", "--out", tmp_path / "set", *more], capsys)
 
 
 def test_the_doctor_exits_with_1_where_a_recording_is_broken(capsys, tmp_path):

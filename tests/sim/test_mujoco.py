@@ -65,7 +65,7 @@ def test_the_contract_holds_with_pictures_from_several_cameras(arm):
     world.close()
 
 
-@pytest.mark.parametrize("name", ["ant", "hopper"])
+@pytest.mark.parametrize("name", ["ant", "hopper", "drone", "car"])
 def test_robots_that_come_with_gymnasium(name):
     world = load(f"mujoco:{name}", **BLIND)
     drawn_or_skipped(world)
@@ -195,3 +195,47 @@ def test_a_robot_that_falls_is_done_and_velocity_is_paid():
     over[:, 4:8] = torch.tensor([0.0, 1, 0, 0], dtype=torch.float64)  # on its back
     assert world.imagine(state.replace(physics=over), torch.zeros(2, 8), rng)["done"].all()
     assert np.isfinite(world.spec.action_limits).all()
+
+
+def test_lidar_tells_how_far_walls_are(tmp_path):
+    (tmp_path / "room.xml").write_text("""<mujoco><worldbody>
+     <geom type="box" size=".1 5 1" pos="2.1 0 0"/><geom type="box" size="5 .1 1" pos="0 3.1 0"/>
+     <body euler="0 0 90"><freejoint/><geom size=".1"/><site name="lidar"/></body></worldbody></mujoco>""")
+    world = load(f"mujoco:{tmp_path / 'room.xml'}", cameras=(), lidar=8, lidar_m=10.0)
+    assert world.spec.units["lidar"] == "m"
+    seen = world.render(world.start(1, make_rng(0)), ("lidar",))["lidar"][0]
+    # counter-clockwise from the body's x, which looks along y
+    far = [3, 3 * 2**0.5, 10, 10, 10, 2 * 2**0.5, 2, 2 * 2**0.5]
+    assert seen.numpy() == pytest.approx(np.array(far), abs=1e-3)
+    rows = load(f"mujoco:{tmp_path / 'room.xml'}", cameras=(), lidar=(3, 8)).spec.channels["lidar"]
+    assert rows.shape == (3, 8)
+
+
+def flown(action: list[float], steps: int):
+    world = load("mujoco:drone", cameras=())
+    rng = make_rng(0)
+    state = world.start(4, rng)
+    for _ in range(steps):
+        state = world.imagine(state, torch.tensor([action] * 4), rng)
+    return world, state
+
+
+def test_the_drone_flies_as_it_is_told_from_any_heading():
+    for asked in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, -1.0, 0.5, 0.0]):
+        world, state = flown(asked, 150)
+        seen = world.render(state, ("velocity", "done", "qvel"))
+        assert not seen["done"].any()
+        found = torch.cat([seen["velocity"][:, :2], seen["qvel"][:, 2:3], seen["velocity"][:, 2:]], 1)
+        assert (found - torch.tensor(asked)).abs().max() < 0.15
+    assert load("mujoco:drone", cameras=(), pilot=False).spec.action_names[0] == "front_left"
+
+
+def test_the_car_drives_and_steers_to_the_left():
+    world, rng = load("mujoco:car", cameras=()), make_rng(0)
+    state = world.start(1, rng)
+    for _ in range(60):
+        state = world.imagine(state, torch.tensor([[0.3, 1.0]]), rng)
+    seen = world.render(state, ("sensor.velocity", "sensor.gyro", "lidar"))
+    assert 0.7 < float(seen["sensor.velocity"][0, 0]) < 1.1 and float(seen["sensor.gyro"][0, 2]) > 0.5
+    assert 0 < seen["lidar"].min() < seen["lidar"].max() < 20
+    assert world.spec.action_units == ("rad", "m/s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +17,7 @@ from .named import Controls, Environment, Keeper
 from .say import Json, Port, Seed, result, say
 
 if TYPE_CHECKING:
+    from ..core.policy import Policy
     from ..core.world import World
     from ..data import Dataset, Recorder
 
@@ -36,6 +38,37 @@ class Recording:
     seed: Seed = 0
     port: Port = 8765
     json: Json = False
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Who plays.
+
+    Args:
+        policy: explorer, random, idle, plan, constant:VALUE, the folder of a learned policy, MODULE:NAME or FILE.py:NAME.
+        episodes: Whole episodes to record in all, in place of --frames.
+        workers: Processes that play at the same time, an episode each; the recording is the same with any number of them.
+        on: Where the workers are: processes of this machine, or Ray's (of the cluster that RAY_ADDRESS names, if it does).
+    """
+
+    policy: str | None = None
+    episodes: int | None = None
+    workers: int | None = None
+    on: Literal["here", "ray"] = "here"
+
+    @property
+    def spread(self) -> bool:
+        return self.episodes is not None or self.workers is not None or self.on != "here"
+
+    def check(self, recording: Recording, frames: int | None) -> None:
+        from ..core.errors import TerrellaError
+
+        if self.spread and (recording.human or recording.live_mcap):
+            raise TerrellaError("--human and --live-mcap are for one player; leave --episodes, --workers and --on out.")
+        if recording.human and self.policy:
+            raise TerrellaError("--human and --policy both say who plays; give one of them.")
+        if frames is not None and self.episodes is not None:
+            raise TerrellaError("--frames and --episodes both say how much to record; give one of them.")
 
 
 def record_doom(
@@ -65,20 +98,35 @@ def record_world(
     recording: Recording,
     controls: Controls,
     environment: Environment,
-    frames: int = 10_000,
-    pictures: Literal["auto", "png", "video"] = "auto",
+    collection: Collection,
+    frames: int | None = None,
+    pictures: Literal["auto", "png", "video", "none"] = "auto",
 ) -> None:
     """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or a learned world.
 
     Args:
         name: A name that `terrella list` shows, or the path of a checkpoint.
-        frames: Frames to record in all. With --human there is no limit.
-        pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above.
+        frames: Frames to record in all, 10,000 unless it is said. With --human there is no limit.
+        pictures: "png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above; "none" draws none.
     """
-    world = controls.of(environment.open(name))
+    opened = partial(_opened, name, controls, environment, pictures != "none", collection.policy or "explorer")
+    collection.check(recording, frames)
+    world, policy = opened()
     for line in described(world.spec):
         say(line)
-    _record(world, recording, frames, stored_as(world.spec) if pictures == "auto" else pictures)
+    kept = stored_as(world.spec) if pictures in ("auto", "none") else pictures
+    if collection.spread:
+        _collect(opened, world, recording, collection, frames, kept)
+    else:
+        _record(world, recording, frames or 10_000, kept, policy() if collection.policy else None)
+
+
+def _opened(name: str, controls: Controls, environment: Environment, rgb: bool, policy: str):
+    """A world and what makes a policy of it: for a worker, too."""
+    from ..act.named import policy_of
+
+    world = controls.of(environment.open(name, rgb=rgb))
+    return world, lambda: policy_of(policy, world.spec, world)
 
 
 def stored_as(spec: Spec) -> Literal["video", "png"]:
@@ -94,19 +142,21 @@ def explore(
     seed: int,
     report: Callable[..., None],
     pictures: Literal["video", "png"],
+    policy: Policy | None = None,
     **more: Any,
 ) -> Recorder:
-    """Lets a script play into the recording `out`, on from what lies there; `more` is what `record` takes."""
+    """Lets a script, or `policy`, play into the recording `out`, on from what lies there; `more` is what `record` takes."""
     from ..act.explorer import Explorer
     from ..core.errors import DatasetError, TerrellaError
     from ..core.world import make_rng
     from ..data import Dataset, record
 
-    player = Explorer(world.spec, out / ".explorer")
-    kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
-    player.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
+    if policy is None:
+        policy = player = Explorer(world.spec, out / ".explorer")
+        kept = Dataset(out) if (out / "meta" / "info.json").exists() else None
+        player.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
     try:
-        return record(world, player, out, frames, make_rng(seed), report, pictures=pictures, **more)
+        return record(world, policy, out, frames, make_rng(seed), report, pictures=pictures, **more)
     except DatasetError:
         raise
     except TerrellaError as error:  # the world's
@@ -114,7 +164,42 @@ def explore(
         raise TerrellaError(f"{error} {safe:,} frames are safe in {out}." if safe else str(error)) from error
 
 
-def _record(world: World, recording: Recording, frames: int, pictures: Literal["video", "png"] = "video") -> None:
+def _collect(
+    opened: Any,
+    world: World,
+    recording: Recording,
+    collection: Collection,
+    frames: int | None,
+    pictures: Literal["video", "png"],
+) -> None:
+    """Records with workers, and says what came of it."""
+    from ..core.world import make_rng
+    from ..data import Dataset, Layout
+    from ..data.collect import LocalWorkers, collect
+    from ..data.ray import RayWorkers
+
+    workers = (RayWorkers if collection.on == "ray" else LocalWorkers)(
+        1 if collection.workers is None else collection.workers
+    )
+    layout, out = replace(Layout.of(world.spec), pictures=pictures), recording.out
+    upto = None if collection.episodes is not None else frames or 10_000
+    try:
+        with progress.shown("recording") as report:
+            rng = make_rng(recording.seed)
+            collect(opened, world, out, rng, workers, collection.episodes, upto, report, layout)
+    except KeyboardInterrupt:
+        safe = len(Dataset(out).episodes) if (out / "meta" / "info.json").exists() else 0
+        raise KeyboardInterrupt(f"stopped: {safe:,} episodes are safe in {out}; the same command goes on.") from None
+    result({"dataset": str(out)} | looked_at(Dataset(out), world.spec.name), recording.json)
+
+
+def _record(
+    world: World,
+    recording: Recording,
+    frames: int,
+    pictures: Literal["video", "png"] = "video",
+    policy: Policy | None = None,
+) -> None:
     from ..core.errors import DatasetError
     from ..data import Dataset, Layout, Recorder
 
@@ -132,7 +217,7 @@ def _record(world: World, recording: Recording, frames: int, pictures: Literal["
             serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed, keep=keeper)
         else:
             with progress.shown("recording") as report:
-                done = explore(world, out, frames, recording.seed, report, pictures, live=live)
+                done = explore(world, out, frames, recording.seed, report, pictures, policy, live=live)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out) if out.exists() else None
     if dataset is None or not dataset.length:

@@ -20,11 +20,11 @@ from .channels import ACTION, DONE, REWARD, feature_of
 from .features import unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even
 from .source import Sensor, follows, is_action
-from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Staged, about, growing, pack_row
+from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Parcel, Staged, about, growing, pack_row
 from .storage.durable import FULL
 from .storage.journal import Journal
 from .storage.mp4 import Mp4Writer, Pressure
-from .writer import Writer, fresh
+from .writer import Draft, Writer, fresh
 
 _BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
 
@@ -183,16 +183,37 @@ class Recorder:
             self._discard()
             return None
         with self._nothing_lost():
-            self._stop()
-            staged = Staged(self._staging)
-            pictures = {
-                name: stats.merge([{name: part} for part in seen])[name] for name, seen in self._pictures.items()
-            }
-            began = self._start_ns if self.layout.clock else None
-            number = self._writer.put(staged.draft(self.in_flight, began if start_ns is None else start_ns, pictures))
+            number = self._writer.put(self._draft(start_ns))
         self._discard()
         self._writer.tidy()
         return number
+
+    def take_episode(self) -> Parcel | None:
+        """The episode in flight, which is not committed here, for `put_episode` of another recorder; None for fewer than 2 rows."""
+        if self.in_flight < 2:
+            self._discard()
+            return None
+        with self._nothing_lost():
+            parcel = Parcel.of(self._draft(None))
+        self._discard()
+        return parcel
+
+    def put_episode(self, parcel: Parcel) -> int:
+        """Commits an episode that another recorder of this layout took; returns its number."""
+        self._check_open()
+        if self.in_flight or self._left:
+            raise DatasetError(f"an episode of {self.root} is in flight; end it before another is put there.")
+        with self._nothing_lost():
+            number = self._writer.put(parcel.unpacked(fresh(self._staging)))
+        self._discard()
+        self._writer.tidy()
+        return number
+
+    def _draft(self, start_ns: int | None) -> Draft:
+        self._stop()
+        pictures = {name: stats.merge([{name: part} for part in seen])[name] for name, seen in self._pictures.items()}
+        began = self._start_ns if self.layout.clock else None
+        return Staged(self._staging).draft(self.in_flight, began if start_ns is None else start_ns, pictures)
 
     def drop_episode(self) -> None:
         """Throws the episode in flight away."""

@@ -49,23 +49,46 @@ def record(
     if max_episode_steps < 1:
         raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
     layout = replace(Layout.of(world.spec, fps), pictures=pictures)
-    base = int(torch.randint(2**62, (1,), generator=rng).item())
+    base = base_of(rng)
     task = task or f"explore {world.spec.name}"
     with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again
+
+        def stop() -> bool:
+            if progress:
+                progress(recorder.rows + recorder.in_flight, frames)
+            return enough()
+
         while recorder.rows < frames - 1 and not enough():  # an episode has 2 rows or more
-            seed = int(np.random.SeedSequence([base, recorder.episodes]).generate_state(1, np.uint64)[0] >> 2)
-            _episode(world, policy, recorder, frames, make_rng(seed), progress, max_episode_steps, enough)
+            steps = min(max_episode_steps, frames - recorder.rows - 1)
+            play_episode(world, policy, recorder, make_rng(seed_of(base, recorder.episodes)), steps, stop)
             recorder.end_episode()
     return recorder
 
 
+def base_of(rng: torch.Generator) -> int:
+    """The number from which the seeds of a recording's episodes come."""
+    return int(torch.randint(2**62, (1,), generator=rng).item())
+
+
+def seed_of(base: int, episode: int) -> int:
+    """The seed of an episode, by its number alone: whoever plays it, and after whatever, plays the same."""
+    return int(np.random.SeedSequence([base, episode]).generate_state(1, np.uint64)[0] >> 2)
+
+
 @torch.no_grad()
-def _episode(world, policy, recorder, frames, rng, progress, max_steps, enough) -> None:
+def play_episode(
+    world: World,
+    policy: Policy,
+    recorder: Recorder,
+    rng: torch.Generator,
+    steps: int,
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Adds the rows of one episode of at most `steps` to `recorder`, without ending it there. `stop()` is asked after each row."""
     channels = [name for name in world.spec.recorded if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]
-    state, left, done = world.start(1, rng), frames - recorder.rows, False
-    memory = policy.begin(1, rng)
-    for _ in range(min(max_steps, left - 1)):
+    state, memory = world.start(1, rng), policy.begin(1, rng)
+    for _ in range(steps):
         seen = world.render(state, channels)
         action, memory = act(policy, seen, memory, 1, world.spec, rng)
         state = world.imagine(state, action, rng)
@@ -73,13 +96,10 @@ def _episode(world, policy, recorder, frames, rng, progress, max_steps, enough) 
         done = bool(after["done"][0]) if "done" in after else False
         reward = float(after["reward"][0]) if "reward" in after else 0.0
         recorder.add(_first(seen), action[0].cpu().numpy(), reward, done)
-        if progress:
-            progress(recorder.rows + recorder.in_flight, frames)
-        if done or enough():
+        if stop() or done:
             break
     recorder.add(_first(world.render(state, channels)))
-    if progress:
-        progress(recorder.rows + recorder.in_flight, frames)
+    stop()
 
 
 def _first(observation: Observation) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -141,6 +142,31 @@ class Staged:
         images = [name for name, sensor in self.rows.items() if sensor.kind == "image" and name not in videos]
         rows = islice(self._rows(encode=False), 0, length, SAMPLE_EVERY) if images else ()
         return found | stats.merge({name: look(row[name]) for name in images} for row in rows)
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A whole episode in memory, on its way from one recorder to another. draft: its films are names alone; films: their bytes."""
+
+    draft: Draft
+    films: Mapping[str, bytes]
+
+    @staticmethod
+    def of(draft: Draft) -> Parcel:
+        films = {path.name: path.read_bytes() for path in [*draft.videos.values(), *draft.films.values()]}
+        streams = {name: list(readings) for name, readings in draft.streams.items()}
+        return Parcel(_moved(replace(draft, rows=list(draft.rows), streams=streams), Path()), films)
+
+    def unpacked(self, folder: Path) -> Draft:
+        """The draft with its films in `folder`."""
+        for name, film in self.films.items():
+            (folder / name).write_bytes(film)
+        return _moved(self.draft, folder)
+
+
+def _moved(draft: Draft, folder: Path) -> Draft:
+    videos, films = ({name: folder / path.name for name, path in of.items()} for of in (draft.videos, draft.films))
+    return replace(draft, videos=videos, films=films)
 
 
 def look(picture: np.ndarray) -> stats.Summary:

@@ -14,6 +14,7 @@ from pathlib import Path
 from ..core.errors import TerrellaError
 from ..similar import did_you_mean
 from .mujoco_model import FREE, add_floor, mujoco, read
+from .mujoco_pilot import Multirotor
 from .mujoco_tasks import Free, Hold, Reach, Task, VelocityTracking
 
 ZOO = "mjlab/asset_zoo/robots/"
@@ -41,7 +42,8 @@ class Servo:
 class Robot:
     """file: inside a wheel, PACKAGE/PATH; servos: by pattern of a joint's name, the first that fits; height: of the free body at
     rest, m; pose: of the joints at rest, by pattern; touching: geoms that collide, by pattern, all where it is ""; adds: what the
-    spec gets besides; step_s, control_s: seconds of a step of physics and of control."""
+    spec gets besides; step_s, control_s: seconds of a step of physics and of control; keys, units: of its actions, where the file
+    does not say; pilot: makes controls of actions, in place of a person who cannot."""
 
     file: str
     what: str
@@ -54,6 +56,9 @@ class Robot:
     step_s: float | None = None
     control_s: float = 0.02
     max_steps: int | None = None
+    keys: Mapping[str, list[float]] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
+    pilot: type[Multirotor] | None = None
 
     def spec(self, name: str) -> mujoco.MjSpec:
         """The robot's file with what is added to it. TerrellaError where the wheel is not installed."""
@@ -111,8 +116,32 @@ def _feet(*sites: str) -> Callable[[mujoco.MjSpec], None]:
     return add
 
 
-def _hand(site: str) -> Callable[[mujoco.MjSpec], None]:
+def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
+    """The arm stands on a table, with three blocks on it; a sensor tells where its hand is."""
+
     def add(spec: mujoco.MjSpec) -> None:
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        floor = next(geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE)
+        floor.pos = [0, 0, -TABLE_M]
+        spec.worldbody.add_geom(
+            name="table", type=box, pos=[0.3, 0, -0.021], size=[0.45, 0.5, 0.02], rgba=[0.72, 0.55, 0.38, 1]
+        )
+        for x, y in ((-0.1, -0.45), (-0.1, 0.45), (0.7, -0.45), (0.7, 0.45)):
+            leg = [0.025, 0.025, (TABLE_M - 0.041) / 2]
+            spec.worldbody.add_geom(type=box, pos=[x, y, -0.041 - leg[2]], size=leg, rgba=[0.3, 0.3, 0.32, 1])
+        for name, at, colour in (
+            ("red", -0.12, [0.8, 0.2, 0.15]),
+            ("green", 0.0, [0.2, 0.6, 0.3]),
+            ("blue", 0.12, [0.2, 0.35, 0.8]),
+        ):
+            block = spec.worldbody.add_body(name=name, pos=[0.35, at, 0.021])
+            block.add_freejoint()
+            block.add_geom(
+                type=box, size=[0.02] * 3, rgba=[*colour, 1], mass=0.05, friction=[1.5, 0.02, 0.001], condim=4
+            )
+        seen = spec.camera("front_cam")
+        seen.pos, seen.alt.type, seen.alt.xyaxes = [1.15, -0.75, 0.7], mujoco.mjtOrientation.mjORIENTATION_XYAXES, _LOOK
+        seen.fovy = 50
         spec.add_sensor(
             name="hand", type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
         )
@@ -120,6 +149,8 @@ def _hand(site: str) -> Callable[[mujoco.MjSpec], None]:
     return add
 
 
+TABLE_M = 0.75  # height of the table on which the arm stands
+_LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # of its camera
 _LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)
 _BODY = Servo(100.0, 5.0, 88.0, 0.01, 0.6)
 ROBOTS: Mapping[str, Robot] = {
@@ -156,7 +187,7 @@ ROBOTS: Mapping[str, Robot] = {
     ),
     "yam": Robot(
         ZOO + "i2rt_yam/xmls/yam.xml",
-        "I2RT YAM, an arm with a gripper that reaches for a point",
+        "I2RT YAM, an arm with a gripper on a table, that reaches for a point",
         Reach(),
         {
             "joint[123]": Servo(40.0, 8.0, 28.0, 0.032, 1.5),
@@ -164,8 +195,24 @@ ROBOTS: Mapping[str, Robot] = {
             "left_finger": Servo(110.0, 35.0, 30.0, 2.6, 0.018),
         },
         pose={"joint2": 1.047, "joint3": 1.05, "joint4": -0.9, "left_finger": 0.018, "right_finger": -0.018},
-        adds=_hand("grasp_site"),
+        adds=_at_table("grasp_site"),
         max_steps=200,
+    ),
+    "drone": Robot(
+        OWN + "drone.xml",
+        "a quadrotor with an autopilot, and LiDAR",
+        VelocityTracking(fallen=(1.3, 0.05), forward=(-1.0, 2.0), turning=(-1.0, 1.0)),
+        max_steps=1000,
+        pilot=Multirotor,
+    ),
+    "car": Robot(
+        OWN + "car.xml",
+        "a car of a tenth of the size, with LiDAR",
+        keys={
+            "ArrowLeft": [0.5, 0], "ArrowRight": [-0.5, 0], "ArrowUp": [0, 2.5], "ArrowDown": [0, -1],
+            "KeyA": [0.5, 0], "KeyD": [-0.5, 0], "KeyW": [0, 2.5], "KeyS": [0, -1],
+        },
+        units=("rad", "m/s"),
     ),
     "ant": Robot(
         GYMNASIUM + "ant.xml", "Gymnasium's ant, four legs with motors", VelocityTracking(fallen=(1.5, 0.35)), max_steps=1000

@@ -60,6 +60,13 @@ class Stepper:
                 found[model.geom_bodyid[geom]] += force[0]
         return found
 
+    def standing(self, physics: np.ndarray, values: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """The model of one world, with its bodies in place."""
+        model, data = self._models.of(values[None, self._columns])[0], self._datas[0]
+        mujoco.mj_setState(model, data, physics, _FULL)
+        mujoco.mj_kinematics(model, data)
+        return model, data
+
     def close(self) -> None:
         if self._pool is not None:
             self._pool.close()

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from ..core import chance
 from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
 from ..core.state import State
+from .mujoco_lidar import SITE, Lidar
 from .mujoco_model import BALL, FREE, SLIDE, bare, compiled, complete, mujoco, read
 from .mujoco_parameters import checked, parameters_of
 from .mujoco_pictures import Pictures, lens
@@ -32,7 +34,7 @@ from .mujoco_tasks import Body, Free, Task, numbers
 FILES = (".xml", ".mjcf", ".urdf")
 FASTEST = 1e4  # m/s or rad/s: a world that moves faster is unstable
 MOST_DUMPS = 8
-DRAWN = ("rgb", "depth", "segmentation")
+DRAWN, SCANNED = ("rgb", "depth", "segmentation"), ("contacts", SITE)
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
@@ -44,6 +46,8 @@ class MujocoWorld:
     size:       (height, width) of pictures.
     cameras:    names of cameras of the model, the first is `rgb`, others `rgb.NAME`; default: the first that there is; () for none.
     depth, segmentation: show these beside each rgb.
+    lidar:      rays of a turn, or (rows, rays), that a site named "lidar" in the file sends out; lidar_m: how far, in m.
+    pilot:      False for the controls themselves of a robot that has an autopilot (the drone's thrusts).
     threads:    that step worlds; default: as many as there are processors for this process.
     parameters: names of `parameters_of` that each world has values of its own of: `state["parameters"]` [B, n].
     dumps:      folder for states that led to an unstable simulation; default: terrella-unstable-USER among temporary files.
@@ -67,6 +71,9 @@ class MujocoWorld:
         cameras: Sequence[str] | None = None,
         depth: bool = False,
         segmentation: bool = False,
+        lidar: int | Sequence[int] = 72,
+        lidar_m: float = 20.0,
+        pilot: bool = True,
         threads: int | None = None,
         parameters: Sequence[str] = (),
         dumps: str | Path | None = None,
@@ -90,6 +97,9 @@ class MujocoWorld:
         self._cameras = _cameras(self._seen, cameras)
         self._kinds = ("rgb", *(kind for kind, asked in (("depth", depth), ("segmentation", segmentation)) if asked))
         self._size, self._limit = (int(size[0]), int(size[1])), robot.max_steps if robot else None
+        self._pilot = robot.pilot(self.file) if robot and robot.pilot and pilot else None
+        self._lidar = Lidar(self.file, lidar, lidar_m) if SITE in {site.name for site in spec.sites} else None
+        self._keys, self._units = (dict(robot.keys), robot.units) if robot else ({}, ())
         self.parameters = parameters_of(self._seen)
         self._what = robot.what if robot else f"the model {Path(label).name}"
         self._lock = threading.Lock()
@@ -159,14 +169,15 @@ class MujocoWorld:
             return state.replace(reward=torch.zeros(state.batch)).put(live, self._moved(state.at(live), ctrl[live]))
         return self._moved(state, ctrl)
 
-    def _moved(self, state: State, ctrl: torch.Tensor) -> State:
+    def _moved(self, state: State, action: torch.Tensor) -> State:
+        ctrl = action if self._pilot is None else self._pilot(self.body, state["physics"], action)
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
             moved = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
         physics, sensors, warmstart = moved
         wild = ~(physics.isfinite().all(1) & (physics[:, self.body.qvel].abs() < FASTEST).all(1))
         if wild.any():
-            self._dump(state.at(wild.nonzero()[:, 0]), ctrl[wild])
+            self._dump(state.at(wild.nonzero()[:, 0]), action[wild])
             keep = {"physics": state["physics"], "sensors": state["sensors"], "warmstart": state["warmstart"]}
             physics, sensors, warmstart = (
                 torch.where(wild[:, None], keep[name], one) for name, one in zip(keep, (physics, sensors, warmstart))
@@ -175,7 +186,7 @@ class MujocoWorld:
         reward, fallen, kept = self.task.judge(self.body, state, {**dict(state.items()), **after})
         return state.replace(**after, **kept, reward=reward.masked_fill(wild, 0.0), done=fallen | wild)
 
-    def _dump(self, state: State, ctrl: torch.Tensor) -> None:
+    def _dump(self, state: State, action: torch.Tensor) -> None:
         """Saves the states before a simulation became unstable, with the actions; says so."""
         self._dumped += 1
         if self._dumped > MOST_DUMPS:
@@ -184,7 +195,7 @@ class MujocoWorld:
         file = self._dumps / f"{stem}-{os.getpid()}-{self._dumped}.safetensors"
         try:
             self._dumps.mkdir(parents=True, exist_ok=True)
-            state.replace(action=ctrl.float()).save(file)
+            state.replace(action=action.float()).save(file)
             kept = f"the states before and their actions are in {file}"
         except OSError as error:
             kept = f"the states before could not be saved ({error})"
@@ -197,7 +208,7 @@ class MujocoWorld:
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
-        drawn = [name for name in channels if kind_of(name) in (*DRAWN, "pose", "contacts")]
+        drawn = [name for name in channels if kind_of(name) in (*DRAWN, *SCANNED, "pose")]
         found = self._drawn(state, drawn) if drawn else {}
         return {name: found[name] if name in found else self._read(state, name) for name in channels}
 
@@ -215,11 +226,11 @@ class MujocoWorld:
         return self.task.see(self.body, state, name)
 
     def _drawn(self, state: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
-        """What is worked out world by world: pictures, poses, contacts."""
+        """What is worked out world by world: pictures, poses, contacts, LiDAR."""
         found: dict[str, list[np.ndarray]] = {name: [] for name in names}
         physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
         values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
-        looked = any(kind_of(name) != "contacts" for name in names)
+        looked = any(kind_of(name) not in SCANNED for name in names)
         with self._lock:
             for row, control, value in zip(physics, ctrl, values):
                 if looked:
@@ -228,6 +239,8 @@ class MujocoWorld:
                     kind, camera = kind_of(name), suffix_of(name) or (self._cameras or [""])[0]
                     if kind == "contacts":
                         found[name].append(self._stepper.contacts(row, control, value))
+                    elif kind == SITE and self._lidar:
+                        found[name].append(self._lidar.scan(*self._stepper.standing(row, value)))
                     else:
                         found[name].append(
                             self._pictures.pose(camera) if kind == "pose" else self._pictures.draw(camera, kind)
@@ -250,20 +263,19 @@ class MujocoWorld:
         channels |= {f"sensor.{name}": numbers(at.stop - at.start) for name, at in body.sensors.items()}
         channels |= {"contacts": numbers(model.nbody), "done": DONE}
         channels |= {"reward": REWARD} if self.task.rewards else {}
+        if self._lidar:
+            channels[SITE], units[SITE] = spaces.Box(0, self._lidar.range_m, self._lidar.shape, np.float32), "m"
         for end in suffix.values():
             channels |= {f"{kind}{end}": spaces_of[kind] for kind in self._kinds} | {f"pose{end}": POSE}
             units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
         cameras = {f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
         return Spec(
             name=self.name,
-            action=spaces.Box(body.low.numpy().astype(np.float32), body.high.numpy().astype(np.float32), dtype=np.float32),
+            **self._acts(),
             channels=channels,
             observes=(),
             dt_s=self._steps * float(model.opt.timestep),
             units=units | {"contacts": "N"},
-            action_names=tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
-            action_units=tuple(_unit(model, at) for at in range(model.nu)),
-            action_mode=_mode(model),
             # Where lenses vary from world to world, none is told: pictures of a false one would mislead whoever trusts it.
             cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
@@ -271,8 +283,29 @@ class MujocoWorld:
                 "what": self._what, "kind": "simulator", "physics": _told(model, self._steps), "varied": list(self.varied),
                 "together": True,
             },
-            idle=tuple(body.rest.float().tolist()),
         )  # fmt: skip
+
+    def _acts(self) -> dict[str, Any]:
+        """What the Spec says of actions: the pilot's, or the actuators' controls."""
+        model, body, pilot = self.file, self.body, self._pilot
+        if pilot is not None:
+            high = np.array(pilot.high, np.float32)
+            named = {
+                "action_names": pilot.names,
+                "action_units": pilot.units,
+                "action_mode": "velocity",
+                "action_frame": "body",
+            }
+            return {"action": spaces.Box(-high, high), "keys": dict(pilot.keys), "idle": (0.0,) * len(high), **named}
+        low, high = (limit.numpy().astype(np.float32) for limit in (body.low, body.high))
+        return {
+            "action": spaces.Box(low, high),
+            "action_names": tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
+            "action_units": self._units or tuple(_unit(model, at) for at in range(model.nu)),
+            "action_mode": _mode(model),
+            "keys": self._keys,
+            "idle": tuple(body.rest.float().tolist()),
+        }
 
 
 def _cores() -> int:

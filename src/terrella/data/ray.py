@@ -1,0 +1,87 @@
+"""Workers on Ray: processes of this machine or of a whole cluster that play the episodes of one recording."""
+
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+# ray is an extra
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from ..core.errors import TerrellaError
+from .collect import MOST_DEATHS, Job, Player
+from .staged import Parcel
+
+
+@contextmanager
+def _finding_our_modules() -> Iterator[None]:
+    """Processes that begin here import from where this one does."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+
+
+class RayWorkers:
+    """`size` actors of one processor each, on the cluster of RAY_ADDRESS, or else on a Ray of this machine alone that ends with us.
+    Episodes come back through Ray: the machines need no common disk, but the same packages. TerrellaError where Ray is not
+    installed, or where the cluster has fewer processors."""
+
+    def __init__(self, size: int):
+        if size < 1:
+            raise TerrellaError(f"{size} workers play nothing; ask for one or more.")
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_worker_niceness", "0")  # else of 15: on a busy machine they would hardly run
+        try:
+            import ray
+        except ImportError as error:
+            raise TerrellaError("--on ray needs Ray: pip install 'terrella[ray]'.") from error
+        self.size, self._ray = size, ray
+        self._asked: dict[Any, tuple[int, int]] = {}  # what was asked -> the episode, and of whom
+
+    def begin(self, job: Job) -> None:
+        ray = self._ray
+        self._ours = not ray.is_initialized()
+        if self._ours:
+            local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": self.size, "include_dashboard": False}
+            with _finding_our_modules():
+                ray.init(log_to_driver=False, logging_level="ERROR", **local)
+        here = int(ray.cluster_resources().get("CPU", 0))
+        if here < self.size:
+            raise TerrellaError(f"this Ray has {here} processors; ask for as many --workers or fewer.")
+        again = {"max_restarts": -1, "max_task_retries": MOST_DEATHS - 1}
+        made = ray.remote(num_cpus=1, **again)(Player)
+        self._actors = [made.remote(job) for _ in range(self.size)]
+
+    def ask(self, number: int) -> None:
+        load = [0] * self.size
+        for _, at in self._asked.values():
+            load[at] += 1
+        at = load.index(min(load))
+        self._asked[self._actors[at].play.remote(number)] = number, at
+
+    def answers(self) -> list[tuple[int, Parcel | str]]:
+        (done,), _ = self._ray.wait(list(self._asked), num_returns=1)
+        number, _ = self._asked.pop(done)
+        try:
+            return [(number, self._ray.get(done))]
+        except self._ray.exceptions.RayError as error:
+            first = (str(error).strip() or type(error).__name__).splitlines()[0]
+            return [
+                (number, f"episode {number} ended its worker {MOST_DEATHS} times, or cannot be played on Ray ({first})")
+            ]
+
+    def close(self) -> None:
+        for actor in getattr(self, "_actors", []):
+            self._ray.kill(actor)
+        self._asked.clear()
+        if getattr(self, "_ours", False):
+            self._ray.shutdown()

@@ -1,0 +1,76 @@
+"""Many workers, one recording: each episode is there once and the same, whoever died on the way."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from crew import STEPS, dying, failing, opened
+
+from terrella.care import doctor
+from terrella.core import make_rng
+from terrella.core.errors import TerrellaError
+from terrella.data import Dataset, record
+from terrella.data.collect import LocalWorkers, collect
+
+COUNT = 5
+
+
+@pytest.fixture(scope="module")
+def never(tmp_path_factory) -> Dataset:
+    """What one process records."""
+    world, policy = opened()
+    root = tmp_path_factory.mktemp("never") / "set"
+    record(world, policy(), root, (STEPS + 1) * COUNT, make_rng(3))
+    return Dataset(root)
+
+
+def gathered(root, workers, open=opened, **more) -> Dataset:
+    collect(open, opened()[0], root, make_rng(3), workers, episodes=COUNT, **more)
+    return Dataset(root)
+
+
+def assert_same(found: Dataset, never: Dataset) -> None:
+    assert doctor(found.root) == [] and len(found.episodes) == len(never.episodes) == COUNT
+    for one, other in zip(found.episodes, never.episodes):
+        mine, theirs = found.episode(one.number), never.episode(other.number)
+        assert all(np.array_equal(mine[name], theirs[name]) for name in theirs)
+    rows = [0, found.length // 2, found.length - 1]
+    assert np.array_equal(found.rgb_at(rows), never.rgb_at(rows))
+
+
+def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, never):
+    (tmp_path / "deaths").mkdir()
+    assert_same(gathered(tmp_path / "set", LocalWorkers(2), partial(dying, tmp_path / "deaths", 2)), never)
+    assert len(list((tmp_path / "deaths").iterdir())) == 2
+
+
+def test_what_was_stopped_goes_on(tmp_path, never):
+    def stop(done, total):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        gathered(tmp_path / "set", LocalWorkers(1), progress=stop)
+    assert len(Dataset(tmp_path / "set").episodes) == 2
+    assert_same(gathered(tmp_path / "set", LocalWorkers(1)), never)
+
+
+def test_what_fails_in_a_worker_is_said(tmp_path):
+    with pytest.raises(TerrellaError, match="this policy fails. 0 episodes are safe"):
+        gathered(tmp_path / "set", LocalWorkers(1), failing)
+    (tmp_path / "deaths").mkdir()
+    with pytest.raises(TerrellaError, match=r"episode 0 ended its worker 3 times .* 0 episodes are safe"):
+        gathered(tmp_path / "set", LocalWorkers(1), partial(dying, tmp_path / "deaths", 99))
+    with pytest.raises(TerrellaError, match="0 workers"):
+        LocalWorkers(0)
+
+
+def test_ray_records_the_same_when_a_worker_is_killed(tmp_path, never):
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'terrella[ray]'")
+    from terrella.data.ray import RayWorkers
+
+    (tmp_path / "deaths").mkdir()
+    assert_same(gathered(tmp_path / "set", RayWorkers(2), partial(dying, tmp_path / "deaths", 1)), never)
+    assert len(list((tmp_path / "deaths").iterdir())) == 1
