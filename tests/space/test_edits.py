@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from terrella.cli import main
-from terrella.core.errors import ContractError
+from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
 from terrella.space.edits import edited
 from terrella.worlds.splat import SplatConfig, SplatWorld
@@ -65,6 +65,7 @@ def test_objects_and_brushes_are_selected():
     {"select": {"sphere": [99, 99, 99, 1]}, "do": "delete"}, {"select": BOX, "do": "move", "by": "far"},
     {"select": {"brush": [1, 2, 3]}, "do": "delete"}, {"select": {"brush": [1, 2, 3, 1, 4]}, "do": "delete"},
     {"select": BOX, "do": "scale", "factor": -1}, {"select": BOX, "do": "move", "by": [0, 0, float("nan")]}, {"do": "delete"},
+    {"select": BOX, "do": "move", "by": [1e300, 0, 0]}, {"select": BOX, "do": "recolour", "colour": [9, 9, 9]},
 ])  # fmt: skip
 def test_what_is_no_edit(edit):
     with pytest.raises(ContractError):
@@ -82,6 +83,9 @@ def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
     assert len((tmp_path / "w" / "world.edits.jsonl").read_text().splitlines()) == 2
     assert main(["space", "edit", place, "--sphere", "90", "2", "1", "0.8", "--delete"]) == 2
     assert main(["space", "edit", place, "--redo"]) == 2
+    assert main(["space", "edit", place, "--delete"]) == 2  # of what?
+    with pytest.raises(CheckpointError, match="has edits"):
+        save_splat(world_of(room(count=800), "room", {}, SplatConfig(LENS, SIZE)), place)
     before = load(place)
     assert main(["space", "edit", place, "--undo"]) == 0 and main(["space", "edit", place, "--undo"]) == 0
     (tmp_path / "saved.jsonl").write_text((tmp_path / "w" / "world.undone.jsonl").read_text())

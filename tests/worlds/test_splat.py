@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 import terrella
 from terrella.cli import main
 from terrella.core import check_world
-from terrella.core.errors import CheckpointError
+from terrella.core.errors import CheckpointError, DatasetError
 from terrella.space.camera import planar_pose
 from terrella.space.files import read_scene, write_scene
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
@@ -69,6 +70,29 @@ def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
     (tmp_path / "bad.ply").write_bytes(b"ply\n")
     assert main(["space", "import", str(tmp_path / "bad.ply"), "--out", str(tmp_path / "b")]) == 2
     assert not (tmp_path / "b").exists()
+
+
+def test_nothing_else_is_overwritten(tmp_path):
+    (tmp_path / "README.md").write_text("mine")
+    with pytest.raises(CheckpointError, match="something else"):
+        save_splat(world_of(room(count=600), "room", {}, SplatConfig(LENS, SIZE)), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["README.md"]
+
+
+def test_one_stands_on_a_bare_floor_and_not_in_the_air():
+    flat = room(count=4000)
+    flat = replace(flat, means=flat.means * torch.tensor([1.0, 1.0, 0.0]))
+    start = world_of(flat, "floor", {}, SplatConfig(LENS, SIZE)).starts[0]
+    assert 1.4 < float(start[2]) < 1.75
+
+
+def test_what_is_empty_is_not_written(tmp_path):
+    nothing = room(count=600).at(torch.zeros(600, dtype=torch.bool))
+    for name in ("x.ply", "x.spz"):
+        with pytest.raises(DatasetError, match="no Gaussian left"):
+            write_scene(nothing, tmp_path / name)
+    with pytest.raises(DatasetError, match="compressed kind"):
+        write_scene(room(count=600), tmp_path / "x.spz", kind="compressed")
 
 
 def test_damaged_folders_are_refused(tmp_path):

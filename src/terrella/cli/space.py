@@ -142,6 +142,8 @@ def edit(
         raise TerrellaError(
             "an edit is of one place (--box, --sphere, --plane or --object) and does one thing (--move, --delete, ...)."
         )
+    if delete and not places:
+        raise TerrellaError("say what to delete: --box, --sphere, --plane or --object.")
     if undo and not edits or redo and not undone:
         raise TerrellaError(f"{world} has no edit to {'undo' if undo else 'redo'}.")
     if replay is not None:

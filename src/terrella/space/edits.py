@@ -109,6 +109,8 @@ def _done(some: Gaussians, edit: Edit) -> Gaussians:
         grown = turned(some, torch.eye(3), float(numbers))
         return replace(grown, means=((means - middle) * float(numbers) + middle).float())
     if deed == "recolour":
+        if numbers.min() < 0 or numbers.max() > 1:
+            raise ContractError("a colour is red, green and blue from 0 to 1.")
         return replace(some, sh=torch.cat([plain_sh(numbers.expand(len(some), 3)), 0 * some.sh[:, 1:]], 1))
     return some.at(torch.zeros(len(some), dtype=torch.bool))
 
@@ -119,4 +121,7 @@ def _numbers(given: Any, count: int, name: str) -> torch.Tensor:
     fits = isinstance(listed, Sequence) and not isinstance(listed, str) and len(listed) == count
     if count and not (fits and all(isinstance(one, int | float) and math.isfinite(one) for one in listed)):
         raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r:.80}.")
-    return torch.tensor(listed if count else [], dtype=torch.float32)
+    found = torch.tensor(listed if count else [], dtype=torch.float32)
+    if not found.isfinite().all():
+        raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r:.80}.")
+    return found

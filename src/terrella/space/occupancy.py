@@ -87,8 +87,13 @@ class Occupancy:
         return (self.solid[cells] & inside).any(1)
 
     def floor(self, place: torch.Tensor, body: Body) -> torch.Tensor:
-        """How high the floor under a body is [B]: the highest surface up to a step above its feet, the mean of what lies around;
-        its feet where there is none."""
+        """How high the floor under a body is [B]; its feet where there is none."""
+        level = self.surface(place, body)
+        return torch.where(level.isnan(), place[:, 2] - body.eye_m, level)
+
+    def surface(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+        """How high the highest surface up to a step above a body's feet is [B], the mean of what lies around; nan where there is
+        none."""
         feet = place[:, 2] - body.eye_m
         deep = math.ceil((_DEEPEST_M + body.step_m) / self.cell_m)
         down = body.step_m - torch.arange(deep) * self.cell_m
@@ -101,8 +106,7 @@ class Occupancy:
         tops = self.top[cells].gather(3, first)[..., 0]
         level = torch.where(solid.any(3), tops, torch.nan).flatten(1)
         middle = level.nanmedian(1, keepdim=True).values
-        near_it = torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
-        return torch.where(near_it.isnan(), feet, near_it)
+        return torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
 
     def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor:
         """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever

@@ -27,8 +27,9 @@ EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # those in 
 
 
 def save_splat(world: SplatWorld, path: str | Path) -> None:
-    """Writes the folder; each file is replaced whole. Edits of a scene that was there before are forgotten."""
+    """Writes the folder; each file is replaced whole. CheckpointError where something else lies there, or edits do."""
     path = Path(path)
+    check_free(path)
     about = {
         "kind": KIND, "version": VERSION, "name": world.name, "config": asdict(world.config), "card": dict(world.card),
     }  # fmt: skip
@@ -40,14 +41,27 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
         "solids": world.solids,
     }
     whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
-    for name in (EDITS_FILE, UNDONE_FILE):
-        (path / name).unlink(missing_ok=True)
     replace_whole(path / SCENE_FILE, lambda file: save_file(whole, file))
     lines = (
         f"# {world.name}\n\nA place of {len(world.gaussians):,} Gaussians: `terrella play {path.name}` walks in it.\n"
     )
     replace_whole(path / "README.md", lambda file: file.write_text(lines))
     replace_whole(path / WORLD_FILE, lambda file: file.write_text(json.dumps(about, indent=1) + "\n"))
+
+
+def check_free(path: str | Path) -> None:
+    """CheckpointError where a world of Gaussians would overwrite what is no such, or one that somebody has edited."""
+    path = Path(path)
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    try:
+        known = json.loads((path / WORLD_FILE).read_text()).get("kind") == KIND
+    except (OSError, ValueError, AttributeError):
+        known = False
+    if not known:
+        raise CheckpointError(f"{path} holds something else already; give another --out.")
+    if any((path / name).exists() and (path / name).stat().st_size for name in (EDITS_FILE, UNDONE_FILE)):
+        raise CheckpointError(f"{path} has edits, which would be lost; give another --out, or remove its {EDITS_FILE}.")
 
 
 def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | None = None) -> SplatWorld:
@@ -122,10 +136,12 @@ def world_of(gaussians: Gaussians, name: str, card: dict[str, Any], config: Spla
     some = gaussians.means[:: max(len(gaussians) // 100_000, 1)]
     low, middle, high = torch.quantile(some, torch.tensor([0.05, 0.5, 0.95]), dim=0)
     rng = torch.Generator().manual_seed(0)
+    high[2] += config.body.eye_m  # an eye is over the floor, and may be over all that there is
     wide = low + (high - low) * torch.rand(400, 3, generator=rng)
     places = torch.cat([middle[None], wide])
-    grounded = torch.cat([places[:, :2], (world.occupancy.floor(places, config.body) + config.body.eye_m)[:, None]], 1)
-    stands = ~world.occupancy.blocked(grounded, config.body)
+    level = world.occupancy.surface(places, config.body)
+    grounded = torch.cat([places[:, :2], (level + config.body.eye_m)[:, None]], 1)
+    stands = level.isfinite() & ~world.occupancy.blocked(grounded.nan_to_num(), config.body)
     places = torch.where(stands[:, None], grounded, places)
     order = (places - middle).norm(dim=1) + 1e3 * ~stands
     x, y, z = places[order.argmin()].expand(8, 3).unbind(1)

@@ -20,7 +20,7 @@ from ...space.files import replace_whole
 from ...space.fitting import Fit, FitConfig, Views, decibels, nearest_views, psnr
 from ...space.occupancy import Body, Occupancy
 from ...worlds.splat import OBSERVED, SplatConfig, SplatWorld
-from ...worlds.splat_folder import save_splat
+from ...worlds.splat_folder import WORLD_FILE, check_free, save_splat
 from ..trainer import Report
 
 RESUME = "resume.safetensors"
@@ -51,6 +51,8 @@ def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Repor
     """Fits, saves OUT/world, and goes on where an earlier run stopped. Returns the figures on held-out pictures (dB, with half the
     width of their 95% interval) beside the baseline of the nearest picture of the fit."""
     out, began = Path(out), time.monotonic()
+    if config.frames < 16 or (config.episodes is not None and config.episodes < 1):
+        raise TrainingError("--frames is 16 or more, --episodes 1 or more.")
     views, spec = read_views(data, config)
     held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
     kept, asked = views.at(~held), views.at(held)
@@ -60,6 +62,9 @@ def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Repor
         raise TrainingError(f"{data}: {error}") from error
     told = {"data": str(data), **{name: str(value) for name, value in asdict(config).items() if name != "save_every_s"}}
     _restore(out / RESUME, fit, told)
+    finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
+    if not finished:
+        check_free(out / "world")
     saved, error = time.monotonic(), 0.0
     try:
         while fit.done < config.fit.steps:
@@ -74,10 +79,10 @@ def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Repor
     except KeyboardInterrupt:
         _save(out / RESUME, fit, told)
         raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command goes on.") from None
-    _save(out / RESUME, fit, told)
     figures = _figures(fit, kept, asked)
-    world = _world(fit, kept, spec, config, {"data": str(data), **figures})
-    save_splat(world, out / "world")
+    if not finished:  # else it may have been edited since
+        _save(out / RESUME, fit, told)
+        save_splat(_world(fit, kept, spec, config, {"data": str(data), **figures}), out / "world")
     return {**figures, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 

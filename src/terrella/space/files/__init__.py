@@ -56,6 +56,10 @@ def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None,
     path = Path(path)
     if path.suffix.lower() not in _USUAL:
         raise DatasetError(f"{path}: Gaussians are written as .ply or .spz; give a name that ends so.")
+    if not len(gaussians):
+        raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
+    if kind == "compressed" and path.suffix.lower() != ".ply":
+        raise DatasetError(f"{path}: the compressed kind is one of .ply; SPZ is compressed by itself.")
     there = turned(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
     if path.suffix.lower() == ".spz":
         data = spz.encode(there)
