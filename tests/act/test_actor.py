@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork, symexp, symlog
-from terrella.act.through import actor_of
+from terrella.act.belief import actor_of
 from terrella.core.errors import ActionError, ChannelError, CheckpointError
 from terrella.core.policy import Policy, act
 from terrella.core.spec import DONE, REWARD, Spec

@@ -57,6 +57,9 @@ def test_reality_and_dream_are_filmed(capsys, tmp_path):
         (["--real", "gym:CartPole-v1"], "they differ"),
         (["--trust", "0.1"], "uncertainty"),
         (["--samples", "1"], "samples are 2 or more"),
+        (["--agent", "random", "--proposal", "random", "--budget-ms", "5"], "leave --proposal, --budget-ms out"),
+        (["--agent", "random", "--curve"], "leave --curve out"),
+        (["--goal", "reward", "--cost", "last"], "leave --cost out"),
     ],
 )
 def test_what_cannot_be_planned_is_said_in_a_sentence(capsys, tmp_path, words, said):
@@ -71,3 +74,36 @@ def test_a_goal_that_is_never_reached_is_said_with_the_nearest_and_the_best_cost
     assert main(["plan", *words]) == 0
     said = capsys.readouterr().out
     assert "never reached" in said and "the best plan in the world cost" in said
+
+
+def test_another_policy_acts_or_proposes_by_its_name(capsys, tmp_path):
+    """Steps to the right alone come to the wall: as the agent, and as what a search of two plans tries as well."""
+    right = [BLIND, "--goal", "20", "--within", "0.001", *QUICK[:4]]
+    acts = planned(capsys, *right, "--agent", "constant:2", "--json", "--out", str(tmp_path / "a"))
+    assert acts["planner"]["success"]["value"] == 1 and "samples" in acts and acts["agent"] == "constant:2"
+    few = [
+        *right,
+        "--search",
+        "random",
+        "--samples",
+        "2",
+        "--iterations",
+        "1",
+        "--horizon",
+        "12",
+        "--seed",
+        "3",
+        "--json",
+    ]
+    alone, helped = (
+        planned(capsys, *few, *words, "--out", str(tmp_path / str(len(words))))["planner"]["success"]["value"]
+        for words in ([], ["--proposal", "constant:2"])
+    )
+    assert helped == 1 > alone
+
+
+def test_an_end_that_is_all_that_counts_is_gone_to_before_the_next_plan(capsys, tmp_path):
+    words = [BLIND, "--goal", "20", "--within", "0.001", *QUICK]
+    assert planned(capsys, *words, "--cost", "last", "--out", str(tmp_path / "a"))["replan"] == 4
+    assert planned(capsys, *words, "--cost", "last", "--replan", "2", "--out", str(tmp_path / "b"))["replan"] == 2
+    assert planned(capsys, *words, "--out", str(tmp_path / "c"))["replan"] == 1

@@ -14,6 +14,7 @@ from tests.learn.stopping import goes_on_exactly, quiet
 from terrella.act.goal_network import GoalActor
 from terrella.act.named import policy_of, proposing
 from terrella.act.planning import Judge, Planner, Reaching, SearchConfig, distance_to, negative_reward, play
+from terrella.cli import main
 from terrella.core.errors import ActionError, ChannelError, CheckpointError, PlanningError, TrainingError
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
@@ -67,6 +68,20 @@ def test_it_reaches_goals_that_random_play_does_not(made):
         play(world, policy, 20, 25, 0, judge, ("observation",)).episodes for policy in (acting, Random(world.spec))
     )
     assert sum(bool(one.success) for one in mine) >= 18 > 6 >= sum(bool(one.success) for one in floor)
+
+
+def test_it_is_no_file_for_other_programs_which_is_said(made, capsys, tmp_path):
+    words = [
+        "export",
+        "policy",
+        str(made[0] / "run"),
+        "--world",
+        "gym:CartPole-v1",
+        "--out",
+        str(tmp_path / "goals.onnx"),
+    ]
+    assert main(words) == 2
+    assert "is a policy for goals" in capsys.readouterr().err and not (tmp_path / "goals.onnx").exists()
 
 
 def test_episodes_at_once_have_their_own_goals_and_do_what_each_would_alone(made):

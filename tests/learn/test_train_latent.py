@@ -108,6 +108,24 @@ def test_the_world_of_the_run_is_opened_by_name_and_keeps_the_contract(run):
     assert world.spec.card["validation"] == json.loads((run[0] / "validation.json").read_text())
 
 
+def test_a_few_numbers_are_the_latent_themselves(vectors, tmp_path):
+    """No encoder, no collapse to prevent: what is decoded is what was predicted."""
+    facts = train_latent(vectors, tmp_path, replace(QUICK, latent=None), quiet)
+    world, seen = terrella.load(tmp_path), {"state": torch.tensor([[0.3, -0.1], [-0.6, 0.2]])}
+    errors = facts["errors"]["state"]
+    assert facts["latent"] == 2 and errors["true actions"]["8"] < 0.5 * errors["copy-last"]["8"]
+    shown = world.render(world.observe(seen, None, make_rng(0)), ("state",))["state"]
+    assert torch.allclose(shown, seen["state"], atol=1e-5)
+    assert "gradients_reach_the_action" in check_world(world, steps=3)
+
+
+def test_who_sees_no_pictures_learns_to_draw_none(tmp_path):
+    data = drifting(tmp_path / "data", pictures=(32, 32), episodes=4, length=30)
+    config = LatentTraining(steps=4, batch=4, rollout=2, pictures=False, strip_every_s=1e9)
+    train_latent(data, tmp_path / "run", config, quiet)
+    assert "rgb" not in terrella.load(tmp_path / "run").spec.channels
+
+
 def test_its_uncertainty_grows_with_what_was_not_seen(run):
     world, rng = terrella.load(run[0]), terrella.make_rng(0)
     state = world.observe({"state": torch.zeros(1, 2)}, None, rng)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from terrella.act.planning import Wayfinder, pace, searches
+from terrella.act.planning import Navigator, budget, searches
 from terrella.cli.driving import Driving
 from terrella.core.errors import TerrellaError
 from terrella.core.world import make_rng
@@ -25,7 +25,7 @@ PATIENT_MS = 50.0
 def clock(monkeypatch):
     """A clock by which whatever is timed takes a millisecond."""
     ticks = itertools.count()
-    for module in (pace, searches):
+    for module in (budget, searches):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: 1e-3 * next(ticks)))
 
 
@@ -64,7 +64,7 @@ def test_a_walker_goes_to_a_place_and_shows_what_it_considers():
     agents = Driving(world, budget_ms=5.0).agents()
     assert agents.places
     agent = agents.make({"pose": torch.tensor([[1.0, 0.0, *[torch.nan] * 5]])})
-    assert isinstance(agent.policy, Wayfinder) and agent.unit == "m"
+    assert isinstance(agent.policy, Navigator) and agent.unit == "m"
     timeline = Timeline([world], 0, policy=agents)
     timeline.seek(Goal(at=(1.2, 0.0)))
     driven(timeline, 1)
@@ -81,11 +81,11 @@ def test_a_picture_that_is_remembered_is_gone_back_to_with_its_heading():
     timeline = Timeline([world], 0, policy=agents)
     seen = world.render(timeline._states[0], world.spec.recorded)
     agent = agents.make(seen)
-    assert isinstance(agent.policy, Wayfinder) and agent.policy.heading is not None
+    assert isinstance(agent.policy, Navigator) and agent.policy.heading is not None
     assert agent.away(timeline._states[0]) == 0.0
     driven(timeline, 3)
     alone = agents.make({"rgb": seen["rgb"]})
-    assert not isinstance(alone.policy, Wayfinder) and alone.unit == "", (
+    assert not isinstance(alone.policy, Navigator) and alone.unit == "", (
         "a panorama cannot tell where a picture was taken"
     )
     assert 0 <= alone.away(timeline._states[0]) < 0.2
@@ -99,7 +99,7 @@ def test_a_lone_picture_is_walked_to_where_the_world_tells_its_place():
 
     world = Told()
     policy = Driving(world, budget_ms=5.0).make({"rgb": torch.zeros(1, 48, 64, 3, dtype=torch.uint8)}).policy
-    assert isinstance(policy, Wayfinder) and policy.place.tolist() == [1.5, 0.0] and policy.heading is not None
+    assert isinstance(policy, Navigator) and policy.place.tolist() == [1.5, 0.0] and policy.heading is not None
 
 
 def test_a_game_that_cannot_be_copied_takes_no_goals():

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import torch
 from safetensors import SafetensorError
@@ -21,6 +21,7 @@ from .actor_network import ActorConfig, ActorNetwork, check_seen
 KIND, VERSION = "actor", 1
 POLICY_FILE, WEIGHTS_FILE = "policy.json", "weights.safetensors"
 RUN = "policy"  # the folder of the policy in that of a training run
+Module = TypeVar("Module", bound=nn.Module)
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError
 
 
@@ -59,20 +60,30 @@ class Actor:
     def load(folder: str | Path, spec: Spec, greedy: bool = True) -> Actor:
         """Reads what `save` wrote, from its folder or that of the training run. CheckpointError for what is missing or foreign,
         ActionError or ChannelError where `spec` has other actions or does not show what it sees."""
-        folder = policy_folder(folder)
-        told = read_policy(folder)
-        if (told.get("kind"), told.get("version")) != (KIND, VERSION):
-            raise CheckpointError(
-                f"{folder} is a policy of kind {told.get('kind')!r}, version {told.get('version')}; this loads kind '{KIND}', "
-                f"version {VERSION}."
-            )
-        try:
-            network = ActorNetwork(ActorConfig(**{name: _tuple(value) for name, value in told["config"].items()}))
-            network.load_state_dict(load_file(folder / WEIGHTS_FILE))
-        except DAMAGE as error:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise CheckpointError(f"{folder} is damaged or incomplete ({why}); copy or train it again.") from error
-        return Actor(network.eval().requires_grad_(False), spec, greedy, told.get("card"))
+        make = lambda told: ActorNetwork(ActorConfig(**told))  # noqa: E731
+        network, card = load_network(folder, KIND, VERSION, make)
+        return Actor(network, spec, greedy, card)
+
+
+def load_network(
+    folder: str | Path, kind: str, version: int, make: Callable[[dict[str, Any]], Module]
+) -> tuple[Module, dict[str, Any]]:
+    """The network of a policy of this kind, which `make` makes of its config, ready to act; and its card. The folder is its own,
+    or that of the training run. CheckpointError for what is missing, foreign or damaged."""
+    folder = policy_folder(folder)
+    told = read_policy(folder)
+    if (told.get("kind"), told.get("version")) != (kind, version):
+        raise CheckpointError(
+            f"{folder} is a policy of kind {told.get('kind')!r}, version {told.get('version')}; this takes kind '{kind}', "
+            f"version {version}."
+        )
+    try:
+        network = make({name: _tuple(value) for name, value in told["config"].items()})
+        network.load_state_dict(load_file(folder / WEIGHTS_FILE))
+    except DAMAGE as error:
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{folder} is damaged or incomplete ({why}); copy or train it again.") from error
+    return network.eval().requires_grad_(False), dict(told.get("card") or {})
 
 
 def write_policy(folder: str | Path, told: Mapping[str, Any], network: nn.Module) -> None:
@@ -113,4 +124,6 @@ def read_policy(folder: str | Path) -> dict[str, Any]:
 
 
 def _tuple(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _tuple(inner) for name, inner in value.items()}
     return tuple(map(_tuple, value)) if isinstance(value, list) else value

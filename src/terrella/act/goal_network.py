@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, final
 
 import torch
-from safetensors.torch import load_file
 from torch import nn
 
-from ..core.errors import ChannelError, CheckpointError
+from ..core.errors import ChannelError
 from ..core.spec import Spec, shape_of
 from ..core.world import Observation
-from .actor import DAMAGE, WEIGHTS_FILE, policy_folder, read_policy, write_policy
+from .actor import load_network, write_policy
 from .actor_network import ActorConfig, perceptron
 from .distributions import ActionDistribution
 
@@ -116,17 +115,9 @@ class GoalActor:
     def load(folder: str | Path, spec: Spec, varied: bool = False) -> GoalActor:
         """What `save` wrote, from its folder or that of the training run. CheckpointError for what is damaged, ActionError or
         ChannelError where it does not fit the world of `spec`."""
-        folder = policy_folder(folder)
-        told = read_policy(folder)
-        try:
-            config = dict(told["config"])
-            actor = ActorConfig(**{name: _tuple(value) for name, value in config.pop("actor").items()})
-            network = GoalNetwork(GoalConfig(actor=actor, **config))
-            network.load_state_dict(load_file(folder / WEIGHTS_FILE))
-        except DAMAGE as error:
-            raise CheckpointError(f"{folder} is damaged or incomplete ({error}); copy or train it again.") from error
-        return GoalActor(network.eval().requires_grad_(False), spec, varied, told.get("card"))
 
+        def make(told: dict[str, Any]) -> GoalNetwork:
+            return GoalNetwork(GoalConfig(**{**told, "actor": ActorConfig(**told["actor"])}))
 
-def _tuple(value: Any) -> Any:
-    return tuple(map(_tuple, value)) if isinstance(value, list) else value
+        network, card = load_network(folder, KIND, VERSION, make)
+        return GoalActor(network, spec, varied, card)

@@ -16,7 +16,7 @@ from .named import seen_by
 from .planning import Episode, Judge, distance, play_from
 from .planning.task import later
 
-CHUNK = 25  # episodes that are played, and saved, together
+CHUNK = 100  # episodes that are played, and saved, together
 FOLLOWED, FOLLOWED_PICTURES = (
     16,
     4,

@@ -22,11 +22,11 @@ from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
 from .actor import policy_folder, read_policy
+from .belief import actor_of
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
-from .through import actor_of
 
 KNOWN = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "

@@ -21,7 +21,7 @@ from ..act.planning import (
     distance_to,
     imagined,
     negative_reward,
-    paced,
+    search_within,
     tells_apart,
 )
 from ..core.errors import PlanningError
@@ -99,7 +99,7 @@ class Driving:
         if world is None or "reward" not in world.spec.channels:
             return None
         cost, state = negative_reward(world.spec), self._first(world)
-        config, fits = paced(world, cost, state, self.budget_ms)
+        config, fits = search_within(world, cost, state, self.budget_ms)
         if not always and not (fits and tells_apart(world, cost, state)):
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
@@ -128,7 +128,7 @@ class Driving:
         whole = {name: goal[name] for name in source.spec.observes if name in goal}
         latent = "latent" in source.spec.channels and set(whole) == set(source.spec.observes) and whole
         cost = distance_to(source, whole) if latent else distance_to(world, aim, latent=False)
-        config, _ = paced(world, cost, self._first(world), self.budget_ms, block=2)
+        config, _ = search_within(world, cost, self._first(world), self.budget_ms, block=2)
         planner = Planner(world, cost, config)
 
         def away(state: State) -> float:
@@ -142,7 +142,7 @@ class Driving:
         goal = Destination(pose)
         cost = goal.cost(world)
         block = max(1, round(STRIDE_S / world.spec.dt_s))
-        config, _ = paced(world, cost, self._first(world), self.budget_ms, block)
+        config, _ = search_within(world, cost, self._first(world), self.budget_ms, block)
         planner = Planner(world, cost, config)
 
         def away(state: State) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from .. import library
+from ..core.errors import TerrellaError
 from .say import Json, result
 
 
@@ -18,9 +19,15 @@ def policy(name: Positional[Path], world: str, out: Path, json: Json = False) ->
         world: A world with the actions that it gives, as the one that it practised in (mujoco:go1).
         out: The file, NAME.onnx.
     """
-    from ..act.actor import Actor
+    from ..act.actor import Actor, policy_folder, read_policy
+    from ..act.goal_network import KIND as GOALS
     from ..act.onnx_file import write_onnx
 
+    if read_policy(policy_folder(name)).get("kind") == GOALS:
+        raise TerrellaError(
+            f"{name} is a policy for goals, which acts through the world that it was learned in: it has no ONNX file; "
+            "`terrella plan WORLD --agent` plays it."
+        )
     spec = library.load(world).spec
     inputs = write_onnx(Actor.load(name, spec), out)
     facts = {"file": str(out), "inputs": inputs, "outputs": {"action": [-1, *(spec.action.shape or ())]}}

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from .. import library, progress
 from ..act.named import policy_of, proposing
@@ -26,7 +26,6 @@ from ..act.planning import (
     Planner,
     Played,
     Revealed,
-    SearchConfig,
     distance,
     distance_to,
     negative_reward,
@@ -44,51 +43,11 @@ from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
 from .goals import REWARD, read_goal
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result, say
+from .searching import Searching, Settled
 from .walking import WALK_S, Walks, is_recording, search_of, views_of
 
 WITHIN = 0.05  # unless it is said
 DOUBLINGS = 5  # of the curve of success against compute
-Kind = Literal["icem", "cem", "mppi", "gradient", "tree", "random"]
-Milliseconds = Annotated[
-    float | None,
-    arg(help="Search for so long a decision instead of --iterations; outcomes then depend on the machine."),
-]
-
-
-@dataclass(frozen=True)
-class Searching:
-    """How plans are searched.
-
-    Args:
-        search: icem, cem, mppi, random; gradient in worlds that can be differentiated; tree over choices.
-        samples: Plans that are tried in a round.
-        iterations: Rounds of a decision.
-        horizon: Moves of a plan.
-        block: Steps for which each move is held.
-        replan: Moves that are done before the next plan is made.
-        cost: Of a goal: sum (sooner is better), last (the end of the horizon alone) or least (its best moment).
-        trust: The world's uncertainty at which a plan ends; unless said, that from which it invents, if it tells one.
-        proposal: A policy whose plans are tried as well: a folder of `train goals`, or another policy's name.
-        agent: A policy that acts in place of the search, by the same names.
-    """
-
-    search: Kind = "icem"
-    samples: int = 64
-    iterations: int = 5
-    horizon: int = 12
-    block: int = 1
-    replan: int = 1
-    cost: Literal["sum", "last", "least"] = "sum"
-    trust: float | None = None
-    proposal: str | None = None
-    agent: str | None = None
-    budget_ms: Milliseconds = None
-
-    @property
-    def config(self) -> SearchConfig:
-        return SearchConfig(
-            self.search, self.samples, self.iterations, self.horizon, self.block, budget_ms=self.budget_ms
-        )
 
 
 @dataclass(frozen=True)
@@ -99,7 +58,7 @@ class _Case:
     real: World
     goal: Mapping[str, torch.Tensor]
     judge: Judge
-    searching: Searching
+    searching: Settled
     episodes: int
     steps: int
     seed: int
@@ -109,10 +68,10 @@ class _Case:
     def within(self) -> float:
         return self.walks.within_m if self.walks else self.judge.within
 
-    def cost(self, searching: Searching) -> Cost:
+    def cost(self, searching: Settled) -> Cost:
         return distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(self.world.spec)
 
-    def planner(self, searching: Searching) -> Planner:
+    def planner(self, searching: Settled) -> Planner:
         spec, trust, config = self.world.spec, searching.trust, searching.config
         leaps = (
             bool(spec.leap) and config.block % spec.leap == 0 and searching.cost == "last"
@@ -128,15 +87,13 @@ class _Case:
         proposal = None if told is None else proposing(told, self.world)
         return Planner(self.world, self.cost(searching), config, trust, proposal, replan=searching.replan)
 
-    def walker(self, searching: Searching, goal: Destination) -> Policy:
+    def walker(self, searching: Settled, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
         cost = goal.cost(self.world)
         return goal.walker(Planner(self.world, cost, searching.config, searching.trust, replan=searching.replan))
 
-    def planned(self, searching: Searching, what: str, keep: tuple[str, ...] = ()) -> Played:
+    def planned(self, searching: Settled, what: str, keep: tuple[str, ...] = ()) -> Played:
         """Episodes of the planner."""
-        if searching.agent and self.walks:
-            raise TerrellaError("who walks to places plans the way; leave --agent out.")
         if searching.agent:
             policy = policy_of(searching.agent, self.real.spec, self.world, self.cost(searching))
         else:
@@ -200,12 +157,16 @@ def plan(
         curve: Also play with half, a quarter ... of the samples: does thinking longer help?
         out: Folder for the page, the film and plan.json; default: plans/ and the world's name.
     """
+    if searching.agent:
+        searching.refuse(f"{searching.agent} acts in place of the search")
+        if curve:
+            raise TerrellaError(f"{searching.agent} acts in place of the search; leave --curve out.")
     case = _opened(name, environment, searching, aim, real, episodes, steps, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
     keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
     mine = case.planned(case.searching, "acting" if searching.agent else "planning", keep)
     floor = case.floor()
-    points = _curve(case, mine) if curve and not searching.agent else []
+    points = _curve(case, mine) if curve else []
     about = {"world": name, "real": real or name, **asdict(aim), "within": case.within}
     asked = {key: value for key, value in asdict(case.searching).items() if value is not None}
     facts = {
@@ -269,18 +230,21 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
     wanted = {} if is_recording(aim.goal) else read_goal(aim.goal, world.spec)
     views = None if aim.success else views_of(aim.goal, wanted, world, acted.spec)
     if views is not None:
-        searching = replace(searching, **search_of(world.spec)) if searching == Searching() else searching
+        searching.refuse("who walks to places plans the way by the distance", "cost", "proposal", "agent")
+        settled = searching.settled(search_of(world.spec))
         walks = Walks(views, apart_m, within or NEAR_M)
         if len(views) > 1 and apart_m <= walks.within_m:
             raise TerrellaError(f"--apart is more than the {walks.within_m:g} m within which a view is reached.")
         limit = steps or acted.spec.max_episode_steps or round(WALK_S / acted.spec.dt_s)
-        case = _Case(world, acted, wanted, Judge(), searching, episodes, limit, seed, walks)
-        case.walker(searching, Destination(views[0]))
+        case = _Case(world, acted, wanted, Judge(), settled, episodes, limit, seed, walks)
+        case.walker(settled, Destination(views[0]))
         return case
     judge = _judge(aim, wanted, acted.spec)
     limit = steps or acted.spec.max_episode_steps or STEPS
-    case = _Case(world, acted, wanted, judge, searching, episodes, limit, seed)
-    case.planner(searching)  # what does not fit is said before anything is played
+    if not wanted:
+        searching.refuse("a reward is summed up to the end of the episode", "cost")
+    case = _Case(world, acted, wanted, judge, searching.settled({}), episodes, limit, seed)
+    case.planner(case.searching)  # what does not fit is said before anything is played
     return case
 
 

@@ -12,9 +12,9 @@ from tyro.conf import arg
 
 from .. import library, progress
 from ..act.actor import Actor
+from ..act.belief import actor_of
 from ..act.named import seen_by
 from ..act.planning.episodes import play
-from ..act.through import actor_of
 from ..core.errors import TerrellaError
 from ..core.policy import Policy, Random
 from ..core.world import World, make_rng

@@ -18,7 +18,7 @@ import torch
 
 from .. import library, progress
 from ..act.actor import Actor
-from ..act.through import Through, actor_of
+from ..act.belief import BeliefPolicy, actor_of
 from ..core.errors import TerrellaError
 from ..core.policy import Policy
 from ..core.world import World, make_rng
@@ -171,8 +171,8 @@ def _collect(rounds: Rounds, number: int, real: World, upto: int, seed: int, rep
 
 def drawing(policy: Policy) -> Policy:
     """The same learned policy, drawing its actions."""
-    if isinstance(policy, Through):
-        return Through(policy.world, Actor(policy.actor.network, policy.actor.spec, greedy=False))
+    if isinstance(policy, BeliefPolicy):
+        return BeliefPolicy(policy.world, Actor(policy.actor.network, policy.actor.spec, greedy=False))
     return Actor(policy.network, policy.spec, greedy=False) if isinstance(policy, Actor) else policy
 
 

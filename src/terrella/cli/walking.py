@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..act.planning import STRIDE_S, Destination, Episode, Judge, Played, play
-from ..act.planning.ways import NoWay
+from ..act.planning.routes import NoRoute
 from ..core.errors import ObservationError, PlanningError
 from ..core.policy import Policy
 from ..core.spec import Spec
@@ -55,7 +55,7 @@ class Walks:
             try:
                 one = play(real, policy_for(goal), 1, steps, own, judge, sees, keep, 0 if filmed else 1)
                 found, skipped, filmed = found + one.episodes, skipped + one.skipped, True
-            except NoWay:
+            except NoRoute:
                 if len(self.views) == 1:
                     raise
                 seen = real.render(real.start(1, make_rng(own)), judge.channels)

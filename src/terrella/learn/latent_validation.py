@@ -148,9 +148,9 @@ def _fit(network: LatentNetwork, spread: torch.Tensor, error: torch.Tensor) -> N
 @torch.inference_mode()
 def foreseen(world: LatentWorld, recording: Recording, steps: int = 64) -> list[torch.Tensor]:
     """Pictures uint8 [9, 3, H, W] of a held-out episode, every eighth of `steps` or of as many as it has, and those decoded of a
-    rollout from the first of them; none where the recording has no pictures."""
+    rollout from the first of them; none of a world that draws none."""
     context, data = world.network.config.history - 1, unseen(recording)
-    if recording.cache.rgb is None:
+    if world.network.config.size is None:
         return []
     fits = [count for count in range(8, steps + 1, 8) if len(data.within(context, count, acted=True))]
     if not fits:

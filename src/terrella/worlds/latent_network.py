@@ -22,7 +22,7 @@ class LatentConfig:
     the channels of numbers, all of which are predicted; size: (height, width) of the pictures, multiples of 16, None without;
     sees_pictures, sees_vectors: which of them are evidence; latent: its width; history: last latents and actions that the
     predictor sees; hidden: width of its layers; members: predictors of the ensemble; leap: steps that a leap takes at once, 0
-    without."""
+    without; identity: the latent is the vectors themselves, scaled, all of which are evidence: there is no encoder."""
 
     actions: int
     rewards: tuple[float, ...] = (0.0, 1.0)
@@ -35,6 +35,7 @@ class LatentConfig:
     hidden: int = 192
     members: int = 3
     leap: int = 0
+    identity: bool = False
 
     @property
     def width(self) -> int:
@@ -160,6 +161,7 @@ class LatentNetwork(nn.Module):
     rewards: torch.Tensor
     spread: torch.Tensor  # KNOTS summed variances of the ensemble, ascending from 0
     error: torch.Tensor  # the error usual at each
+    unit: torch.Tensor  # by which each number of the latent usually changes in a step, where the latent is the vectors
 
     kind = "joint-embedding"
 
@@ -167,11 +169,13 @@ class LatentNetwork(nn.Module):
         super().__init__()
         self.config = config
         latent, hidden, window = config.latent, config.hidden, config.history * config.latent
-        self.encoder = Encoder(config)
+        self.encoder = nn.Identity() if config.identity else Encoder(config)
         self.predictor = Ensemble(config.members, window + config.history * config.actions, hidden, latent)
         self.heads = nn.ModuleDict(
             {
-                "numbers": _perceptron(window, hidden, config.width) if config.width else nn.Identity(),
+                "numbers": _perceptron(window, hidden, config.width)
+                if config.width and not config.identity
+                else nn.Identity(),
                 "outcome": _perceptron(window + config.actions + latent, hidden // 2, len(config.rewards) + 1),
                 "inverse": _perceptron(window + latent, hidden // 2, config.actions),
             }
@@ -184,6 +188,7 @@ class LatentNetwork(nn.Module):
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
         self.register_buffer("spread", torch.linspace(0, 1, KNOTS))
         self.register_buffer("error", torch.linspace(0, 1, KNOTS))
+        self.register_buffer("unit", torch.ones(latent), persistent=config.identity)
 
     def scaled(self, numbers: torch.Tensor) -> torch.Tensor:
         """Numbers [..., width] in standard deviations from their mean."""
@@ -200,21 +205,23 @@ class LatentNetwork(nn.Module):
                 assert rgb is not None
                 numbers, there = self.mean.expand(len(rgb), -1), torch.zeros(len(rgb), device=rgb.device)
             seen = self.scaled(numbers)[:, self.config.columns]
+            if self.config.identity:
+                return seen
         return self.encoder(rgb if self.config.pictured else None, seen, there)
 
     def predict(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """The next latent as each member has it [members, B, D], after actions [B, K, A], the newest last."""
-        found = window[:, -1] + self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
+        found = window[:, -1] + self.unit * self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
         return found.clamp(-FARTHEST, FARTHEST)
 
     def leap(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """The window [B, K, D] `config.leap` steps later, at once, after actions [B, K - 1 + leap, A], the newest last."""
         found = self.leaper(torch.cat([window.flatten(1), actions.flatten(1)], 1))[0].view_as(window)
-        return (window[:, -1:] + found).clamp(-FARTHEST, FARTHEST)
+        return (window[:, -1:] + self.unit * found).clamp(-FARTHEST, FARTHEST)
 
     def numbers(self, window: torch.Tensor) -> torch.Tensor:
         """The vectors that are read off a window, scaled: [B, width]."""
-        return self.heads["numbers"](window.flatten(1))
+        return window[:, -1] if self.config.identity else self.heads["numbers"](window.flatten(1))
 
     def outcome(self, window: torch.Tensor, action: torch.Tensor, after: torch.Tensor) -> Outcomes:
         """What a step from `window` by `action` [B, A] to the latent `after` [B, D] brings."""

@@ -16,8 +16,9 @@ from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import distance
 from .planner import Decision, Thought
-from .ways import Walk
+from .routes import Walk
 
+_STREAMS = 1 << 40, 2 << 40, 3 << 40  # of the seed: what the world, the policy's actions and its beginning draw
 MOST_SKIPPED = 20  # starts that are already solved, for each episode that is asked for
 
 
@@ -103,10 +104,7 @@ def play(
     played at once, else one after the other. PlanningError where nearly every start is already solved.
     """
     judge = judge or Judge()
-    spec, starts, begins = world.spec, make_rng(seed), make_rng(seed + 1)
-    told = [name for name in ("reward", "done") if name in spec.channels]
-    spec.check_channels((*judge.channels, *sees, *keep))
-    channels = tuple(dict.fromkeys((*sees, *judge.channels, *told)))
+    spec, starts = world.spec, make_rng(seed)
     found, skipped = list[Episode](), 0
     while len(found) < episodes:
         batch = min(episodes - len(found), spec.max_batch or episodes) if spec.forkable else 1
@@ -122,8 +120,8 @@ def play(
             if solved.all():
                 continue
             state = state.at((~solved).nonzero()[:, 0]) if solved.any() else state
-        group = _Group(world, policy, judge, channels, tuple(keep), max(0, kept - len(found)), steps)
-        found += group.play(state, make_rng(seed + 2 + len(found) + skipped), begins)
+        own, left = seed + 1 + len(found) + skipped, max(0, kept - len(found))
+        found += play_from(world, state, policy, steps, own, judge, sees, keep, left)
         if report:
             report(len(found), episodes)
     return Played(found, skipped)
@@ -146,8 +144,8 @@ def play_from(
     told = [name for name in ("reward", "done") if name in world.spec.channels]
     world.spec.check_channels((*judge.channels, *sees, *keep))
     channels = tuple(dict.fromkeys((*sees, *judge.channels, *told)))
-    group = _Group(world, policy, judge, channels, tuple(keep), kept, steps, make_rng(seed))
-    return group.play(state, make_rng(seed + 1), make_rng(seed + 2))
+    group = _Group(world, policy, judge, channels, tuple(keep), kept, steps)
+    return group.play(state, *(make_rng(seed ^ which) for which in _STREAMS))
 
 
 @dataclass
@@ -161,10 +159,12 @@ class _Group:
     keep: tuple[str, ...]
     kept: int
     steps: int
-    moves: torch.Generator | None = None  # of the world alone
 
     @torch.no_grad()
-    def play(self, state: State, chance: torch.Generator, begins: torch.Generator) -> list[Episode]:
+    def play(
+        self, state: State, moves: torch.Generator, chance: torch.Generator, begins: torch.Generator
+    ) -> list[Episode]:
+        """moves: of the world alone; chance: of the policy's actions; begins: of its memory."""
         episodes = [Episode(success=False if self.judge.judges else None) for _ in range(state.batch)]
         memory, going = self.policy.begin(state.batch, begins), list(range(state.batch))
         seen = self.world.render(state, self.channels)
@@ -177,7 +177,7 @@ class _Group:
             ms = 1e3 * (time.perf_counter() - began) / len(going)
             for entry, number in enumerate(going):
                 _decided(episodes[number], action[entry], ms, memory, entry)
-            state = self.world.imagine(state, action, self.moves or chance)
+            state = self.world.imagine(state, action, moves)
             seen = self.world.render(state, self.channels)
             over = self._judged(episodes, going, seen)
             if over.any():

@@ -23,6 +23,7 @@ KNOTS, REACH = 17, 3.0  # where the characteristic function is compared, from 0 
 PROJECTIONS, SAMPLE = 128, 256  # of latents, of which SIGReg takes as many as these at a time
 SIGREG = 0.09
 LONE, BLIND = 0.2, 0.3  # shares of clips that begin without a past, and of those whose numbers are not seen
+LEAST_UNIT = 1e-3  # deviations, that a number counts as changing in a step
 DRAWN = 24  # latents a step that the decoder learns from
 # Shares of the loss.
 OF_NUMBERS, OF_OUTCOME, OF_INVERSE = 1.0, 0.3, 0.05
@@ -77,12 +78,8 @@ class LatentPrediction:
     def __init__(self, network: LatentNetwork, controls: Controls, learning_rate: float, steps: int):
         self.network, self.controls, self.steps = network, controls, steps
         self.modules = {"network": network}
-        trained = (
-            network.encoder,
-            network.predictor,
-            network.heads,
-            *([network.leaper] if network.config.leap else []),
-        )
+        parts = (network.encoder, network.predictor, network.heads, network.leaper)
+        trained = [part for part in parts if parameters(part)]
         self.learners = {"latent": adamw(trained, warmed(learning_rate, 100, 0.02))}
         if network.config.size:
             self.learners["decoder"] = adamw((network.decoder,), warmed(learning_rate, 100, 0.02))
@@ -91,7 +88,9 @@ class LatentPrediction:
         network, config = self.network, self.network.config
         latents = self._encoded(batch, now)
         windows, foretold, away = self._rolled(latents, batch, now)
-        parts = {"prediction": away, "sigreg": self._regular(latents, now)}
+        parts = {"prediction": away}
+        if not config.identity:  # which cannot collapse
+            parts["sigreg"] = self._regular(latents, now)
         if config.leap:
             parts["leap"] = self._leapt(latents, batch, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
@@ -138,7 +137,7 @@ class LatentPrediction:
         for step in range(self.steps):
             actions = torch.cat([past, batch.actions[:, history - 1 + step, None]], 1)
             found = network.predict(window, actions)
-            away = away + (learns * (found - latents[:, history + step]).square()).mean() / 0.75
+            away = away + (learns * self._missed(found, latents[:, history + step])).mean() / 0.75
             windows.append(window)
             foretold.append(found.mean(0))
             window, past = torch.cat([window[:, 1:], foretold[-1][:, None]], 1), actions[:, 1:]
@@ -155,7 +154,15 @@ class LatentPrediction:
         first = config.history - 1
         window = torch.where(lone, spans[:, first : first + 1], spans[:, : config.history])
         acts = torch.cat([torch.where(lone, 0.0, acts[:, :first]), acts[:, first:]], 1)
-        return (network.leap(window, acts) - spans[:, config.leap :]).square().mean()
+        return self._missed(network.leap(window, acts), spans[:, config.leap :]).mean()
+
+    def _missed(self, found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        """The error of each number: squared; where the latent is the vectors themselves, in units of a step, and less steep where
+        it is large (Huber), for a rollout that went astray says little."""
+        if not self.network.config.identity:
+            return (found - truth).square()
+        unit = self.network.unit
+        return F.smooth_l1_loss(found / unit, (truth / unit).expand_as(found), reduction="none")
 
     def _regular(self, latents: torch.Tensor, now: Now) -> torch.Tensor:
         flat = latents.flatten(0, 1)
@@ -175,7 +182,7 @@ class LatentPrediction:
         acts = batch.actions[:, first:-1].flatten(0, 1)
         reward, done = (part[:, first:-1].flatten() for part in (batch.reward, batch.done))
         parts: dict[str, torch.Tensor] = {}
-        if network.config.width:
+        if network.config.width and not network.config.identity:
             told = network.scaled(batch.numbers[:, first:])
             found = network.numbers(torch.stack([real, windows]).flatten(0, 2)).view(2, *told.shape)
             parts["numbers"] = F.smooth_l1_loss(found, told.expand_as(found))
@@ -207,15 +214,18 @@ def picture_loss(drawn: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return ((1 + 8 * differs) * (drawn - truth).square()).mean()
 
 
-def settle_scale(network: LatentNetwork, numbers: np.ndarray) -> None:
-    """Tells the network the mean and the standard deviation of the numbers [N, width] of its vectors."""
+def settle_scale(network: LatentNetwork, numbers: np.ndarray, follows: np.ndarray) -> None:
+    """Tells the network the mean and the standard deviation of the numbers [N, width] of its vectors, and by how much they change
+    in a step; follows bool [N - 1]: whether the next row comes after the row."""
     if not network.config.width:
         return
     found = torch.from_numpy(np.nan_to_num(numbers.astype(np.float64), posinf=0.0, neginf=0.0))
-    spread = found.std(0, correction=0)
-    still = spread <= 1e-6 * found.abs().amax(0).clamp_min(1e-6)
     network.mean.copy_(found.mean(0))
-    network.scale.copy_(torch.where(still, 1.0, spread))
+    spread = found.std(0, correction=0)
+    network.scale.copy_(torch.where(spread <= 1e-6 * found.abs().amax(0).clamp_min(1e-6), 1.0, spread))
+    if network.config.identity:
+        scaled = found / network.scale
+        network.unit.copy_(scaled.diff(dim=0)[torch.from_numpy(follows)].square().mean(0).sqrt().clamp_min(LEAST_UNIT))
 
 
 def parameters(module: nn.Module) -> int:

@@ -30,6 +30,7 @@ from ..trainer import Report, Run, Trainer, device_named
 STAGE = "latent"
 SIDE, COARSE = 64, 16  # pixels: of the larger side at most, and what sides are multiples of
 WIDEST = 512  # numbers of a channel that is a vector
+LATENT_WIDEST = 64  # numbers of all vectors that may be the latent themselves
 STARTS = 64
 LEAP = 5  # steps at once, unless it is said
 NOT_NUMBERS = (
@@ -54,10 +55,11 @@ class LatentTraining:
 
     Args:
         name: Name of the world.
-        pictures: See the recording's pictures. --no-pictures sees its state vectors alone.
+        pictures: See the recording's pictures. --no-pictures sees its state vectors alone, and draws nothing.
         vectors: See the recording's state vectors. --no-vectors sees its pictures alone, and predicts the vectors all the same.
         size: Height and width at which pictures are seen, multiples of 16. Default: their own shape, within 64 x 64.
-        latent: Width of the latent. Default: 32, and with pictures 64.
+        latent: Width of the latent. Default: 64 with pictures; without, the state vectors themselves, scaled, where they have 64
+            numbers or fewer, else 32.
         history: Last latents and actions that the predictor sees.
         rollout: Steps that are predicted one from another. Default: 12, and with pictures 6; fewer where episodes are short.
         leap: Steps that a leap takes at once, for planners that hold or try moves of so many; 0 learns none. Default: 5, where
@@ -157,7 +159,8 @@ class _Learned:
         arrays = [self._array(name) for name, _ in shape.vectors]
         rows = np.flatnonzero(recording.usable)
         flat = [np.asarray(array[rows], np.float32).reshape(len(rows), -1) for array in arrays]
-        settle_scale(self.network, np.concatenate(flat, 1) if flat else np.zeros((len(rows), 0)))
+        follows = (np.diff(recording.start[rows]) == 0) & (np.diff(rows) == 1)
+        settle_scale(self.network, np.concatenate(flat, 1) if flat else np.zeros((len(rows), 0)), follows)
 
     def _array(self, channel: str) -> np.ndarray:
         return self.recording.cache.arrays[self.recording.cache.keys[channel]]
@@ -171,15 +174,19 @@ class _Learned:
                 f"{recording.name} holds no {'state vectors' if has_pictures else 'pictures and no state vectors'} for the "
                 "world to see: record some, or leave --no-pictures and --no-vectors out."
             )
+        seen = config.vectors and not pictured and all(kind_of(name) != "pose" for name, _ in vectors)
+        width = sum(width for _, width in vectors)
+        identity = seen and config.latent is None and width <= LATENT_WIDEST
         paid = np.zeros(1) if cache.reward is None else np.asarray(cache.reward, np.float32)[recording.usable]
         return LatentConfig(
             actions=self.controls.numbers,
             rewards=levels(paid),
             vectors=vectors,
-            size=(cache.rgb.shape[1], cache.rgb.shape[2]) if cache.rgb is not None else None,
+            size=(cache.rgb.shape[1], cache.rgb.shape[2]) if pictured else None,
             sees_pictures=config.pictures,
             sees_vectors=config.vectors,
-            latent=config.latent or (64 if pictured else 32),
+            latent=width if identity else config.latent or (64 if pictured else 32),
+            identity=identity,
             history=config.history,
             leap=self._leap(),
         )

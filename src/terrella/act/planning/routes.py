@@ -1,4 +1,4 @@
-"""Ways to a place that is further off than a planner sees: over places where a camera was before, planned stretch by stretch."""
+"""Routes to a place that is further off than a planner sees: over places where a camera was before, planned stretch by stretch."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .costs import Cost, distance_to
 from .planner import Planner, Thought
 
 
-class NoWay(PlanningError):
+class NoRoute(PlanningError):
     """No way to a place is known."""
 
 
@@ -31,7 +31,7 @@ _ANEW_STEPS = 70  # after which ways are looked for among the places that are kn
 
 
 @dataclass(frozen=True)
-class Ways:
+class Routes:
     """Known places [N, 2] in metres, how far each is from the goal along them [N] (inf: no way is known), and the next one on the
     way there, -1 for the goal itself."""
 
@@ -64,7 +64,7 @@ class Walk:
     """The memory of one episode: the planner's, the ways, the place walked to next, and where the walker was some steps ago."""
 
     thought: Thought
-    ways: Ways | None = None
+    routes: Routes | None = None
     next: tuple[float, float] | None = None
     step: int = 0
     before: tuple[float, float] = (math.inf, math.inf)
@@ -72,7 +72,7 @@ class Walk:
     avoided: tuple[tuple[float, float], ...] = ()
 
 
-def ways_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, float], ...] = ()) -> Ways:
+def routes_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, float], ...] = ()) -> Routes:
     """Dijkstra (1959) from the goal [2] over known places [N, 2]; places near `avoided` ones count as further off."""
     cells = np.round(known / CELL_M).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -94,14 +94,14 @@ def ways_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, flo
             further = far + apart[at, other] + toll[other]
             if further < left[other]:
                 heapq.heappush(queue, (float(further), other, at))
-    return Ways(places, left, onward)
+    return Routes(places, left, onward)
 
 
-class Wayfinder:
+class Navigator:
     """Walks to `place`, x and y in metres, in a world with the channel `pose`; there it turns to `heading` radians, if one is
     given.
 
-    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Ways lead over the places of the
+    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Routes lead over the places of the
     channel `keyframes`, seen or remembered by the planner's world; without any, straight on. PlanningError where none is known.
     """
 
@@ -124,13 +124,13 @@ class Wayfinder:
         """The walk with the next place as its planner's goal."""
         here = observation["pose"][entry, :2].double().cpu().numpy()
         walk = self._noted(walk, here)
-        if walk.ways is None or walk.step % _ANEW_STEPS == 0 or not len(walk.ways.places):
+        if walk.routes is None or walk.step % _ANEW_STEPS == 0 or not len(walk.routes.places):
             known = self._known(observation, walk, entry)
-            walk = replace(walk, ways=ways_to(self.place, known, walk.avoided))
-        assert walk.ways is not None
-        target, left = walk.ways.target(here, self.place)
+            walk = replace(walk, routes=routes_to(self.place, known, walk.avoided))
+        assert walk.routes is not None
+        target, left = walk.routes.target(here, self.place)
         if not math.isfinite(left):
-            raise NoWay("no way to that place is known; choose one near where somebody has been.")
+            raise NoRoute("no way to that place is known; choose one near where somebody has been.")
         pose = torch.full_like(walk.thought.goal["pose"], torch.nan)
         pose[0, :2] = torch.from_numpy(target).to(pose)
         if self.heading is not None and left < _TURNS_M:
@@ -154,7 +154,7 @@ class Wayfinder:
             return replace(walk, before=(float(here[0]), float(here[1])), noted=walk.step)
         if walk.step - walk.noted < _STUCK_STEPS or walk.next is None:
             return walk
-        return replace(walk, ways=None, avoided=(*walk.avoided, walk.next), noted=walk.step)
+        return replace(walk, routes=None, avoided=(*walk.avoided, walk.next), noted=walk.step)
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ class Destination:
         asked[:2] = self.pose[:2]
         return distance_to(world, {"pose": asked})
 
-    def walker(self, planner: Planner) -> Wayfinder:
-        return Wayfinder(planner, self.place, self.heading)
+    def walker(self, planner: Planner) -> Navigator:
+        return Navigator(planner, self.place, self.heading)
 
     def away(self, pose: torch.Tensor) -> torch.Tensor:
         """How many metres [B] poses [B, 7] are away; who is near and faces elsewhere is a little more than `near_m` away."""

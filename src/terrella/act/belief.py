@@ -18,7 +18,7 @@ from .planning import Cost, Reaching
 
 
 @final
-class Through:
+class BeliefPolicy:
     """The world folds what is seen into its state, the policy is shown what it sees of that. Its memory is the world's state."""
 
     def __init__(self, world: World, actor: Actor):
@@ -52,4 +52,4 @@ def actor_of(folder: str | Path, spec: Spec, world: World | None = None, cost: C
     lacks = [name for name in world.spec.observes if name not in spec.channels]
     if lacks:
         raise ChannelError(f"{world.spec.name} observes {', '.join(lacks)}, which {spec.name} does not show.")
-    return Through(world, Actor.load(folder, world.spec))
+    return BeliefPolicy(world, Actor.load(folder, world.spec))

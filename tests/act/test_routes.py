@@ -1,4 +1,4 @@
-"""Ways to a place: over known places round a wall, planned stretch by stretch, and a sentence where there is none."""
+"""Routes to a place: over known places round a wall, planned stretch by stretch, and a sentence where there is none."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from gymnasium import spaces
 
 from terrella.act.planning import (
     Destination,
+    Navigator,
     Planner,
     Revealed,
     SearchConfig,
-    Wayfinder,
     distance,
     distance_to,
-    paced,
+    search_within,
     tells_apart,
 )
-from terrella.act.planning.ways import STRIDE_M, ways_to
+from terrella.act.planning.routes import STRIDE_M, routes_to
 from terrella.core import Spec, State, check_world
 from terrella.core.errors import ContractError, ObservationError, PlanningError
 from terrella.core.spec import POSE
@@ -71,7 +71,7 @@ class Yard:
 def walk(place, steps=120, shown=("pose", "keyframes")):
     world = Revealed(Yard())
     cost = distance_to(world, {"pose": torch.tensor([*place, *[torch.nan] * 5])})
-    way = Wayfinder(Planner(world, cost, SearchConfig(samples=24, iterations=2, horizon=5)), place)
+    way = Navigator(Planner(world, cost, SearchConfig(samples=24, iterations=2, horizon=5)), place)
     rng = make_rng(0)
     state, memory, trace = world.start(1, rng), way.begin(1, rng), []
     for _ in range(steps):
@@ -90,7 +90,7 @@ def test_the_yard_keeps_the_contract():
 
 def test_ways_lead_round_the_wall_and_grow_shorter():
     goal = np.array([4.0, 0.0])
-    ways = ways_to(goal, KNOWN)
+    ways = routes_to(goal, KNOWN)
     here = np.array([0.0, 0.0])
     target, left = ways.target(here, goal)
     assert target[1] > 0 and left > 2 * math.dist(here, goal), "not straight at the wall"
@@ -111,19 +111,21 @@ def test_a_walker_goes_round_a_wall_that_its_planner_does_not_see_past(shown):
 
 def test_who_is_off_all_ways_goes_to_the_nearest_place_that_lies_on_one():
     alone = np.array([[-4.0, 0.0]])  # as the first place that a camera remembers of a room nobody was in
-    target, left = ways_to(np.array([4.0, 0.0]), np.concatenate([KNOWN, alone])).target(alone[0], np.array([4.0, 0.0]))
+    target, left = routes_to(np.array([4.0, 0.0]), np.concatenate([KNOWN, alone])).target(
+        alone[0], np.array([4.0, 0.0])
+    )
     assert target.tolist() == [0.0, 0.0] and math.isfinite(left)
 
 
 def test_a_place_that_nobody_knows_is_refused_in_a_sentence():
     with pytest.raises(PlanningError, match="no way to that place is known"):
         walk((20.0, 20.0))
-    assert not np.isfinite(ways_to(np.array([20.0, 20.0]), KNOWN).left_m).any()
+    assert not np.isfinite(routes_to(np.array([20.0, 20.0]), KNOWN).left_m).any()
 
 
 def test_a_place_that_could_not_be_walked_to_is_avoided():
     goal = np.array([4.0, 4.0])
-    far = ways_to(goal, KNOWN, avoided=((1.0, 4.0),)).left_m - ways_to(goal, KNOWN).left_m
+    far = routes_to(goal, KNOWN, avoided=((1.0, 4.0),)).left_m - routes_to(goal, KNOWN).left_m
     assert (far >= -1e-9).all() and far.max() > 0.5
 
 
@@ -131,9 +133,9 @@ def test_a_search_is_paced_and_knows_whether_there_is_anything_to_plan_for():
     world = Revealed(Yard())
     state = world.start(1, make_rng(0))
     near = distance_to(world, {"pose": torch.tensor([1.0, 0.0, *[torch.nan] * 5])})
-    config, fits = paced(world, near, state, 1e4)
+    config, fits = search_within(world, near, state, 1e4)
     assert fits and config.horizon == 16 and config.samples == 32
-    config, fits = paced(world, near, state, 1e-3)
+    config, fits = search_within(world, near, state, 1e-3)
     assert not fits and config.horizon == 4 and config.samples == 8
     assert tells_apart(world, near, state)
     same = distance_to(world, {"pose": torch.tensor([torch.nan, torch.nan, 0.0, *[torch.nan] * 4])})

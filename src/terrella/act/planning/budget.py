@@ -23,7 +23,7 @@ _HOLD_S, _AHEAD_S = (
 
 
 @torch.no_grad()
-def paced(
+def search_within(
     world: World, cost: Cost, state: State, budget_ms: float, block: int = 1, samples: int = 32
 ) -> tuple[SearchConfig, bool]:
     """An iCEM search from states like `state` [1] of which a round takes about `budget_ms` here and now, and whether it does: a
