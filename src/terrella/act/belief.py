@@ -1,4 +1,4 @@
-"""Through: a policy that sees an environment as a world does, by the world's latent or whatever else that makes of it."""
+"""BeliefPolicy: a policy that sees an environment as a world does, by the world's latent or whatever else that makes of it."""
 
 from __future__ import annotations
 
