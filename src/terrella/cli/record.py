@@ -239,6 +239,8 @@ def looked_at(dataset: Dataset, world: str) -> dict[str, object]:
     facts: dict[str, object] = {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world}
     if dataset.has("rgb"):
         facts["look"] = str(_contact_sheet(dataset, Path(dataset.root) / "look.jpg"))
+        films = sorted(Path(dataset.root).glob("videos/*/chunk-*/*.mp4"))
+        facts |= {"film": str(films[0])} if films else {}
         covered = coverage(dataset)
         facts |= covered.facts()
         for warning in covered.warnings():
