@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -11,11 +11,15 @@ from .. import progress
 from ..learn.recipes.splat import SplatFit, fit_splat
 from ..library import folder_of
 from ..space.edits import DEEDS, edited
-from ..space.files import read_scene, write_scene
+from ..space.files import read_scene, replace_whole, write_scene
+from ..space.solids import Solids
 from ..worlds.folder import open_world
-from ..worlds.splat import SplatConfig, SplatWorld
+from ..worlds.splat import OBSERVED, SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
-from .say import Json, result
+from .say import Host, Json, Port, Token, result
+
+if TYPE_CHECKING:
+    from ..serve.place import Place
 
 Axes = Literal["rdf", "rub", "flu"]
 
@@ -79,7 +83,9 @@ def export(
     compressed: bool = False,
     json: Json = False,
 ) -> None:
-    """Write the Gaussians of a world for other tools: .ply or .spz (version 3).
+    """Write the Gaussians of a world for other tools (.ply, or .spz of version 3), or as a page to walk in and edit (.html).
+
+    The page is one file that draws by itself, also from a disk; it holds the place as it was before its edits, and these.
 
     Args:
         world: A world of Gaussians: its folder, or the run that made it.
@@ -87,10 +93,53 @@ def export(
         axes: Axes of the file; default: rdf for .ply and rub for .spz.
         compressed: SuperSplat's compressed kind of .ply.
     """
+    if file.suffix.lower() == ".html":
+        from ..serve.place import PlacePage
+
+        place, edits = place_of(world), read_edits(folder_of(world))
+        content = PlacePage(place).html(edits)
+        replace_whole(file, lambda staged: staged.write_bytes(content))
+        return result({"gaussians": len(place.gaussians), "bytes": file.stat().st_size, "file": str(file)}, json)
     opened = open_splat(world)
     write_scene(opened.gaussians, file, axes, "compressed" if compressed else "")
     facts = {"gaussians": len(opened.gaussians), "bytes": file.stat().st_size, "file": str(file)}
     result(facts, json)
+
+
+def view(
+    world: Positional[str], port: Port = 8767, host: Host = "127.0.0.1", token: Token = None, json: Json = False
+) -> None:
+    """Walk in a place and edit it by hand, on a page that your browser draws. Edits that are saved there are the world's own.
+
+    Args:
+        world: A world of Gaussians: its folder, or the run that made it.
+    """
+    from ..serve.place import serve_place
+
+    folder, place = folder_of(world), place_of(world)
+
+    def save(text: str) -> None:
+        write_edits(folder, checked_edits(source_of(folder), text))
+
+    def ready(address: str) -> None:
+        result({"address": address, "gaussians": len(place.gaussians)}, json, f"{place.name}: open {address}")
+
+    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready)
+
+
+def place_of(world: str) -> Place:
+    """What a page shows of a world of Gaussians: as it was before its edits."""
+    from ..serve.place import Place
+
+    open_splat(world)  # refuses what is none
+    source = source_of(folder_of(world))
+    config, named = source.config, source.card.get("objects", [])
+    collider = Solids(source.solids) if len(source.solids) else source.occupancy
+    seen, names = source.provenance == OBSERVED, [str(one) for one in named] if isinstance(named, list) else []
+    return Place(
+        source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
+        config.keep, config.dt_s, names,
+    )  # fmt: skip
 
 
 def edit(

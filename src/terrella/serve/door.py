@@ -68,19 +68,25 @@ def page_address(host: str, port: int, token: str | None) -> str:
 
 
 def application(
-    index: str,
+    index: str | Callable[[], bytes],
     routes: Sequence[BaseRoute],
     lifespan: Callable[[Starlette], AbstractAsyncContextManager[None]],
     host: str,
     token: str | None,
+    policy: str | None = None,
 ) -> Starlette:
-    """A page as an ASGI application. index: the file below web/ that is shown first; `host` is the address that it is bound
-    to, which decides what Host headers it answers to."""
+    """A page as an ASGI application. index: the file below web/ that is shown first, or what gives its content, which nobody
+    sees without the token; `host` is the address that it is bound to, which decides what Host headers it answers to;
+    `policy`: its own Content-Security-Policy."""
     kinds = {f"/{file.relative_to(WEB).as_posix()}": KINDS.get(file.suffix) for file in WEB.rglob("*.*")}
     contents = {path: ((WEB / path[1:]).read_bytes(), kind) for path, kind in kinds.items() if kind}
-    contents["/"] = (WEB / index).read_bytes(), "text/html"
+    if isinstance(index, str):
+        contents["/"] = (WEB / index).read_bytes(), "text/html"
+    made = index if callable(index) else None
 
     def show(request: Request) -> Response:
+        if made is not None and request.url.path == "/":
+            return Response(made(), media_type="text/html")
         content, kind = contents[request.url.path]
         return Response(content, media_type=kind)
 
@@ -91,10 +97,22 @@ def application(
             app.state.on_ready()
             yield
 
-    guard = Middleware(Guard, host=host, token=token, files=contents)
+    guard = Middleware(Guard, host=host, token=token, files=contents, policy=policy)
     return Starlette(
-        routes=[*(Route(path, show) for path in contents), *routes], lifespan=quiet_lifespan, middleware=[guard]
+        routes=[*(Route(path, show) for path in {**contents, "/": None}), *routes],
+        lifespan=quiet_lifespan,
+        middleware=[guard],
     )
+
+
+async def posted(request: Request, most: int) -> bytes:
+    """What was posted; ServeError for more than `most` bytes."""
+    content = b""
+    async for part in request.stream():
+        content += part
+        if len(content) > most:
+            raise ServeError(f"more than {most:,} bytes were sent at once; send less.")
+    return content
 
 
 def make_server(

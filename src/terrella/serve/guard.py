@@ -74,10 +74,11 @@ class RateLimit:
 
 class Guard:
     """ASGI middleware: refuses whom `refusal` refuses, and puts `HEADERS` on every answer. The files that make up a page need
-    no token: there is nothing secret in them."""
+    no token: there is nothing secret in them. `policy` takes the place of the Content-Security-Policy."""
 
-    def __init__(self, app: ASGIApp, host: str, token: str | None, files: Collection[str]):
+    def __init__(self, app: ASGIApp, host: str, token: str | None, files: Collection[str], policy: str | None = None):
         self._app, self._host, self._token, self._files = app, host, token, files
+        self._headers = {**HEADERS, "Content-Security-Policy": policy or HEADERS["Content-Security-Policy"]}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -92,7 +93,7 @@ class Guard:
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                extra = [(name.lower().encode(), value.encode()) for name, value in self._headers.items()]
                 message = {**message, "headers": [*message["headers"], *extra]}
             await send(message)
 

@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .door import application, serve_page
+from .door import application, posted, serve_page
 
 _LONGEST_MESSAGE = 4096  # bytes that the page may post at once
 _BUCKETS = 4096  # of one series, at most
@@ -252,15 +252,10 @@ def build_viewer(
 
 async def _mark_of(request: Request) -> tuple[int, bool]:
     """The posted episode, and whether it is bad; ServeError where that is not what was posted."""
-    content = b""
-    async for part in request.stream():
-        content += part
-        if len(content) > _LONGEST_MESSAGE:
-            break
     try:
-        body = json.loads(content) if len(content) <= _LONGEST_MESSAGE else {}
+        body = json.loads(await posted(request, _LONGEST_MESSAGE))
         number, bad = body["episode"], body["bad"]
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ServeError, ValueError, KeyError, TypeError, RecursionError):
         number, bad = None, None
     if type(number) is not int or type(bad) is not bool:
         raise ServeError("a mark is {episode: a whole number, bad: true or false}; reload the page.")

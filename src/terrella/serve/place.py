@@ -1,0 +1,196 @@
+"""A place of Gaussians as one HTML file that draws, walks and edits by itself, also from a disk; and a server that keeps its
+edits."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import gzip
+import hashlib
+import html
+import json
+import re
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
+
+from ..core.errors import TerrellaError
+from ..space.edits import Edit
+from ..space.files.compressed import packed_quats
+from ..space.occupancy import Body, Occupancy, samples
+from ..space.raster import Gaussians
+from ..space.raster.gaussians import Y0
+from ..space.solids import Solids
+from .door import WEB, application, posted, serve_page
+
+PAGE = WEB / "place"
+MOST_STARTS = 64
+LONGEST_EDITS = 1 << 22  # bytes
+_IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
+_EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What the page shows: Gaussians before all edits, of which `seen` bool [N] were observed, and objects int32 [N] says to which
+    object each belongs (0: none) of those that `names` lists; starts [S, 7] poses; what is solid and who walks; pace and keep as a
+    SplatConfig has them, and dt_s of a step."""
+
+    name: str
+    gaussians: Gaussians
+    seen: torch.Tensor
+    objects: torch.Tensor
+    starts: torch.Tensor
+    collider: Occupancy | Solids
+    body: Body
+    pace: Sequence[float]
+    keep: Sequence[float]
+    dt_s: float
+    names: Sequence[str] = ()
+
+
+class PlacePage:
+    """The page of a place. It loads nothing from anywhere: `policy` is its Content-Security-Policy."""
+
+    def __init__(self, place: Place):
+        columns, (solid, cubes) = _packed(place), _packed_solid(place.collider)
+        self._place, self._solid = place, solid
+        self._data = base64.b64encode(gzip.compress(columns + cubes, 6, mtime=0)).decode()
+        self._style = (WEB / "style.css").read_text("utf-8") + (PAGE / "place.css").read_text("utf-8")
+        self._script = bundled(PAGE / "app.js")
+        self.policy = (
+            f"default-src 'none'; script-src {_hash(self._script)}; worker-src blob:; style-src {_hash(self._style)}; "
+            "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
+        )
+
+    def html(self, edits: Sequence[Edit], save: str = "") -> bytes:
+        """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
+        file."""
+        place = self._place
+        about = {
+            "name": place.name, "count": len(place.gaussians), "solid": self._solid, "body": asdict(place.body), "save": save,
+            "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
+            "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits), "objects": list(place.names), "samples": samples().tolist(),
+        }  # fmt: skip
+        parts = {
+            "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
+            "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data,
+        }  # fmt: skip
+        text = (PAGE / "index.html").read_text("utf-8")
+        return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
+
+
+def bundled(path: Path) -> str:
+    """A script and all that it imports from its own folder as one: each module a function that returns what it exports."""
+    order: list[Path] = []
+
+    def visit(file: Path) -> None:
+        for _, name in _IMPORT.findall(file.read_text("utf-8")):
+            visit(file.with_name(f"{name}.js"))
+        if file not in order:
+            order.append(file)
+
+    visit(path)
+    return "\n".join(_module(file, last=file == path) for file in order)
+
+
+def _module(file: Path, last: bool) -> str:
+    text = _IMPORT.sub(
+        lambda found: f"const {{ {found[1].replace(' as ', ': ')} }} = m_{found[2]};\n", file.read_text("utf-8")
+    )
+    names = [name for _, name in _EXPORT.findall(text)]
+    body = _EXPORT.sub(r"\1", text)
+    return body if last else f"const m_{file.stem} = (() => {{\n{body}return {{ {', '.join(names)} }};\n}})();"
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _packed(place: Place) -> bytes:
+    """The columns that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
+    scene = place.gaussians
+    byte = lambda part: part.round().clamp(0, 255).to(torch.uint8).contiguous().numpy().tobytes()  # noqa: E731
+    return b"".join([
+        _by_bytes(scene.means.numpy(), "<f4"), _by_bytes(packed_quats(scene.quats).numpy(), "<u4"),
+        byte((scene.scales.clamp_min(1e-9).log() + 10) * 16), byte(204 * (0.5 + Y0 * scene.sh[:, 0])), byte(255 * scene.opacities),
+        byte(place.seen.float()), _by_bytes(place.objects.clamp(0, 65535).numpy(), "<u2"),
+    ])  # fmt: skip
+
+
+def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]:
+    """What solid.js reads: a bit for each cube, and for solid ones a byte that says where in it the surface is; nothing of boxes."""
+    if isinstance(occupancy, Solids):
+        return {}, b""
+    solid = occupancy.solid.numpy()
+    floors = occupancy.origin[2] + occupancy.cell_m * torch.arange(solid.shape[2])
+    within = ((occupancy.top - floors) / occupancy.cell_m).clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
+    about = {
+        "origin": occupancy.origin.tolist(),
+        "cell": occupancy.cell_m,
+        "size": list(solid.shape),
+        "filled": int(solid.sum()),
+    }
+    return about, np.packbits(solid.ravel()).tobytes() + within[solid].tobytes()
+
+
+def _by_bytes(numbers: np.ndarray, kind: str) -> bytes:
+    """All first bytes, then all second ones: they compress better so."""
+    flat = np.ascontiguousarray(numbers).ravel().astype(kind)
+    return flat.view(np.uint8).reshape(len(flat), -1).T.tobytes()
+
+
+def build_place(
+    place: Place,
+    edits: Callable[[], Sequence[Edit]],
+    save: Callable[[str], None],
+    host: str = "127.0.0.1",
+    token: str | None = None,
+) -> Starlette:
+    """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts edits as lines of JSON;
+    `save` keeps them or raises a TerrellaError, whose sentence the page shows."""
+    page = PlacePage(place)
+
+    async def keep(request: Request) -> PlainTextResponse:
+        try:
+            content = await posted(request, LONGEST_EDITS)
+            await run_in_threadpool(save, content.decode())
+        except UnicodeDecodeError:
+            return PlainTextResponse("edits are lines of JSON; reload the page.", 422)
+        except TerrellaError as error:
+            return PlainTextResponse(str(error), 422)
+        return PlainTextResponse("")
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+
+    routes = [Route("/edits", keep, methods=["POST"])]
+    return application(lambda: page.html(edits(), "/edits"), routes, lifespan, host, token, page.policy)
+
+
+def serve_place(
+    place: Place,
+    edits: Callable[[], Sequence[Edit]],
+    save: Callable[[str], None],
+    port: int = 8767,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    on_ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serves the page of a place until interrupted; `edits` and `save` as `build_place` has them.
+
+    On any address but this machine's own a token is mandatory, for the page can change the place: where none is given one is
+    made, and the address carries it. ServeError where the port is taken.
+    """
+    build = lambda token: build_place(place, edits, save, host, token)  # noqa: E731
+    serve_page(build, host, port, token, on_ready, websockets=False)

@@ -1,0 +1,192 @@
+// The page of a place: opens it, walks in it, edits it.
+
+import { Boxes } from './boxes.js';
+import { axes, matrices } from './camera.js';
+import { Drawing, NEAR } from './draw.js';
+import { Editor } from './editor.js';
+import { Hands } from './hands.js';
+import { offerHeadset } from './headset.js';
+import { MiniMap } from './minimap.js';
+import { inflate, Reader, unpackScene } from './scene.js';
+import { Solid } from './solid.js';
+import { Sorter } from './sort.js';
+import { Story } from './story.js';
+import { Walker } from './walk.js';
+
+const $ = (id) => document.getElementById(id);
+const TALL = 0.62, WIDEST = 1.35, SLOW_MS = 40, FAST_MS = 20, COARSEST = 0.25;
+const seen = { painted: 0, times: [], share: 1, dirty: true, last: 0, running: false, sorted: '', solidOf: null };
+
+const world = JSON.parse($('world').textContent), canvas = $('view');
+$('name').textContent = world.name;
+await new Promise((done) => { setTimeout(done); });  // so that the banner is shown
+
+const ready = await open().catch((error) => {
+  $('place').dataset.state = 'failed';
+  $('banner').textContent = error.message.charAt(0).toUpperCase() + error.message.slice(1);
+});
+
+async function open() {
+  const drawing = new Drawing(canvas), reader = new Reader(await inflate($('data').textContent));
+  const source = unpackScene(reader, world.count), story = new Story(source, world.edits), solid = world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, world.solid);
+  $('data').remove();
+  return { drawing, source, story, solid };
+}
+
+if (ready) run(ready);
+
+function run({ drawing, source, story, solid: first }) {
+  let solid = first;
+  const walker = new Walker(world), map = new MiniMap($('minimap').querySelector('canvas'));
+  const sorter = new Sorter((order, share) => { drawing.order(order, share); redraw(); });
+  const hands = new Hands(canvas, $('stick'), {
+    moved: wake, tool: (name, event) => editor.open && editor.selecting.handle(name, event),
+    look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
+  });
+  const editor = new Editor(story, drawing, world.objects, {
+    changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep,
+  });
+
+  /** A scene is drawn, and what is solid is read off it. */
+  function take(scene) {
+    drawing.set(scene);
+    sorter.set(scene);
+    solid = scene === source ? first : Solid.of(scene, world.samples);
+    map.layer = null;
+    seen.sorted = '';
+    $('what').textContent = `${scene.length.toLocaleString('en')} Gaussians`;
+    const known = scene.seen.reduce((sum, one) => sum + one, 0) / scene.length;
+    $('share-seen').textContent = `${Math.round(100 * known)}%`;
+    $('share-invented').textContent = `${Math.round(100 * (1 - known))}%`;
+    redraw();
+  }
+
+  function lens() {
+    const aspect = innerWidth / innerHeight, wide = Math.min(WIDEST, TALL * aspect);
+    return { wide, tall: wide / aspect };
+  }
+
+  function redraw() { seen.dirty = true; wake(); }
+
+  function wake() {
+    if (seen.running) return;
+    seen.running = true;
+    seen.last = performance.now();
+    requestAnimationFrame(frame);
+  }
+
+  function frame(time) {
+    const passed = Math.min(Math.max(time - seen.last, 0), 200), moves = walker.pass(solid, hands.wish, passed / 1000);
+    seen.last = time;
+    if (moves) adapt(passed); else if (seen.share < 1) { seen.share = 1; seen.dirty = true; }
+    sort();
+    if (moves || seen.dirty) paint();
+    if (moves || seen.dirty || sorter.busy) requestAnimationFrame(frame); else { seen.running = false; figures(); }
+  }
+
+  /** Coarser while it moves where the browser draws slowly, at full sharpness when it stands still. */
+  function adapt(passed) {
+    seen.mean = 0.8 * (seen.mean ?? FAST_MS) + 0.2 * passed;
+    const share = seen.mean > SLOW_MS ? Math.max(COARSEST, seen.share * (passed > 3 * SLOW_MS ? 0.5 : 0.85)) : seen.mean < FAST_MS ? Math.min(1, seen.share * 1.1) : seen.share;
+    if (share !== seen.share) Object.assign(seen, { share, mean: (SLOW_MS + FAST_MS) / 2 });
+  }
+
+  /** Has the Gaussians ordered for where the eye is, if it is elsewhere than for the last order. */
+  function sort() {
+    const eye = walker.eye, key = [...eye.place, eye.heading, eye.pitch, innerWidth, innerHeight, seen.share].map((part) => part.toFixed(3)).join();
+    if (key === seen.sorted) return;
+    seen.sorted = key;
+    sorter.ask({ eye: eye.place, ...axes(eye), ...lens(), near: NEAR, share: seen.share });
+    seen.dirty = true;
+  }
+
+  function paint() {
+    const sharp = (devicePixelRatio || 1) * seen.share, width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    seen.dirty = false;
+    drawing.clear();
+    drawing.paint(matrices(walker.eye, lens()), [0, 0, width, height], editor.wires);
+    if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
+    seen.painted += 1;
+    seen.times.push(performance.now());
+    if (seen.times.length > 240) seen.times.splice(0, 120);
+    if (drawing.count) $('place').dataset.state = 'open';
+  }
+
+  function figures() {
+    const since = performance.now() - 1500, times = seen.times.filter((time) => time > since);
+    $('fps').textContent = times.length > 4 ? Math.round(((times.length - 1) * 1000) / (times.at(-1) - times[0])) : '–';
+    $('where').textContent = walker.eye.place.map((part) => part.toFixed(1)).join(' ');
+    $('fly').setAttribute('aria-pressed', walker.flying);
+  }
+
+  const home = () => { walker.start(0); redraw(); };
+  const fly = () => { walker.flying = !walker.flying; wake(); figures(); };
+  const flip = (id, shown) => { $(id).setAttribute('aria-pressed', shown); redraw(); };
+  const tint = () => { drawing.tint = 1 - drawing.tint; $('legend').hidden = !drawing.tint; flip('tint', !!drawing.tint); };
+  const showMap = () => { $('minimap').hidden = !$('minimap').hidden; flip('map-open', !$('minimap').hidden); };
+  const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
+  const does = { home, fly, edit: () => editor.toggle(), tint, 'map-open': showMap, full };
+  Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
+  const shortcuts = { KeyH: home, KeyF: fly, KeyE: does.edit, KeyT: tint, KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  addEventListener('keydown', (event) => {
+    if (event.target.closest?.('input')) return;
+    if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
+    else if (!event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey && shortcuts[event.code]) shortcuts[event.code]();
+  });
+  canvas.addEventListener('wheel', (event) => {
+    event.preventDefault();
+    if (!(editor.open && editor.selecting.wheel(editor.chosen, event.deltaY < 0 ? 1.1 : 1 / 1.1))) walker.look(-event.deltaX / 600, -event.deltaY / 1200);
+    redraw();
+  }, { passive: false });
+  addEventListener('resize', () => { map.layer = null; redraw(); });
+  addEventListener('beforeunload', (event) => { if (story.unsaved) event.preventDefault(); });
+  setInterval(figures, 400);
+  offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
+
+  take(story.scene);
+  greet();
+
+  // the state of the page, for whoever drives it by a script
+  window.terrella = {
+    story, editor, drawing, walker, lens, get solid() { return solid; }, get painted() { return seen.painted; },
+    get idle() { return !seen.running && !seen.dirty && drawing.count > 0; }, get eye() { return walker.eye; },
+    stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
+    pixels() {
+      paint();
+      const { gl } = drawing, { width, height } = canvas, data = new Uint8Array(4 * width * height);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
+      return { width, height, data: Array.from(data) };
+    },
+  };
+}
+
+/** Keeps edits: at the server that showed this page, or as a file. */
+async function keep(lines) {
+  if (world.save) {
+    const answer = await fetch(world.save + location.search, { method: 'POST', body: lines });
+    if (!answer.ok) throw new Error(await answer.text());
+    toast('Saved with the place.');
+    return;
+  }
+  const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(new Blob([lines])), download: 'world.edits.jsonl' });
+  anchor.click();
+  setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
+  toast('Saved world.edits.jsonl: `terrella space edit PLACE --replay world.edits.jsonl` does the same to the place.');
+}
+
+function greet() {
+  const caps = (text) => text.split(' ').flatMap((cap) => [Object.assign(document.createElement('kbd'), { textContent: cap }), ' ']);
+  const touch = matchMedia('(pointer: coarse)').matches;
+  $('hint').replaceChildren(...(touch ? ['Left thumb walks, right thumb looks'] : [...caps('W A S D'), 'to walk, drag to look, ', ...caps('Space'), 'lifts off, ', ...caps('C'), 'comes down']));
+  $('hint').classList.add('show');
+  setTimeout(() => $('hint').classList.remove('show'), 8000);
+}
+
+let toastTimer = 0;
+function toast(text) {
+  $('toast').textContent = text.charAt(0).toUpperCase() + text.slice(1);
+  $('toast').classList.add('show');
+  clearTimeout(toastTimer);
+  toastTimer = setTimeout(() => $('toast').classList.remove('show'), 6000);
+}

@@ -1,0 +1,98 @@
+// The language of edits, as space/edits.py speaks it: places are computed in double precision and kept in single.
+
+import { Scene } from './scene.js';
+
+const single = (numbers) => [numbers].flat().map(Math.fround);
+
+/** Which Gaussians {kind: numbers} selects: 1 or 0 for each, and their `count`. */
+export function select(scene, chosen) {
+  const [kind, given] = Object.entries(chosen)[0], n = single(given), { means, objects, length } = scene;
+  const mask = new Uint8Array(length);
+  let test;
+  if (kind === 'box') {
+    const low = [0, 1, 2].map((a) => Math.min(n[a], n[a + 3])), high = [0, 1, 2].map((a) => Math.max(n[a], n[a + 3]));
+    test = (x, y, z) => x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1] && z >= low[2] && z <= high[2];
+  } else if (kind === 'sphere' || kind === 'brush') {
+    test = (x, y, z) => {
+      for (let d = 0; d < n.length; d += 4) if ((x - n[d]) ** 2 + (y - n[d + 1]) ** 2 + (z - n[d + 2]) ** 2 <= n[d + 3] * n[d + 3]) return true;
+      return false;
+    };
+  } else if (kind === 'plane') test = (x, y, z) => x * n[0] + y * n[1] + z * n[2] > n[3];
+  else if (kind === 'object') test = (x, y, z, k) => objects[k] === n[0] && n[0] > 0;
+  else test = () => true;
+  mask.count = 0;
+  for (let k = 0; k < length; k += 1) if (test(means[3 * k], means[3 * k + 1], means[3 * k + 2], k)) { mask[k] = 1; mask.count += 1; }
+  return mask;
+}
+
+/** The middle of what is selected: half way between its ends along each axis. */
+export function middleOf(scene, mask) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let k = 0; k < scene.length; k += 1) {
+    if (!mask[k]) continue;
+    for (let a = 0; a < 3; a += 1) { low[a] = Math.min(low[a], scene.means[3 * k + a]); high[a] = Math.max(high[a], scene.means[3 * k + a]); }
+  }
+  return low.map((value, a) => (value + high[a]) / 2);
+}
+
+/** The scene after an edit; an Error where nothing is selected. What was changed counts as not seen. */
+export function edited(scene, edit) {
+  const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
+  if (!mask.count) throw new Error('nothing lies there; choose another place.');
+  if (edit.do === 'delete') return scene.at(numbers(mask, 0));
+  if (edit.do === 'duplicate') {
+    const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
+    const fresh = scene.objects.reduce((most, number) => Math.max(most, number), 0) + 1, [dx, dy, dz] = single(by);
+    for (let k = many; k < both.length; k += 1) {
+      both.seen[k] = 0;
+      both.objects[k] = fresh;
+      shift(both.means, k, dx, dy, dz);
+    }
+    return both;
+  }
+  const after = scene.copy(), middle = middleOf(scene, mask);
+  const change = { move: () => moved(after, single(by)), turn: () => turned(after, single(degrees)[0], middle), scale: () => scaled(after, single(factor)[0], middle), recolour: () => recoloured(after, single(colour)) }[edit.do]();
+  for (let k = 0; k < after.length; k += 1) if (mask[k]) { change(k); after.seen[k] = 0; }
+  return after;
+}
+
+/** Numbers of those whose mask is `value`; of all where it is -1. */
+function numbers(mask, value) {
+  const found = [];
+  for (let k = 0; k < mask.length; k += 1) if (value < 0 || mask[k] === value) found.push(k);
+  return found;
+}
+
+function shift(means, k, dx, dy, dz) {
+  means[3 * k] += dx;
+  means[3 * k + 1] += dy;
+  means[3 * k + 2] += dz;
+}
+
+const moved = (scene, [dx, dy, dz]) => (k) => shift(scene.means, k, dx, dy, dz);
+
+function turned({ means, quats }, degrees, [mx, my]) {
+  const angle = degrees * (Math.PI / 180), c = Math.cos(angle), s = Math.sin(angle), ch = Math.cos(angle / 2), sh = Math.sin(angle / 2);
+  return (k) => {
+    const x = means[3 * k] - mx, y = means[3 * k + 1] - my, [w, qx, qy, qz] = quats.subarray(4 * k, 4 * k + 4);
+    means[3 * k] = c * x - s * y + mx;
+    means[3 * k + 1] = s * x + c * y + my;
+    quats.set([ch * w - sh * qz, ch * qx - sh * qy, ch * qy + sh * qx, ch * qz + sh * w], 4 * k);
+  };
+}
+
+const scaled = ({ means, scales }, factor, middle) => (k) => {
+  for (let a = 0; a < 3; a += 1) {
+    means[3 * k + a] = (means[3 * k + a] - middle[a]) * factor + middle[a];
+    scales[3 * k + a] *= factor;
+  }
+};
+
+const recoloured = ({ colours }, colour) => (k) => colours.set(colour, 3 * k);
+
+/** An edit in words. */
+export function told(edit) {
+  const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? `object ${edit.select.object}` : `a ${kind}`;
+  const more = { move: () => `by ${edit.by.join(' ')} m`, duplicate: () => `${edit.by.join(' ')} m away`, turn: () => `by ${edit.degrees}°`, scale: () => `× ${edit.factor}`, recolour: () => '', delete: () => '' }[edit.do]();
+  return `${edit.do} ${what} ${more}`.trim();
+}

@@ -1,0 +1,35 @@
+// The edits of a place: those in force, those taken back, and the scene that they make of its source.
+
+import { edited } from './edits.js';
+
+export class Story {
+  constructor(source, edits) {
+    Object.assign(this, { source, edits: [], undone: [], scene: source });
+    this.replay(edits);
+    this.saved = this.lines;
+  }
+
+  get lines() { return this.edits.map((edit) => `${JSON.stringify(edit)}\n`).join(''); }
+
+  get unsaved() { return this.lines !== this.saved; }
+
+  /** Takes these edits in place of those in force; an Error leaves all as it was. */
+  replay(edits, undone = []) {
+    const scene = edits.reduce(edited, this.source);
+    Object.assign(this, { edits: [...edits], undone, scene });
+  }
+
+  add(edit) {
+    this.scene = edited(this.scene, edit);
+    this.edits.push(edit);
+    this.undone = [];
+  }
+
+  undo() {
+    if (this.edits.length) this.replay(this.edits.slice(0, -1), [...this.undone, this.edits.at(-1)]);
+  }
+
+  redo() {
+    if (this.undone.length) this.replay([...this.edits, this.undone.at(-1)], this.undone.slice(0, -1));
+  }
+}

@@ -1,0 +1,235 @@
+"""The page of a place in a real browser: it draws, walks, edits and remembers as Python does, from a disk and from a server."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from terrella.cli import main
+from terrella.cli.space import place_of
+from terrella.library import load
+from terrella.serve.door import make_server, open_port
+from terrella.serve.place import PAGE, PlacePage, build_place, bundled
+from terrella.space.camera import planar_pose
+from terrella.space.edits import edited
+from terrella.space.occupancy import Body, Occupancy
+from terrella.space.raster import rasterise
+from terrella.worlds.splat import SplatConfig, SplatWorld
+from terrella.worlds.splat_folder import checked_edits, read_edits, save_splat, source_of, write_edits
+
+from ..space.test_fitting import LENS, SIZE, room
+from .test_page import until
+
+EDITS = [
+    {"select": {"sphere": [1.0, 2.0, 0.2, 0.7]}, "do": "move", "by": [0.5, 0.25, 0.1]},
+    {"select": {"box": [3.0, 0.0, 0.0, 5.0, 4.0, 3.0]}, "do": "turn", "degrees": 20},
+    {"select": {"brush": [0.0, 2.0, 1.0, 0.5, 0.0, 3.0, 1.0, 0.6]}, "do": "recolour", "colour": [1, 0, 0.5]},
+    {"select": {"object": 2}, "do": "duplicate", "by": [0, 1, 0]},
+    {"select": {"object": 3}, "do": "scale", "factor": 1.5},
+    {"select": {"plane": [0, 0, 1, 2.2]}, "do": "delete"},
+]
+COLUMNS = """() => { const { scene } = terrella.story, listed = (name) => Array.from(scene[name]);
+  return Object.fromEntries(['means', 'scales', 'colours', 'seen', 'objects'].map((name) => [name, listed(name)])); }"""
+
+
+def world(count: int) -> SplatWorld:
+    two = torch.full((1,), 2.0)
+    seen, objects = torch.ones(count, dtype=torch.uint8), torch.zeros(count, dtype=torch.int32)
+    seen[::5], objects[100:140], objects[200:240] = 0, 1, 2
+    starts = planar_pose(two, two, torch.full((1,), 1.6), torch.tensor([0.3]))
+    card = {"objects": ["chair", "table"]}
+    full = room(count=count)
+    full = replace(full, scales=full.scales * min(1, (6000 / count) ** 0.5))  # as dense as the small one
+    return SplatWorld("a <room>", full, seen, starts, SplatConfig(LENS, SIZE), card, objects)
+
+
+@pytest.fixture
+def opened(browser):
+    """opened(address) -> a page that shows its place; fails at the end if a script threw or a policy was broken."""
+    contexts, faults = [], []
+
+    def open_page(url: str, size=(320, 240)):
+        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}))
+        page = contexts[-1].new_page()
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("console", lambda message: faults.append(message.text) if "Content Security" in message.text else None)
+        page.on("request", lambda asked: None if asked.url.startswith(("blob:", url)) else faults.append(asked.url))
+        page.goto(url)
+        until(page, "!!window.terrella && terrella.idle")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not faults, faults
+
+
+def exported(tmp_path, count: int):
+    save_splat(world(count), tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    return (tmp_path / "place.html").as_uri()
+
+
+def rows(means) -> np.ndarray:
+    """Places in an order that does not depend on theirs."""
+    means = np.asarray(means, np.float32).reshape(-1, 3)
+    return means[np.lexsort(means.T)]
+
+
+def test_modules_become_one_script():
+    script = bundled(PAGE / "app.js")
+    assert "\nimport " not in script and "\nexport " not in script
+    assert script.index("const m_scene") < script.index("const m_edits") < script.index("const m_editor")
+    assert set(script.split()) >= {"m_" + file.stem for file in PAGE.glob("*.js")} - {"m_app"}
+
+
+def test_the_page_says_only_what_it_should(tmp_path):
+    save_splat(world(300), tmp_path / "w")
+    page = PlacePage(place_of(str(tmp_path / "w")))
+    text = page.html([{"select": {"all": True}, "do": "delete", "note": "</script><script>"}]).decode()
+    assert "unsafe" not in page.policy and "http" not in page.policy
+    assert text.count("</script>") == 3 and "<title>a &lt;room&gt;" in text and "{{" not in text
+
+
+def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
+    page = opened(exported(tmp_path, 3000))
+    page.evaluate("terrella.stand([1.5, 2.0, 1.4], 0.7, 0)")
+    until(page, "terrella.idle")
+    shown, lens = page.evaluate("terrella.pixels()"), page.evaluate("terrella.lens()")
+    mine = np.array(shown["data"], np.uint8).reshape(shown["height"], shown["width"], 4)[::-1, :, :3] / 255
+    pose = planar_pose(*(torch.tensor([value]) for value in (1.5, 2.0, 1.4, 0.7)))
+    true = rasterise(world(3000).gaussians, pose, (0.5 / lens["wide"], 0.5 / lens["tall"], 0.5, 0.5), mine.shape[:2])
+    error = float(((torch.tensor(mine).permute(2, 0, 1) - true.rgb[0].clamp(0, 1)) ** 2).mean())
+    assert -10 * math.log10(error) > 33
+
+
+def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
+    page, place = opened(exported(tmp_path, 3000)), world(3000)
+    page.evaluate("edits => { terrella.story.replay(edits); }", EDITS)
+    there, here = page.evaluate(COLUMNS), edited(place.gaussians, EDITS, place.objects)
+    assert len(there["seen"]) == len(here.gaussians) < 3040
+    assert np.abs(rows(there["means"]) - rows(here.gaussians.means)).max() < 1e-6
+    seen = torch.where(here.origin < 0, 0, place.provenance[here.origin])
+    for name, mine in (("seen", seen), ("objects", here.objects)):
+        assert sorted(there[name]) == sorted(mine.tolist())
+    for name, mine, off in (("scales", here.gaussians.scales, 0.035), ("colours", here.gaussians.colours, 0.01)):
+        theirs = np.asarray(there[name]).reshape(-1, 3)
+        order, other = (
+            np.lexsort(np.asarray(there["means"]).reshape(-1, 3).T),
+            np.lexsort(here.gaussians.means.numpy().T),
+        )
+        assert (
+            np.abs(theirs[order].clip(0, 1) - mine.numpy()[other]) / (1 if name == "colours" else mine.numpy()[other])
+        ).max() < off
+    page.evaluate("() => { for (let k = 0; k < 6; k += 1) terrella.story.undo(); }")
+    assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(place.gaussians.means))
+
+
+def test_bodies_move_as_they_do_in_python(tmp_path, opened):
+    page, place, body = opened(exported(tmp_path, 6000)), world(6000), Body()
+    rng = torch.Generator().manual_seed(1)
+    points = torch.tensor([-0.5, -0.5, 1.2]) + torch.tensor([5.0, 5.0, 1.5]) * torch.rand(300, 3, generator=rng)
+    wish = 0.6 * torch.rand(300, 3, generator=rng) - 0.3
+    ask = """([p, w]) => { const { solid, walker } = terrella, { body } = walker.world;
+      return p.map((at, k) => [...solid.moved(at, w[k], body), solid.floor(at, body)]); }"""
+    for solid in (place.occupancy, Occupancy.of(edited(place.gaussians, EDITS[:1]).gaussians)):
+        theirs = torch.tensor(page.evaluate(ask, [points.tolist(), wish.tolist()]))
+        mine = torch.cat([solid.moved(points, wish, body), solid.floor(points, body)[:, None]], 1)
+        assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
+        page.evaluate("edits => { terrella.editor.change(() => terrella.story.replay(edits)); }", EDITS[:1])
+
+
+def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened, capsys):
+    page = opened(exported(tmp_path, 200_000))
+    assert len(gzip.compress((tmp_path / "place.html").read_bytes())) < 6_000_000
+    before = page.evaluate("terrella.eye.place")
+    page.keyboard.down("KeyW")
+    until(page, f"Math.hypot(terrella.eye.place[0] - {before[0]}, terrella.eye.place[1] - {before[1]}) > 0.5")
+    page.keyboard.up("KeyW")
+    until(page, "terrella.idle")
+    page.keyboard.down("KeyW")  # to the wall, and no farther
+    time.sleep(2)
+    page.keyboard.up("KeyW")
+    until(page, "terrella.idle")
+    assert page.evaluate("terrella.eye.place")[0] < 3.95 and abs(page.evaluate("terrella.eye.place")[2] - 1.6) < 0.2
+
+    page.evaluate("terrella.stand([2, 2, 1.6], 0.3, -0.3)")
+    until(page, "terrella.idle")
+    page.keyboard.press("KeyE")
+    page.mouse.move(250, 30)  # above the panel
+    page.mouse.down()
+    page.mouse.move(262, 30, steps=3)
+    page.mouse.up()
+    until(page, "!!terrella.editor.mask")
+    chosen = page.evaluate("terrella.editor.mask.count")
+    page.evaluate("document.querySelector('[data-do=delete]').click()")
+    until(page, f"terrella.idle && terrella.story.scene.length === {200_000 - chosen}")
+    page.keyboard.press("Control+z")
+    until(page, "terrella.story.scene.length === 200000")
+    page.keyboard.press("Control+Shift+Z")
+    until(page, f"terrella.story.scene.length === {200_000 - chosen}")
+    page.evaluate("terrella.editor.choose({ sphere: [2, 2, 0, 0.5] })")
+    page.evaluate(
+        "document.getElementById('colour').value = '#ff0000'; document.querySelector('[data-do=recolour]').click()"
+    )
+    with page.expect_download() as download:
+        page.evaluate("document.getElementById('save').click()")
+    download.value.save_as(tmp_path / "saved.jsonl")
+    assert main(["space", "edit", str(tmp_path / "w"), "--replay", str(tmp_path / "saved.jsonl")]) == 0
+    after, there = load(tmp_path / "w"), page.evaluate(COLUMNS)
+    assert isinstance(after, SplatWorld) and len(after.gaussians) == 200_000 - chosen
+    assert np.array_equal(rows(there["means"]), rows(after.gaussians.means))
+    assert sum(there["seen"]) == int((after.provenance == 1).sum()) < 160_000
+    capsys.readouterr()
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "again.html")]) == 0
+    again = opened((tmp_path / "again.html").as_uri())
+    assert np.array_equal(rows(again.evaluate(COLUMNS)["means"]), rows(after.gaussians.means))
+
+
+def test_a_server_keeps_the_edits(tmp_path, opened, serving):
+    save_splat(world(1500), tmp_path / "w")
+    folder = tmp_path / "w"
+    save = lambda text: write_edits(folder, checked_edits(source_of(folder), text))  # noqa: E731
+    url = serving(build_place(place_of(str(folder)), lambda: read_edits(folder), save))
+    page = opened(url)
+    page.evaluate("terrella.editor.choose({ object: 1 })")
+    assert page.evaluate("document.getElementById('count').textContent") == "40 selected: chair"
+    page.evaluate("terrella.editor.act({ do: 'duplicate', by: [0, 0, 1] })")
+    page.evaluate("document.getElementById('save').click()")
+    until(page, "!terrella.story.unsaved")
+    assert read_edits(folder) == [{"select": {"object": 1}, "do": "duplicate", "by": [0, 0, 1]}]
+    page.reload()
+    until(page, "!!window.terrella && terrella.story.scene.length === 1540")
+    answer = page.evaluate(
+        "fetch('/edits', { method: 'POST', body: '{\"do\": 1}' }).then((a) => a.text().then((t) => [a.status, t]))"
+    )
+    assert answer[0] == 422 and "selects one of" in answer[1] and len(read_edits(folder)) == 1
+
+
+@pytest.fixture
+def serving():
+    """serving(application) -> its address; stopped at the end of the test."""
+    import threading
+
+    stops = []
+
+    def start(app) -> str:
+        listener, ready, address = open_port("127.0.0.1", 0), threading.Event(), []
+        server = make_server(app, listener, "127.0.0.1", None, lambda url: (address.append(url), ready.set()), False)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        assert ready.wait(20)
+        stops.append((server, thread, listener))
+        return address[0]
+
+    yield start
+    for server, thread, listener in stops:
+        server.should_exit = True
+        thread.join(20)
+        listener.close()
