@@ -24,7 +24,7 @@ from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import checked_edits, read_edits, save_splat, source_of, write_edits
 
 from ..space.test_fitting import LENS, SIZE, room
-from .test_page import until
+from .test_page import until as within
 
 EDITS = [
     {"select": {"sphere": [1.0, 2.0, 0.2, 0.7]}, "do": "move", "by": [0.5, 0.25, 0.1]},
@@ -36,6 +36,14 @@ EDITS = [
 ]
 COLUMNS = """() => { const { scene } = terrella.story, listed = (name) => Array.from(scene[name]);
   return Object.fromEntries(['means', 'scales', 'colours', 'seen', 'objects'].map((name) => [name, listed(name)])); }"""
+
+PATIENCE_S = 240  # drawn in software, perhaps on a busy machine
+MOVED = """([p, w]) => { const { solid, walker } = terrella, { body } = walker.world;
+  return p.map((at, k) => [...solid.moved(at, w[k], body), solid.floor(at, body)]); }"""
+
+
+def until(page, expression: str) -> None:
+    within(page, expression, PATIENCE_S)
 
 
 def world(count: int) -> SplatWorld:
@@ -136,13 +144,27 @@ def test_bodies_move_as_they_do_in_python(tmp_path, opened):
     rng = torch.Generator().manual_seed(1)
     points = torch.tensor([-0.5, -0.5, 1.2]) + torch.tensor([5.0, 5.0, 1.5]) * torch.rand(300, 3, generator=rng)
     wish = 0.6 * torch.rand(300, 3, generator=rng) - 0.3
-    ask = """([p, w]) => { const { solid, walker } = terrella, { body } = walker.world;
-      return p.map((at, k) => [...solid.moved(at, w[k], body), solid.floor(at, body)]); }"""
     for solid in (place.occupancy, Occupancy.of(edited(place.gaussians, EDITS[:1]).gaussians)):
-        theirs = torch.tensor(page.evaluate(ask, [points.tolist(), wish.tolist()]))
+        theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
         mine = torch.cat([solid.moved(points, wish, body), solid.floor(points, body)[:, None]], 1)
         assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
         page.evaluate("edits => { terrella.editor.change(() => terrella.story.replay(edits)); }", EDITS[:1])
+
+
+def test_known_walls_are_met_as_in_python(tmp_path, opened):
+    boxes = torch.tensor(
+        [[-1, -1, -0.2, 5, 5, 0], [4, -1, 0, 4.2, 5, 3], [1, 1, 0, 2, 2, 0.3], [0, 3, 0, 4, 3.2, 2]]
+    ).float()
+    full, body = world(600), Body()
+    walled = SplatWorld("walls", full.gaussians, full.provenance, full.starts, full.config, solids=boxes)
+    save_splat(walled, tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page, rng = opened((tmp_path / "place.html").as_uri()), torch.Generator().manual_seed(2)
+    points = torch.tensor([0.0, 0.0, 1.6]) + torch.tensor([4.0, 4.0, 0.6]) * torch.rand(300, 3, generator=rng)
+    wish = torch.rand(300, 3, generator=rng) - 0.5
+    theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
+    mine = torch.cat([walled.collider.moved(points, wish, body), walled.collider.floor(points, body)[:, None]], 1)
+    assert ((theirs - mine).abs().amax(1) < 0.01).float().mean() > 0.98
 
 
 def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened, capsys):

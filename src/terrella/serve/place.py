@@ -79,7 +79,8 @@ class PlacePage:
         about = {
             "name": place.name, "count": len(place.gaussians), "solid": self._solid, "body": asdict(place.body), "save": save,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
-            "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits), "objects": list(place.names), "samples": samples().tolist(),
+            "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits),
+            "objects": list(place.names), "samples": samples().tolist(),
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
@@ -128,7 +129,8 @@ def _packed(place: Place) -> bytes:
 
 
 def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]:
-    """What solid.js reads: a bit for each cube, and for solid ones a byte that says where in it the surface is; nothing of boxes."""
+    """What solid.js reads: a bit for each cube, and for solid ones a byte that says where in it the surface is; boxes
+    need nothing."""
     if isinstance(occupancy, Solids):
         return {}, b""
     solid = occupancy.solid.numpy()

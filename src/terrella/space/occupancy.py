@@ -119,7 +119,6 @@ class Occupancy:
         return at.clamp_min(0).minimum(size - 1).unbind(-1), ((at >= 0) & (at < size)).all(-1)
 
 
-<<<<<<< HEAD
 def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
     """Places [B, 3] moved by `wish` [B, 3] in short steps, none of which goes deeper into anything (`depth` [B] says how deep a
     place is): the whole step, or along one axis after the other."""
@@ -133,9 +132,9 @@ def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wi
             place, here = torch.where(free[:, None], there, place), torch.where(free, deep, here)
             step = torch.where(free[:, None], step * (1 - step.new_tensor(axes)), step)
     return place
-=======
+
+
 def samples() -> torch.Tensor:
     """Points [n, 3] at which each Gaussian is looked at, in its deviations."""
     noise = torch.randn(_SAMPLES, 3, generator=torch.Generator().manual_seed(0))
     return noise * (1.2 / noise.norm(dim=1, keepdim=True).clamp_min(1.2))
->>>>>>> 3afc856 (Places in the browser: one HTML file that draws, walks and edits; a server that keeps its edits)
