@@ -159,8 +159,6 @@ def _sentence(error: Exception) -> str | None:
         return f"{error.strerror}{where}; choose another folder, or free some space."
     if isinstance(error, ModuleNotFoundError) and error.name in ("mujoco", "glfw", "OpenGL"):
         return f"{error.name} is not installed; `pip install 'terrella[mujoco]'` installs what MuJoCo's worlds need."
-    if isinstance(error, ModuleNotFoundError) and error.name == "imageio":
-        return "Gymnasium's MuJoCo environments draw with imageio: `pip install 'terrella[mujoco]'` installs it."
     if _of_a_renderer(error):
         sys.unraisablehook = lambda _: None  # half-made renderers complain again when they are thrown away
         what = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
