@@ -113,3 +113,16 @@ def test_the_command_says_what_it_did_not_understand(tmp_path, capsys):
     for wrong in (["--text", "quux"], [], [str(tmp_path / "none.json")], ["--text", "room", "--gaussians", "3"]):
         assert main(["space", "build", *wrong, "--out", str(tmp_path / "no")]) != 0
         assert not (tmp_path / "no").exists() and len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_it_is_exported_to_other_tools(folder, tmp_path, capsys):
+    (tmp_path / "path.json").write_text(json.dumps([[1, 1, 1.6, 0], [2, 1, 1.6, 90]]))
+    way = ["--seconds", "0.5", "--path", str(tmp_path / "path.json")]
+    for name, more, head in (("c.glb", ["--kind", "collider"], b"glTF"), ("g.glb", ["--kind", "gaussians"], b"glTF"),
+                             ("p.png", [], b"\x89PNG"), ("f.mp4", way, b"\0\0\0")):  # fmt: skip
+        assert main(["space", "export", str(folder), str(tmp_path / name), *more]) == 0
+        assert (tmp_path / name).read_bytes().startswith(head)
+    (tmp_path / "path.json").write_text("[[1, 2]]")
+    for name, more in (("no.mp4", way), ("no.mp4", ["--seconds", "-1"]), ("no.glb", ["--cell", "nan"]), ("no.obj", [])):
+        assert main(["space", "export", str(folder), str(tmp_path / name), *more]) != 0
+    assert not [path for path in tmp_path.iterdir() if "no." in path.name]

@@ -17,6 +17,7 @@ from ..worlds.folder import open_world
 from ..worlds.splat import OBSERVED, SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
 from .say import Host, Json, Port, Token, result
+from .space_export import ENDINGS, Kind, write_other
 
 if TYPE_CHECKING:
     from ..serve.place import Place
@@ -81,17 +82,26 @@ def export(
     file: Positional[Path],
     axes: Axes | None = None,
     compressed: bool = False,
+    kind: Kind = "mesh",
+    cell: float = 0.05,
+    seconds: float = 8.0,
+    path: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Write the Gaussians of a world for other tools (.ply, or .spz of version 3), or as a page to walk in and edit (.html).
+    """Write a world for other tools: Gaussians as .ply or .spz (version 3), .glb, a panorama (.png), a film (.mp4), a page (.html).
 
-    The page is one file that draws by itself, also from a disk; it holds the place as it was before its edits, and these.
+    The page, to walk in and edit, is one file that draws by itself, also from a disk;
+    it holds the place as it was before its edits, and these.
 
     Args:
         world: A world of Gaussians: its folder, or the run that made it.
         file: The file to write; its ending says which kind.
         axes: Axes of the file; default: rdf for .ply and rub for .spz.
         compressed: SuperSplat's compressed kind of .ply.
+        kind: What a .glb holds: a mesh with colours, the mesh of what stops bodies, or the Gaussians (KHR_gaussian_splatting).
+        cell: Metres of a cell of the mesh.
+        seconds: Of the film.
+        path: The film's way: a JSON list of [x, y, z, degrees]. Default: a look around from each start.
     """
     if file.suffix.lower() == ".html":
         from ..serve.place import PlacePage
@@ -101,6 +111,9 @@ def export(
         replace_whole(file, lambda staged: staged.write_bytes(content))
         return result({"gaussians": len(place.gaussians), "bytes": file.stat().st_size, "file": str(file)}, json)
     opened = open_splat(world)
+    if file.suffix.lower() in ENDINGS:
+        result(write_other(opened, file, kind, cell, seconds, path), json)
+        return
     write_scene(opened.gaussians, file, axes, "compressed" if compressed else "")
     facts = {"gaussians": len(opened.gaussians), "bytes": file.stat().st_size, "file": str(file)}
     result(facts, json)

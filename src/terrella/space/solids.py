@@ -6,7 +6,6 @@ World frame, metres, z up. A body is an upright round column; its place is where
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 
@@ -14,13 +13,6 @@ from .occupancy import Body, slide
 
 _FOOT_M = 0.1  # what lies so far beside the middle of a body still bears it
 _DEEPEST_M = 8.0  # floors lower than this below the feet are not looked for
-
-
-class Collider(Protocol):
-    """What walks and flies need to know of a place."""
-
-    def floor(self, place: torch.Tensor, body: Body) -> torch.Tensor: ...
-    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor: ...
 
 
 @dataclass(frozen=True)

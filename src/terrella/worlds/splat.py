@@ -19,7 +19,7 @@ from ..core.world import Observation
 from ..space.camera import Intrinsics, yaw
 from ..space.occupancy import Body, Occupancy
 from ..space.raster import Drawing, Gaussians, rasterise
-from ..space.solids import Collider, Solids
+from ..space.solids import Solids
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "UP", "DOWN")
 KEYS = {
@@ -105,7 +105,7 @@ class SplatWorld:
         return Occupancy.of(self.gaussians)
 
     @cached_property
-    def collider(self) -> Collider:
+    def collider(self) -> Solids | Occupancy:
         """What stops bodies."""
         return Solids(self.solids) if len(self.solids) else self.occupancy
 

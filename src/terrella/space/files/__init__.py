@@ -1,4 +1,4 @@
-"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ."""
+"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ; see glb.py for GLB."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None,
     """Writes a .ply or .spz (version 3); kind "compressed" makes the .ply SuperSplat's. The file is replaced whole."""
     path = Path(path)
     if path.suffix.lower() not in _USUAL:
-        raise DatasetError(f"{path}: Gaussians are written as .ply or .spz; give a name that ends so.")
+        raise DatasetError(f"{path}: a place is written as .ply, .spz, .glb, .png or .mp4; give a name that ends so.")
     if not len(gaussians):
         raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
     if kind == "compressed" and path.suffix.lower() != ".ply":
