@@ -19,6 +19,8 @@ COMMANDS = {
     "play": ("play:play", "play a world in the browser"),
     "plan": ("planning:plan", "plan in a world, act in the real environment"),
     "evaluate": ("evaluate:evaluate", "judge policies in a world and in the real environment"),
+    "transfer": ("transfer:transfer", "carry policies over to a real robot that differs, and measure what helps"),
+    "bench acceleration": ("acceleration:acceleration", "how much faster than time a world imagines, beside MuJoCo"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),

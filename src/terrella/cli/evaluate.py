@@ -139,10 +139,10 @@ def _report(log: JudgedLog, names: tuple[str, ...], episodes: int, folder: Path,
     page.write_text(judged_page(title, found, facts), encoding="utf-8")
     whole = sound({**as_dict(found), **facts, "names": {labels[name]: name for name in names}, "page": str(page)})
     log.save(whole)
-    result(whole, json, "\n".join([*verdict(found), "", *_table(*table(found)), "", f"the page: {page}"]))
+    result(whole, json, "\n".join([*verdict(found), "", *table_lines(*table(found)), "", f"the page: {page}"]))
 
 
-def _table(heads: list[str], lines: list[list[str]]) -> list[str]:
+def table_lines(heads: list[str], lines: list[list[str]]) -> list[str]:
     widths = [max(len(line[at]) for line in [heads, *lines]) for at in range(len(heads))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths)).rstrip() for line in [heads, *lines]]
 

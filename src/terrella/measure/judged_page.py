@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from pathlib import Path
 
 from .judged import CONTROL, DREAM, HELD, RANDOM, REAL, SUCCESS, UNCERTAINTY, Judged, table, verdict
-from .page_parts import COLOURS, QUIET, section, table_of
+from .page_parts import COLOURS, QUIET, document, keys_of, section, table_of, words_and_interval
 from .plot import Line, line_chart, y_span
 from .plot_points import Point, listed, scatter
 from .statistics import Band
 
-_HERE = Path(__file__).parent
 _REAL, _DREAM = COLOURS[1], COLOURS[0]
 
 
 def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
     """HTML that needs nothing from outside."""
-    style = (_HERE / "page.css").read_text(encoding="utf-8")
     lines = [line[:1].upper() + line[1:] for line in verdict(judged)]
     heads, cells = table(judged)
-    found = table_of(list(map(escape, heads)), [[_cell(cell) for cell in line] for line in cells])
+    found = table_of(list(map(escape, heads)), [[words_and_interval(cell) for cell in line] for line in cells])
     known = {name.replace("_", " "): value for name, value in facts.items() if value is not None}
     settings = "".join(f"<li>{escape(name)}: {escape(str(value))}</li>" for name, value in known.items())
     words = "".join(f"<li>{escape(line)}</li>" for line in lines[1:])
@@ -37,18 +34,7 @@ def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
         ),
         section("How this was measured", "", _method(judged) + f"<h3>Settings</h3><ul>{settings}</ul>"),
     ]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1></header>"
-        f"<main>{''.join(parts)}</main></body></html>\n"
-    )
-
-
-def _cell(words: str) -> str:
-    value, _, interval = words.partition(" [")
-    low_high = interval.rstrip("]").replace(", ", " to ")
-    return escape(value) + (f"<small>{escape(low_high)}</small>" if interval else "")
+    return document(title, parts)
 
 
 def _lead(judged: Judged) -> str:
@@ -80,7 +66,7 @@ def _listed(judged: Judged) -> str:
     keys = {{REAL: "in reality", DREAM: "in the dream"}[arm]: colour for arm, colour in shown.items()}
     keys |= {"acting at random" + (" in reality" if real else ""): QUIET} if floor else {}
     label = "share of successes" if judged.what == SUCCESS else judged.what
-    return f'<div class=scroll><div style="min-width:560px">{listed(rows, label, guides)}</div></div>{_keys(keys)}'
+    return f'<div class=scroll><div style="min-width:560px">{listed(rows, label, guides)}</div></div>{keys_of(keys)}'
 
 
 def _errors(judged: Judged) -> str:
@@ -96,7 +82,7 @@ def _errors(judged: Judged) -> str:
         told = channel == UNCERTAINTY
         title = "The uncertainty that the dream tells" if told else f"Error in {channel}"
         svg = line_chart(lines, ticks, "steps", "expected error" if told else "distance to reality", True, span)
-        keys = _keys({line.label: line.colour for line in lines})
+        keys = keys_of({line.label: line.colour for line in lines})
         boxes += f"<figure><h3>{escape(title)}</h3>{svg}{keys}</figure>"
     return f"<div class=charts>{boxes}</div>" if boxes else ""
 
@@ -104,15 +90,6 @@ def _errors(judged: Judged) -> str:
 def _line(label: str, band: Band, colour: str, dash: str = "") -> Line:
     steps = list(map(float, range(1, len(band.value))))
     return Line(label, steps, band.value[1:], band.low[1:], band.high[1:], colour, dash)
-
-
-def _keys(colours: Mapping[str, str]) -> str:
-    keys = "".join(
-        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{colour}" stroke-width="2.5"/></svg>'
-        f"{escape(label)}</span>"
-        for label, colour in colours.items()
-    )
-    return f"<figcaption>{keys}</figcaption>"
 
 
 def _method(judged: Judged) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,34 @@ QUIET = "#8b93a3"
 
 def section(heading: str, lead: str, inside: str) -> str:
     return f"<section><h2>{escape(heading)}</h2><p>{lead}</p>{inside}</section>" if inside else ""
+
+
+def document(title: str, sections: Sequence[str]) -> str:
+    """A page that needs nothing from outside."""
+    style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1></header>"
+        f"<main>{''.join(sections)}</main></body></html>\n"
+    )
+
+
+def keys_of(colours: Mapping[str, str]) -> str:
+    """The legend of a chart: label -> colour."""
+    keys = "".join(
+        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{colour}" stroke-width="2.5"/></svg>'
+        f"{escape(label)}</span>"
+        for label, colour in colours.items()
+    )
+    return f"<figcaption>{keys}</figcaption>"
+
+
+def words_and_interval(words: str) -> str:
+    """A cell of "VALUE [LOW, HIGH]", the interval small."""
+    value, _, interval = words.partition(" [")
+    low_high = interval.rstrip("]").replace(", ", " to ")
+    return escape(value) + (f"<small>{escape(low_high)}</small>" if interval else "")
 
 
 def number(value: float) -> str:

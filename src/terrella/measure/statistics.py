@@ -67,6 +67,30 @@ def wilson(successes: int, count: int) -> Figure:
     return Figure(share, max(0.0, middle - half), min(1.0, middle + half), count)
 
 
+def clopper_pearson(successes: int, count: int) -> Figure:
+    """The share of successes with the exact 95% interval of Clopper and Pearson (1934): what it leaves out is less likely than
+    2.5% either way."""
+    if not count:
+        return Figure(math.nan, math.nan, math.nan, 0)
+    log_ways = [math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(count + 1)]
+
+    def at_least(least: int, share: float) -> float:
+        """How likely `least` successes or more are."""
+        one, none = math.log(share), math.log1p(-share)
+        return sum(math.exp(log_ways[k] + k * one + (count - k) * none) for k in range(least, count + 1))
+
+    def where(least: int, level: float) -> float:
+        low, high = 0.0, 1.0
+        for _ in range(50):
+            middle = (low + high) / 2
+            low, high = (middle, high) if at_least(least, middle) < level else (low, middle)
+        return (low + high) / 2
+
+    low = where(successes, 0.025) if successes else 0.0
+    high = where(successes + 1, 0.975) if successes < count else 1.0
+    return Figure(successes / count, low, high, count)
+
+
 def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
     """sum(top) / sum(bottom) over clips [n], both resampled together: no clip with a tiny denominator rules it."""
     return ratio_band(top[:, None], bottom[:, None], rng).at(0)

@@ -81,7 +81,7 @@ class MujocoWorld:
         label = name.file if isinstance(name, Robot) else str(name)
         robot = name if isinstance(name, Robot) else None if label.endswith(FILES) else robot_of(label)
         spec = complete(read(label) if robot is None else robot.spec(label), label)
-        self._seen = compiled(spec, label)
+        self._source, self._seen = spec, compiled(spec, label)
         self.file = bare(spec, self._seen, label)
         self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it would begin anew in silence
         self.name = f"mujoco:{label}"
@@ -131,6 +131,22 @@ class MujocoWorld:
                     f"{float(column.min()):g} to {float(column.max()):g}."
                 )
         return state.replace(parameters=values.double())
+
+    def replaced(self, before: State, state: State, qpos: torch.Tensor, qvel: torch.Tensor) -> State:
+        """`state`, to which a step from `before` has led, with other qpos [B, nq] and qvel [B, nv]: sensed and judged anew."""
+        physics = state["physics"].clone()
+        physics[:, self.body.qpos], physics[:, self.body.qvel] = qpos.double(), qvel.double()
+        values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
+        with self._lock:
+            _, sensors, _ = self._stepper.step(physics, state["warmstart"], state["ctrl"], values, 1)
+        after = {"physics": physics, "sensors": sensors}
+        reward, fallen, kept = self.task.judge(self.body, before, {**dict(state.items()), **after})
+        over = before["done"]
+        return state.replace(**after, **kept, reward=reward.masked_fill(over, 0.0), done=state["done"] | fallen)
+
+    def fingerprint(self) -> str:
+        """All that its physics and its task are made of, as text: two worlds of the same text are the same world."""
+        return f"MuJoCo {mujoco.__version__}, {self._steps} steps a control step, {self.task}\n{self._source.to_xml()}"
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` worlds at rest, changed as the task has it."""

@@ -146,7 +146,7 @@ class Randomised:
             raise TerrellaError(f"the scale of what is randomised is from 0 to 1; got {scale:g}.")
         self.scale = scale
         nominal = [known[name].nominal if name in known else 0.0 for name in distributions]
-        self._nominal = torch.tensor(nominal, dtype=torch.float64)
+        self.nominal = torch.tensor(nominal, dtype=torch.float64)
         names = tuple(distributions)
         told = {name: {one.kind: list(one.numbers)} for name, one in distributions.items()}
         shown = spaces.Box(-np.inf, np.inf, (len(names),), np.float32)
@@ -194,20 +194,25 @@ class Randomised:
         if close is not None:
             close()
 
-    def _drew(self, state: State, rng: torch.Generator) -> State:
-        """The state with what its episodes drew."""
-        seeds, names = chance.seeds(state.batch, rng), list(self.distributions)
-        drawn = torch.stack([one.draw(seeds, _DRAW + at) for at, one in enumerate(self.distributions.values())], 1)
-        drawn = self._nominal + self.scale * (drawn - self._nominal)
+    def drawn_as(self, state: State, drawn: torch.Tensor) -> State:
+        """The state with values [B, n] drawn for the parameters, in their order; what was asked of late axes is forgotten."""
+        names, rest = list(self.distributions), torch.from_numpy(neutral_action(self.spec))
         if self._own:
             adjustable: Any = self.world
             state = adjustable.adjusted(state, drawn[:, [names.index(name) for name in self._own]])
-        held, rest = {f"{_HELD}drawn": drawn, _SEEDS: seeds}, torch.from_numpy(neutral_action(self.spec))
+        held = {f"{_HELD}drawn": drawn}
         if BACKLASH in self.distributions:
             held[f"{_HELD}followed"] = rest.expand(state.batch, *rest.shape).clone()
         if self._latest:
             held[f"{_HELD}queue"] = rest.expand(state.batch, self._latest, *rest.shape).clone()
         return state.replace(**held)
+
+    def _drew(self, state: State, rng: torch.Generator) -> State:
+        """The state with what its episodes drew."""
+        seeds = chance.seeds(state.batch, rng)
+        drawn = torch.stack([one.draw(seeds, _DRAW + at) for at, one in enumerate(self.distributions.values())], 1)
+        drawn = self.nominal + self.scale * (drawn - self.nominal)
+        return self.drawn_as(state, drawn).replace(**{_SEEDS: seeds})
 
     def _drawn(self, state: State, name: str) -> torch.Tensor:
         return state[f"{_HELD}drawn"][:, list(self.distributions).index(name)]

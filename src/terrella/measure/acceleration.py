@@ -1,0 +1,106 @@
+"""How much faster than time a world imagines, with fresh actions at each control step: per stream, in all, and in joules."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from ..core.state import State
+from ..core.world import World, make_rng
+from .statistics import Figure, last_step_above
+
+POWERCAP = Path("/sys/class/powercap")
+WATTS_OF_A_CORE = 10.0  # assumed where no counter of energy is at hand
+LEARNERS = ("observation", "reward", "done")  # what a learner is shown at each step
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Of one batch size: imagined seconds a wall second, of all streams together, and joules an imagined second."""
+
+    batch: int
+    aggregate: float
+    joules: float
+
+    @property
+    def stream(self) -> float:
+        return self.aggregate / self.batch
+
+
+class Meter:
+    """Joules since it was made: of RAPL where the machine tells, else processor seconds at an assumed power."""
+
+    def __init__(self) -> None:
+        self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _readable(file))
+        self._first, self._busy = self._counted(), time.process_time()
+
+    @property
+    def how(self) -> str:
+        return "RAPL, of the whole processor" if self.files else f"estimated: {WATTS_OF_A_CORE:g} W a busy core"
+
+    def joules(self) -> float:
+        if self.files:
+            return (self._counted() - self._first) / 1e6
+        return WATTS_OF_A_CORE * (time.process_time() - self._busy)
+
+    def _counted(self) -> int:
+        return sum(int(file.read_text()) for file in self.files)
+
+
+@torch.inference_mode()
+def pace(world: World, batch: int, seconds: float, seed: int = 0) -> Pace:
+    """Steps `batch` streams for about `seconds` of wall time, each step with fresh uniform actions, showing what a learner sees."""
+    rng, spec = make_rng(seed), world.spec
+    shown = [name for name in LEARNERS if name in spec.channels]
+    low, high = (torch.as_tensor(limit).float() for limit in spec.action_limits)
+    state = _stepped(world, world.start(batch, rng), low, high, shown, rng)  # the first may compile
+    fresh, steps, meter, began = state, 0, Meter(), time.perf_counter()
+    while (took := time.perf_counter() - began) < seconds or steps < 3:
+        state = _stepped(world, state, low, high, shown, rng)
+        steps += 1
+        if steps % 50 == 0:
+            state = fresh  # so that none stands still after its end
+    imagined = batch * steps * spec.dt_s
+    return Pace(batch, imagined / took, meter.joules() / imagined)
+
+
+def _stepped(
+    world: World, state: State, low: torch.Tensor, high: torch.Tensor, shown: Sequence[str], rng: torch.Generator
+) -> State:
+    action = low + (high - low) * torch.rand(state.batch, *low.shape, generator=rng)
+    state = world.imagine(state, action, rng)
+    world.render(state, shown)
+    return state
+
+
+@torch.inference_mode()
+def horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int = 0) -> Figure:
+    """The steps for which the world, begun where episodes of the real one do and given the same random actions, foretells its
+    numbers better than standing still does; in the channels that it observes."""
+    rng, names = make_rng(seed), list(world.spec.observes)
+    truth = real.start(episodes, rng)
+    first = real.render(truth, names)
+    state, gains = world.observe(first, None, rng), []
+    low, high = (torch.as_tensor(limit).float() for limit in real.spec.action_limits)
+    for _ in range(steps):
+        action = low + (high - low) * torch.rand(episodes, *low.shape, generator=rng)
+        truth, state = real.imagine(truth, action, rng), world.imagine(state, action, rng)
+        seen, dreamt = real.render(truth, names), world.render(state, names)
+        unit = {name: seen[name].float().std(0).clamp_min(1e-3) for name in names}
+        error, held = (
+            sum(((seen[name] - other[name]).float() / unit[name]).square().flatten(1).mean(1) for name in names)
+            for other in (dreamt, first)
+        )
+        gains.append(torch.as_tensor(held - error))
+    return last_step_above(torch.stack(gains, 1), torch.zeros(episodes), rng)
+
+
+def _readable(file: Path) -> bool:
+    try:
+        return bool(file.read_text())
+    except OSError:
+        return False

@@ -1,0 +1,109 @@
+"""What came of carrying policies over to a real robot: successes of each arm, how much of the gap it recovers, and a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from .agreement import Agreement, agreement
+from .judged import share, told
+from .statistics import Figure, clopper_pearson
+
+NOMINAL, ORACLE, RANDOM, IDLE = "nominal", "oracle", "random", "idle"
+FLOORS = (RANDOM, IDLE)
+FAILS, SUCCEEDS, RECOVERS = 0.2, 0.8, 0.6  # shares that the experiment asks for
+
+Played = Mapping[str, Mapping[int, torch.Tensor]]  # arm -> seed -> successes [episodes]
+
+
+@dataclass(frozen=True)
+class Transferred:
+    """arms: of each its successes in the real one, over all seeds and episodes; least, most: over seeds; recovered: of the gap
+    between nominal and oracle; dial: arm -> gap -> successes; agreed: by simulator or model, how it and the real one agree on
+    all policies."""
+
+    arms: dict[str, Figure]
+    spread: dict[str, tuple[float, float]]
+    recovered: dict[str, float]
+    dial: dict[str, dict[float, Figure]]
+    agreed: dict[str, Agreement]
+
+
+def transferred(
+    real: Played, dial: Mapping[str, Mapping[float, torch.Tensor]], inside: Mapping[str, Played]
+) -> Transferred:
+    """Figures of all arms. inside: by simulator or model, the same policies' successes there, from starts of its own."""
+    arms = {arm: _share(torch.cat(list(seeds.values()))) for arm, seeds in real.items()}
+    spread = {arm: _ends([float(one.float().mean()) for one in seeds.values()]) for arm, seeds in real.items()}
+    recovered = {}
+    if NOMINAL in arms and ORACLE in arms and arms[ORACLE].value > arms[NOMINAL].value:
+        low, high = arms[NOMINAL].value, arms[ORACLE].value
+        recovered = {arm: (figure.value - low) / (high - low) for arm, figure in arms.items() if arm not in FLOORS}
+    rng = torch.Generator().manual_seed(0)
+    agreed = {}
+    for name, played in inside.items():
+        pairs = [
+            (one, real[arm][seed]) for arm, seeds in played.items() for seed, one in seeds.items() if arm != ORACLE
+        ]
+        if len(pairs) > 2:
+            dreamt, seen = (torch.stack([pair[at].float() for pair in pairs]) for at in (0, 1))
+            agreed[name] = agreement(dreamt, seen, rng, 1.0)
+    curves = {arm: {gap: _share(one) for gap, one in gaps.items()} for arm, gaps in dial.items()}
+    return Transferred(arms, spread, recovered, curves, agreed)
+
+
+def best(found: Transferred) -> str:
+    """The arm that succeeds most often of those that saw few real episodes or none."""
+    own = [arm for arm in found.arms if arm not in (*FLOORS, NOMINAL, ORACLE)]
+    return max(own, key=lambda arm: found.arms[arm].value, default=NOMINAL)
+
+
+def verdict(found: Transferred) -> list[str]:
+    """Sentences, the answer first."""
+    arms, winner = found.arms, best(found)
+    lines = [f"Trained in the simulator alone a policy succeeds in {share(arms[NOMINAL])} of real episodes"]
+    if winner != NOMINAL:
+        lines[0] += f"; the best of the others, {winner}, in {share(arms[winner])}"
+    lines[0] += "."
+    if ORACLE in arms:
+        lines.append(f"trained in the real one itself: {share(arms[ORACLE])}")
+    lines += [f"{arm}: {share(arms[arm])}" for arm in FLOORS if arm in arms]
+    if arms[NOMINAL].value >= FAILS:
+        lines.append(f"the gap is small: nominal succeeds in {FAILS:.0%} or more, so there is little to carry over")
+    for arm, part in found.recovered.items():
+        if arm not in (NOMINAL, ORACLE):
+            lines.append(f"{arm} recovers {part:.0%} of the gap between nominal and oracle")
+    for name, agreed in found.agreed.items():
+        lines.append(
+            f"{name} and the real one on {agreed.pearson.count} policies: Pearson {told(agreed.pearson)}, MMRV {told(agreed.mmrv)}"
+        )
+    return lines
+
+
+def table(found: Transferred) -> tuple[list[str], list[list[str]]]:
+    """Heads and lines of the arms in their order."""
+    lines = []
+    for arm, figure in found.arms.items():
+        low, high = found.spread[arm]
+        part = f"{found.recovered[arm]:.0%}" if arm in found.recovered else ""
+        lines.append([arm, share(figure), f"{low:.0%} to {high:.0%}", part])
+    return ["arm", "real successes", "seeds", "gap recovered"], lines
+
+
+def as_dict(found: Transferred) -> dict[str, Any]:
+    """Plain data for JSON, the verdict first."""
+    plain = dataclasses.asdict(found)
+    plain["dial"] = {arm: {f"{gap:g}": one for gap, one in gaps.items()} for arm, gaps in plain["dial"].items()}
+    return {"verdict": verdict(found), **plain}
+
+
+def _share(successes: torch.Tensor) -> Figure:
+    return clopper_pearson(int(successes.sum()), len(successes))
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    return min(values), max(values)

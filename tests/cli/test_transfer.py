@@ -1,0 +1,121 @@
+"""transfer: pairs that fit are carried over and reported, others are refused in a sentence; recordings stand for reality; pace."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import pytest
+
+from terrella.cli import main
+
+pytestmark = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
+
+
+def ran(capsys, *words) -> tuple[int, str, str]:
+    code = main([str(word) for word in words])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+@pytest.fixture
+def few(monkeypatch):
+    from terrella.cli import transfer_arms
+
+    monkeypatch.setattr(transfer_arms, "FITTED", 10)
+    monkeypatch.setattr(transfer_arms, "GATHER", 2)
+
+
+def test_a_pair_is_carried_over_and_goes_on_where_it_was(tmp_path, capsys, few):
+    asked = [
+        "transfer",
+        "--practice",
+        1,
+        "--episodes",
+        6,
+        "--seeds",
+        1,
+        "--real-episodes",
+        1,
+        2,
+        "--out",
+        tmp_path / "t",
+        "--json",
+    ]
+    code, out, _ = ran(capsys, *asked, "--arms", "nominal", "model")
+    told = json.loads(out)
+    assert code == 0 and {"nominal", "model 1", "model 2", "random", "idle"} == set(told["arms"])
+    assert told["arms"]["idle"]["count"] == 6 and "the model" in told["agreed"]
+    assert told["hash"] in (tmp_path / "t" / "transfer.html").read_text()
+    again = json.loads(ran(capsys, *asked, "--arms", "nominal")[1])
+    assert again["arms"]["nominal"] == told["arms"]["nominal"]
+    code, _, err = ran(capsys, *asked, "--dial", "0.5")
+    assert code == 2 and "another experiment" in err and "dial" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--sim", "mujoco:arm", "--real", "mujoco:ant"), "takes actions in"),
+        (("--sim", "mujoco:reacher", "--real", "mujoco:reacher", "--arms", "nominal"), "has no channel 'success'"),
+        (("--sim", "mujoco:ant"), "say what stands for reality"),
+        (("--dial", "3"), "from 0 to 1"),
+        (("--arms", "nominal", "wishful"), "--arms are some of"),
+    ],
+)
+def test_what_is_no_pair_is_refused_in_a_sentence(tmp_path, capsys, words, why):
+    code, _, err = ran(capsys, "transfer", *words, "--out", tmp_path / "t")
+    assert code == 2 and why in err and err.count("\n") == 1
+
+
+def test_an_unknown_parameter_of_the_gap_is_named(tmp_path, capsys):
+    (tmp_path / "gap.toml").write_text("fricton = 2.0")
+    code, _, err = ran(capsys, "transfer", "--gap", tmp_path / "gap.toml", "--out", tmp_path / "t")
+    assert code == 2 and "no parameter 'fricton'" in err and "friction" in err
+
+
+def test_a_recording_stands_for_reality(tmp_path, capsys, few):
+    from terrella.core import make_rng
+    from terrella.core.policy import Random
+    from terrella.data import record
+    from terrella.library import load
+
+    real = load("mujoco:arm-real", cameras=())
+    record(real, Random(real.spec, (1, 9)), tmp_path / "set", 120, make_rng(0), max_episode_steps=30)
+    words = ("transfer", "--real", tmp_path / "set", "--real-episodes", 2, "--out", tmp_path / "t", "--json")
+    code, out, _ = ran(capsys, *words)
+    told = json.loads(out)
+    assert code == 0 and set(told["open_loop"]) == {"simulator", "model 2", "stands still"} and told["held_out"] == 2
+    assert told["open_loop"]["simulator"]["10"]["value"] < 0.1 * told["open_loop"]["stands still"]["10"]["value"]
+    assert told["action_error"]["simulator"]["value"] < 0.5 * told["action_error"]["random"]["value"]
+    code, _, err = ran(capsys, *words, "--sim", "mujoco:ant")
+    assert code == 2 and "actions" in err and err.count("\n") == 1
+    about = tmp_path / "set" / "meta" / "terrella.json"
+    about.write_text(about.read_text().replace('"action_mode": "torque"', '"action_mode": "position"'))
+    code, _, err = ran(capsys, *words)
+    assert code == 2 and "other semantics" in err
+
+
+def test_acceleration_is_told_beside_a_simulator(capsys):
+    words = (
+        "bench",
+        "acceleration",
+        "mujoco:arm",
+        "--beside",
+        "mujoco:arm-real",
+        "--batches",
+        1,
+        8,
+        "--seconds",
+        0.01,
+        "--turns",
+        1,
+    )
+    code, out, _ = ran(capsys, *words, "--json")
+    told = json.loads(out)
+    assert code == 0 and told["ratio"] > 0 and [one["batch"] for one in told["world_paces"]] == [1, 8]
+    assert "imagines" in ran(capsys, *words)[1]
+    code, _, err = ran(capsys, "bench", "acceleration", "mujoco:arm", "--beside", "mujoco:ant")
+    assert code == 2 and "differ" in err
+    code, _, err = ran(capsys, "bench", "acceleration", "mujoco:arm", "--agent", "x")
+    assert code == 2 and "all three" in err
