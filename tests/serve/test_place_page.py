@@ -167,6 +167,7 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     assert ((theirs - mine).abs().amax(1) < 0.01).float().mean() > 0.98
 
 
+@pytest.mark.slow
 def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened, capsys):
     page = opened(exported(tmp_path, 200_000))
     assert len(gzip.compress((tmp_path / "place.html").read_bytes())) < 6_000_000
