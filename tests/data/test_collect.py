@@ -46,6 +46,13 @@ def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, nev
     assert len(list((tmp_path / "deaths").iterdir())) == 2
 
 
+def test_nothing_is_left_among_temporary_files(tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    gathered(tmp_path / "set", LocalWorkers(2))
+    assert not list((tmp_path / "temporary").glob("terrella-*"))
+
+
 def test_what_was_stopped_goes_on(tmp_path, never):
     def stop(done, total):
         if done == 2:

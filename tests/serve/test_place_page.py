@@ -229,10 +229,13 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
     assert read_edits(folder) == [{"select": {"object": 1}, "do": "duplicate", "by": [0, 0, 1]}]
     page.reload()
     until(page, "!!window.terrella && terrella.story.scene.length === 1540")
-    answer = page.evaluate(
-        "fetch('/edits', { method: 'POST', body: '{\"do\": 1}' }).then((a) => a.text().then((t) => [a.status, t]))"
-    )
-    assert answer[0] == 422 and "selects one of" in answer[1] and len(read_edits(folder)) == 1
+    post = """saved => fetch('/edits', { method: 'POST', body: JSON.stringify({ saved, lines: '{"do": 1}' }) })
+        .then((answer) => answer.text().then((text) => [answer.status, text]))"""
+    status, said = page.evaluate(post, page.evaluate("terrella.story.saved"))
+    assert status == 422 and "selects one of" in said
+    status, said = page.evaluate(post, "")  # a page that was opened before those edits
+    assert status == 422 and "edited elsewhere" in said
+    assert len(read_edits(folder)) == 1
 
 
 @pytest.fixture

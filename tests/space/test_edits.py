@@ -66,10 +66,21 @@ def test_objects_and_brushes_are_selected():
     {"select": {"brush": [1, 2, 3]}, "do": "delete"}, {"select": {"brush": [1, 2, 3, 1, 4]}, "do": "delete"},
     {"select": BOX, "do": "scale", "factor": -1}, {"select": BOX, "do": "move", "by": [0, 0, float("nan")]}, {"do": "delete"},
     {"select": BOX, "do": "move", "by": [1e300, 0, 0]}, {"select": BOX, "do": "recolour", "colour": [9, 9, 9]},
+    {"select": BOX, "do": []}, {"select": BOX, "do": "scale", "factor": True}, {"select": BOX, "do": "scale", "factor": 10**400},
 ])  # fmt: skip
 def test_what_is_no_edit(edit):
     with pytest.raises(ContractError):
         edited(cloud(60), [edit])
+
+
+def test_edits_that_ruin_a_place_together_are_refused(monkeypatch):
+    monkeypatch.setattr("terrella.space.edits.MOST_GAUSSIANS", 10_000)
+    grow = {"select": {"all": True}, "do": "scale", "factor": 1e25}
+    with pytest.raises(ContractError, match="out of all numbers"):
+        edited(cloud(60), [grow, grow])
+    twice = {"select": {"all": True}, "do": "duplicate", "by": [0, 0, 0]}
+    with pytest.raises(ContractError, match="at most"):
+        edited(cloud(60), [twice] * 30)
 
 
 def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
@@ -84,6 +95,7 @@ def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
     assert main(["space", "edit", place, "--sphere", "90", "2", "1", "0.8", "--delete"]) == 2
     assert main(["space", "edit", place, "--redo"]) == 2
     assert main(["space", "edit", place, "--delete"]) == 2  # of what?
+    assert main(["space", "edit", place, "--undo", "--sphere", "0", "2", "1", "0.8"]) == 2
     with pytest.raises(CheckpointError, match="has edits"):
         save_splat(world_of(room(count=800), "room", {}, SplatConfig(LENS, SIZE)), place)
     before = load(place)

@@ -118,7 +118,7 @@ def record_world(
     if collection.spread:
         _collect(opened, world, recording, collection, frames, kept)
     else:
-        _record(world, recording, frames or 10_000, kept, policy() if collection.policy else None)
+        _record(world, recording, 10_000 if frames is None else frames, kept, policy() if collection.policy else None)
 
 
 def _opened(name: str, controls: Controls, environment: Environment, rgb: bool, policy: str):
@@ -182,7 +182,7 @@ def _collect(
         1 if collection.workers is None else collection.workers
     )
     layout, out = replace(Layout.of(world.spec), pictures=pictures), recording.out
-    upto = None if collection.episodes is not None else frames or 10_000
+    upto = None if collection.episodes is not None else 10_000 if frames is None else frames
     try:
         with progress.shown("recording") as report:
             rng = make_rng(recording.seed)

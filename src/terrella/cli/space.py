@@ -206,6 +206,8 @@ def edit(
         )
     if delete and not places:
         raise TerrellaError("say what to delete: --box, --sphere, --plane or --object.")
+    if places and not deeds:
+        raise TerrellaError("--undo, --redo and --replay are of the whole place; leave the selection out.")
     if undo and not edits or redo and not undone:
         raise TerrellaError(f"{world} has no edit to {'undo' if undo else 'redo'}.")
     if replay is not None:

@@ -35,7 +35,7 @@ def write_other(
         raise DatasetError(f"{world.name} has no Gaussian left; undo an edit.")
     if not all(bool(part.isfinite().all()) for part in vars(world.gaussians).values()):
         raise DatasetError(
-            f"{world.name} has Gaussians whose numbers are not finite; import its file again, which leaves them out."
+            f"{world.name} has Gaussians whose numbers are not finite; undo an edit, or import its file again."
         )
     suffix = file.suffix.lower()
     with torch.no_grad():

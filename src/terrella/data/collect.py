@@ -5,10 +5,11 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import tempfile
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +25,7 @@ from .recording import LONGEST, base_of, play_episode, seed_of
 from .staged import Parcel
 
 AHEAD = 3  # episodes for each worker that may wait for an earlier one
+PATIENCE_S = 1.0
 MOST_DEATHS = 3  # workers that one episode may cost
 Open = Callable[[], tuple[World, Callable[[], Policy]]]
 
@@ -38,6 +40,7 @@ class Job:
     task: str
     base: int
     steps: int
+    scratch: str | None = None  # a folder for what is not finished, which whoever sends the job removes
 
 
 class Player:
@@ -45,7 +48,7 @@ class Player:
 
     def __init__(self, job: Job):
         self._job, self._opened = job, None
-        self._folder = tempfile.TemporaryDirectory(prefix="terrella-")
+        self._folder = tempfile.TemporaryDirectory(prefix="terrella-", dir=job.scratch)
 
     def play(self, number: int) -> Parcel | str:
         """The episode, or a sentence that says why there is none."""
@@ -93,7 +96,8 @@ def collect(
 
     `open` is sent to the workers (it must be picklable), and opens the same world there. Episodes are committed in the order of
     their numbers and each is made of the seed and its number alone: the recording is the same with any number of workers, however
-    often it was stopped, and the same that `record` makes of a policy that does not learn. Returns the closed recorder.
+    often it was stopped. Of a policy that does not learn `record` makes the same, but for the last episode, which it may cut.
+    Returns the closed recorder.
     DatasetError as Recorder raises it; TerrellaError for what goes wrong in a world, or where an episode ends its worker
     each time; what was committed before is safe.
     """
@@ -168,7 +172,8 @@ class LocalWorkers:
         self._processes: list[Any] = []
 
     def begin(self, job: Job) -> None:
-        self._job = job
+        self._scratch = tempfile.TemporaryDirectory(prefix="terrella-", ignore_cleanup_errors=True)
+        self._job = replace(job, scratch=self._scratch.name)
         for _ in range(self.size):
             self._launch()
 
@@ -193,9 +198,12 @@ class LocalWorkers:
     def close(self) -> None:
         for pipe in [*self._idle, *self._busy]:
             pipe.close()
+        until = time.monotonic() + PATIENCE_S  # who waits for work ends by itself, and its world with it
         for process in self._processes:
+            process.join(max(0.0, until - time.monotonic()))
             process.kill()
             process.join()
+        self._scratch.cleanup()
         self._processes.clear()
         self._idle.clear()
         self._busy.clear()

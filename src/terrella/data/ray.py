@@ -52,8 +52,12 @@ class RayWorkers:
         self._ours = not ray.is_initialized()
         if self._ours:
             local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": self.size, "include_dashboard": False}
-            with _finding_our_modules():
-                ray.init(log_to_driver=False, logging_level="ERROR", **local)
+            try:
+                with _finding_our_modules():
+                    ray.init(log_to_driver=False, logging_level="ERROR", **local)
+            except Exception as error:
+                first = (str(error).strip() or type(error).__name__).splitlines()[0]
+                raise TerrellaError(f"Ray did not start ({first}); look at RAY_ADDRESS, or leave it unset.") from error
         here = int(ray.cluster_resources().get("CPU", 0))
         if here < self.size:
             raise TerrellaError(f"this Ray has {here} processors; ask for as many --workers or fewer.")

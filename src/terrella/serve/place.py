@@ -10,6 +10,7 @@ import hashlib
 import html
 import json
 import re
+import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
-from ..core.errors import TerrellaError
+from ..core.errors import ServeError, TerrellaError
 from ..space.edits import Edit
 from ..space.files.compressed import packed_quats
 from ..space.occupancy import Body, Occupancy, samples
@@ -120,6 +121,8 @@ def _hash(text: str) -> str:
 def _packed(place: Place) -> bytes:
     """The columns that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
     scene = place.gaussians
+    if place.objects.numel() and int(place.objects.max()) > 65535:
+        raise ServeError(f"{place.name} has more than 65,535 objects, and a page shows no more.")
     byte = lambda part: part.round().clamp(0, 255).to(torch.uint8).contiguous().numpy().tobytes()  # noqa: E731
     return b"".join([
         _by_bytes(scene.means.numpy(), "<f4"), _by_bytes(packed_quats(scene.quats).numpy(), "<u4"),
@@ -158,15 +161,21 @@ def build_place(
     host: str = "127.0.0.1",
     token: str | None = None,
 ) -> Starlette:
-    """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts edits as lines of JSON;
-    `save` keeps them or raises a TerrellaError, whose sentence the page shows."""
-    page = PlacePage(place)
+    """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
+    saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows."""
+    page, alone = PlacePage(place), threading.Lock()
+
+    def kept(content: bytes) -> None:
+        told = json.loads(content)
+        with alone:
+            if [json.loads(line) for line in told["saved"].splitlines() if line] != list(edits()):
+                raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
+            save(told["lines"])
 
     async def keep(request: Request) -> PlainTextResponse:
         try:
-            content = await posted(request, LONGEST_EDITS)
-            await run_in_threadpool(save, content.decode())
-        except UnicodeDecodeError:
+            await run_in_threadpool(kept, await posted(request, LONGEST_EDITS))
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             return PlainTextResponse("edits are lines of JSON; reload the page.", 422)
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)

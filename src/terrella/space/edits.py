@@ -24,12 +24,13 @@ from .raster import Gaussians, join
 from .raster.gaussians import plain_sh
 from .raster.move import turned
 
-SELECTIONS = {"box": 6, "sphere": 4, "brush": 4, "plane": 4, "object": 1, "all": 1}  # and how many numbers each takes
+SELECTIONS = {"box": 6, "sphere": 4, "brush": 4, "plane": 4, "object": 1, "all": 0}  # and how many numbers each takes
 DEEDS = {
     "move": ("by", 3), "duplicate": ("by", 3), "turn": ("degrees", 1), "scale": ("factor", 1), "recolour": ("colour", 3),
     "delete": ("", 0),
 }  # fmt: skip
 MOST_DABS = 10_000  # spheres of a brush
+MOST_GAUSSIANS = 20_000_000  # of a place that was edited
 Edit = Mapping[str, Any]
 
 
@@ -53,6 +54,10 @@ def edited(gaussians: Gaussians, edits: Sequence[Edit], objects: torch.Tensor | 
         if edit["do"] == "duplicate":
             belong = torch.full_like(belong, int(objects.max()) + 1)
             chosen = torch.zeros_like(chosen)  # what was duplicated stays, too
+        if not (done.means.isfinite().all() and done.scales.isfinite().all()):
+            raise ContractError(f"'{edit['do']}' leads out of all numbers; take smaller ones.")
+        if len(gaussians) + len(done) > MOST_GAUSSIANS:
+            raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; duplicate less.")
         gaussians = join([gaussians.at(~chosen), done])
         origin = torch.cat([origin[~chosen], origin.new_full((len(done),), -1)])
         objects = torch.cat([objects[~chosen], belong[: len(done)]])
@@ -90,7 +95,7 @@ def selected(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.T
 
 def _done(some: Gaussians, edit: Edit) -> Gaussians:
     deed = edit.get("do")
-    if deed not in DEEDS:
+    if not isinstance(deed, str) or deed not in DEEDS:
         raise ContractError(f"an edit does one of {', '.join(DEEDS)}; got {deed!r}.")
     name, count = DEEDS[deed]
     numbers, means = _numbers(edit.get(name), count, name), some.means.double()
@@ -119,9 +124,11 @@ def _numbers(given: Any, count: int, name: str) -> torch.Tensor:
     """float32 [count] that are finite."""
     listed = [given] if isinstance(given, int | float) else given
     fits = isinstance(listed, Sequence) and not isinstance(listed, str) and len(listed) == count
-    if count and not (fits and all(isinstance(one, int | float) and math.isfinite(one) for one in listed)):
+    if count and not (fits and all(_plain(one) for one in listed)):
         raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r:.80}.")
-    found = torch.tensor(listed if count else [], dtype=torch.float32)
-    if not found.isfinite().all():
-        raise ContractError(f"'{name}' takes {count} finite numbers; got {given!r:.80}.")
-    return found
+    return torch.tensor(listed if count else [], dtype=torch.float32)
+
+
+def _plain(number: Any) -> bool:
+    """Whether it is a number, and one that float32 holds well."""
+    return isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e30

@@ -102,8 +102,11 @@ def source_of(path: str | Path) -> SplatWorld:
 
 
 def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
-    """The edits of a world (those taken back: `file=UNDONE_FILE`), the oldest first; ValueError for a line that is no JSON."""
-    return parse_edits((path / file).read_text()) if (path / file).exists() else []
+    """The edits of a world (those taken back: `file=UNDONE_FILE`), the oldest first; CheckpointError for a line that is no JSON."""
+    try:
+        return parse_edits((path / file).read_text()) if (path / file).exists() else []
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path / file} is damaged ({error}); mend or remove it.") from error
 
 
 def parse_edits(text: str) -> list[Edit]:
@@ -116,7 +119,7 @@ def checked_edits(source: SplatWorld, text: str) -> list[Edit]:
     try:
         edits = parse_edits(text)
         edited(source.gaussians, edits, source.objects)
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise ContractError(f"these are no edits ({error}); give the lines of a world.edits.jsonl.") from error
     return edits
 

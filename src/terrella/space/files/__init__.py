@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None,
 
 def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
     """`write` fills a neighbour of `path`, which then takes its place; DatasetError where it cannot be written."""
-    staged = path.with_name(f".{path.name}.new")
+    staged = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(staged)

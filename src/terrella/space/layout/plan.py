@@ -183,8 +183,9 @@ def check(plan: Plan) -> None:
     names = [room.name for room in plan.rooms]
     if len(set(names)) < len(names):
         raise ContractError(f"two rooms are called '{max(names, key=names.count)}'; give each its own name.")
-    if len(plan.things) + len(plan.stairs) > MOST_THINGS:
-        raise ContractError(f"a layout has at most {MOST_THINGS} things; this one has {len(plan.things)}.")
+    count = len(plan.things) + len(plan.stairs)
+    if count > MOST_THINGS:
+        raise ContractError(f"a layout has at most {MOST_THINGS} things; this one has {count}.")
     for room in plan.rooms:
         _sizes(room.size, f"the room '{room.name}'", 0.8)
         for look in (room.floor, room.walls, room.ceiling):

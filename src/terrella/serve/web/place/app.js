@@ -162,9 +162,9 @@ function run({ drawing, source, story, solid: first }) {
 }
 
 /** Keeps edits: at the server that showed this page, or as a file. */
-async function keep(lines) {
+async function keep(lines, saved) {
   if (world.save) {
-    const answer = await fetch(world.save + location.search, { method: 'POST', body: lines });
+    const answer = await fetch(world.save + location.search, { method: 'POST', body: JSON.stringify({ saved, lines }) });
     if (!answer.ok) throw new Error(await answer.text());
     toast('Saved with the place.');
     return;

@@ -107,7 +107,7 @@ export class Editor {
 
   async save() {
     const { lines } = this.story;
-    await this.on.keep(lines).then(() => { this.story.saved = lines; }, (error) => this.on.say(error.message));
+    await this.on.keep(lines, this.story.saved).then(() => { this.story.saved = lines; }, (error) => this.on.say(error.message));
     this.show();
   }
 
