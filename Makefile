@@ -7,13 +7,14 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test test-all test-portable test-lerobot judge check format bench clean
+.PHONY: help play test test-all test-portable test-lerobot test-splats judge check format bench clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
 	@echo "make test-all  the same with the slow sweeps (damaged files, many seeds)"
 	@echo "make test-portable  run the numeric tests as a plain processor would: no wide vectors, one thread"
 	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
+	@echo "make test-splats  try our files of Gaussians in Spark, three.js and PlayCanvas, and theirs in ours (npm; into ~/.cache/terrella)"
 	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (it trains for some six minutes of one core first)"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
@@ -43,6 +44,11 @@ test-portable: $(VENV)/.ready-dev
 test-lerobot: $(VENV)/.ready-dev
 	@python=$$(sh tests/lerobot_setup.sh .venv-lerobot); \
 	TERRELLA_LEROBOT_PYTHON=$$python $(BIN)/python -m pytest -rs tests/data/test_lerobot.py
+
+test-splats: $(VENV)/.ready-dev
+	@sh tests/browser_setup.sh $(BIN)/python
+	@folder=$$(sh tests/splat_tools_setup.sh "$${XDG_CACHE_HOME:-$$HOME/.cache}/terrella/splats" $(BIN)/python); \
+	TERRELLA_SPLAT_TOOLS=$$folder $(PYTEST) -rs tests/space/test_other_tools.py
 
 judge:
 	@python=$$(sh benchmarks/judge_setup.sh .venv-judge) && OMP_NUM_THREADS=1 $$python -W ignore benchmarks/judge.py $(ARGS)

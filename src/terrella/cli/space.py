@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
 from .. import progress
-from ..learn.recipes.splat import SplatFit, fit_splat
+from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
 from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, replace_whole, write_scene
@@ -16,7 +18,7 @@ from ..space.solids import Solids
 from ..worlds.folder import open_world
 from ..worlds.splat import OBSERVED, SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
-from .say import Host, Json, Port, Token, result
+from .say import Host, Json, Port, Token, result, say
 from .space_export import ENDINGS, Kind, write_other
 
 if TYPE_CHECKING:
@@ -25,15 +27,20 @@ if TYPE_CHECKING:
 Axes = Literal["rdf", "rub", "flu"]
 
 
-def fit(data: Positional[str], out: str, config: SplatFit, json: Json = False) -> None:
+def fit(
+    data: Positional[str], out: str, config: SplatFit, watch: bool = False, port: Port = 8767, json: Json = False
+) -> None:
     """Make a place to walk in of a recording with depth and poses. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run; the world lies in OUT/world.
+        watch: Show the place on a page meanwhile, sharper every few seconds.
     """
-    with progress.shown("fitting") as report:
-        facts = fit_splat(data, out, config, report)
+    with contextlib.ExitStack() as stack:
+        seen = stack.enter_context(_watching(port)) if watch else None
+        report = stack.enter_context(progress.shown("fitting"))
+        facts = fit_splat(data, out, config, report, seen)
     (ours, ours_by), (copied, copied_by) = facts["held_out_db"], facts["nearest_picture_db"]
     text = (
         f"{facts['gaussians']:,} Gaussians from {facts['pictures']} pictures in {facts['seconds']:.0f} s\n"
@@ -41,6 +48,15 @@ def fit(data: Positional[str], out: str, config: SplatFit, json: Json = False) -
         f"picture instead: {copied:.1f} (+-{copied_by:.1f})\nwalk in it: terrella play {facts['world']}"
     )
     result(facts, json, text)
+
+
+@contextlib.contextmanager
+def _watching(port: int) -> Iterator[Watch]:
+    """A page on this machine that shows a fit."""
+    from ..serve.watching import watched
+
+    with watched("127.0.0.1", port, lambda address: say(f"watch it at {address}")) as show:
+        yield lambda make, facts: show(lambda: shown_place(make()), facts)
 
 
 def import_(
@@ -142,10 +158,14 @@ def view(
 
 def place_of(world: str) -> Place:
     """What a page shows of a world of Gaussians: as it was before its edits."""
+    open_splat(world)  # refuses what is none
+    return shown_place(source_of(folder_of(world)))
+
+
+def shown_place(source: SplatWorld) -> Place:
+    """A world of Gaussians as a page takes it."""
     from ..serve.place import Place
 
-    open_splat(world)  # refuses what is none
-    source = source_of(folder_of(world))
     config, named = source.config, source.card.get("objects", [])
     collider = Solids(source.solids) if len(source.solids) else source.occupancy
     seen, names = source.provenance == OBSERVED, [str(one) for one in named] if isinstance(named, list) else []

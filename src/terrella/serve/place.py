@@ -63,9 +63,9 @@ class PlacePage:
     """The page of a place. It loads nothing from anywhere: `policy` is its Content-Security-Policy."""
 
     def __init__(self, place: Place):
-        columns, (solid, cubes) = _packed(place), _packed_solid(place.collider)
-        self._place, self._solid = place, solid
-        self._data = base64.b64encode(gzip.compress(columns + cubes, 6, mtime=0)).decode()
+        self._place = place
+        self._packed, data = packed_place(place)
+        self._data = base64.b64encode(data).decode()
         self._style = (WEB / "style.css").read_text("utf-8") + (PAGE / "place.css").read_text("utf-8")
         self._script = bundled(PAGE / "app.js")
         self.policy = (
@@ -73,12 +73,12 @@ class PlacePage:
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
         )
 
-    def html(self, edits: Sequence[Edit], save: str = "") -> bytes:
+    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "") -> bytes:
         """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
-        file."""
+        file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile."""
         place = self._place
         about = {
-            "name": place.name, "count": len(place.gaussians), "solid": self._solid, "body": asdict(place.body), "save": save,
+            **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits),
             "objects": list(place.names), "samples": samples().tolist(),
@@ -89,6 +89,12 @@ class PlacePage:
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
         return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
+
+
+def packed_place(place: Place) -> tuple[dict[str, Any], bytes]:
+    """What scene.js and solid.js unpack: `count` and `solid`, and columns in gzip."""
+    columns, (solid, cubes) = _packed(place), _packed_solid(place.collider)
+    return {"count": len(place.gaussians), "solid": solid}, gzip.compress(columns + cubes, 6, mtime=0)
 
 
 def bundled(path: Path) -> str:

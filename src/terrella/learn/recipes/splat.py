@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,17 @@ from ...space.camera import FAR_M
 from ...space.files import replace_whole
 from ...space.fitting import Fit, FitConfig, Views, decibels, nearest_views, psnr
 from ...space.occupancy import Body, Occupancy
+from ...space.raster import Gaussians
 from ...worlds.splat import OBSERVED, SplatConfig, SplatWorld
 from ...worlds.splat_folder import WORLD_FILE, check_free, save_splat
 from ..trainer import Report
 
 RESUME = "resume.safetensors"
+LOOK_S, LOOK_SHARE, LOOKED_AT = (
+    2.0,
+    20,
+    4,
+)  # seconds between looks, which cost a twentieth at most; pictures that measure one
 HELD_OUT = 8  # every so-manyth picture is kept from the fit, to measure it
 
 
@@ -47,9 +53,17 @@ class SplatFit:
     fit: FitConfig = field(default_factory=FitConfig)
 
 
-def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Report | None = None) -> dict[str, Any]:
+Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
+
+
+def fit_splat(
+    data: str | Path, out: str | Path, config: SplatFit, report: Report | None = None, watch: Watch | None = None
+) -> dict[str, Any]:
     """Fits, saves OUT/world, and goes on where an earlier run stopped. Returns the figures on held-out pictures (dB, with half the
-    width of their 95% interval) beside the baseline of the nearest picture of the fit."""
+    width of their 95% interval) beside the baseline of the nearest picture of the fit.
+
+    watch: called every few seconds with what gives the world as it is then, and `step`, `steps` and `db` of a few kept pictures.
+    """
     out, began = Path(out), time.monotonic()
     if config.frames < 16 or (config.episodes is not None and config.episodes < 1):
         raise TrainingError("--frames is 16 or more, --episodes 1 or more.")
@@ -65,9 +79,22 @@ def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Repor
     finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
     if not finished:
         check_free(out / "world")
-    saved, error = time.monotonic(), 0.0
+    saved, looked, error = time.monotonic(), -np.inf, 0.0
+
+    def look() -> float:
+        """Has the fit watched, and says when next."""
+        if watch is None:
+            return np.inf
+        start, now = time.monotonic(), fit.gaussians.each(torch.Tensor.detach)
+        db = float(psnr(now, asked.at(torch.arange(len(asked))[:: max(len(asked) // LOOKED_AT, 1)])).mean())
+        facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
+        watch(lambda: _world(now, kept, spec, config, {}), facts)
+        return start + max(LOOK_S, LOOK_SHARE * (time.monotonic() - start))
+
     try:
         while fit.done < config.fit.steps:
+            if time.monotonic() > looked:
+                looked = look()
             error = 0.95 * error + 0.05 * fit.step() if error else fit.step()
             if report:
                 report(
@@ -79,10 +106,11 @@ def fit_splat(data: str | Path, out: str | Path, config: SplatFit, report: Repor
     except KeyboardInterrupt:
         _save(out / RESUME, fit, told)
         raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command goes on.") from None
+    look()
     figures = _figures(fit, kept, asked)
     if not finished:  # else it may have been edited since
         _save(out / RESUME, fit, told)
-        save_splat(_world(fit, kept, spec, config, {"data": str(data), **figures}), out / "world")
+        save_splat(_world(fit.gaussians, kept, spec, config, {"data": str(data), **figures}), out / "world")
     return {**figures, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
@@ -141,9 +169,10 @@ def _figures(fit: Fit, kept: Views, asked: Views) -> dict[str, Any]:
     }
 
 
-def _world(fit: Fit, kept: Views, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]) -> SplatWorld:
+def _world(
+    gaussians: Gaussians, kept: Views, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
+) -> SplatWorld:
     """The world of a fit, in which one is as tall as the recording's camera was over its floor."""
-    gaussians = fit.gaussians
     gaussians = gaussians.at(gaussians.opacities > 0.01)
     eye = kept.pose[:, :3]
     below = Occupancy.of(gaussians).floor(eye, Body(eye_m=0.5, step_m=0.0))

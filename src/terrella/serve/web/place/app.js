@@ -4,10 +4,11 @@ import { Boxes } from './boxes.js';
 import { axes, matrices } from './camera.js';
 import { Drawing, NEAR } from './draw.js';
 import { Editor } from './editor.js';
+import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
-import { inflate, Reader, unpackScene } from './scene.js';
+import { decoded, inflate, Reader, unpackScene } from './scene.js';
 import { Solid } from './solid.js';
 import { Sorter } from './sort.js';
 import { Story } from './story.js';
@@ -27,16 +28,21 @@ const ready = await open().catch((error) => {
 });
 
 async function open() {
-  const drawing = new Drawing(canvas), reader = new Reader(await inflate($('data').textContent));
-  const source = unpackScene(reader, world.count), story = new Story(source, world.edits), solid = world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, world.solid);
+  const drawing = new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
-  return { drawing, source, story, solid };
+  return { drawing, source, story: new Story(source, world.edits), solid };
+}
+
+/** The Gaussians of a place, and what is solid in it. */
+async function unpacked({ count, solid }, packed) {
+  const reader = new Reader(await inflate(packed)), source = unpackScene(reader, count);
+  return { source, solid: world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, solid) };
 }
 
 if (ready) run(ready);
 
 function run({ drawing, source, story, solid: first }) {
-  let solid = first;
+  let solid = first, made = '';
   const walker = new Walker(world), map = new MiniMap($('minimap').querySelector('canvas'));
   const sorter = new Sorter((order, share) => { drawing.order(order, share); redraw(); });
   const hands = new Hands(canvas, $('stick'), {
@@ -54,11 +60,21 @@ function run({ drawing, source, story, solid: first }) {
     solid = scene === source ? first : Solid.of(scene, world.samples);
     map.layer = null;
     seen.sorted = '';
-    $('what').textContent = `${scene.length.toLocaleString('en')} Gaussians`;
+    $('what').textContent = `${scene.length.toLocaleString('en')} Gaussians${made}`;
     const known = scene.seen.reduce((sum, one) => sum + one, 0) / scene.length;
     $('share-seen').textContent = `${Math.round(100 * known)}%`;
     $('share-invented').textContent = `${Math.round(100 * (1 - known))}%`;
     redraw();
+  }
+
+  /** A newer state of a place that is being made. */
+  async function newer(about, packed) {
+    ({ source, solid: first } = await unpacked(about, packed));
+    made = ` · step ${about.step.toLocaleString('en')} of ${about.steps.toLocaleString('en')} · ${about.db.toFixed(1)} dB`;
+    $('making').firstElementChild.style.width = `${(100 * about.step) / about.steps}%`;
+    story.source = source;
+    story.replay([]);
+    take(source);
   }
 
   function lens() {
@@ -80,7 +96,7 @@ function run({ drawing, source, story, solid: first }) {
     seen.last = time;
     if (moves) adapt(passed); else if (seen.share < 1) { seen.share = 1; seen.dirty = true; }
     sort();
-    if (moves || seen.dirty) paint();
+    if ((moves || seen.dirty) && drawing.ready) paint();  // till it is ordered, what is on the screen stays
     if (moves || seen.dirty || sorter.busy) requestAnimationFrame(frame); else { seen.running = false; figures(); }
   }
 
@@ -110,7 +126,7 @@ function run({ drawing, source, story, solid: first }) {
     seen.painted += 1;
     seen.times.push(performance.now());
     if (seen.times.length > 240) seen.times.splice(0, 120);
-    if (drawing.count) $('place').dataset.state = 'open';
+    $('place').dataset.state = 'open';
   }
 
   function figures() {
@@ -128,7 +144,7 @@ function run({ drawing, source, story, solid: first }) {
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
   const does = { home, fly, edit: () => editor.toggle(), tint, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyE: does.edit, KeyT: tint, KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: tint, KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
@@ -146,11 +162,16 @@ function run({ drawing, source, story, solid: first }) {
 
   take(story.scene);
   greet();
+  if (world.watch) {
+    $('making').hidden = false;
+    $('edit').hidden = true;
+    follow(world.watch, { newer, over: () => { $('making').hidden = true; toast('Nothing newer comes: the fit is done, or was stopped.'); } });
+  }
 
   // the state of the page, for whoever drives it by a script
   window.terrella = {
     story, editor, drawing, walker, lens, get solid() { return solid; }, get painted() { return seen.painted; },
-    get idle() { return !seen.running && !seen.dirty && drawing.count > 0; }, get eye() { return walker.eye; },
+    get idle() { return !seen.running && !seen.dirty && drawing.ready; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {
       paint();

@@ -12,7 +12,7 @@ export class Drawing {
   constructor(canvas) {
     const gl = canvas.getContext('webgl2', { antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella play`, which draws on its own machine.');
-    Object.assign(this, { canvas, gl, count: 0, share: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
+    Object.assign(this, { canvas, gl, ready: false, count: 0, share: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
     this.preview = this.still;
     this.splats = program(gl, SPLAT_SHADERS);
     this.lines = program(gl, LINE_SHADERS);
@@ -44,7 +44,7 @@ export class Drawing {
       floats.set(covariance(scene, k), at + 4);
     }
     upload(gl, this.texture, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, ACROSS * TEXELS, rows, data);
-    this.count = 0;
+    this.ready = false;
     this.mark(scene, null);
   }
 
@@ -60,7 +60,7 @@ export class Drawing {
     const { gl } = this, rows = Math.max(1, Math.ceil(order.length / ACROSS)), data = new Uint32Array(rows * ACROSS);
     data.set(order);
     upload(gl, this.orders, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, ACROSS, rows, data);
-    Object.assign(this, { count: order.length, share });
+    Object.assign(this, { ready: true, count: order.length, share });
   }
 
   clear(target = null) {

@@ -27,9 +27,11 @@ export class Scene {
 }
 Scene.columns = [...Object.keys(UNPACKED), 'seen', 'objects'];
 
-/** base64 of gzip as bytes. */
-export async function inflate(text) {
-  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
+/** base64 as bytes. */
+export const decoded = (text) => Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
+
+/** What gzip packed. */
+export async function inflate(packed) {
   return new Uint8Array(await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 

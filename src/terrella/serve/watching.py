@@ -1,0 +1,85 @@
+"""The page of a place that is still being made: it shows the newest state, and whoever makes it waits for nobody."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from .door import application, make_server, open_port
+from .place import Place, PlacePage, packed_place
+
+Show = Callable[[Callable[[], Place], Mapping[str, Any]], None]
+STARTS_S = 20.0
+
+
+class Newest:
+    """The newest state that was shown: packed when a page asks for it, once."""
+
+    def __init__(self):
+        self._lock, self._number, self._packed = threading.Lock(), 0, (0, b"", b"")
+        self._make: Callable[[], Place] | None = None
+        self._facts: Mapping[str, Any] = {}
+
+    def show(self, make: Callable[[], Place], facts: Mapping[str, Any]) -> None:
+        """`make` gives the place as it is now; facts: `step`, `steps` and `db` (PSNR), for the page's head."""
+        self._make, self._facts, self._number = make, facts, self._number + 1
+
+    def html(self) -> bytes:
+        assert self._make is not None
+        return PlacePage(self._make()).html([], watch="/now")
+
+    def answer(self, after: int) -> tuple[bytes, bytes] | None:
+        """What is said of the newest state, as JSON, and its columns in gzip; None where it is not newer than `after`."""
+        with self._lock:
+            number, make, facts = self._number, self._make, self._facts
+            if number <= after or make is None:
+                return None
+            if self._packed[0] != number:
+                about, data = packed_place(make())
+                self._packed = number, json.dumps({**about, **facts, "number": number}).encode(), data
+            return self._packed[1:]
+
+
+@contextlib.contextmanager
+def watched(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator[Show]:
+    """Serves a page, in a thread, as long as the block lasts: the block calls what it gets, `Show`, at once and then now and then.
+    ServeError where the port is taken."""
+    newest = Newest()
+
+    async def now(request: Request) -> Response:
+        after = request.query_params.get("after", "0")
+        found = await run_in_threadpool(newest.answer, int(after) if after.isdecimal() else 0)
+        if found is None:
+            return Response(status_code=204)
+        about, data = found
+        return Response(len(about).to_bytes(4, "little") + about + data, media_type="application/octet-stream")
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+
+    with contextlib.closing(open_port(host, port)) as listener, contextlib.ExitStack() as stack:
+
+        def show(make: Callable[[], Place], facts: Mapping[str, Any]) -> None:
+            newest.show(make, facts)
+            if not started.is_set():
+                started.set()
+                policy = PlacePage(make()).policy
+                app = application(newest.html, [Route("/now", now)], lifespan, host, None, policy)
+                server = make_server(app, listener, host, None, on_ready, websockets=False)
+                thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+                thread.start()
+                stack.callback(thread.join, STARTS_S)
+                stack.callback(setattr, server, "should_exit", True)
+
+        started = threading.Event()
+        yield show
