@@ -74,6 +74,29 @@ def test_an_unknown_parameter_of_the_gap_is_named(tmp_path, capsys):
     assert code == 2 and "no parameter 'fricton'" in err and "friction" in err
 
 
+def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeypatch):
+    from terrella.cli import transfer_look
+    from terrella.core.errors import TerrellaError
+    from terrella.core.world import make_rng
+    from terrella.library import load
+
+    try:
+        seen = load("mujoco:arm", size=(8, 8))
+        seen.render(seen.start(1, make_rng(0)), ("rgb",))
+    except TerrellaError as error:
+        pytest.skip(str(error))
+    for name, value in {"LABELLED": 64, "UNLABELLED": 64, "STEPS": 3}.items():
+        monkeypatch.setattr(transfer_look, name, value)
+    words = ("transfer", "--practice", 1, "--episodes", 4, "--seeds", 1, "--out", tmp_path / "t", "--json")
+    plain = json.loads(ran(capsys, *words, "--arms", "nominal")[1])
+    code, out, _ = ran(capsys, *words, "--arms", "nominal", "--camera")
+    told = json.loads(out)
+    assert code == 0 and told["arms"] == plain["arms"] and told["look_hash"] != told["hash"]
+    assert {"nominal", "visual", "nominal, adversarial encoder"} < set(told["camera"]) and len(told["errors"]) == 4
+    code, _, err = ran(capsys, *words, "--look", "x.toml")
+    assert code == 2 and "--camera" in err
+
+
 def test_a_recording_stands_for_reality(tmp_path, capsys, few):
     from terrella.core import make_rng
     from terrella.core.policy import Random

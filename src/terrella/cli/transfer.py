@@ -17,7 +17,7 @@ import torch
 from .. import library
 from ..core.errors import TerrellaError
 from ..data.storage.durable import write_json
-from ..measure.transferred import Played, as_dict, table, transferred, verdict
+from ..measure.transferred import Played, as_dict, camera_table, table, transferred, verdict
 from ..measure.transferred_page import transferred_page
 from .beside import check_alike, sound
 from .evaluate import table_lines
@@ -25,13 +25,15 @@ from .say import Json, Seed, result, say
 
 BUNDLED = Path(__file__).parent.parent / "sim" / "models"
 ARMS = ("nominal", "randomised", "identified", "model", "oracle")
-FREE = ("arms", "real_episodes")  # more of them may be asked for later
+FREE = ("arms", "real_episodes", "look", "looks", "look_hash")  # more of them may be asked for later
+PICTURE = (64, 64)  # pixels of the real one's pictures, where its goal is read off them
 DIAL = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is asked. real: mujoco:NAME; gap: the file of how it differs at 1; randomise: the file of what the engineer varies."""
+    """What is asked. real: mujoco:NAME; gap: the file of how it differs at 1; randomise: the file of what the engineer varies;
+    look, looks: files of how it looks, and of what looks the engineer varies; "" where no camera is asked for."""
 
     sim: str
     real: str
@@ -44,6 +46,9 @@ class Experiment:
     success: str
     arms: tuple[str, ...]
     hash: str
+    look: str = ""
+    looks: str = ""
+    look_hash: str = ""
 
 
 def transfer(
@@ -58,6 +63,9 @@ def transfer(
     seeds: int = 3,
     practice: int = 120,
     success: str = "success",
+    look: Path | None = None,
+    looks: Path | None = None,
+    camera: bool = False,
     out: Path | None = None,
     workers: int = 1,
     seed: Seed = 0,
@@ -81,6 +89,10 @@ def transfer(
         seeds: Whole repetitions, each with its own training and its own real episodes to learn from.
         practice: Updates of practice (of 6,144 steps) of the nominal policy, and again of each arm after it.
         success: The channel that is above 0 where an episode has succeeded.
+        camera: Judge besides policies that are told their goal by an encoder of pictures: nominal, of randomised looks, adapted
+            to unlabelled real pictures by an adversary, or of the real one.
+        look: A TOML or JSON file of how the real one looks otherwise at a gap of 1. Default: the bundled pair's.
+        looks: A TOML or JSON file of the looks that are randomised. Default: the bundled pair's.
         out: Folder for the page, the figures and the policies; default: transfers/NAME.
         workers: Seeds that run at once, each a process of its own.
     """
@@ -105,8 +117,21 @@ def transfer(
         raise TerrellaError(
             "say what is randomised with --randomise FILE, or leave randomised and identified out of --arms."
         )
+    look_file, looks_file = (
+        str(said or (BUNDLED / own if bundled and camera else ""))
+        for said, own in ((look, "arm_look.toml"), (looks, "arm_looks.toml"))
+    )
+    if camera and not (look_file and looks_file):
+        raise TerrellaError(
+            "say how the real one looks with --look FILE, and what looks are randomised with --looks FILE."
+        )
+    if not camera and (look or looks):
+        raise TerrellaError("--look and --looks are of --camera; give that too.")
     mark = real_hash(real_name, gap_file, dial)
-    asked = Experiment(sim, real_name, gap_file, dial, ranges, episodes, practice, real_episodes, success, arms, mark)
+    asked = Experiment(
+        sim, real_name, gap_file, dial, ranges, episodes, practice, real_episodes, success, arms, mark,
+        look_file, looks_file, real_hash(real_name, gap_file, dial, look_file) if camera else "",
+    )  # fmt: skip
     check_pair(asked)
     folder = out or Path("transfers") / sim.partition(":")[2].replace("/", "-")
     same_as_before(folder, asked)
@@ -125,22 +150,23 @@ def _all_seeds(asked: Experiment, folder: Path, seeds: range, workers: int) -> d
         return dict(zip(seeds, pool.map(run, seeds)))
 
 
-def opened_real(name: str, gap: str, dial: float) -> Any:
-    """The real one at a gap; TerrellaError for what cannot be."""
+def opened_real(name: str, gap: str, dial: float, look: str = "") -> Any:
+    """The real one at a gap, with a camera where a look is asked for; TerrellaError for what cannot be."""
     from ..sim import randomised
 
     if not 0 <= dial <= 1:
         raise TerrellaError(f"--dial is the share of the gap, from 0 to 1; got {dial:g}.")
-    world = library.load(name, cameras=(), threads=1)
-    return randomised.Randomised(world, randomised.read(gap), dial) if gap else world
+    world = library.load(name, cameras=None if look else (), size=PICTURE, threads=1)
+    told = {key: one for file in (gap, look) if file for key, one in randomised.read(file).items()}
+    return randomised.Randomised(world, told, dial) if told else world
 
 
-def real_hash(name: str, gap: str, dial: float) -> str:
-    """sha256 of all that the real one is: engine, model, task, and its gap."""
-    world = opened_real(name, gap, dial)
+def real_hash(name: str, gap: str, dial: float, look: str = "") -> str:
+    """sha256 of all that the real one is: engine, model, task, its gap, and its look."""
+    world = opened_real(name, gap, dial, look)
     told = world.spec.card.get("randomised", {})
     inside = getattr(world, "world", world).fingerprint()
-    return hashlib.sha256(json_text.dumps([inside, told, dial if gap else 0], sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json_text.dumps([inside, told, dial if told else 0], sort_keys=True).encode()).hexdigest()
 
 
 def check_pair(asked: Experiment) -> None:
@@ -187,7 +213,13 @@ def _report(folder: Path, asked: Experiment, found: Mapping[int, Mapping[str, An
     inside = {
         name: played(name) for name in ("the simulator", "the model") if any(one.get(name) for one in found.values())
     }
-    whole = transferred(played("real"), dial if asked.gap else {}, inside)
+    looked = [(seed, one["camera"][asked.look_hash]) for seed, one in found.items() if asked.look]
+    named = list(dict.fromkeys(arm for _, one in looked for arm in one["arms"]))
+    camera = {
+        arm: {seed: torch.tensor(one["arms"][arm]) for seed, one in looked if arm in one["arms"]} for arm in named
+    }
+    errors = {name: [one["errors"][name] for _, one in looked] for name in (looked[0][1]["errors"] if looked else ())}
+    whole = transferred(played("real"), dial if asked.gap else {}, inside, camera, errors)
     identified = [one["identified"] for one in found.values() if one.get("identified")]
     facts: dict[str, Any] = {**asdict(asked), "seeds": list(found), "identified": identified}
     page = folder / "transfer.html"
@@ -198,6 +230,7 @@ def _report(folder: Path, asked: Experiment, found: Mapping[int, Mapping[str, An
         "",
         *table_lines(*table(whole)),
         "",
+        *((*table_lines(*camera_table(whole)), "") if camera else ()),
         f"the real one: sha256 {asked.hash}",
         f"the page: {page}",
     ]

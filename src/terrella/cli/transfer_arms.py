@@ -28,9 +28,11 @@ from ..sim.randomised import Randomised, read
 from ..sim.trials import Trials, collect, inner
 from .say import say
 from .transfer import DIAL, Experiment, opened_real
+from .transfer_look import Encoders, arms_of, told_by
 
 HIDDEN, LEARNING_RATE = 64, 3e-3
-GENTLY = 5e-4  # of a policy that has practised already: at the first rate it forgets
+GENTLY = 2e-3  # of a policy that has practised already
+ENTROPY = 1e-2  # a policy that is sure of what it learned in the simulator must try other things again
 FITTED = 500  # steps of a residual's regression
 SLIPS = 0.3  # of the actions in the episodes that are learned from are random
 IDENTIFIED_FROM, GATHER = 10, 50  # real episodes: of identification, and so many or more are gathered
@@ -84,7 +86,24 @@ class _Seed:
         for arm, policy in {"random": Random(self.sim.spec), "idle": Idle(self.sim.spec)}.items():
             if arm not in self.found["real"]:
                 self._judge(arm, policy, few if models else None)
+        if asked.look:
+            self._look([*worlds], f"model {few}")
         return self.found
+
+    def _look(self, arms: list[str], best: str) -> None:
+        """Judges policies that are told their goal by a camera, in the real one as it looks."""
+        asked, kept = self.asked, self.found.setdefault("camera", {}).setdefault(self.asked.look_hash, {})
+        pairs = {name: pair for name, pair in arms_of(arms, best).items() if name not in kept.get("arms", {})}
+        real = opened_real(asked.real, asked.gap, asked.dial, asked.look)
+        encoders = Encoders(asked.sim, real, asked.looks, self.folder / asked.look_hash[:8], self.seed)
+        for name in dict.fromkeys(encoder for _, encoder in pairs.values()):
+            encoder = encoders[name]
+            kept.setdefault("errors", {})[name] = encoders.error(encoder)
+            for arm, (policy, _) in pairs.items():
+                if pairs[arm][1] == name:
+                    actor = Actor.load(self.folder / policy, self.sim.spec)
+                    kept.setdefault("arms", {})[arm] = self._successes(told_by(encoder, real), actor)
+            write_json(self.file, self.found)
 
     def _practised(self, arm: str, world: World, before: Path | None) -> None:
         rate = LEARNING_RATE if before is None else GENTLY
@@ -93,6 +112,7 @@ class _Seed:
             steps=self.asked.practice,
             hidden=HIDDEN,
             learning_rate=rate,
+            entropy=ENTROPY,
             seed=self.seed,
             save_every_s=60,
         )

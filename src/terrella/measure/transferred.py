@@ -31,12 +31,19 @@ class Transferred:
     recovered: dict[str, float]
     dial: dict[str, dict[float, Figure]]
     agreed: dict[str, Agreement]
+    camera: dict[str, Figure]
+    errors: dict[str, tuple[float, float]]
 
 
 def transferred(
-    real: Played, dial: Mapping[str, Mapping[float, torch.Tensor]], inside: Mapping[str, Played]
+    real: Played,
+    dial: Mapping[str, Mapping[float, torch.Tensor]],
+    inside: Mapping[str, Played],
+    camera: Played,
+    errors: Mapping[str, Sequence[float]],
 ) -> Transferred:
-    """Figures of all arms. inside: by simulator or model, the same policies' successes there, from starts of its own."""
+    """Figures of all arms. inside: by simulator or model, the same policies' successes there, from starts of its own; camera: those
+    of arms that are told their goal by an encoder of pictures; errors: encoder -> seeds, how far off the goal is that it reads."""
     arms = {arm: _share(torch.cat(list(seeds.values()))) for arm, seeds in real.items()}
     spread = {arm: _ends([float(one.float().mean()) for one in seeds.values()]) for arm, seeds in real.items()}
     recovered = {}
@@ -53,7 +60,9 @@ def transferred(
             dreamt, seen = (torch.stack([pair[at].float() for pair in pairs]) for at in (0, 1))
             agreed[name] = agreement(dreamt, seen, rng, 1.0)
     curves = {arm: {gap: _share(one) for gap, one in gaps.items()} for arm, gaps in dial.items()}
-    return Transferred(arms, spread, recovered, curves, agreed)
+    by_camera = {arm: _share(torch.cat(list(seeds.values()))) for arm, seeds in camera.items()}
+    off = {name: _ends(values) for name, values in errors.items()}
+    return Transferred(arms, spread, recovered, curves, agreed, by_camera, off)
 
 
 def best(found: Transferred) -> str:
@@ -81,7 +90,20 @@ def verdict(found: Transferred) -> list[str]:
         lines.append(
             f"{name} and the real one on {agreed.pearson.count} policies: Pearson {told(agreed.pearson)}, MMRV {told(agreed.mmrv)}"
         )
+    if found.camera:
+        winner = max((arm for arm in found.camera if ORACLE not in arm), key=lambda arm: found.camera[arm].value)
+        told_so = f"told the goal by a camera, nominal succeeds in {share(found.camera[NOMINAL])}"
+        lines.append(f"{told_so}; the best that saw no real goal, {winner}, in {share(found.camera[winner])}")
     return lines
+
+
+def camera_table(found: Transferred) -> tuple[list[str], list[list[str]]]:
+    """The same of the arms with a camera, and how far off their encoder's goals are."""
+    lines = []
+    for arm, figure in found.camera.items():
+        off = next((ends for name, ends in found.errors.items() if arm.endswith(f"{name} encoder")), None)
+        lines.append([arm, share(figure), f"{off[0]:.3f} to {off[1]:.3f}" if off else ""])
+    return ["with a camera", "real successes", "goal's error, seeds"], lines
 
 
 def table(found: Transferred) -> tuple[list[str], list[list[str]]]:

@@ -101,6 +101,12 @@ def _colour(axis: int) -> Parameter:
     return Parameter(0.0, -1.0, 1.0, "", "added to this share of all colours", change, True)
 
 
+DISTRACTORS = Parameter(
+    0.0, 0.0, 20.0, "", "balls and boxes that stand about: how many, and after the point where and how they look",
+    lambda model, file, value: None, True,
+)  # fmt: skip
+
+
 def parameters_of(model: Model) -> Mapping[str, Parameter]:
     """What may be changed of a model, by name; `mass.NAME` is that of one body."""
     gravity = -float(model.opt.gravity[2])
@@ -120,7 +126,7 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "camera.z": _camera("cam_pos", 2, 1.0, "m", "moved along its body's z"),
         "camera.fov": _camera("cam_fovy", None, 0.0, "x", "field of view"),
         "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
-        "red": _colour(0), "green": _colour(1), "blue": _colour(2),
+        "red": _colour(0), "green": _colour(1), "blue": _colour(2), "distractors": DISTRACTORS,
     }  # fmt: skip
     acts = {
         "damping": "dof_damping", "armature": "dof_armature", "joint_friction": "dof_frictionloss",

@@ -18,9 +18,10 @@ import numpy as np
 from ..core.errors import TerrellaError
 from ..core.spec import Camera
 from .mujoco_model import mujoco
-from .mujoco_parameters import Models, Parameter
+from .mujoco_parameters import DISTRACTORS, Models, Parameter
 
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # left out: they cost most of the time
+MARK, MARK_M = (1.0, 0.25, 0.2, 1.0), 0.03  # the marker's colour and radius
 HINT = "set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts, and install libegl1 or libosmesa6"
 
 
@@ -43,9 +44,13 @@ class Pictures:
             model.vis.quality.offsamples = 0  # small pictures are drawn three times as fast without
         self._data = mujoco.MjData(model)
         self._renderer: mujoco.Renderer | None = None
+        self._about = next((at for at, one in changes.items() if one is DISTRACTORS), None)
+        self._mark: np.ndarray | None = None
+        self._distractors = 0.0
 
-    def put(self, physics: np.ndarray, row: np.ndarray) -> None:
-        """Stands at a world: its state, and its values of the parameters."""
+    def put(self, physics: np.ndarray, row: np.ndarray, mark: np.ndarray | None = None) -> None:
+        """Stands at a world: its state, its values of the parameters, and the point [3], m, that is marked."""
+        self._mark, self._distractors = mark, 0.0 if self._about is None else float(row[self._about])
         if self._columns:
             self._models.changed(self._model, row[self._columns])
         mujoco.mj_setState(self._model, self._data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -68,6 +73,7 @@ class Pictures:
         elif kind == "segmentation":
             renderer.enable_segmentation_rendering()
         renderer.update_scene(self._data, camera)
+        self._furnish(renderer.scene)
         for flag in _PLAIN:
             renderer.scene.flags[flag] = 0
         try:
@@ -79,6 +85,18 @@ class Pictures:
             return seen
         geoms = np.where(seen[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), seen[..., 0], -1)
         return np.where(geoms >= 0, self._model.geom_bodyid[geoms], -1).astype(np.int32)
+
+    def _furnish(self, scene: mujoco.MjvScene) -> None:
+        """Puts what is looked at and touched by nobody into the scene: the marker, and distractors."""
+        if self._mark is not None:
+            _put(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, MARK_M), self._mark, MARK)
+        count = int(self._distractors)
+        rng = np.random.default_rng(np.float64(self._distractors).view(np.uint64))
+        for _ in range(count):
+            kind = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX)[rng.integers(2)]
+            size = self._model.stat.extent * rng.uniform(0.02, 0.08, 3)
+            at = self._model.stat.center + self._model.stat.extent * rng.uniform(-0.8, 0.8, 3)
+            _put(scene, kind, size, at, (*rng.uniform(0, 1, 3), 1.0))
 
     def close(self) -> None:
         if self._renderer is not None:
@@ -96,6 +114,13 @@ class Pictures:
                 first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
                 raise TerrellaError(f"MuJoCo cannot draw without a display ({first}): {HINT}.") from error
         return self._renderer
+
+
+def _put(scene: mujoco.MjvScene, kind: int, size: np.ndarray, at: np.ndarray, colour: tuple[float, ...]) -> None:
+    if scene.ngeom < scene.maxgeom:
+        geom, upright = scene.geoms[scene.ngeom], np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, kind, size, np.asarray(at, np.float64), upright, np.asarray(colour, np.float32))
+        scene.ngeom += 1
 
 
 def _blind() -> bool:

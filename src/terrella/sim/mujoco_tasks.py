@@ -15,6 +15,7 @@ from ..core.errors import TerrellaError
 
 Tensors = Mapping[str, torch.Tensor]
 _START, _GOAL = 1, 2  # streams of chance
+MARKER = "marker"  # of a state, where a task keeps one: a point [B, 3], m, that pictures show as a ball
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Body:
 
 
 class Task(Protocol):
-    """`begin` changes the starts [B, nq], [B, nv] and gives tensors of its own for the state; `judge` gives reward [B], fallen bool
-    [B] and its tensors after a step; `channels` says what `see` shows."""
+    """`begin` changes the starts [B, nq], [B, nv] and gives tensors of its own for the state (`marker` is drawn); `judge`
+    gives reward [B], fallen bool [B] and its tensors after a step; `channels` says what `see` shows."""
 
     rewards: bool
 
@@ -166,7 +167,8 @@ class Reach:
 
     def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
         low, high = torch.tensor(self.low), torch.tensor(self.high)
-        return {"goal": low + (high - low) * chance.uniform(seeds, (3,), _GOAL)}
+        goal = low + (high - low) * chance.uniform(seeds, (3,), _GOAL)
+        return {"goal": goal, MARKER: goal.double()}
 
     def judge(
         self, body: Body, before: Tensors, after: Tensors
@@ -210,7 +212,8 @@ class Hold:
         low, high = self.ring
         length, turn = (low**2 + (high**2 - low**2) * radius).sqrt(), 2 * torch.pi * angle
         goal = torch.stack([length * turn.cos(), length * turn.sin()], 1)
-        return {"goal": goal, "held": torch.zeros(len(goal), dtype=torch.int64)}
+        marker = torch.stack([goal[:, 0], torch.zeros(len(goal)), goal[:, 1]], 1).double()
+        return {"goal": goal, MARKER: marker, "held": torch.zeros(len(goal), dtype=torch.int64)}
 
     def judge(
         self, body: Body, before: Tensors, after: Tensors

@@ -29,7 +29,7 @@ from .mujoco_parameters import checked, parameters_of
 from .mujoco_pictures import Pictures, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
-from .mujoco_tasks import Body, Free, Task, numbers
+from .mujoco_tasks import MARKER, Body, Free, Task, numbers
 
 FILES = (".xml", ".mjcf", ".urdf")
 FASTEST = 1e4  # m/s or rad/s: a world that moves faster is unstable
@@ -246,11 +246,12 @@ class MujocoWorld:
         found: dict[str, list[np.ndarray]] = {name: [] for name in names}
         physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
         values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
+        marks = state[MARKER].numpy() if MARKER in state else [None] * state.batch
         looked = any(kind_of(name) not in SCANNED for name in names)
         with self._lock:
-            for row, control, value in zip(physics, ctrl, values):
+            for row, control, value, mark in zip(physics, ctrl, values, marks):
                 if looked:
-                    self._pictures.put(row, value)
+                    self._pictures.put(row, value, mark)
                 for name in names:
                     kind, camera = kind_of(name), suffix_of(name) or (self._cameras or [""])[0]
                     if kind == "contacts":
