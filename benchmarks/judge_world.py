@@ -27,7 +27,7 @@ from stable_worldmodel.policy import BasePolicy  # noqa: E402
 ENVIRONMENT, SIZE, LONGEST = "swm/TwoRoom-v1", (64, 64), 100
 REACHED = 16.0  # pixels of 224: what TwoRoom calls reached
 WALL = 112.0  # where the wall between the rooms stands
-SPEED = 5.0  # pixels a step
+DOOR_MARGIN = 1.75  # pixels beside a door that TwoRoom still lets through
 AT_ONCE = 25  # episodes that are collected side by side
 
 
@@ -151,10 +151,33 @@ CALLABLES = [
 ]
 
 
-def evaluated(policy: Any, held: Held, starts: tuple[list[int], list[int]], offset: int, budget: int) -> np.ndarray:
-    """bool [n]: which starts reached their goals, by stable-worldmodel's own `evaluate`."""
-    world = opened(len(starts[0]))
-    world.set_policy(policy)
+class _Watched(BasePolicy):
+    """A policy, and where the agent was at each of its decisions: places, each [n, 2] in pixels of 224."""
+
+    def __init__(self, policy: Any):
+        super().__init__()
+        self.policy, self.places = policy, []
+
+    def set_env(self, env: Any) -> None:
+        super().set_env(env)
+        self.policy.set_env(env)
+
+    def get_action(self, infos: dict, **kwargs: Any) -> np.ndarray:
+        self.places.append(_places(infos))
+        return self.policy.get_action(infos, **kwargs)
+
+
+def _places(infos: dict) -> np.ndarray:
+    return np.array(infos["state"][:, -1, :2], np.float64)
+
+
+def evaluated(
+    policy: Any, held: Held, starts: tuple[list[int], list[int]], offset: int, budget: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """bool [n] twice: which starts reached their goals, by stable-worldmodel's own `evaluate`; and strictly, by a way that nowhere
+    cuts the wall, and into the goal's own room (within REACHED may be through the wall)."""
+    world, watched = opened(len(starts[0])), _Watched(policy)
+    world.set_policy(watched)
     np.random.seed(0)
     found = world.evaluate(
         dataset=held,
@@ -164,5 +187,20 @@ def evaluated(policy: Any, held: Held, starts: tuple[list[int], list[int]], offs
         eval_budget=budget,
         callables=CALLABLES,
     )
+    goals = np.stack([held.held[number]["state"][row + offset][:2] for number, row in zip(*starts)])
+    ways = np.stack([*watched.places, _places(world.infos)], 1)
+    rooms = [one.unwrapped for one in world.envs.envs]
     world.close()
-    return np.asarray(found["episode_successes"], bool)
+    reached = np.asarray(found["episode_successes"], bool)
+    valid = [keeps_to_the_door(way, room) for way, room in zip(ways, rooms)]
+    return reached, reached & valid & ((ways[:, -1, 0] < WALL) == (goals[:, 0] < WALL))
+
+
+def keeps_to_the_door(way: np.ndarray, room: Any) -> bool:
+    """Whether a way [steps, 2] is in the wall's stripe only where a door is (with the margin that TwoRoom itself leaves)."""
+    shares = np.linspace(0, 1, 6)[:, None, None]
+    x, y = np.moveaxis(way[None, :-1] * (1 - shares) + way[None, 1:] * shares, 2, 0)
+    inside = abs(x - WALL) <= room.wall_thickness // 2
+    doors = zip(room.door_positions[: room.num_doors].tolist(), room.door_sizes[: room.num_doors].tolist())
+    open_ = np.any([abs(y - centre) <= half + DOOR_MARGIN for centre, half in doors], axis=0)
+    return not bool((inside & ~open_).any())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from ..measure.acted import compute_chart, film, film_strip, plan_page
 from ..measure.statistics import Figure, mean_interval, wilson
 from ..serve.picture import uncertainty_levels
 from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
+from .compute_curve import Point, compute_of, gain, helped, less
 from .goals import REWARD, read_goal
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result, say
@@ -47,7 +48,6 @@ from .searching import Searching, Settled
 from .walking import WALK_S, Walks, is_recording, search_of, views_of
 
 WITHIN = 0.05  # unless it is said
-DOUBLINGS = 5  # of the curve of success against compute
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def plan(
     real: str | None = None,
     episodes: int = 10,
     steps: int | None = None,
-    curve: bool = False,
+    curve: bool = True,
     out: Path | None = None,
     device: Device = "auto",
     seed: Seed = 0,
@@ -154,19 +154,17 @@ def plan(
         name: The world to plan in: what `terrella list` shows, the path of a checkpoint, or a simulator itself (gym:CartPole-v1).
         real: The environment to act in (gym:CartPole-v1); without one, the world itself.
         steps: Of an episode at most; default: the environment's own limit, or 200, for who walks as many as are 30 s.
-        curve: Also play with half, a quarter ... of the samples: does thinking longer help?
+        curve: Also play with half, a quarter ... of the plans, or of --budget-ms: does thinking longer help?
         out: Folder for the page, the film and plan.json; default: plans/ and the world's name.
     """
     if searching.agent:
         searching.refuse(f"{searching.agent} acts in place of the search")
-        if curve:
-            raise TerrellaError(f"{searching.agent} acts in place of the search; leave --curve out.")
     case = _opened(name, environment, searching, aim, real, episodes, steps, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
     keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
     mine = case.planned(case.searching, "acting" if searching.agent else "planning", keep)
     floor = case.floor()
-    points = _curve(case, mine) if curve else []
+    points = _curve(case, mine) if curve and not searching.agent else []
     about = {"world": name, "real": real or name, **asdict(aim), "within": case.within}
     asked = {key: value for key, value in asdict(case.searching).items() if value is not None}
     facts = {
@@ -190,19 +188,22 @@ def _report(
     """Writes the page and the film; what came of it in words, and all of it."""
     arms = {"planner": _figures(mine, case.seed), "random": _figures(floor, case.seed)}
     what = "success" if "success" in arms["planner"] else "return"
-    curve = [(steps, figures[what]) for steps, figures in points]
-    lines = _lines(case, mine, arms, curve)
+    lines = _lines(case, mine, arms, points, what)
     divergence, picture, filmed = _filmed(
         case, next((one for one in mine.episodes if one.seen), mine.episodes[0]), folder
     )
+    curve = [(point.imagined, point.worth) for point in points]
     chart = compute_chart(curve, arms["random"][what], what) if curve else ""
     page = plan_page(f"{facts['world']}: {facts['goal']}", lines, arms, chart, picture, filmed, facts)
     (folder / "plan.html").write_text(page, encoding="utf-8")
     return lines, {
         **facts,
         **{arm: _plain(figures) for arm, figures in arms.items()},
-        "difference": _plain({what: _paired(mine, floor, what, case.seed)}),
-        "curve": [{"imagined": steps, **_plain(figures)} for steps, figures in points],
+        "difference": _plain({what: gain(mine, floor, what, case.seed)}),
+        "curve": [
+            {"with": point.words, "imagined": point.imagined, **_plain(_figures(point.played, case.seed))}
+            for point in points
+        ],
         "divergence": divergence,
         "played": [_told(episode) for episode in mine.episodes],
         "page": str(folder / "plan.html"),
@@ -288,28 +289,22 @@ def _middle(values: list) -> Figure:
     return Figure(middle, low, high, len(values))
 
 
-def _paired(mine: Played, floor: Played, what: str, seed: int) -> Figure:
-    """By how much the planner is better than chance, start by start."""
-    worth = lambda one: float(bool(one.success)) if what == "success" else one.reward  # noqa: E731
-    apart = [worth(one) - worth(other) for one, other in zip(mine.episodes, floor.episodes)]
-    return mean_interval(torch.tensor(apart), make_rng(seed))
-
-
-def _curve(case: _Case, mine: Played) -> list[tuple[float, dict[str, Figure]]]:
-    """The same starts with the samples halved again and again, up to what was asked: steps imagined, figures."""
+def _curve(case: _Case, mine: Played) -> list[Point]:
+    """The same starts with less and less compute, up to what was asked; nothing where a search imagines nothing."""
     points = []
-    for halvings in range(DOUBLINGS - 1, -1, -1):
-        samples = case.searching.samples >> halvings
-        if samples < 2:
-            continue
-        searching = replace(case.searching, samples=samples)
-        played = case.planned(searching, f"planning with {samples} samples") if halvings else mine
+    for searching in [*less(case.searching), case.searching]:
+        whole = searching is case.searching
+        played = mine if whole else case.planned(searching, f"planning with {compute_of(searching)}")
         figures = _figures(played, case.seed)
-        points.append((figures["steps imagined"].value, figures))
+        if "steps imagined" in figures:
+            worth = figures["success" if "success" in figures else "return"]
+            points.append(Point(searching, figures["steps imagined"].value, worth, played))
     return points
 
 
-def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], points: list) -> list[str]:
+def _lines(
+    case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], points: list[Point], what: str
+) -> list[str]:
     """What came of it, for people."""
     count, planner, floor = len(mine.episodes), arms["planner"], arms["random"]
     lines = []
@@ -335,7 +330,9 @@ def _lines(case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], 
         best = min(one.best_cost for one in mine.episodes)
         cost = f"; the best plan in the world cost {best:.3g}" if math.isfinite(best) else ""
         lines.append(f"the goal was never reached{away}{cost}: it may be impossible")
-    lines += [f"{steps:>10,.0f} imagined steps: {figure}" for steps, figure in points]
+    lines += [f"{point.imagined:>10,.0f} imagined steps, {point.words}: {what} {point.worth}" for point in points]
+    if len(points) > 1:
+        lines.append(helped(points, what, case.seed))
     if case.searching.budget_ms is not None:
         lines.append("planned by the clock: another run may differ")
     return lines

@@ -1,0 +1,67 @@
+"""The curve of `terrella plan`: the same starts with ever fewer plans a decision, or ever less time; does thinking longer help?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from ..act.planning import Played
+from ..core.world import make_rng
+from ..measure.statistics import Figure, mean_interval
+from .searching import Settled
+
+DOUBLINGS = 5  # points of the curve, at most
+FEWEST = 2  # plans of a round that a search can do with
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a planner came to with so much compute. imagined: steps imagined for a decision, the median."""
+
+    searching: Settled
+    imagined: float
+    worth: Figure
+    played: Played
+
+    @property
+    def words(self) -> str:
+        return compute_of(self.searching)
+
+
+def compute_of(asked: Settled) -> str:
+    """How much a search is given, in words."""
+    return f"{asked.samples} plans a round" if asked.budget_ms is None else f"{asked.budget_ms:g} ms a decision"
+
+
+def less(searching: Settled) -> list[Settled]:
+    """The settings with the plans of a round, or the time of a decision, halved again and again; the least first."""
+    shares = range(DOUBLINGS - 1, 0, -1)
+    if searching.budget_ms is not None:
+        return [replace(searching, budget_ms=searching.budget_ms / 2**halvings) for halvings in shares]
+    return [
+        replace(searching, samples=searching.samples >> halvings)
+        for halvings in shares
+        if searching.samples >> halvings >= FEWEST
+    ]
+
+
+def helped(points: Sequence[Point], what: str, seed: int) -> str:
+    """In a sentence: whether the most compute did better than the least, start by start, and from where no more was gained."""
+    least, most = points[0], points[-1]
+    gained = gain(most.played, least.played, what, seed)
+    between = f"by {gained} in {what} from {least.words} to {most.words}"
+    if gained.low <= 0:
+        return f"Thinking longer is not seen to help: {between}."
+    apart = [gain(most.played, point.played, what, seed).low > 0 for point in points]
+    enough = points[1 + max(at for at, found in enumerate(apart) if found)]
+    plateau = "no plateau is seen yet" if enough is most else f"more than {enough.words} is not seen to help"
+    return f"Thinking longer helps, {between}; {plateau}."
+
+
+def gain(mine: Played, other: Played, what: str, seed: int) -> Figure:
+    """By how much one is better than another, start by start."""
+    worth = lambda one: float(bool(one.success)) if what == "success" else one.reward  # noqa: E731
+    apart = [worth(one) - worth(beside) for one, beside in zip(mine.episodes, other.episodes)]
+    return mean_interval(torch.tensor(apart), make_rng(seed))

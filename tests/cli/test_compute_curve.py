@@ -1,0 +1,44 @@
+"""The curve of success against compute: what is halved, and what is said of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from terrella.act.planning import Episode, Played
+from terrella.cli.compute_curve import Point, helped, less
+from terrella.cli.searching import Searching
+from terrella.measure.statistics import wilson
+
+PLAIN = Searching(samples=16).settled({})
+
+
+def test_plans_and_milliseconds_are_halved_and_two_plans_are_the_fewest():
+    assert [one.samples for one in less(PLAIN)] == [2, 4, 8]
+    assert [one.samples for one in less(Searching(samples=64).settled({}))] == [4, 8, 16, 32]
+    by_the_clock = less(Searching(budget_ms=40).settled({}))
+    assert [one.budget_ms for one in by_the_clock] == [2.5, 5, 10, 20] and {one.samples for one in by_the_clock} == {64}
+
+
+@pytest.mark.parametrize(
+    "reached, said",
+    [
+        (
+            (0, 5, 20, 20),
+            "Thinking longer helps, by 1 [1, 1] (n=20) in success from 2 plans a round to 16 plans a round; ",
+        ),
+        ((0, 5, 20, 20), "more than 8 plans a round is not seen to help"),
+        ((0, 1, 5, 20), "no plateau is seen yet"),
+        ((10, 11, 12, 10), "Thinking longer is not seen to help"),
+        ((20, 10, 5, 0), "Thinking longer is not seen to help"),
+    ],
+)
+def test_whether_it_helped_is_told_with_its_plateau(reached, said):
+    points = [
+        Point(searching, 10.0 * searching.samples, wilson(count, 20), _played(count))
+        for searching, count in zip([*less(PLAIN), PLAIN], reached)
+    ]
+    assert said in helped(points, "success", 0)
+
+
+def _played(reached: int) -> Played:
+    return Played([Episode(success=at < reached) for at in range(20)], 0)
