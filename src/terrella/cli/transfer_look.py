@@ -23,35 +23,32 @@ LABELLED, UNLABELLED = (
     2048,
     512,
 )  # pictures of the simulator, of which the goal is known; of the real one, of which it is not
-STEPS = 700
+STEPS = 1000
 LABELLED_SEED, UNLABELLED_SEED = 3_000_003, 4_000_003
 ENCODERS = ("nominal", "randomised", "adversarial", "oracle")
 
 
 class Encoders:
-    """The encoders of one seed: nominal has seen the simulator, randomised many looks of it, adversarial the simulator with
-    labels and the real one without, oracle the real one with labels. looks: the file of what is randomised."""
+    """The encoders of one seed: nominal has seen the simulator, randomised many looks of it, adversarial those and
+    the real one without labels, oracle the real one with labels. looks: the file of what is randomised."""
 
     def __init__(self, sim: str, real: World, looks: str, folder: Path, seed: int):
         self.sim: World = library.load(sim, cameras=None, size=PICTURE, threads=1)
         self.real, self.looks, self.folder, self.seed = real, looks, folder, seed
 
     @cached_property
-    def _plain(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return pictures(self.sim, LABELLED, LABELLED_SEED + self.seed)
+    def _looks(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return pictures(Randomised(self.sim, read(self.looks)), LABELLED, LABELLED_SEED + self.seed)
 
     def __getitem__(self, name: str) -> Encoder:
         """The encoder of this name, trained or as it was trained before."""
-        if name == "oracle":
-            shown = Pictures(*pictures(self.real, LABELLED, LABELLED_SEED + self.seed))
-        elif name == "randomised":
-            looks = Randomised(self.sim, read(self.looks))
-            shown = Pictures(*pictures(looks, LABELLED, LABELLED_SEED + self.seed))
+        if name == "randomised":
+            shown = Pictures(*self._looks)
+        elif name == "adversarial":
+            shown = Pictures(*self._looks, pictures(self.real, UNLABELLED, UNLABELLED_SEED + self.seed)[0])
         else:
-            others = None
-            if name == "adversarial":
-                others, _ = pictures(self.real, UNLABELLED, UNLABELLED_SEED + self.seed)
-            shown = Pictures(*self._plain, others)
+            world = self.real if name == "oracle" else self.sim
+            shown = Pictures(*pictures(world, LABELLED, LABELLED_SEED + self.seed))
         torch.manual_seed(self.seed)
         encoder = Encoder(shown.numbers.shape[1])
         encoder.settle(shown.numbers)

@@ -22,7 +22,7 @@ METHOD = (
     "episodes best; then practice in narrow ranges around them.",
     "model N: the simulator and a learned residual, fitted to N real episodes, as one world model; then practice in it.",
     "With a camera: an encoder reads the goal off one picture when an episode begins. It learned from pictures of the simulator "
-    "with their goals (nominal); of many looks of it (randomised); of it, and of the real one without goals, which an adversary "
+    "with their goals (nominal); of many looks of it (randomised); of those, and of the real one without goals, which an adversary "
     "must not tell apart (adversarial, by gradient reversal); or of the real one with goals (oracle). visual: the nominal policy "
     "with the randomised encoder; both: the randomised policy with it.",
     "MMRV (SIMPLER): the most by which a policy really differs from one that is put on its other side; the mean over policies. "
