@@ -1,4 +1,4 @@
-"""Pictures, depth, segmentation and poses of MuJoCo worlds: one renderer, made when the first picture is asked for."""
+"""Pictures, depth, segmentation and poses of MuJoCo worlds: made when the first is asked for."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -11,16 +11,17 @@ import math
 import os
 import sys
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from ..core.errors import TerrellaError
 from ..core.spec import Camera
+from .mujoco_canvas import Canvas, simplify
 from .mujoco_model import mujoco
 from .mujoco_parameters import DISTRACTORS, Models, Parameter
 
-_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # left out: they cost most of the time
 MARK, MARK_M = (1.0, 0.25, 0.2, 1.0), 0.03  # the marker's colour and radius
 HINT = "set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts, and install libegl1 or libosmesa6"
 
@@ -38,12 +39,8 @@ class Pictures:
         self.size, self._columns = size, list(changes)
         self._models = Models(copy.copy(model), tuple(changes.values()))
         self._model = model
-        model.vis.global_.offheight = max(size[0], int(model.vis.global_.offheight))
-        model.vis.global_.offwidth = max(size[1], int(model.vis.global_.offwidth))
-        if max(size) <= 128:
-            model.vis.quality.offsamples = 0  # small pictures are drawn three times as fast without
         self._data = mujoco.MjData(model)
-        self._renderer: mujoco.Renderer | None = None
+        self._made: dict[str, Canvas | mujoco.Renderer] = {}
         self._about = next((at for at, one in changes.items() if one is DISTRACTORS), None)
         self._mark: np.ndarray | None = None
         self._distractors = 0.0
@@ -65,23 +62,31 @@ class Pictures:
         mujoco.mju_mat2Quat(turn, np.stack([-back, -right, up], 1).ravel())
         return np.concatenate([at.xpos, turn]).astype(np.float32)
 
-    def draw(self, camera: str, kind: str) -> np.ndarray:
-        """rgb: uint8 [H, W, 3]; depth: float32 [H, W], m along the optical axis; segmentation: int32 [H, W], the body or -1."""
-        renderer = self._drawer()
+    def draw(self, camera: str) -> bool:
+        """Draws the world in colour, and says whether it must be `read` before the next."""
+        canvas = self._maker("colour", lambda: Canvas(self._model, self.size))
+        canvas.draw(self._data, camera, self._furnish)
+        return canvas.full
+
+    def read(self) -> np.ndarray:
+        """uint8 [n, H, W, 3]: what was drawn since it was last read."""
+        return self._made["colour"].read()
+
+    def measure(self, camera: str, kind: str) -> np.ndarray:
+        """depth: float32 [H, W], m along the optical axis; segmentation: int32 [H, W], the body or -1."""
+        renderer = self._maker("measures", lambda: mujoco.Renderer(self._model, *self.size))
         if kind == "depth":
             renderer.enable_depth_rendering()
-        elif kind == "segmentation":
+        else:
             renderer.enable_segmentation_rendering()
         renderer.update_scene(self._data, camera)
         self._furnish(renderer.scene)
-        for flag in _PLAIN:
-            renderer.scene.flags[flag] = 0
         try:
             seen = renderer.render()
         finally:
             renderer.disable_depth_rendering()
             renderer.disable_segmentation_rendering()
-        if kind != "segmentation":
+        if kind == "depth":
             return seen
         geoms = np.where(seen[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), seen[..., 0], -1)
         return np.where(geoms >= 0, self._model.geom_bodyid[geoms], -1).astype(np.int32)
@@ -99,21 +104,25 @@ class Pictures:
             _put(scene, kind, size, at, (*rng.uniform(0, 1, 3), 1.0))
 
     def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        while self._made:
+            self._made.popitem()[1].close()
 
-    def _drawer(self) -> mujoco.Renderer:
-        if self._renderer is None:
+    def _maker(self, name: str, make: Callable[[], Any]) -> Any:
+        if name not in self._made:
             if _blind():
                 raise TerrellaError(f"MuJoCo cannot draw without a display: {HINT}.")
             try:
-                self._renderer = mujoco.Renderer(self._model, *self.size)
-                atexit.register(_closed, weakref.ref(self))  # at the exit itself it is too late
+                model = self._model
+                if not self._made:
+                    simplify(model, self.size)
+                    model.vis.global_.offheight = max(self.size[0], int(model.vis.global_.offheight))
+                    model.vis.global_.offwidth = max(self.size[1], int(model.vis.global_.offwidth))
+                    atexit.register(_closed, weakref.ref(self))  # at the exit itself it is too late
+                self._made[name] = make()
             except Exception as error:
                 first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
                 raise TerrellaError(f"MuJoCo cannot draw without a display ({first}): {HINT}.") from error
-        return self._renderer
+        return self._made[name]
 
 
 def _put(scene: mujoco.MjvScene, kind: int, size: np.ndarray, at: np.ndarray, colour: tuple[float, ...]) -> None:

@@ -247,22 +247,39 @@ class MujocoWorld:
         physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
         values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
         marks = state[MARKER].numpy() if MARKER in state else [None] * state.batch
-        looked = any(kind_of(name) not in SCANNED for name in names)
+        looked = [name for name in names if kind_of(name) not in SCANNED and kind_of(name) != "rgb"]
         with self._lock:
+            for name in names:
+                if kind_of(name) == "rgb":
+                    found[name] = self._pictured(self._camera_of(name), physics, values, marks)
             for row, control, value, mark in zip(physics, ctrl, values, marks):
                 if looked:
                     self._pictures.put(row, value, mark)
                 for name in names:
-                    kind, camera = kind_of(name), suffix_of(name) or (self._cameras or [""])[0]
+                    kind, camera = kind_of(name), self._camera_of(name)
                     if kind == "contacts":
                         found[name].append(self._stepper.contacts(row, control, value))
                     elif kind == SITE and self._lidar:
                         found[name].append(self._lidar.scan(*self._stepper.standing(row, value)))
-                    else:
-                        found[name].append(
-                            self._pictures.pose(camera) if kind == "pose" else self._pictures.draw(camera, kind)
-                        )
+                    elif kind == "pose":
+                        found[name].append(self._pictures.pose(camera))
+                    elif kind != "rgb":
+                        found[name].append(self._pictures.measure(camera, kind))
         return {name: torch.from_numpy(np.stack(rows)) for name, rows in found.items()}
+
+    def _camera_of(self, channel: str) -> str:
+        return suffix_of(channel) or (self._cameras or [""])[0]
+
+    def _pictured(
+        self, camera: str, physics: np.ndarray, values: np.ndarray, marks: Sequence[np.ndarray | None]
+    ) -> list[np.ndarray]:
+        """What a camera sees of each world, in colour."""
+        found: list[np.ndarray] = []
+        for at, (row, value, mark) in enumerate(zip(physics, values, marks)):
+            self._pictures.put(row, value, mark)
+            if self._pictures.draw(camera) or at == len(physics) - 1:
+                found += list(self._pictures.read())
+        return found
 
     def _describe(self) -> Spec:
         model, body = self.file, self.body

@@ -57,10 +57,13 @@ class LatentTraining:
         name: Name of the world.
         pictures: See the recording's pictures. --no-pictures sees its state vectors alone, and draws nothing.
         vectors: See the recording's state vectors. --no-vectors sees its pictures alone, and predicts the vectors all the same.
+        channels: Vectors of the recording that it learns, such as observation. Default: all.
         size: Height and width at which pictures are seen, multiples of 16. Default: their own shape, within 64 x 64.
         latent: Width of the latent. Default: 64 with pictures; without, the state vectors themselves, scaled, where they have 64
             numbers or fewer, else 32.
-        history: Last latents and actions that the predictor sees.
+        history: Last latents and actions that the predictor sees. 1 is enough, and fast, where the vectors tell speeds.
+        hidden: Width of the layers.
+        members: Predictors, whose disagreement says how wrong they may be; with 1 it says nothing.
         rollout: Steps that are predicted one from another. Default: 12, and with pictures 6; fewer where episodes are short.
         leap: Steps that a leap takes at once, for planners that hold or try moves of so many; 0 learns none. Default: 5, where
             the rollout has room for it.
@@ -77,9 +80,12 @@ class LatentTraining:
     name: str = "latent"
     pictures: bool = True
     vectors: bool = True
+    channels: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
     latent: int | None = None
     history: int = 3
+    hidden: int = 192
+    members: int = 3
     rollout: int | None = None
     leap: int | None = None
     steps: int | None = None
@@ -110,10 +116,12 @@ def train_latent(data: str | Path, out: str | Path, config: LatentTraining, repo
 def _check(config: LatentTraining) -> None:
     if config.size and any(side < COARSE or side % COARSE for side in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of {COARSE}.")
-    counts = (config.latent, config.rollout, config.steps, config.batch, config.history, config.leap or None)
+    sizes = (config.history, config.hidden, config.members)
+    counts = (config.latent, config.rollout, config.steps, config.batch, config.leap or None, *sizes)
     if any(count is not None and count < 1 for count in counts) or (config.batch or 2) < 2 or config.history > 16:
         raise TrainingError(
-            "--latent, --rollout and --steps are 1 or more, --history is 1 to 16, and a --batch has 2 clips or more."
+            "--latent, --rollout, --steps, --hidden and --members are 1 or more, --history is 1 to 16, and a --batch has 2 "
+            "clips or more."
         )
     if not (config.pictures or config.vectors):
         raise TrainingError("--no-pictures --no-vectors leaves nothing to see; leave one of them out.")
@@ -129,8 +137,8 @@ def fitting(dataset: Dataset) -> tuple[int, int]:
     return height, width
 
 
-def vectors_of(recording: Recording) -> tuple[tuple[str, int], ...]:
-    """(channel, width) of what a recording holds in numbers: state vectors, poses, vitals."""
+def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
+    """(channel, width) of what a recording holds in numbers: state vectors, poses, vitals; of all, or of those that are wanted."""
     cache, found = recording.cache, {}
     for channel, key in cache.keys.items():
         array = cache.arrays.get(key)
@@ -143,7 +151,11 @@ def vectors_of(recording: Recording) -> tuple[tuple[str, int], ...]:
             continue
         if (width := int(np.prod(array.shape[1:]))) <= WIDEST:
             found[channel] = width
-    return tuple(sorted(found.items()))
+    if lacks := [name for name in wanted if name not in found]:
+        raise DatasetError(
+            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(found)) or 'none'}."
+        )
+    return tuple((name, width) for name, width in sorted(found.items()) if not wanted or name in wanted)
 
 
 class _Learned:
@@ -167,7 +179,7 @@ class _Learned:
 
     def _shape(self) -> LatentConfig:
         recording, config, cache = self.recording, self.config, self.recording.cache
-        vectors, has_pictures = vectors_of(recording), cache.rgb is not None
+        vectors, has_pictures = vectors_of(recording, config.channels), cache.rgb is not None
         pictured = has_pictures and config.pictures
         if not pictured and not (config.vectors and any(kind_of(name) != "pose" for name, _ in vectors)):
             raise DatasetError(
@@ -188,6 +200,8 @@ class _Learned:
             latent=width if identity else config.latent or (64 if pictured else 32),
             identity=identity,
             history=config.history,
+            hidden=config.hidden,
+            members=config.members,
             leap=self._leap(),
         )
 
