@@ -216,3 +216,13 @@ def test_figures_of_latents_whose_answers_are_known():
     assert linear_probe(latents[:1000], told[:1000], latents[1000:], told[1000:]) > 0.99
     noise = torch.randn(2000, 2, generator=rng)
     assert linear_probe(latents[:1000], noise[:1000], latents[1000:], noise[1000:]) < 0.1
+
+
+def test_it_learns_the_vectors_that_are_asked_for(tmp_path):
+    folder = drifting(tmp_path / "drift")
+    config = replace(QUICK, steps=3, latent=None, channels=("state",), history=1, hidden=16, members=2)
+    train_latent(folder, tmp_path / "run", config, quiet)
+    world = terrella.load(tmp_path / "run")
+    assert world.spec.observes == ("state",) and world.spec.channels["latent"].shape == (2,)
+    with pytest.raises(DatasetError, match="no vector speed; it has state"):
+        train_latent(folder, tmp_path / "other", replace(config, channels=("speed",)), quiet)

@@ -16,6 +16,8 @@ from terrella.library import load
 if find_spec("mujoco") is None:
     pytest.skip("mujoco is not installed: pip install 'terrella[mujoco]'", allow_module_level=True)
 
+from terrella.sim.mujoco_world import MujocoWorld
+
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
  <light pos="0 0 3"/><geom name="ground" type="plane" size="2 2 .1"/>
  <camera name="eye" pos="0 -2 1" xyaxes="1 0 0 0 0.4 0.9"/><camera name="top" pos="0 0 3"/>
@@ -239,3 +241,44 @@ def test_the_car_drives_and_steers_to_the_left():
     assert 0.7 < float(seen["sensor.velocity"][0, 0]) < 1.1 and float(seen["sensor.gyro"][0, 2]) > 0.5
     assert 0 < seen["lidar"].min() < seen["lidar"].max() < 20
     assert world.spec.action_units == ("rad", "m/s")
+
+
+def test_many_pictures_drawn_at_once_are_those_drawn_one_by_one():
+    world = drawn_or_skipped(load("mujoco:ant", size=(24, 32)))
+    assert isinstance(world, MujocoWorld)
+    state = world.start(70, make_rng(0))  # more than are drawn before they are read
+    seen = world.render(state, ("rgb",))["rgb"]
+    alone = torch.cat([world.render(state.at(at), ("rgb",))["rgb"] for at in (0, 1, 63, 64, 69)])
+    assert (seen[[0, 1, 63, 64, 69]].float() - alone.float()).abs().mean() < 0.5
+    assert seen.float().std(0).mean() > 1  # they differ
+    world.close()
+
+
+def test_a_small_picture_of_a_fine_mesh_looks_as_before(tmp_path):
+    turns = [(a, b) for a in range(40) for b in range(80)]
+    points = "".join(
+        f"v {np.sin(np.pi * a / 39) * np.cos(np.pi * b / 40):.5f} {np.sin(np.pi * a / 39) * np.sin(np.pi * b / 40):.5f} "
+        f"{np.cos(np.pi * a / 39):.5f}\n"
+        for a, b in turns
+    )
+    at = lambda a, b: 80 * a + b % 80 + 1  # noqa: E731
+    faces = "".join(
+        f"f {at(a, b)} {at(a + 1, b)} {at(a + 1, b + 1)}\nf {at(a, b)} {at(a + 1, b + 1)} {at(a, b + 1)}\n"
+        for a, b in turns
+        if a < 39
+    )
+    (tmp_path / "ball.obj").write_text(points + faces)
+    (tmp_path / "ball.xml").write_text(
+        '<mujoco><asset><mesh name="ball" file="ball.obj" scale=".3 .3 .3"/></asset><worldbody><light pos="0 0 3"/>'
+        '<camera name="eye" pos="0 -1.5 .3" xyaxes="1 0 0 0 0 1"/><geom type="plane" size="0 0 .05"/>'
+        '<body pos="0 0 .3"><freejoint/><geom type="mesh" mesh="ball"/></body></worldbody></mujoco>'
+    )
+    small = drawn_or_skipped(load(f"mujoco:{tmp_path / 'ball.xml'}", size=(32, 32)))
+    large = load(f"mujoco:{tmp_path / 'ball.xml'}", size=(256, 256))
+    assert isinstance(small, MujocoWorld) and isinstance(large, MujocoWorld)
+    seen, fine = (world.render(world.start(1, make_rng(0)), ("rgb",))["rgb"][0].float() for world in (small, large))
+    coarse = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 8).permute(1, 2, 0)
+    assert small._pictures._model.mesh_facenum[0] < large._pictures._model.mesh_facenum[0] / 2
+    assert (seen - coarse).square().mean().sqrt() < 12  # of 255
+    small.close()
+    large.close()

@@ -72,15 +72,15 @@ class Canvas:
 
 
 def simplify(model: Any, size: tuple[int, int]) -> None:
-    """Makes a model cheap to draw in pictures of `size`, in place: floors without end get one, for MuJoCo draws those twenty times
-    as slowly; in small pictures meshes lose what is finer than a pixel, and round things are made of fewer parts."""
+    """Makes a model cheap to draw in small pictures, in place: floors without end get one, for MuJoCo draws those many times as
+    slowly; meshes lose what is finer than a pixel; round things are made of fewer parts, and edges are not smoothed."""
+    if max(size) > SMALL:
+        return
     endless = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_size[:, :2] == 0).all(1)
     plain = np.array([at < 0 or bool(model.mat_texuniform[at]) for at in model.geom_matid], bool)
     model.geom_size[endless & plain] = [_WIDE_M, _WIDE_M, _GRID_M]
-    if max(size) > SMALL:
-        return
-    model.vis.quality.offsamples = 0
-    model.vis.quality.numslices, model.vis.quality.numstacks = _SLICES, _STACKS
+    quality = model.vis.quality
+    quality.offsamples, quality.numslices, quality.numstacks = 0, _SLICES, _STACKS
     for mesh in range(model.nmesh):
         _thin(model, mesh, float(model.stat.extent) / max(size))
 
