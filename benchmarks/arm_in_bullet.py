@@ -7,7 +7,7 @@ friction, and the rotors' inertia put into the links.
 Starts, goals, observations and success are those of our task. Prints the successes here and in MuJoCo, from the same starts.
 """
 
-# pyright: reportMissingImports=false
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ import tyro
 
 import terrella
 from terrella.core import make_rng
+from terrella.core.policy import Policy
 from terrella.measure.judged import share
 from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import mujoco
+from terrella.sim.mujoco_world import MujocoWorld
 
 
 class Arm:
@@ -85,7 +87,7 @@ def _bullet(turn) -> list[float]:
 
 
 @torch.inference_mode()
-def successes(world, policy, episodes: int, seed: int, arm: Arm | None) -> int:
+def successes(world: MujocoWorld, policy: Policy, episodes: int, seed: int, arm: Arm | None) -> int:
     """Of episodes in Bullet's arm, or without one in MuJoCo's."""
     rng, steps = make_rng(seed), round(world.spec.dt_s / float(world.file.opt.timestep))
     whole, count = world.start(episodes, rng), 0
@@ -109,7 +111,7 @@ def successes(world, policy, episodes: int, seed: int, arm: Arm | None) -> int:
 
 def main(policies: tyro.conf.Positional[list[Path]], /, episodes: int = 300, seed: int = 1_000_003) -> None:
     torch.set_num_threads(1)
-    world = terrella.load("mujoco:arm", cameras=(), threads=1)
+    world = MujocoWorld("arm", cameras=(), threads=1)
     arm = Arm(world.file, float(world.file.opt.timestep))
     for folder in policies:
         policy = terrella.load_policy(str(folder), world.spec)
