@@ -1,4 +1,4 @@
-"""Controllers of a few lines for Pendulum and CartPole: policies of your own, to be judged in a dream beside reality.
+"""Controllers of a few lines for Pendulum, CartPole and Acrobot: policies of your own, to be judged in a dream beside reality.
 
     terrella evaluate examples/04_controllers.py:swing_up examples/04_controllers.py:swing_up@0.3 \
         examples/04_controllers.py:brake idle --in RUN --real gym:Pendulum-v1
@@ -53,6 +53,21 @@ def lean(seen, rng):
 def follow(seen, rng):
     """Pushes the cart to where the pole turns: the pole stays up, the cart drifts away."""
     return (seen["observation"][:, 3] > 0).long()
+
+
+def pump(seen, rng):
+    """Pushes an acrobot's lower link the way that it turns, so that its energy grows."""
+    return 2 * (seen["observation"][:, 5] > 0).long()
+
+
+def against(seen, rng):
+    """Pushes an acrobot's lower link against the way that the upper one turns."""
+    return 2 * (seen["observation"][:, 4] < 0).long()
+
+
+def along(seen, rng):
+    """Pushes an acrobot's lower link the way that the upper one turns: it never gets up."""
+    return 2 * (seen["observation"][:, 4] > 0).long()
 
 
 def main(episodes: int = 8) -> dict[str, float]:

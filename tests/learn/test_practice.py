@@ -69,6 +69,17 @@ def test_lambda_returns_are_what_they_are_defined_to_be(td_lambda: float) -> Non
     torch.testing.assert_close(fast, slowly(reward, goes_on, value, known, wanted))
 
 
+def test_the_cautious_count_the_unknown_as_the_worst_that_is_expected_anywhere() -> None:
+    reward, goes_on = torch.zeros(3, 2), torch.ones(3, 2)
+    value = torch.tensor([[5.0, 4.0], [5.0, 4.0], [90.0, 4.0], [90.0, 4.0]])
+    known = torch.tensor([[True, True], [False, True], [False, True]])
+    plain, cautious = (
+        lambda_returns(reward, goes_on, value, known, Wanted(0.5, 1.0, cautious=said)) for said in (False, True)
+    )
+    assert plain[:2, 0].tolist() == [22.5, 45.0] and cautious[:2, 0].tolist() == [1.0, 2.0]
+    assert torch.equal(plain[:, 1], cautious[:, 1])
+
+
 def test_what_comes_after_an_end_or_the_unknown_counts_for_nothing() -> None:
     goes_on = torch.tensor([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     known = torch.tensor([[True, False, True], [True, True, True], [True, True, True]])

@@ -23,11 +23,14 @@ MIDDLE, STEADY = (0.05, 0.95), 0.99  # quantiles between which returns lie, and 
 @dataclass(frozen=True)
 class Wanted:
     """What the policy is to be paid for. discount: of a reward a step later; td_lambda: lambda, from 0 (the critic's word after one
-    step) to 1 (what came to the end of the dream); entropy: what a nat is worth, in ranges of returns."""
+    step) to 1 (what came to the end of the dream); entropy: what a nat is worth, in ranges of returns; cautious: where a dream is
+    no longer known counts as the worst that the critic expects anywhere in the batch, so that a policy stays where the world knows
+    what comes (after MOReL, Kidambi et al. 2020)."""
 
     discount: float = 0.99
     td_lambda: float = 0.95
     entropy: float = 3e-4
+    cautious: bool = False
 
 
 def lambda_returns(
@@ -35,6 +38,8 @@ def lambda_returns(
 ) -> torch.Tensor:
     """[T, B]: what is paid from each step on, by rewards [T, B] and by values [T + 1, B] of where they led (Sutton & Barto 2018,
     12.1). A dream that is no longer `known` counts as far, and its value from there."""
+    if wanted.cautious:
+        value = torch.cat([value[:1], torch.where(known, value[1:], value.detach().min())])
     found, after = [], value[-1]
     for step in range(len(reward) - 1, -1, -1):
         td_lambda = wanted.td_lambda * known[step]

@@ -50,6 +50,7 @@ class Practice:
             of ppo 2e-3.
         gradients: Of axes, follow the world's own gradients where it has some. --no-gradients learns from what paid.
         trust: The world's uncertainty at which a dream ends. Default: as the world says that it invents, if it does.
+        cautious: What lies beyond counts as the worst that the critic expects anywhere, in place of its word there.
         hidden: Width of the networks' layers.
         learning_rate: Highest learning rate.
         save_every_s: Seconds between saves.
@@ -67,6 +68,7 @@ class Practice:
     entropy: float | None = None
     gradients: bool = True
     trust: float | None = None
+    cautious: bool = False
     hidden: int = 128
     learning_rate: float = 1e-3
     save_every_s: float = 30.0
@@ -127,7 +129,7 @@ def train_policy(
     for network in (actor, critic):
         network.to(run.device).eyes.settle(usual)
     kept = {**starts.modules, **({} if growth is None else {"growth": growth})}
-    wanted = Wanted(config.discount, config.td_lambda, config.entropy)
+    wanted = Wanted(config.discount, config.td_lambda, config.entropy, config.cautious)
     objective: Objective = (
         Ppo(actor, critic, wanted, config.learning_rate, kept)
         if ppo
