@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from terrella.care import doctor
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset, record
-from terrella.data.collect import LocalWorkers, collect
+from terrella.data.collect import Job, LocalWorkers, Player, collect
+from terrella.data.format import Layout
 
 COUNT = 5
 
@@ -81,3 +83,46 @@ def test_ray_records_the_same_when_a_worker_is_killed(tmp_path, never):
     (tmp_path / "deaths").mkdir()
     assert_same(gathered(tmp_path / "set", RayWorkers(2), partial(dying, tmp_path / "deaths", 1)), never)
     assert len(list((tmp_path / "deaths").iterdir())) == 1
+
+
+class BusyRay:
+    """A Ray of which only so many actors ever start."""
+
+    def __init__(self, free: int):
+        self.free, self.killed = free, []
+
+    def wait(self, asked, num_returns, timeout):
+        return asked[: self.free], asked[self.free :]
+
+    def kill(self, actor):
+        self.killed.append(actor)
+
+
+class Asked:
+    def __init__(self, number: int):
+        self.__ray_ready__, self.remote = self, lambda: number
+
+
+@pytest.mark.parametrize("free", [0, 1])
+def test_busy_processors_are_said_and_not_waited_for(free):
+    from terrella.data.ray import RayWorkers
+
+    workers: Any = object.__new__(RayWorkers)
+    workers.size, workers._ray, workers._actors = 2, BusyRay(free), [Asked(0), Asked(1)]
+    if free:
+        with pytest.warns(UserWarning, match="1 of 2 workers found no free processor"):
+            workers._started()
+        assert workers.size == 1 and len(workers._ray.killed) == 1
+    else:
+        with pytest.raises(TerrellaError, match="no worker has started on Ray"):
+            workers._started()
+
+
+def test_a_player_clears_what_one_that_died_has_left(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    job = Job(opened, Layout.of(opened()[0].spec), "test", 0, STEPS)
+    (Player(job, "one")._folder / "half an episode").touch()
+    again = Player(job, "one")
+    assert not list(again._folder.iterdir())
+    again.clear()
+    assert not list(tmp_path.iterdir())

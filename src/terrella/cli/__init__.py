@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 
 from ..core.errors import TerrellaError
@@ -71,11 +75,31 @@ _DRAWERS = (
 )
 
 
+@contextmanager
+def _ended_as_a_whole() -> Iterator[None]:
+    """Lets SIGTERM end the workers of this process, and itself as Ctrl-C does."""
+
+    def end(number: int, frame: object) -> None:
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command. The exit code is 0, the command's own, 2 with one sentence on stderr, or 130 after Ctrl-C."""
+    """Runs one command. The exit code is 0, the command's own, 2 with one sentence on stderr, or 130 after Ctrl-C or SIGTERM."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return _run(given)
+        with _ended_as_a_whole():
+            return _run(given)
     except KeyboardInterrupt as stop:
         print(f"terrella: {str(stop) or 'stopped.'}", file=sys.stderr)
         return 130

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import signal
 import tempfile
 import time
@@ -46,9 +47,19 @@ class Job:
 class Player:
     """Plays episodes of a job by their numbers; the world is opened once."""
 
-    def __init__(self, job: Job):
+    def __init__(self, job: Job, label: str = ""):
+        """label: of a folder among temporary files that is this player's alone; it clears what one of that name left who died."""
         self._job, self._opened = job, None
-        self._folder = tempfile.TemporaryDirectory(prefix="terrella-", dir=job.scratch)
+        if label:
+            self._folder = Path(tempfile.gettempdir()) / f"terrella-{label}"
+            self.clear()
+            self._folder.mkdir()
+        else:
+            self._folder = Path(tempfile.mkdtemp(prefix="terrella-", dir=job.scratch))
+
+    def clear(self) -> None:
+        """Removes what it keeps on disk; it plays no more."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def play(self, number: int) -> Parcel | str:
         """The episode, or a sentence that says why there is none."""
@@ -56,7 +67,7 @@ class Player:
         try:
             if self._opened is None:
                 torch.set_num_threads(1)
-                self._opened = *job.open(), Recorder(Path(self._folder.name), job.layout, job.task)
+                self._opened = *job.open(), Recorder(self._folder, job.layout, job.task)
             world, policy, recorder = self._opened
             recorder.drop_episode()
             play_episode(world, policy(), recorder, make_rng(seed_of(job.base, number)), job.steps)

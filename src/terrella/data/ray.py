@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import sys
+import uuid
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 from ..core.errors import TerrellaError
 from .collect import MOST_DEATHS, Job, Player
 from .staged import Parcel
+
+START_S, CLEAR_S = 180.0, 5.0  # that workers may take to start, and to remove what they keep
 
 
 @contextmanager
@@ -62,8 +66,27 @@ class RayWorkers:
         if here < self.size:
             raise TerrellaError(f"this Ray has {here} processors; ask for as many --workers or fewer.")
         again = {"max_restarts": -1, "max_task_retries": MOST_DEATHS - 1}
-        made = ray.remote(num_cpus=1, **again)(Player)
-        self._actors = [made.remote(job) for _ in range(self.size)]
+        made, run = ray.remote(num_cpus=1, **again)(Player), uuid.uuid4().hex[:12]
+        self._actors = [made.remote(job, f"{run}-{at}") for at in range(self.size)]
+        self._started()
+
+    def _started(self) -> None:
+        """Goes on with the workers that have started, which may be fewer than were asked for. TerrellaError where none has."""
+        ready = {actor.__ray_ready__.remote(): actor for actor in self._actors}
+        _, late = self._ray.wait(list(ready), num_returns=self.size, timeout=START_S)
+        if len(late) == self.size:
+            raise TerrellaError(
+                f"no worker has started on Ray within {START_S:.0f} s: its processors are busy (`ray status` says with what). Wait "
+                "until some are free, or leave --on ray out."
+            )
+        for one in late:
+            self._ray.kill(ready[one])
+            self._actors.remove(ready[one])
+        if late:
+            warnings.warn(
+                f"{len(late)} of {self.size} workers found no free processor; the others go on.", stacklevel=2
+            )
+        self.size = len(self._actors)
 
     def ask(self, number: int) -> None:
         load = [0] * self.size
@@ -84,7 +107,10 @@ class RayWorkers:
             ]
 
     def close(self) -> None:
-        for actor in getattr(self, "_actors", []):
+        actors = getattr(self, "_actors", [])
+        if actors:
+            self._ray.wait([actor.clear.remote() for actor in actors], num_returns=len(actors), timeout=CLEAR_S)
+        for actor in actors:
             self._ray.kill(actor)
         self._asked.clear()
         if getattr(self, "_ours", False):

@@ -270,9 +270,7 @@ class MujocoWorld:
     def _camera_of(self, channel: str) -> str:
         return suffix_of(channel) or (self._cameras or [""])[0]
 
-    def _pictured(
-        self, camera: str, physics: np.ndarray, values: np.ndarray, marks: Sequence[np.ndarray | None]
-    ) -> list[np.ndarray]:
+    def _pictured(self, camera: str, physics: np.ndarray, values: np.ndarray, marks: Any) -> list[np.ndarray]:
         """What a camera sees of each world, in colour."""
         found: list[np.ndarray] = []
         for at, (row, value, mark) in enumerate(zip(physics, values, marks)):
