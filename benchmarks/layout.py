@@ -62,8 +62,9 @@ def main() -> None:
     starts[:, 2] += BODY.eye_m
     known = torch.ones(len(place.gaussians), dtype=torch.uint8)
     world = SplatWorld(
-        "built", place.gaussians, known, starts, SplatConfig(size=(96, 128), body=BODY), solids=place.solids
-    )
+        "built", place.gaussians, known, starts, SplatConfig(size=(96, 128), body=BODY), objects=place.objects,
+        solids=place.solids, bodies=place.bodies,
+    )  # fmt: skip
     agreement(world, heard.plan.rooms, given.walks)
     walks(world, given.walks, given.steps)
     closure(world)
@@ -89,6 +90,7 @@ def walks(world: SplatWorld, count: int, steps: int) -> None:
     """How many random walks come deeper than 5 cm into a wall."""
     rng = torch.Generator().manual_seed(1)
     state = world.start(count, make_rng(1))
+    still = world.collider.boxes  # what can be pushed goes away from where it was
     leaked, free = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
     drift, heading = state["pose"][:, :3].clone(), 2 * math.pi * torch.rand(count, generator=rng)
     for step in range(steps):
@@ -100,13 +102,17 @@ def walks(world: SplatWorld, count: int, steps: int) -> None:
         drift[:, 0] += 0.08 * heading.cos()
         drift[:, 1] += 0.08 * heading.sin()
         if step % 6 == 5:
-            leaked |= in_a_wall(state["pose"][:, :3], world.solids, BODY.radius_m - 0.05)
-            free |= in_a_wall(drift, world.solids, BODY.radius_m - 0.05)
+            leaked |= in_a_wall(state["pose"][:, :3], still, BODY.radius_m - 0.05)
+            free |= in_a_wall(drift, still, BODY.radius_m - 0.05)
     gone = (state["pose"][:, :2] - world.starts[0, :2]).norm(dim=1)
     print(
         f"{int(leaked.sum())} of {count} random walks of {steps} steps enter a wall (they end {gone.mean():.1f} m away); bar 0.5%"
     )
     print(f"{int(free.sum())} of {count} do where nothing stops bodies")
+    if world.things:
+        pushed = (state["bodies"] - world.rigid.rest)[..., :3].norm(dim=2) > 0.05
+        low = float(state["bodies"][..., 2].min())
+        print(f"{int(pushed.any(1).sum())} of them pushed one of {len(world.things)} things, none of which is below {low:.2f} m")
 
 
 def closure(world: SplatWorld) -> None:

@@ -126,3 +126,51 @@ def test_it_is_exported_to_other_tools(folder, tmp_path, capsys):
     for name, more in (("no.mp4", way), ("no.mp4", ["--seconds", "-1"]), ("no.glb", ["--cell", "nan"]), ("no.obj", [])):
         assert main(["space", "export", str(folder), str(tmp_path / name), *more]) != 0
     assert not [path for path in tmp_path.iterdir() if "no." in path.name]
+
+
+PUSHED = {"rooms": [{"name": "hall", "at": [0, 0], "size": [8, 4, 3]}],
+          "things": [{"label": "crate", "at": [3, 2]}, {"label": "stool", "at": [3, 2, 0.7]}, {"label": "table", "at": [6, 0.6]},
+                     {"label": "crate", "at": [6, 3.4], "movable": False}]}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pushable(tmp_path_factory):
+    pytest.importorskip("mujoco")
+    path = tmp_path_factory.mktemp("pushed")
+    (path / "layout.json").write_text(json.dumps(PUSHED))
+    small = ["--gaussians", "4000", "--size", "24", "32"]
+    assert main(["space", "build", str(path / "layout.json"), "--out", str(path / "w"), *small]) == 0
+    return open_world(path / "w")
+
+
+def test_the_laws_hold_among_things_that_can_be_pushed(pushable):
+    check_world(pushable, steps=3)
+    assert pushable.things == [1, 2] and pushable.spec.channels["bodies"].shape == (2, 7)
+
+
+def test_who_walks_pushes_what_stands_there_and_the_rest_rides_and_falls(pushable):
+    start = put(pushable, 1.2, 2, 0, 0.0)
+    rest = pushable.render(start, ("bodies",))["bodies"]
+    pushed = walk(pushable, start, 45, "MOVE_FORWARD")
+    gone = pushable.render(pushed, ("bodies",))["bodies"] - rest
+    assert gone[0, 0, 0] > 1 and abs(gone[0, 0, 2]) < 0.05 and gone[0, 1, 0] > 0.7  # the crate, and the stool on it
+    assert (
+        pushed["pose"][0, 0] < pushable.render(pushed, ("bodies",))["bodies"][0, 0, 0] - 0.5
+    )  # nobody walks through it
+    eye = pushed["pose"][:, :3].tolist()[0]
+    seen = [
+        pushable.render(state, ("rgb",))["rgb"].float()
+        for state in (start, pushable.observe(start, pushed, make_rng(0)))
+    ]
+    assert (seen[0] - seen[1]).abs().mean() > 1 and eye[0] > 2  # the picture from the same place is another
+    tipped = pushed.replace(
+        body_speeds=pushed["body_speeds"] + torch.tensor([0, 3.0, 0, 0, 0, 0]) * torch.tensor([[[0.0], [1.0]]])
+    )
+    assert float(walk(pushable, tipped, 60)["bodies"][0, 1, 2]) < 0.5  # a stool shoved off the crate lies on the floor
+
+
+def test_nobody_is_pushed_through_a_wall_and_what_is_far_rests(pushable):
+    state = walk(pushable, put(pushable, 1.2, 2, 0, 0.0), 150, "MOVE_FORWARD")
+    assert state["bodies"][0, 0, 0] < 8 - 0.3 and state["pose"][0, 0] < 7.1
+    away = walk(pushable, put(pushable, 1.2, 3.4, 0, 3.1), 20, "MOVE_FORWARD")
+    assert torch.equal(away["bodies"][0], pushable.rigid.rest)

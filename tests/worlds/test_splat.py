@@ -11,7 +11,7 @@ import torch
 import terrella
 from terrella.cli import main
 from terrella.core import check_world
-from terrella.core.errors import CheckpointError, DatasetError
+from terrella.core.errors import CheckpointError, DatasetError, ObservationError
 from terrella.space.camera import planar_pose
 from terrella.space.files import read_scene, write_scene
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
@@ -53,6 +53,32 @@ def test_one_walks_to_the_wall_flies_and_falls():
     assert not state["flying"] and abs(state["pose"][0, 2] - 1.6) < 0.2
     seen = world.render(state, ("known", "uncertainty", "ids"))
     assert seen["known"].mean() > 0.9 and seen["uncertainty"] < 0.1 and seen["ids"].max() < 6000
+
+
+def test_a_picture_changes_the_place_of_its_episode_alone(tmp_path):
+    made, rng = splat(), terrella.make_rng(0)
+    world = SplatWorld("room", room(count=600), torch.ones(600, dtype=torch.uint8), made.starts, made.config)
+    state = world.start(2, rng)
+    before = world.render(state, ("rgb", "depth"))
+    red = before["rgb"].clone()
+    red[0] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+    for _ in range(6):
+        state = world.observe({"rgb": red, "depth": before["depth"], "pose": state["pose"]}, state, rng)
+    off = (world.render(state, ("rgb",))["rgb"].float() - before["rgb"].float()).abs().mean((1, 2, 3))
+    assert off[0] > 15 and off[1] < 4
+    elsewhere = world.render(world.start(2, rng), ("rgb", "pose"))
+    assert torch.equal(elsewhere["rgb"], world.render(world.observe(elsewhere, None, rng), ("rgb",))["rgb"])
+    gone_on = world.imagine(state.at([0, 0]), torch.zeros(2, len(BUTTONS), dtype=torch.int8), rng)
+    gone_on.save(tmp_path / "state.safetensors")
+    again = terrella.State.load(tmp_path / "state.safetensors")
+    seen = [world.render(one, ("rgb", "known")) for one in (gone_on, again)]
+    assert all(torch.equal(seen[0][name], seen[1][name]) for name in seen[0])
+    more = world.observe(
+        {"rgb": red[:1], "depth": before["depth"][:1, ::2, ::2], "pose": again["pose"][:1]}, again.at(0), rng
+    )
+    assert more.batch == 1
+    with pytest.raises(ObservationError, match="depth"):
+        world.observe({"rgb": red, "depth": before["depth"][:1], "pose": state["pose"]}, state, rng)
 
 
 def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):

@@ -15,8 +15,9 @@ from ..library import folder_of
 from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, replace_whole, write_scene
 from ..space.solids import Solids
+from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
-from ..worlds.splat import OBSERVED, SplatConfig, SplatWorld
+from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
 from .say import Host, Json, Port, Token, result, say
 from .space_export import ENDINGS, Kind, write_other

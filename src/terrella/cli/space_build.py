@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_text
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +54,17 @@ def build(
         said = asdict(plan)
     place = built(plan, gaussians)
     _save(place, plan.name, text, size, out, said)
+    pushed = [place.names[number - 1] for number in sorted(set(place.bodies.tolist()) - {0})]
     facts = {
         "world": str(out), "gaussians": len(place.gaussians), "rooms": len(plan.rooms), "objects": list(place.names),
-        "not_understood": list(unknown), "no_place_for": list(left_out),
+        "movable": pushed, "not_understood": list(unknown), "no_place_for": list(left_out),
     }  # fmt: skip
     lines = [
         f"{len(place.gaussians):,} Gaussians, {len(plan.rooms)} room(s), {', '.join(place.names) or 'nothing'} in them"
     ]
+    if pushed:
+        without = "" if find_spec("mujoco") else " (once MuJoCo is installed: pip install 'terrella[mujoco]')"
+        lines.append(f"can be pushed: {', '.join(pushed)}{without}")
     if unknown:
         lines.append(f"not understood: {', '.join(unknown)}")
     if left_out:
@@ -72,7 +77,8 @@ def _save(place: Any, name: str, text: str | None, size: tuple[int, int], out: P
 
     from ..space.files import replace_whole
     from ..space.occupancy import Body
-    from ..worlds.splat import INVENTED, OBSERVED, SplatConfig, SplatWorld
+    from ..worlds.additions import INVENTED, OBSERVED
+    from ..worlds.splat import SplatConfig, SplatWorld
     from ..worlds.splat_folder import save_splat
 
     body = Body(eye_m=1.65, step_m=0.35)
@@ -82,5 +88,7 @@ def _save(place: Any, name: str, text: str | None, size: tuple[int, int], out: P
     config = SplatConfig((0.5, 0.5 * size[1] / size[0], 0.5, 0.5), size, body=body)
     card = {"objects": list(place.names), **({"text": text} if text else {})}
     origin = torch.full((len(place.gaussians),), known, dtype=torch.uint8)
-    save_splat(SplatWorld(name, place.gaussians, origin, starts, config, card, place.objects, place.solids), out)
+    save_splat(
+        SplatWorld(name, place.gaussians, origin, starts, config, card, place.objects, place.solids, place.bodies), out
+    )
     replace_whole(out / LAYOUT_FILE, lambda file: file.write_text(json_text.dumps(said, indent=1) + "\n"))

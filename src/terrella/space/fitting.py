@@ -44,8 +44,13 @@ class Views:
 
     def depths(self, rows: torch.Tensor) -> torch.Tensor:
         """Depth of some of them at the size of the pictures: [n, H, W], 0 where nothing is known."""
-        depth = F.interpolate(self.depth[rows][:, None], self.size, mode="nearest-exact")[:, 0]
+        depth = resized(self.depth[rows], self.size)
         return torch.where((depth > 0) & (depth < FAR_M) & depth.isfinite(), depth, 0.0)
+
+
+def resized(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Depth [n, h, w] at another size, the nearest pixel's."""
+    return F.interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]
 
 
 @dataclass(frozen=True)

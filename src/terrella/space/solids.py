@@ -17,17 +17,17 @@ _DEEPEST_M = 8.0  # floors lower than this below the feet are not looked for
 
 @dataclass(frozen=True)
 class Solids:
-    """boxes float32 [K, 6]: low and high corners."""
+    """boxes float32 [K, 6]: low and high corners; or [B, K, 6], each body's own."""
 
     boxes: torch.Tensor
 
     def depth(self, place: torch.Tensor, body: Body) -> torch.Tensor:
         """How deep, in metres sideways, bodies at `place` [B, 3] are in something: [B], 0 for free. What is as low as a step does
         not count."""
-        low, high = self.boxes[:, :3], self.boxes[:, 3:]
+        low, high = self.boxes[..., :3], self.boxes[..., 3:]
         feet, head = place[:, 2] - body.eye_m + body.step_m, place[:, 2] + body.head_m
-        level = (feet[:, None] < high[:, 2]) & (head[:, None] > low[:, 2])
-        off = torch.maximum(low[:, :2] - place[:, None, :2], place[:, None, :2] - high[:, :2])  # [B, K, 2]
+        level = (feet[:, None] < high[..., 2]) & (head[:, None] > low[..., 2])
+        off = torch.maximum(low[..., :2] - place[:, None, :2], place[:, None, :2] - high[..., :2])  # [B, K, 2]
         apart = off.clamp_min(0).norm(dim=2) + off.amax(2).clamp_max(0)
         return torch.where(level, body.radius_m - apart, 0.0).clamp_min(0).amax(1)
 
@@ -37,13 +37,17 @@ class Solids:
 
     def floor(self, place: torch.Tensor, body: Body) -> torch.Tensor:
         """How high the floor under a body is [B]: the highest top up to a step above its feet; its feet where there is none."""
+        found = self.highest(place, body)
+        return torch.where(found > -torch.inf, found, place[:, 2] - body.eye_m)
+
+    def highest(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+        """The same, and -inf where there is none."""
         feet = place[:, 2] - body.eye_m
-        low, high = self.boxes[:, :3], self.boxes[:, 3:]
-        off = torch.maximum(low[:, :2] - place[:, None, :2], place[:, None, :2] - high[:, :2]).amax(2)
-        top = high[:, 2]
+        low, high = self.boxes[..., :3], self.boxes[..., 3:]
+        off = torch.maximum(low[..., :2] - place[:, None, :2], place[:, None, :2] - high[..., :2]).amax(2)
+        top = high[..., 2]
         bears = (off < _FOOT_M) & (top <= feet[:, None] + body.step_m) & (top > feet[:, None] - _DEEPEST_M)
-        found = torch.where(bears, top, -torch.inf).amax(1)
-        return torch.where(bears.any(1), found, feet)
+        return torch.where(bears, top, -torch.inf).amax(1)
 
     def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor:
         """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever

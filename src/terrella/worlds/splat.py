@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from typing import Any, final
 
 import numpy as np
@@ -16,10 +17,14 @@ from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import POSE, POSE_UNIT, Camera, Spec
 from ..core.state import State
 from ..core.world import Observation
-from ..space.camera import Intrinsics, yaw
+from ..space.camera import Intrinsics, rotation, yaw
+from ..space.fitting import resized
 from ..space.occupancy import Body, Occupancy
 from ..space.raster import Drawing, Gaussians, rasterise
+from ..space.raster.move import multiplied
 from ..space.solids import Solids
+from .additions import OBSERVED, Additions
+from .parts import check_prior, picture_of
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "UP", "DOWN")
 KEYS = {
@@ -31,7 +36,6 @@ _PUSH = torch.tensor(
     [[1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1]]
 ).float()
 GRAVITY = 9.81  # m/s^2
-OBSERVED, INVENTED = 1, 0  # provenance of a Gaussian
 
 
 @dataclass(frozen=True)
@@ -46,17 +50,21 @@ class SplatConfig:
     pace: tuple[float, float, float, float] = (0.03, 0.025, 0.018, 0.025)
     keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)
     body: Body = Body()
+    additions: int = 32768
 
 
 @final
 class SplatWorld:
     """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
     `objects`, int32 [N], says which object each belongs to (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies meet
-    `solids`, boxes float32 [S, 6] (low and high corners), where they are known, and else what the Gaussians fill.
+    `solids`, boxes float32 [S, 6] (low and high corners), where they are known, and else what the Gaussians fill. `bodies`, int32
+    [S], says of which object that can be pushed each solid is a part (0: it stays). Where MuJoCo is installed those are rigid
+    bodies, on which their Gaussians ride; the channel `bodies` [K, 7] has their poses, in the order of the objects.
 
     rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
     none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
-    goes UP lifts off; who comes DOWN to the floor walks again.
+    goes UP lifts off; who comes DOWN to the floor walks again. What pictures with depth show is fused into the place of that
+    episode alone (space/fusing.py); floors and walls stay.
     """
 
     def __init__(
@@ -69,16 +77,22 @@ class SplatWorld:
         card: Mapping[str, Any] | None = None,
         objects: torch.Tensor | None = None,
         solids: torch.Tensor | None = None,
+        bodies: torch.Tensor | None = None,
     ):
         self.name, self.gaussians, self.provenance, self.starts = name, gaussians, provenance, starts
         self.config, self.card = config or SplatConfig(), dict(card or {})
         self.objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
         self.solids = torch.zeros(0, 6) if solids is None else solids
+        self.bodies = torch.zeros(len(self.solids), dtype=torch.int32) if bodies is None else bodies
+        things = self.bodies.unique().tolist() if find_spec("mujoco") else []
+        self.things = [number for number in things if number]  # the objects that are rigid bodies here
+        self.added = Additions(gaussians, provenance, self.config.additions)
         self.spec = self._spec()
 
     def _spec(self) -> Spec:
         height, width = self.config.size
         buttons = self.config.buttons
+        poses = {"bodies": spaces.Box(-np.inf, np.inf, (len(self.things), 7), np.float32)} if self.things else {}
         return Spec(
             name=self.name,
             action=spaces.MultiBinary(len(buttons)),
@@ -89,10 +103,12 @@ class SplatWorld:
                 "ids": spaces.Box(-1, 2**24, (height, width), np.int32),
                 "known": spaces.Box(0, 1, (height, width), np.float32),
                 "uncertainty": spaces.Box(0, 1, (), np.float32),
+                **poses,
             },
             observes=("pose",),
+            may_observe=("rgb", "depth"),
             dt_s=self.config.dt_s,
-            units={"depth": "m", "pose": POSE_UNIT},
+            units={"depth": "m", "pose": POSE_UNIT, **dict.fromkeys(poses, POSE_UNIT.replace("cam", "body"))},
             action_names=buttons,
             keys={k: [float(one == name) for one in buttons] for k, name in KEYS.items() if name in buttons},
             cameras={"rgb": Camera(self.config.camera, self.config.size)},
@@ -106,8 +122,28 @@ class SplatWorld:
 
     @cached_property
     def collider(self) -> Solids | Occupancy:
-        """What stops bodies."""
-        return Solids(self.solids) if len(self.solids) else self.occupancy
+        """What stops who walks, but for what can be pushed."""
+        still = ~torch.isin(self.bodies, torch.tensor(self.things, dtype=torch.int32))
+        return Solids(self.solids[still]) if len(self.solids) else self.occupancy
+
+    @cached_property
+    def rigid(self) -> Any:
+        """The physics of the things that can be pushed (space/mujoco_bodies.py)."""
+        from ..space.mujoco_bodies import RigidBodies
+
+        owner = torch.zeros_like(self.bodies)
+        for at, number in enumerate(self.things):
+            owner[self.bodies == number] = at + 1
+        return RigidBodies(self.solids, owner, self.config.body, self.config.dt_s)
+
+    @cached_property
+    def _riders(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which Gaussians ride on things, and on which."""
+        place = torch.full((max(int(self.objects.max()) if len(self.objects) else 0, *self.things, 0) + 1,), -1)
+        place[self.things] = torch.arange(len(self.things))
+        on = place[self.objects.long()]
+        rows = (on >= 0).nonzero()[:, 0]
+        return rows, on[rows]
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """Poses drawn from `starts`."""
@@ -118,7 +154,7 @@ class SplatWorld:
         return self._standing(self.starts[row])
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
-        """The eye is where the evidence says; pictures change nothing of the place."""
+        """The eye is where the evidence says; a picture with its depth (metres, 0: unknown) changes the place of that episode."""
         if "pose" not in observation:
             raise ObservationError(f"{self.name} observes `pose`.")
         pose = torch.as_tensor(observation["pose"]).float()
@@ -126,9 +162,18 @@ class SplatWorld:
             raise ObservationError(
                 f"{self.name} observes finite poses [B, 7]; got a tensor of shape {tuple(pose.shape)}."
             )
-        if prior is None or prior.batch != len(pose):
-            return self._standing(pose)
-        return prior.replace(pose=pose.clone())
+        if prior is not None:
+            check_prior(prior.batch, len(pose))
+        state = self._standing(pose) if prior is None else prior.replace(pose=pose.clone())
+        if not {"rgb", "depth"} <= set(observation):
+            return state
+        rgb, depth = picture_of(observation, self.config.size, "cpu"), torch.as_tensor(observation["depth"]).float()
+        if depth.ndim != 3 or not len(depth) == len(rgb) == len(pose) or not bool((depth >= 0).all()):
+            raise ObservationError(
+                f"depth is [{len(pose)}, h, w] in metres, 0 where unknown; got {tuple(depth.shape)}."
+            )
+        deep = resized(depth, self.config.size)
+        return self.added.observed(state, rgb, deep, self.config.camera, lambda one, at: self._ridden(one, state, at))
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         """One step on: pushed by the buttons, held up by floors, stopped by walls."""
@@ -139,8 +184,8 @@ class SplatWorld:
         speed = state["speed"] * torch.tensor(config.keep) + self._ahead(pose, wish)
         flying = state["flying"] | (wish[:, 3] > 0)
         level = torch.cat([speed[:, :2], (speed[:, 3] * flying)[:, None]], 1)
-        place = self.collider.moved(pose[:, :3], level, config.body)
-        stand = self.collider.floor(place, config.body) + config.body.eye_m
+        place, pushed = self._gone(state, level)
+        stand = self._floor({**state, **pushed}, place) + config.body.eye_m
         falling = torch.where(flying, 0.0, state["falling"] + GRAVITY * config.dt_s**2)
         flying = flying & ~((wish[:, 3] < 0) & (place[:, 2] <= stand + 0.05))
         climbed = place[:, 2] + ((stand - place[:, 2]) * 0.3).clamp_max(0.15)
@@ -153,36 +198,63 @@ class SplatWorld:
         )  # a wall takes the speed into it
         speed = torch.cat([gone, speed[:, 2:]], 1)
         pose = torch.cat([place[:, :2], z[:, None], _yawed(pose[:, 3:], speed[:, 2])], 1)
-        return State({"pose": pose, "speed": speed, "falling": falling, "flying": flying})
+        return state.replace(pose=pose, speed=speed, falling=falling, flying=flying, **pushed)
+
+    def _gone(self, state: State, level: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Where who wishes to go by `level` [B, 3] comes, and what that does to the things that stand there."""
+        eye, body = state["pose"][:, :3], self.config.body
+        goal = self.collider.moved(eye, level, body)
+        if not self.things:
+            return goal, {}
+        poses, speeds, came = self.rigid.step(state["bodies"], state["body_speeds"], eye, goal)
+        held = (came != goal).any(1, keepdim=True)  # things push back, but never into a wall
+        place = torch.where(held, self.collider.moved(eye, came - eye, body), goal)
+        return place, {"bodies": poses, "body_speeds": speeds}
+
+    def _floor(self, state: Mapping[str, torch.Tensor], place: torch.Tensor) -> torch.Tensor:
+        """How high the floor under `place` [B, 3] is: the place's own, or the top of a thing on which one stands."""
+        level = self.collider.floor(place, self.config.body)
+        if not self.things:
+            return level
+        low = replace(self.config.body, step_m=0.1)
+        return torch.maximum(level, Solids(self.rigid.boxes(state["bodies"])).highest(place, low))
 
     def render(self, state: State, channels: Sequence[str]) -> Observation:
-        """The asked channels; of the rest only `pose` costs no drawing."""
+        """The asked channels; of the rest only `pose` and `bodies` cost no drawing."""
         self.spec.check_channels(channels)
-        if not set(channels) - {"pose"}:
+        if not set(channels) - {"pose", "bodies"}:
             return {name: state[name] for name in channels}
-        with torch.no_grad():
-            seen = rasterise(self.gaussians, state["pose"], self.config.camera, self.config.size)
-        return {name: self._shown(seen, state, name) for name in channels}
+        shown = [self._seen(state, entry, channels) for entry in range(state.batch)]
+        drawn = {name: torch.cat([one[name] for one in shown]) for name in shown[0]}
+        return {name: drawn[name] if name in drawn else state[name] for name in channels}
 
-    def _shown(self, seen: Drawing, state: State, name: str) -> torch.Tensor:
-        if name == "pose":
-            return state["pose"]
-        if name == "rgb":
-            return (seen.rgb.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
-        if name == "depth":
-            return torch.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp_min(0.5), 0.0)
-        if name == "ids":
-            return seen.ids
-        origin = torch.cat([self.provenance, self.provenance.new_zeros(1)]) == OBSERVED  # the last for -1
-        known = seen.alpha.clamp(0, 1) * origin[seen.ids.long()]
-        return known if name == "known" else 1 - known.mean((1, 2))
+    def _seen(self, state: State, entry: int, channels: Sequence[str]) -> dict[str, torch.Tensor]:
+        """What has to be drawn of the channels for one entry of a state."""
+        scene, provenance = self.added.of(state, entry)
+        scene = self._ridden(scene, state, entry)
+        with torch.no_grad():
+            seen = rasterise(scene, state["pose"][entry][None], self.config.camera, self.config.size)
+        return {name: _shown(seen, provenance, name) for name in channels if name not in state}
+
+    def _ridden(self, scene: Gaussians, state: State, entry: int) -> Gaussians:
+        """The Gaussians of things where these are."""
+        if not self.things or torch.equal(state["bodies"][entry], self.rigid.rest):
+            return scene
+        (rows, on), poses = self._riders, state["bodies"][entry]
+        off = scene.means[rows] - self.rigid.rest[on, :3]
+        means = (rotation(poses)[on] @ off[..., None])[..., 0] + poses[on, :3]
+        quats = multiplied(poses[on, 3:], scene.quats[rows])
+        moved = {"means": scene.means.index_copy(0, rows, means), "quats": scene.quats.index_copy(0, rows, quats)}
+        return replace(scene, **moved)
 
     def _standing(self, pose: torch.Tensor) -> State:
         count = len(pose)
         flying = torch.zeros(count, dtype=torch.bool)
-        return State(
-            {"pose": pose.clone(), "speed": torch.zeros(count, 4), "falling": torch.zeros(count), "flying": flying}
-        )
+        still = {"speed": torch.zeros(count, 4), "falling": torch.zeros(count), "flying": flying}
+        if self.things:
+            still["bodies"] = self.rigid.rest.expand(count, -1, -1).clone()
+            still["body_speeds"] = torch.zeros(count, len(self.things), 6)
+        return State({"pose": pose.clone(), **still, **self.added.empty(count)}, self.added.arenas)
 
     def _ahead(self, pose: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
         """What wishes [B, 4] forward, left, turn, up add to the speeds along world x and y, of turning, and upward."""
@@ -198,3 +270,16 @@ def _yawed(quats: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     w, x, y, z = quats.unbind(1)
     turned = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], 1)
     return turned / turned.norm(dim=1, keepdim=True)
+
+
+def _shown(seen: Drawing, provenance: torch.Tensor, name: str) -> torch.Tensor:
+    """A channel of what was drawn of Gaussians with that provenance."""
+    if name == "rgb":
+        return (seen.rgb.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+    if name == "depth":
+        return torch.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp_min(0.5), 0.0)
+    if name == "ids":
+        return seen.ids
+    origin = torch.cat([provenance, provenance.new_zeros(1)]) == OBSERVED  # the last for -1
+    known = seen.alpha.clamp(0, 1) * origin[seen.ids.long()]
+    return known if name == "known" else 1 - known.mean((1, 2))

@@ -19,7 +19,8 @@ from ..space.edits import Edit, edited
 from ..space.files import replace_whole
 from ..space.occupancy import Body
 from ..space.raster import Gaussians
-from .splat import INVENTED, OBSERVED, SplatConfig, SplatWorld
+from .additions import INVENTED, OBSERVED
+from .splat import SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
 WORLD_FILE, SCENE_FILE = "world.json", "scene.safetensors"
@@ -39,6 +40,7 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
         "starts": world.starts,
         "objects": world.objects,
         "solids": world.solids,
+        "bodies": world.bodies,
     }
     whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
     replace_whole(path / SCENE_FILE, lambda file: save_file(whole, file))
@@ -81,12 +83,13 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         if len(provenance) != len(tensors["means"]) or starts.ndim != 2 or starts.shape[1] != 7 or not len(starts):
             raise ValueError("its parts do not fit one another")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
-        solids, edits = tensors.pop("solids", None), read_edits(path) if edits is None else edits
+        solids, bodies = tensors.pop("solids", None), tensors.pop("bodies", None)
+        edits = read_edits(path) if edits is None else edits
         after = edited(Gaussians(**tensors), edits, objects)
         provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
         return SplatWorld(
             str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects,
-            None if edits else solids,  # edits move what they describe: then the Gaussians themselves stop bodies
+            *((None, None) if edits else (solids, bodies)),  # edits move what they describe: then the Gaussians stop bodies
         )  # fmt: skip
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error

@@ -20,7 +20,8 @@ from ...space.files import replace_whole
 from ...space.fitting import Fit, FitConfig, Views, decibels, nearest_views, psnr
 from ...space.occupancy import Body, Occupancy
 from ...space.raster import Gaussians
-from ...worlds.splat import OBSERVED, SplatConfig, SplatWorld
+from ...worlds.additions import OBSERVED
+from ...worlds.splat import SplatConfig, SplatWorld
 from ...worlds.splat_folder import WORLD_FILE, check_free, save_splat
 from ..trainer import Report
 

@@ -34,12 +34,14 @@ _AXES = ((1, 2), (0, 2), (0, 1))  # the two axes along a side, for each axis acr
 @dataclass(frozen=True)
 class Built:
     """A place built of a plan: Gaussians, the object of each int32 [N] (0: the building), names of objects 1, 2, ...; solids
-    float32 [S, 6], boxes that stop bodies; starts [R, 7], a pose on the floor of each room (the height is the floor's)."""
+    float32 [S, 6], boxes that stop bodies, and int32 [S] the object of each that can be pushed (0: none); starts [R, 7], a pose on
+    the floor of each room (the height is the floor's)."""
 
     gaussians: Gaussians
     objects: torch.Tensor
     names: tuple[str, ...]
     solids: torch.Tensor
+    bodies: torch.Tensor
     starts: torch.Tensor
 
 
@@ -65,7 +67,7 @@ class _Grid:
 def build(plan: Plan, count: int = 120_000) -> Built:
     """The place of a plan, of about `count` Gaussians. ContractError for what does not fit. The same plan, the same numbers."""
     blocks = blocks_of(plan)
-    boxes = np.concatenate([np.asarray(blocks.low), np.asarray(blocks.high)], 1).astype(np.float64)
+    boxes, bodies = blocks.boxes, blocks.bodies
     air = np.array([[*low, *high] for low, high in blocks.air])
     texels = _grid(boxes, np.full(len(boxes), TEXEL_M))
     bare = _bare(texels, boxes, air)
@@ -74,13 +76,14 @@ def build(plan: Plan, count: int = 120_000) -> Built:
     fine = np.array([FINE.get(look.material, 1.0) for look in blocks.looks])
     apart = math.sqrt((area * fine[texels.blocks]).sum() / count)
     spacing = np.clip(apart / np.sqrt(fine), FINEST_M, 0.3)
-    cells = _some(_grid(boxes, spacing), boxes, air)
+    cells = _some(_grid(boxes, spacing), boxes, air, bodies)
     colours = _brightness(plan, blocks, boxes, cells, texels, bare, light)
     return Built(
         _gaussians(cells, colours),
         torch.from_numpy(np.asarray(blocks.objects, np.int32)[cells.blocks]),
         tuple(blocks.names),
         torch.from_numpy(blocks.solids),
+        torch.from_numpy(bodies[np.asarray(blocks.solid)]),
         _starts(plan, blocks),
     )
 
@@ -114,15 +117,21 @@ def _grid(boxes: np.ndarray, spacing: np.ndarray) -> _Grid:
 def _bare(grid: _Grid, boxes: np.ndarray, air: np.ndarray) -> np.ndarray:
     """Which cells have air before them: bool [N]."""
     front = grid.points + 0.004 * grid.normals
-    free, filled = np.empty(len(front), np.bool_), np.empty(len(front), np.bool_)
-    over_views(len(front), lambda first, last: kernels.in_any(first, last, front, air, 0.0, free))
-    over_views(len(front), lambda first, last: kernels.in_any(first, last, front, boxes, 0.0, filled))
-    return free & ~filled
+    return _in(front, air) & ~_in(front, boxes)
 
 
-def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray) -> _Grid:
-    """The cells that can be seen."""
-    bare = _bare(grid, boxes, air)
+def _in(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    found = np.empty(len(points), np.bool_)
+    over_views(len(points), lambda first, last: kernels.in_any(first, last, points, boxes, 0.0, found))
+    return found
+
+
+def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray, bodies: np.ndarray) -> _Grid:
+    """The cells that can be seen, at once or after things were pushed away."""
+    bare, whose = _bare(grid, boxes[bodies == 0], air), bodies[grid.blocks]
+    for number in np.unique(bodies[bodies > 0]):
+        rows = np.flatnonzero(whose == number)
+        bare[rows] = ~_in(grid.points[rows] + 0.004 * grid.normals[rows], boxes[bodies == number])
     return _Grid(grid.points[bare], grid.sides[bare], grid.blocks[bare], grid.widths[bare], grid.starts, grid.counts)
 
 
@@ -265,7 +274,11 @@ def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, 
     near = total / np.maximum(weight, 1e-9)[:, None]
     lost = weight <= 0
     if lost.any():  # none of the four is bare: the mean of its block
-        near[lost] = values[bare].mean(0)
+        total, count = np.zeros((len(boxes), 3)), np.zeros(len(boxes))
+        np.add.at(total, texels.blocks[bare], values[bare])
+        np.add.at(count, texels.blocks[bare], 1)
+        means = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], values[bare].mean(0))
+        near[lost] = means[cells.blocks[lost]]
     return near
 
 

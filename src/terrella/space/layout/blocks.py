@@ -16,6 +16,7 @@ from .plan import REACH_M, WALL_M, WALLS, Door, Plan, Room, Stairs, Thing, Windo
 RISER_M = 0.18  # steps of stairs are at most so high
 FRAME_M = 0.05
 _LEAF_M = 0.04
+INSIDE_M = 2e-3  # deeper in something else nothing can be pushed
 LEVEL_M = 0.35  # a door joins floors that differ by no more
 _TURNS = {"south": 0, "east": 1, "north": 2, "west": 3}  # quarter turns to the left
 
@@ -25,7 +26,7 @@ Corner = tuple[float, float, float]
 @dataclass
 class Blocks:
     """low, high: corners of K boxes [3] each; looks; objects: which thing each belongs to, 0 for the building; solid: whether
-    bodies meet it; air: boxes in which one can be; names: of objects 1, 2, ..."""
+    bodies meet it; air: boxes in which one can be; names: of objects 1, 2, ...; movable: which of them can be pushed."""
 
     low: list[Corner] = field(default_factory=list)
     high: list[Corner] = field(default_factory=list)
@@ -34,6 +35,7 @@ class Blocks:
     solid: list[bool] = field(default_factory=list)
     air: list[tuple[Corner, Corner]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
+    movable: set[int] = field(default_factory=set)
 
     def add(self, low: Sequence[float], high: Sequence[float], look: Look, thing: int = 0, solid: bool = True) -> None:
         self.low.append((low[0], low[1], low[2]))
@@ -50,8 +52,25 @@ class Blocks:
     @property
     def solids(self) -> np.ndarray:
         """float32 [S, 6], the boxes that stop bodies: low and high corners."""
-        both = np.concatenate([np.asarray(self.low), np.asarray(self.high)], 1)
-        return both[np.asarray(self.solid)].astype(np.float32)
+        return self.boxes[np.asarray(self.solid)].astype(np.float32)
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """float64 [K, 6]: low and high corners."""
+        return np.concatenate([np.asarray(self.low), np.asarray(self.high)], 1).astype(np.float64)
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """int32 [K]: of each box the object that can be pushed, 0 for what stays: also things that stand partly in something."""
+        boxes, solid = self.boxes, np.asarray(self.solid)
+        found = np.array([one if one in self.movable else 0 for one in self.objects], np.int32)
+        for number in sorted(self.movable):
+            mine = found == number
+            other = boxes[~mine & solid]
+            shared = np.minimum(boxes[mine, None, 3:], other[:, 3:]) - np.maximum(boxes[mine, None, :3], other[:, :3])
+            if (shared > INSIDE_M).all(2).any():
+                found[mine] = 0
+        return found
 
 
 def blocks_of(plan: Plan) -> Blocks:
@@ -234,6 +253,8 @@ def _thing(blocks: Blocks, plan: Plan, thing: Thing) -> None:
     low = (thing.at[0] - spans[0] / 2, thing.at[1] - spans[1] / 2, thing.at[2])
     high = (low[0] + spans[0], low[1] + spans[1], low[2] + height)
     _inside(plan, low, high, thing.label)
+    if kind.movable if thing.movable is None else thing.movable:
+        blocks.movable.add(number)
     own = look_of(thing.look, look_of(kind.look).material) if thing.look else look_of(kind.look)
     for x0, y0, z0, x1, y1, z1, said in kind.parts:
         corners = [((x - 0.5) * width, (y - 0.5) * depth) for x, y in ((x0, y0), (x1, y1))]

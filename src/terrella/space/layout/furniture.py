@@ -12,13 +12,14 @@ Part = tuple[
 @dataclass(frozen=True)
 class Kind:
     """size: width, depth, height in metres, its front to the south; look; stands: wall, middle, corner, any or hung (at a wall);
-    parts: by default one box; soft: bodies go through it."""
+    parts: by default one box; soft: bodies go through it; movable: it can be pushed."""
 
     size: tuple[float, float, float]
     look: str
     stands: str = "any"
     parts: tuple[Part, ...] = ((0, 0, 0, 1, 1, 1, ""),)
     soft: bool = False
+    movable: bool = False
 
 
 def _legs(top: float, thick: float, look: str = "") -> tuple[Part, ...]:
@@ -49,8 +50,8 @@ KINDS = {
         "wall",
         ((0, 0, 0.94, 1, 1, 1, ""), (0, 0, 0, 0.05, 1, 0.94, ""), (0.7, 0.05, 0, 1, 1, 0.94, "")),
     ),
-    "chair": Kind((0.45, 0.45, 0.95), "wood", "any", _SEAT),
-    "stool": Kind((0.4, 0.4, 0.5), "wood", "any", ((0, 0, 0.88, 1, 1, 1, ""), *_legs(0.88, 0.12))),
+    "chair": Kind((0.45, 0.45, 0.95), "wood", "any", _SEAT, movable=True),
+    "stool": Kind((0.4, 0.4, 0.5), "wood", "any", ((0, 0, 0.88, 1, 1, 1, ""), *_legs(0.88, 0.12)), movable=True),
     "bench": Kind(
         (1.5, 0.4, 0.45),
         "wood",
@@ -76,8 +77,8 @@ KINDS = {
         "wall",
         ((0, 0.05, 0, 1, 1, 1, ""), (0.01, 0, 0.02, 0.99, 0.05, 0.62, ""), (0.01, 0, 0.64, 0.99, 0.05, 0.98, "")),
     ),
-    "crate": Kind((0.7, 0.7, 0.7), "wood", "corner"),
-    "box": Kind((0.5, 0.5, 0.5), "brown paint", "any"),
+    "crate": Kind((0.7, 0.7, 0.7), "wood", "corner", movable=True),
+    "box": Kind((0.5, 0.5, 0.5), "brown paint", "any", movable=True),
     "pillar": Kind((0.45, 0.45, 9.0), "stone", "middle", ((0, 0, 0, 1, 1, 1, ""),)),
     "lamp": Kind(
         (0.4, 0.4, 1.6),

@@ -83,13 +83,15 @@ class Stairs:
 @dataclass(frozen=True)
 class Thing:
     """What stands in a room: `label` a kind of furniture (furniture.py), or any other word for a plain box. at: the middle of
-    its foot; size: along x, y and z as it would face south; facing: where its front looks."""
+    its foot; size: along x, y and z as it would face south; facing: where its front looks; movable: whether it can be pushed, by
+    default as its kind."""
 
     label: str
     at: tuple[float, float, float]
     size: tuple[float, float, float] | None = None
     facing: str = "south"
     look: str | None = None
+    movable: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,10 @@ def _value(value: Any, kind: str, where: str) -> Any:
         if isinstance(value, Sequence) and len(value) == many and all(map(_finite, value)):
             return tuple(float(v) for v in value)
         raise ContractError(f"{where} takes {many} finite numbers; got {value!r:.60}.")
+    if kind.startswith("bool"):
+        if isinstance(value, bool):
+            return value
+        raise ContractError(f"{where} is true or false; got {value!r:.60}.")
     if kind.startswith("str"):
         if isinstance(value, str) and value.strip():
             return value
