@@ -112,7 +112,9 @@ def walks(world: SplatWorld, count: int, steps: int) -> None:
     if world.things:
         pushed = (state["bodies"] - world.rigid.rest)[..., :3].norm(dim=2) > 0.05
         low = float(state["bodies"][..., 2].min())
-        print(f"{int(pushed.any(1).sum())} of them pushed one of {len(world.things)} things, none of which is below {low:.2f} m")
+        print(
+            f"{int(pushed.any(1).sum())} of them pushed one of {len(world.things)} things, none of which is below {low:.2f} m"
+        )
 
 
 def closure(world: SplatWorld) -> None:

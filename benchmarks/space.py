@@ -1,6 +1,7 @@
 """Times Gaussian splatting: pictures drawn a second, and steps of a fit (draw, gradients, Adam) a second.
 
 python benchmarks/space.py [--threads 2] [--repeats 30] [--json]
+python benchmarks/space.py --rooms [--steps 1000] [--gaussians 30000]   # fits a room of Doom and one in MuJoCo
 
 The scene is a room of 8 x 6 x 3 m with four pillars, its surfaces covered evenly by N flat Gaussians of opacity 0.9 that touch one
 another, seen from eight headings; about half of it is in sight. Of each
@@ -17,6 +18,7 @@ from collections.abc import Callable
 import torch
 
 from terrella.space.camera import planar_pose
+from terrella.space.fitting import Fit, FitConfig, decibels, nearest_views, psnr
 from terrella.space.raster import Gaussians, rasterise
 from terrella.space.raster.gaussians import plain_sh
 
@@ -100,13 +102,42 @@ def steps_a_second(repeats: int) -> tuple[float, float]:
     return _best([lambda pair=pair: step(*pair) for pair in zip(poses(), goal)], repeats)
 
 
+def fit_rooms(gaussians: int, steps: int) -> None:
+    """Fits two rooms, every eighth picture kept from the fit, and prints how those come out."""
+    from rooms import doom_room, mujoco_room
+
+    for name, made, bar_db, bar_s in (("Doom", doom_room, 27, 180), ("MuJoCo", mujoco_room, 28, 300)):
+        views = made()
+        held = torch.arange(len(views)) % 8 == 4
+        kept, asked = views.at(~held), views.at(held)
+        begun, used = time.perf_counter(), time.process_time()
+        fit = Fit(kept, FitConfig(gaussians=gaussians, steps=steps))
+        while fit.done < steps:
+            fit.step()
+        spent, busy = time.perf_counter() - begun, time.process_time() - used
+        found = psnr(fit.gaussians, asked)
+        near = nearest_views(kept, asked)
+        copied = torch.stack([decibels(kept.rgb[a].float() - b.float()) for a, b in zip(near, asked.rgb)])
+        db, by = float(found.mean()), float(1.96 * found.std() / len(found) ** 0.5)
+        print(
+            f"a room of {name}: {db:.1f} dB (+-{by:.1f}) on {len(asked)} kept from the fit of {len(kept)}, bar {bar_db}; "
+            f"the nearest picture {float(copied.mean()):.1f}; {spent:.0f} s ({busy:.0f} s of a processor), bar {bar_s}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rooms", action="store_true")
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--gaussians", type=int, default=30_000)
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
+    if given.rooms:
+        fit_rooms(given.gaussians, given.steps)
+        return
     rows = {f"{n // 1000}k Gaussians at {size[0]}x{size[1]}, frames/s": (frames_a_second(n, size, given.repeats), bar)
             for n, size, bar in RENDERS}  # fmt: skip
     rows[f"{FIT // 1000}k Gaussians at {FIT_SIZE[0]}x{FIT_SIZE[1]}, steps/s"] = steps_a_second(given.repeats), FIT_BAR
