@@ -57,7 +57,7 @@ def _room_xml(seed: int) -> str:
     colour = lambda: " ".join(f"{v:.2f}" for v in rng.uniform(0.2, 0.9, 3))  # noqa: E731
     textures = "".join(
         f'<texture name="t{k}" type="2d" builtin="{LOOKS[k % 3]}" rgb1="{colour()}" rgb2="{colour()}" width="128" height="128"/>'
-        f'<material name="m{k}" texture="t{k}" texrepeat="3 3" texuniform="false"/>' for k in range(8)
+        f'<material name="m{k}" texture="t{k}" texrepeat="3 3" specular="0"/>' for k in range(8)
     )  # fmt: skip
     sides = [(3, 2.5, -0.05, 3.1, 2.6, 0.05), (3, 2.5, 2.85, 3.1, 2.6, 0.05), (-0.05, 2.5, 1.4, 0.05, 2.6, 1.4),
              (6.05, 2.5, 1.4, 0.05, 2.6, 1.4), (3, -0.05, 1.4, 3.1, 0.05, 1.4), (3, 5.05, 1.4, 3.1, 0.05, 1.4)]  # fmt: skip
@@ -68,6 +68,8 @@ def _room_xml(seed: int) -> str:
         x, y = 3 + 2.4 * np.cos(turn), 2.5 + 1.9 * np.sin(turn)
         kind, size = (("box", "0.25 0.2 0.4"), ("cylinder", "0.2 0.5"), ("sphere", "0.3"))[k % 3]
         geoms.append(f'<geom type="{kind}" pos="{x:.2f} {y:.2f} 0.4" size="{size}" material="m{6 + k % 2}"/>')
-    return f"""<mujoco><visual><global fovy="90"/><map znear="0.01"/></visual><asset>{textures}</asset><worldbody>
-<light pos="3 2.5 2.6" dir="0 0 -1" diffuse=".7 .7 .7" castshadow="false"/><camera name="eye" fovy="90"/>
+    return f"""<mujoco><visual><headlight active="0"/><global fovy="90"/><map znear="0.01"/></visual>
+<asset>{textures}</asset><worldbody>
+<light pos="3 2.5 2.6" dir="0 0 -1" ambient=".4 .4 .4" diffuse=".6 .6 .6" specular="0 0 0" castshadow="false"/>
+<camera name="eye" fovy="90"/>
 {"".join(geoms)}</worldbody></mujoco>"""

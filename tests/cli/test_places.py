@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import terrella
@@ -45,7 +46,8 @@ def test_it_is_recorded_and_scored(place, tmp_path, capsys):
 
 def test_one_plans_in_it_and_policies_are_judged(place, tmp_path, capsys):
     world = terrella.load(place)
-    rgb = world.render(world.start(1, terrella.make_rng(0)), ("rgb",))["rgb"][0].numpy()
+    elsewhere = {"pose": torch.tensor([[4.5, 1.0, 1.65, 0.0, 0.0, 0.0, 1.0]])}  # and looking back
+    rgb = world.render(world.observe(elsewhere, None, terrella.make_rng(0)), ("rgb",))["rgb"][0].numpy()
     Image.fromarray(np.asarray(rgb)).save(tmp_path / "goal.png")
     short = ["--steps", "4", "--episodes", "1", "--samples", "4", "--horizon", "3", "--iterations", "1"]
     for goal in ("pose=2,2,_,_,_,_,_", str(tmp_path / "goal.png")):

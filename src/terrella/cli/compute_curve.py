@@ -52,7 +52,7 @@ def helped(points: Sequence[Point], what: str, seed: int) -> str:
     least, most = points[0], points[-1]
     gained = gain(most.played, least.played, what, seed)
     between = f"by {gained} in {what} from {least.words} to {most.words}"
-    if gained.low <= 0:
+    if not gained.low > 0:  # nor where it cannot be told
         return f"Thinking longer is not seen to help: {between}."
     apart = [gain(most.played, point.played, what, seed).low > 0 for point in points]
     enough = points[1 + max(at for at, found in enumerate(apart) if found)]
