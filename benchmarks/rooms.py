@@ -68,8 +68,10 @@ def _room_xml(seed: int) -> str:
         x, y = 3 + 2.4 * np.cos(turn), 2.5 + 1.9 * np.sin(turn)
         kind, size = (("box", "0.25 0.2 0.4"), ("cylinder", "0.2 0.5"), ("sphere", "0.3"))[k % 3]
         geoms.append(f'<geom type="{kind}" pos="{x:.2f} {y:.2f} 0.4" size="{size}" material="m{6 + k % 2}"/>')
-    return f"""<mujoco><visual><headlight active="0"/><global fovy="90"/><map znear="0.01"/></visual>
+    return f"""<mujoco><visual><headlight ambient=".5 .5 .5" diffuse="0 0 0" specular="0 0 0"/><global fovy="90"/>
+<map znear="0.01"/></visual>
 <asset>{textures}</asset><worldbody>
-<light pos="3 2.5 2.6" dir="0 0 -1" ambient=".4 .4 .4" diffuse=".6 .6 .6" specular="0 0 0" castshadow="false"/>
+<light directional="true" dir=".3 .5 -1" diffuse=".4 .4 .4" specular="0 0 0" castshadow="false"/>
+<light directional="true" dir="-.5 -.3 .6" diffuse=".25 .25 .25" specular="0 0 0" castshadow="false"/>
 <camera name="eye" fovy="90"/>
 {"".join(geoms)}</worldbody></mujoco>"""
