@@ -102,7 +102,7 @@ def test_the_page_says_only_what_it_should(tmp_path):
     page = PlacePage(place_of(str(tmp_path / "w")))
     text = page.html([{"select": {"all": True}, "do": "delete", "note": "</script><script>"}]).decode()
     assert "unsafe" not in page.policy and "http" not in page.policy
-    assert text.count("</script>") == 3 and "<title>a &lt;room&gt;" in text and "{{" not in text
+    assert text.count("</script>") == 4 and "<title>a &lt;room&gt;" in text and "{{" not in text
 
 
 def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
@@ -165,6 +165,41 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
     mine = torch.cat([walled.collider.moved(points, wish, body), walled.collider.floor(points, body)[:, None]], 1)
     assert ((theirs - mine).abs().amax(1) < 0.01).float().mean() > 0.98
+
+
+def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser, monkeypatch):
+    monkeypatch.setattr("terrella.serve.place.WHOLE", 2000)
+    monkeypatch.setattr("terrella.serve.place.FIRST", 500)
+    save_splat(world(4000), tmp_path / "w")
+    content = PlacePage(place_of(str(tmp_path / "w"))).html(EDITS[:1])
+    early, _, late = content.partition(b'<script type="text/plain" id="rest">')
+    (tmp_path / "early.html").write_bytes(early)
+    (tmp_path / "whole.html").write_bytes(early + b'<script type="text/plain" id="rest">' + late)
+    page = browser.new_page(viewport={"width": 320, "height": 240})
+    page.goto((tmp_path / "early.html").as_uri())
+    until(page, "!!window.terrella && terrella.painted > 0")
+    assert page.evaluate("[terrella.story.scene.length, terrella.drawing.stands, terrella.idle]") == [500, 8, False]
+    page.close()
+    page = opened((tmp_path / "whole.html").as_uri())
+    after = edited(world(4000).gaussians, EDITS[:1])
+    assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(after.gaussians.means))
+    assert page.evaluate("!terrella.story.unsaved && !document.getElementById('edit').hidden")
+
+
+def test_far_gaussians_are_fewer_and_stand_for_more(tmp_path, opened):
+    page = opened(exported(tmp_path, 6000))
+    page.evaluate("terrella.stand([0.3, 2.0, 1.2], 0, 0)")
+    until(page, "terrella.idle")
+    whole = page.evaluate("terrella.drawing.count")
+    ask = """most => new Promise((done) => { terrella.sorter.onOrder = done; terrella.sorter.ask({ ...terrella.sight(), most }); })
+        .then(({ order, within, all }) => [Array.from(order), within, all])"""
+    order, within, seen = page.evaluate(ask, 1500)
+    place = world(6000).gaussians.means[order]
+    away = (place - torch.tensor([0.3, 2.0, 1.2])).norm(dim=1)
+    assert seen == whole and 1000 < len(order) < 1700 and 0.1 < within < 3
+    near = (world(6000).gaussians.means - torch.tensor([0.3, 2.0, 1.2])).norm(dim=1) < 0.9 * within
+    assert set(order) >= set(near.nonzero()[:, 0].tolist()) & set(page.evaluate(ask, 1e9)[0])
+    assert (away > within).any()
 
 
 @pytest.mark.slow

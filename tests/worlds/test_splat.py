@@ -14,8 +14,9 @@ from terrella.core import check_world
 from terrella.core.errors import CheckpointError, DatasetError, ObservationError
 from terrella.space.camera import planar_pose
 from terrella.space.files import read_scene, write_scene
+from terrella.worlds import splat_folder
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import save_splat, world_of
+from terrella.worlds.splat_folder import UNDONE_FILE, read_edits, save_splat, world_of, write_edits
 
 from ..space.test_fitting import LENS, SIZE, room
 
@@ -126,3 +127,23 @@ def test_damaged_folders_are_refused(tmp_path):
     (tmp_path / "scene.safetensors").write_bytes(b"no")
     with pytest.raises(CheckpointError, match="damaged"):
         terrella.load(tmp_path)
+
+
+def test_a_crash_between_two_files_loses_no_edit(tmp_path, monkeypatch):
+    one, two = ({"select": {"all": True}, "do": "turn", "degrees": angle} for angle in (10, 20))
+    replace_whole = splat_folder.replace_whole
+    for edits, undone in (([one], [two]), ([one, two], []), ([one, two, one], [])):  # undo, redo, another
+        write_edits(tmp_path, [one, two] if undone else [one], [] if undone else [two])
+        written = []
+
+        def crash(path, write, written=written):
+            if written:
+                raise KeyboardInterrupt
+            written.append(replace_whole(path, write))
+
+        monkeypatch.setattr(splat_folder, "replace_whole", crash)
+        with pytest.raises(KeyboardInterrupt):
+            write_edits(tmp_path, edits, undone)
+        monkeypatch.setattr(splat_folder, "replace_whole", replace_whole)
+        left = read_edits(tmp_path) + read_edits(tmp_path, UNDONE_FILE)
+        assert one in left and two in left

@@ -95,6 +95,8 @@ def play(
 
     def ready(address: str) -> None:
         result({"address": address, "worlds": names}, json, f"{' and '.join(names)}: open {address}")
+        if learned.spec.card.get("kind") == "splat":
+            say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
 
     keeping: dict[str, Any] = {"keep": keeper, "kept_in": keeper.place}
     serve(worlds, host, port, token, sink, ready, seed, picture=picture, policy=driver, **keeping)

@@ -21,7 +21,7 @@ import torch
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse
+from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
@@ -32,9 +32,14 @@ from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
 from .door import WEB, application, posted, serve_page
+from .frames import Frames
 
 PAGE = WEB / "place"
 MOST_STARTS = 64
+WHOLE, FIRST = (
+    150_000,
+    50_000,
+)  # Gaussians: of more, so many spread over all of them come first, and show the place meanwhile
 LONGEST_EDITS = 1 << 22  # bytes
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
@@ -64,37 +69,44 @@ class PlacePage:
 
     def __init__(self, place: Place):
         self._place = place
-        self._packed, data = packed_place(place)
-        self._data = base64.b64encode(data).decode()
+        first = len(place.gaussians) if len(place.gaussians) <= WHOLE else FIRST
+        self._packed, *parts = packed_place(place, first)
+        self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
         self._style = (WEB / "style.css").read_text("utf-8") + (PAGE / "place.css").read_text("utf-8")
-        self._script = bundled(PAGE / "app.js")
+        self._script = f"(async () => {{\n'use strict';\n{bundled(PAGE / 'app.js')}}})();"
         self.policy = (
             f"default-src 'none'; script-src {_hash(self._script)}; worker-src blob:; style-src {_hash(self._style)}; "
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
         )
 
-    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "") -> bytes:
+    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "") -> bytes:
         """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
-        file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile."""
+        file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile. `frames`: the
+        address that draws for browsers that cannot."""
         place = self._place
         about = {
-            **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch,
+            **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits),
             "objects": list(place.names), "samples": samples().tolist(),
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
-            "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data,
+            "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data, "rest": self._rest,
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
         return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
 
 
-def packed_place(place: Place) -> tuple[dict[str, Any], bytes]:
-    """What scene.js and solid.js unpack: `count` and `solid`, and columns in gzip."""
-    columns, (solid, cubes) = _packed(place), _packed_solid(place.collider)
-    return {"count": len(place.gaussians), "solid": solid}, gzip.compress(columns + cubes, 6, mtime=0)
+def packed_place(place: Place, first: int) -> tuple[dict[str, Any], bytes, bytes]:
+    """What scene.js and solid.js unpack: `count`, `first` and `solid`; what is solid and the columns of so many Gaussians,
+    which are spread over all, in gzip; and the columns of the rest, empty where there is none."""
+    count, (solid, cubes) = len(place.gaussians), _packed_solid(place.collider)
+    chosen = torch.zeros(count, dtype=torch.bool)
+    chosen[torch.arange(first) * count // max(first, 1)] = True
+    parts = [cubes + _packed(place, chosen), _packed(place, ~chosen) if first < count else b""]
+    early, late = (gzip.compress(part, 6, mtime=0) if part else b"" for part in parts)
+    return {"count": count, "first": first, "solid": solid}, early, late
 
 
 def bundled(path: Path) -> str:
@@ -124,16 +136,16 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _packed(place: Place) -> bytes:
-    """The columns that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
-    scene = place.gaussians
+def _packed(place: Place, chosen: torch.Tensor) -> bytes:
+    """The columns of some Gaussians that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
+    scene = place.gaussians.at(chosen)
     if place.objects.numel() and int(place.objects.max()) > 65535:
         raise ServeError(f"{place.name} has more than 65,535 objects, and a page shows no more.")
     byte = lambda part: part.round().clamp(0, 255).to(torch.uint8).contiguous().numpy().tobytes()  # noqa: E731
     return b"".join([
         _by_bytes(scene.means.numpy(), "<f4"), _by_bytes(packed_quats(scene.quats).numpy(), "<u4"),
         byte((scene.scales.clamp_min(1e-9).log() + 10) * 16), byte(204 * (0.5 + Y0 * scene.sh[:, 0])), byte(255 * scene.opacities),
-        byte(place.seen.float()), _by_bytes(place.objects.clamp(0, 65535).numpy(), "<u2"),
+        byte(place.seen[chosen].float()), _by_bytes(place.objects[chosen].clamp(0, 65535).numpy(), "<u2"),
     ])  # fmt: skip
 
 
@@ -169,7 +181,7 @@ def build_place(
 ) -> Starlette:
     """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
     saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows."""
-    page, alone = PlacePage(place), threading.Lock()
+    page, alone, frames = PlacePage(place), threading.Lock(), Frames(place.gaussians, place.objects, edits)
 
     def kept(content: bytes) -> None:
         told = json.loads(content)
@@ -187,12 +199,20 @@ def build_place(
             return PlainTextResponse(str(error), 422)
         return PlainTextResponse("")
 
+    async def draw(request: Request) -> Response:
+        try:
+            return Response(await run_in_threadpool(frames.draw, request.query_params), media_type="image/jpeg")
+        except TerrellaError as error:
+            return PlainTextResponse(str(error), 422)
+
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         yield
 
-    routes = [Route("/edits", keep, methods=["POST"])]
-    return application(lambda: page.html(edits(), "/edits"), routes, lifespan, host, token, page.policy)
+    routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
+    return application(
+        lambda: page.html(edits(), "/edits", frames="/frame"), routes, lifespan, host, token, page.policy
+    )
 
 
 def serve_place(

@@ -44,7 +44,8 @@ class Newest:
             if number <= after or make is None:
                 return None
             if self._packed[0] != number:
-                about, data = packed_place(make())
+                place = make()
+                about, data, _ = packed_place(place, len(place.gaussians))
                 self._packed = number, json.dumps({**about, **facts, "number": number}).encode(), data
             return self._packed[1:]
 

@@ -128,8 +128,11 @@ def checked_edits(source: SplatWorld, text: str) -> list[Edit]:
 
 
 def write_edits(path: Path, edits: Sequence[Edit], undone: Sequence[Edit] = ()) -> None:
-    """Replaces the edits of a world, and those that were taken back."""
-    for name, lines in ((UNDONE_FILE, undone), (EDITS_FILE, edits)):
+    """Replaces the edits of a world, and those that were taken back. What gains an edit is written first: a crash loses none."""
+    files = [(EDITS_FILE, edits), (UNDONE_FILE, undone)]
+    if len(undone) > len(read_edits(path, UNDONE_FILE)):
+        files.reverse()
+    for name, lines in files:
         text = "".join(json.dumps(edit) + "\n" for edit in lines)
         replace_whole(path / name, lambda file, text=text: file.write_text(text))
 

@@ -8,15 +8,16 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
-import { decoded, inflate, Reader, unpackScene } from './scene.js';
+import { Remote } from './remote.js';
+import { decoded, inflate, joined, Reader, unpackScene } from './scene.js';
 import { Solid } from './solid.js';
 import { Sorter } from './sort.js';
 import { Story } from './story.js';
 import { Walker } from './walk.js';
 
 const $ = (id) => document.getElementById(id);
-const TALL = 0.62, WIDEST = 1.35, SLOW_MS = 40, FAST_MS = 20, COARSEST = 0.25;
-const seen = { painted: 0, times: [], share: 1, dirty: true, last: 0, running: false, sorted: '', solidOf: null };
+const TALL = 0.62, WIDEST = 1.35, SLOW_MS = 40, FAST_MS = 20, COARSEST = 0.25, LEAST = 0.04, FEWEST = 20000;
+const seen = { painted: 0, times: [], share: 1, stands: 1, dirty: true, last: 0, running: false, toasted: 0, sorted: '', solidOf: null };
 
 const world = JSON.parse($('world').textContent), canvas = $('view');
 $('name').textContent = world.name;
@@ -28,15 +29,25 @@ const ready = await open().catch((error) => {
 });
 
 async function open() {
-  const drawing = new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
+  const drawing = world.frames && !document.createElement('canvas').getContext('webgl2') ? new Remote(canvas, world.frames, toast) : new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
-  return { drawing, source, story: new Story(source, world.edits), solid };
+  const story = new Story(source, []);
+  try { story.begin(source, world.edits); } catch (error) { if (source.length === world.count) throw error; }  // the rest comes
+  return { drawing, source, story, solid };
 }
 
-/** The Gaussians of a place, and what is solid in it. */
-async function unpacked({ count, solid }, packed) {
-  const reader = new Reader(await inflate(packed)), source = unpackScene(reader, count);
-  return { source, solid: world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, solid) };
+/** What comes first of a place: Gaussians that are spread over all, and what is solid. */
+async function unpacked(about, packed) {
+  const reader = new Reader(await inflate(packed)), solid = world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, about.solid);
+  return { source: unpackScene(reader, about.first), solid };
+}
+
+/** All Gaussians, as soon as the rest of the page is there. */
+async function whole(source) {
+  while (!$('end') || !seen.painted) await new Promise((done) => { setTimeout(done, 50); });
+  const rest = unpackScene(new Reader(await inflate(decoded($('rest').textContent))), world.count - source.length);
+  $('rest').remove();
+  return joined(source, rest);
 }
 
 if (ready) run(ready);
@@ -44,7 +55,7 @@ if (ready) run(ready);
 function run({ drawing, source, story, solid: first }) {
   let solid = first, made = '';
   const walker = new Walker(world), map = new MiniMap($('minimap').querySelector('canvas'));
-  const sorter = new Sorter((order, share) => { drawing.order(order, share); redraw(); });
+  const sorter = new Sorter(({ order, within, all }) => { drawing.order(order, within); seen.visible = all; redraw(); });
   const hands = new Hands(canvas, $('stick'), {
     moved: wake, tool: (name, event) => editor.open && editor.selecting.handle(name, event),
     look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
@@ -55,12 +66,12 @@ function run({ drawing, source, story, solid: first }) {
 
   /** A scene is drawn, and what is solid is read off it. */
   function take(scene) {
-    drawing.set(scene);
+    drawing.set(scene, seen.stands);
     sorter.set(scene);
     solid = scene === source ? first : Solid.of(scene, world.samples);
     map.layer = null;
     seen.sorted = '';
-    $('what').textContent = `${scene.length.toLocaleString('en')} Gaussians${made}`;
+    $('what').textContent = `${seen.stands > 1 ? `${scene.length.toLocaleString('en')} of ${world.count.toLocaleString('en')}` : scene.length.toLocaleString('en')} Gaussians${made}`;
     const known = scene.seen.reduce((sum, one) => sum + one, 0) / scene.length;
     $('share-seen').textContent = `${Math.round(100 * known)}%`;
     $('share-invented').textContent = `${Math.round(100 * (1 - known))}%`;
@@ -72,8 +83,7 @@ function run({ drawing, source, story, solid: first }) {
     ({ source, solid: first } = await unpacked(about, packed));
     made = ` · step ${about.step.toLocaleString('en')} of ${about.steps.toLocaleString('en')} · ${about.db.toFixed(1)} dB`;
     $('making').firstElementChild.style.width = `${(100 * about.step) / about.steps}%`;
-    story.source = source;
-    story.replay([]);
+    story.begin(source, []);
     take(source);
   }
 
@@ -93,35 +103,39 @@ function run({ drawing, source, story, solid: first }) {
 
   function frame(time) {
     const passed = Math.min(Math.max(time - seen.last, 0), 200), moves = walker.pass(solid, hands.wish, passed / 1000);
-    seen.last = time;
-    if (moves) adapt(passed); else if (seen.share < 1) { seen.share = 1; seen.dirty = true; }
+    Object.assign(seen, { last: time, before: seen.last, dirty: seen.dirty || (seen.moves && !moves), moves });  // at rest it is drawn once more
+    if (moves && !drawing.remote) adapt(time - seen.before); else if (seen.share < 1 && !seen.dirty && !sorter.busy) Object.assign(seen, { share: Math.min(1, 3 * seen.share), dirty: true });
     sort();
     if ((moves || seen.dirty) && drawing.ready) paint();  // till it is ordered, what is on the screen stays
     if (moves || seen.dirty || sorter.busy) requestAnimationFrame(frame); else { seen.running = false; figures(); }
   }
 
-  /** Coarser while it moves where the browser draws slowly, at full sharpness when it stands still. */
+  /** Coarser while it moves where the browser draws slowly, and sharper and sharper when it stands still. */
   function adapt(passed) {
-    seen.mean = 0.8 * (seen.mean ?? FAST_MS) + 0.2 * passed;
-    const share = seen.mean > SLOW_MS ? Math.max(COARSEST, seen.share * (passed > 3 * SLOW_MS ? 0.5 : 0.85)) : seen.mean < FAST_MS ? Math.min(1, seen.share * 1.1) : seen.share;
+    seen.mean = 0.8 * (seen.mean ?? FAST_MS) + 0.2 * Math.min(passed, 200);
+    const share = seen.mean > SLOW_MS ? Math.max(LEAST, seen.share * (passed > 3 * SLOW_MS ? Math.max(0.1, SLOW_MS / passed) : 0.85)) : seen.mean < FAST_MS ? Math.min(1, seen.share * 1.1) : seen.share;
     if (share !== seen.share) Object.assign(seen, { share, mean: (SLOW_MS + FAST_MS) / 2 });
   }
 
   /** Has the Gaussians ordered for where the eye is, if it is elsewhere than for the last order. */
   function sort() {
-    const eye = walker.eye, key = [...eye.place, eye.heading, eye.pitch, innerWidth, innerHeight, seen.share].map((part) => part.toFixed(3)).join();
+    if (drawing.remote) return;
+    const eye = walker.eye, most = seen.share < 1 ? Math.max(FEWEST, seen.share * (seen.visible ?? 1e9)) : Infinity;
+    const key = [...eye.place, eye.heading, eye.pitch, innerWidth, innerHeight, seen.share].map((part) => part.toFixed(3)).join();
     if (key === seen.sorted) return;
     seen.sorted = key;
-    sorter.ask({ eye: eye.place, ...axes(eye), ...lens(), near: NEAR, share: seen.share });
+    sorter.ask({ ...sight(), most });
     seen.dirty = true;
   }
 
+  function sight() { return { eye: walker.eye.place, ...axes(walker.eye), ...lens(), near: NEAR }; }
+
   function paint() {
-    const sharp = (devicePixelRatio || 1) * seen.share, width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
+    const sharp = (devicePixelRatio || 1) * Math.max(COARSEST, seen.share), width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     seen.dirty = false;
     drawing.clear();
-    drawing.paint(matrices(walker.eye, lens()), [0, 0, width, height], editor.wires);
+    drawing.paint({ ...matrices(walker.eye, lens()), eye: walker.eye, lens: lens(), moves: seen.moves }, [0, 0, width, height], editor.wires);
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
     seen.painted += 1;
     seen.times.push(performance.now());
@@ -144,7 +158,7 @@ function run({ drawing, source, story, solid: first }) {
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
   const does = { home, fly, edit: () => editor.toggle(), tint, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: tint, KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
@@ -160,8 +174,23 @@ function run({ drawing, source, story, solid: first }) {
   setInterval(figures, 400);
   offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
 
+  seen.stands = world.count / source.length;
   take(story.scene);
   greet();
+  if (seen.stands > 1) {
+    $('edit').hidden = true;
+    whole(source).then((all) => {
+      source = all;
+      story.begin(source, world.edits);
+      seen.stands = 1;
+      $('edit').hidden = !!drawing.remote;
+      take(story.scene);
+    }).catch((error) => toast(error.message));
+  }
+  if (drawing.remote) {
+    for (const id of ['edit', 'tint']) $(id).hidden = true;
+    toast('This browser has no WebGL2, so the server draws: walk as ever; editing needs a browser that has it.');
+  }
   if (world.watch) {
     $('making').hidden = false;
     $('edit').hidden = true;
@@ -170,8 +199,8 @@ function run({ drawing, source, story, solid: first }) {
 
   // the state of the page, for whoever drives it by a script
   window.terrella = {
-    story, editor, drawing, walker, lens, get solid() { return solid; }, get painted() { return seen.painted; },
-    get idle() { return !seen.running && !seen.dirty && drawing.ready; }, get eye() { return walker.eye; },
+    story, editor, drawing, walker, sorter, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
+    get idle() { return !seen.running && !seen.dirty && drawing.ready && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {
       paint();
@@ -204,10 +233,9 @@ function greet() {
   setTimeout(() => $('hint').classList.remove('show'), 8000);
 }
 
-let toastTimer = 0;
 function toast(text) {
   $('toast').textContent = text.charAt(0).toUpperCase() + text.slice(1);
   $('toast').classList.add('show');
-  clearTimeout(toastTimer);
-  toastTimer = setTimeout(() => $('toast').classList.remove('show'), 6000);
+  clearTimeout(seen.toasted);
+  seen.toasted = setTimeout(() => $('toast').classList.remove('show'), 6000);
 }

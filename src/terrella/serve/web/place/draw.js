@@ -11,8 +11,8 @@ export const NEAR = 0.05;
 export class Drawing {
   constructor(canvas) {
     const gl = canvas.getContext('webgl2', { antialias: false, premultipliedAlpha: true });
-    if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella play`, which draws on its own machine.');
-    Object.assign(this, { canvas, gl, ready: false, count: 0, share: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
+    if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella space view`, which then draws on its own machine.');
+    Object.assign(this, { canvas, gl, ready: false, count: 0, within: Infinity, stands: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
     this.preview = this.still;
     this.splats = program(gl, SPLAT_SHADERS);
     this.lines = program(gl, LINE_SHADERS);
@@ -34,8 +34,8 @@ export class Drawing {
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
   }
 
-  /** Takes a scene: places, covariances and colours. */
-  set(scene) {
+  /** Takes a scene: places, covariances and colours; each Gaussian stands for so many that are not there. */
+  set(scene, stands = 1) {
     const { gl } = this, rows = Math.max(1, Math.ceil(scene.length / ACROSS)), data = new Uint32Array(rows * ACROSS * TEXELS * 4), floats = new Float32Array(data.buffer);
     for (let k = 0; k < scene.length; k += 1) {
       const at = 12 * k, byte = (value) => Math.min(255, Math.max(0, Math.round(value)));
@@ -44,7 +44,7 @@ export class Drawing {
       floats.set(covariance(scene, k), at + 4);
     }
     upload(gl, this.texture, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, ACROSS * TEXELS, rows, data);
-    this.ready = false;
+    Object.assign(this, { ready: false, stands });
     this.mark(scene, null);
   }
 
@@ -55,12 +55,12 @@ export class Drawing {
     upload(gl, this.flags, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, ACROSS, rows, data);
   }
 
-  /** The order to draw in, of a share of all: each stands for others, and is so much larger. */
-  order(order, share = 1) {
+  /** The order to draw in. Farther away than `within` metres there are fewer: each stands for others, and is so much larger. */
+  order(order, within = Infinity) {
     const { gl } = this, rows = Math.max(1, Math.ceil(order.length / ACROSS)), data = new Uint32Array(rows * ACROSS);
     data.set(order);
     upload(gl, this.orders, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, ACROSS, rows, data);
-    Object.assign(this, { ready: true, count: order.length, share });
+    Object.assign(this, { ready: true, count: order.length, within });
   }
 
   clear(target = null) {
@@ -106,7 +106,8 @@ export class Drawing {
     gl.uniformMatrix4fv(splats.at('view'), false, view);
     gl.uniformMatrix4fv(splats.at('projection'), false, projection);
     gl.uniform2f(splats.at('size'), width, height);
-    gl.uniform1f(splats.at('grown'), 1 / this.share);
+    gl.uniform1f(splats.at('within'), Math.min(this.within, 1e4));
+    gl.uniform1f(splats.at('stands'), this.stands);
     gl.uniform1i(splats.at('tint'), this.tint);
     gl.uniform3fv(splats.at('middle'), preview.middle);
     gl.uniform3fv(splats.at('move'), preview.move);

@@ -2,6 +2,8 @@
 
 import { NEAR } from './draw.js';
 
+const MOST = 300000;  // Gaussians of a picture
+
 /** Shows the button where there is a headset. */
 export async function offerHeadset(button, page) {
   if (!(await navigator.xr?.isSessionSupported('immersive-vr').catch(() => false))) return;
@@ -29,7 +31,7 @@ async function enter({ drawing, walker, hands, sorter, solid, redraw }) {
       const { x, y, width, height } = layer.getViewport(view);
       drawing.paint({ view: inverseOf(view.transform, stand), projection: view.projectionMatrix }, [x, y, width, height], [], layer.framebuffer);
     }
-    sorter.ask(sightOf(pose.transform, stand));
+    sorter.ask({ ...sightOf(pose.transform, stand), most: MOST });
   });
 }
 

@@ -27,6 +27,16 @@ export class Scene {
 }
 Scene.columns = [...Object.keys(UNPACKED), 'seen', 'objects'];
 
+/** All of one scene, then all of another. */
+export function joined(one, other) {
+  return new Scene(Object.fromEntries(Scene.columns.map((name) => {
+    const both = new one[name].constructor(one[name].length + other[name].length);
+    both.set(one[name]);
+    both.set(other[name], one[name].length);
+    return [name, both];
+  })));
+}
+
 /** base64 as bytes. */
 export const decoded = (text) => Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
 

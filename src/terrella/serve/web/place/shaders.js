@@ -7,7 +7,7 @@ uniform ivec2 range;
 uniform mat4 view, projection;
 uniform vec2 size, turn;
 uniform vec3 middle, move;
-uniform float factor, grown;
+uniform float factor, within, stands;
 uniform int tint;
 out vec4 colour;
 out vec2 off;
@@ -24,7 +24,7 @@ void main() {
   vec2 d = uintBitsToFloat(texelFetch(data, ivec2(column * 3 + 2, row), 0)).xy;
   uint flag = texelFetch(flags, ivec2(column, row), 0).x;
   vec3 place = uintBitsToFloat(first.xyz);
-  mat3 spread = grown * mat3(c.x, c.y, c.z, c.y, c.w, d.x, c.z, d.x, d.y);
+  mat3 spread = mat3(c.x, c.y, c.z, c.y, c.w, d.x, c.z, d.x, d.y);
   if ((flag & 2u) != 0u) {  // what is being moved
     mat3 change = mat3(turn.x, turn.y, 0, -turn.y, turn.x, 0, 0, 0, factor);
     place = change * (place - middle) + middle + move;
@@ -38,7 +38,8 @@ void main() {
   vec2 slope = clamp(at.xy / ahead, -limit, limit);
   mat3 linear = mat3(focal.x / ahead, 0, 0, 0, focal.y / ahead, 0, slope.x * focal.x / ahead, slope.y * focal.y / ahead, 0);
   mat3 whole = linear * mat3(view);
-  mat3 flat_ = whole * spread * transpose(whole);
+  float thinned = stands * max(1.0, dot(at, at) / (within * within));  // how many this one stands for
+  mat3 flat_ = thinned * whole * spread * transpose(whole);
   float a = flat_[0][0] + 0.3, b = flat_[0][1], e = flat_[1][1] + 0.3, half_ = (a + e) / 2.0, apart = length(vec2((a - e) / 2.0, b));
   float long_ = half_ + apart, wide = max(half_ - apart, 0.05);
   vec2 axis = abs(b) > 1e-6 ? normalize(vec2(b, long_ - a)) : (a >= e ? vec2(1, 0) : vec2(0, 1));

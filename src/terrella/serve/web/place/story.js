@@ -4,7 +4,13 @@ import { edited } from './edits.js';
 
 export class Story {
   constructor(source, edits) {
-    Object.assign(this, { source, edits: [], undone: [], scene: source });
+    Object.assign(this, { edits: [], undone: [], scene: source });
+    this.begin(source, edits);
+  }
+
+  /** Another source, with the edits that were saved of it. */
+  begin(source, edits) {
+    this.source = source;
     this.replay(edits);
     this.saved = this.lines;
   }

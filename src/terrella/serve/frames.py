@@ -1,0 +1,47 @@
+"""Frames of a place, drawn on the server for browsers that cannot draw it."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+import simplejpeg
+import torch
+
+from ..core.errors import ServeError
+from ..space.edits import Edit, edited
+from ..space.raster import Gaussians, rasterise
+
+NAMES = ("x", "y", "z", "heading", "pitch", "wide", "tall", "width", "height")
+SMALLEST, LARGEST, WIDEST = 8, 1280, 20.0
+
+
+class Frames:
+    """Pictures of Gaussians, objects int32 [N], after the `edits` of the moment; one is drawn at a time."""
+
+    def __init__(self, gaussians: Gaussians, objects: torch.Tensor, edits: Callable[[], Sequence[Edit]]):
+        self._source, self._objects, self._edits, self._alone = gaussians, objects, edits, threading.Lock()
+        self._scene, self._done = gaussians, "[]"
+
+    def draw(self, view: Mapping[str, str]) -> bytes:
+        """A JPEG from an eye at x, y, z (metres) that looks along `heading` and `pitch` (radians, upwards); half of what it sees at
+        a distance of 1 is `wide` and `tall`; width and height in pixels. ServeError for what is no such view."""
+        try:
+            x, y, z, heading, pitch, wide, tall, width, height = (float(view[name]) for name in NAMES)
+        except (KeyError, ValueError) as error:
+            raise ServeError(f"a view is {', '.join(NAMES)}; reload the page.") from error
+        inside = all(map(math.isfinite, (x, y, z, heading, pitch))) and 0 < wide < WIDEST and 0 < tall < WIDEST
+        if not inside or not all(SMALLEST <= size <= LARGEST for size in (width, height)):
+            raise ServeError(f"a view has finite numbers, and {SMALLEST} to {LARGEST} pixels a side; reload the page.")
+        c, s, cp, sp = math.cos(heading / 2), math.sin(heading / 2), math.cos(pitch / 2), -math.sin(pitch / 2)
+        pose = torch.tensor([[x, y, z, c * cp, -s * sp, c * sp, s * cp]])
+        with self._alone, torch.no_grad():
+            told = json.dumps(list(edits := self._edits()))
+            if told != self._done:
+                self._scene, self._done = edited(self._source, edits, self._objects).gaussians, told
+            lens = (0.5 / wide, 0.5 / tall, 0.5, 0.5)
+            seen = rasterise(self._scene, pose, lens, (round(height), round(width))).rgb[0]
+        picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous()
+        return simplejpeg.encode_jpeg(picture.numpy(), quality=85, colorspace="RGB")
