@@ -59,7 +59,7 @@ class _Seed:
         self.judge = Judge(channel=asked.success)
         self.steps = self.real.spec.max_episode_steps or 200
         places = ("real", "the simulator", "the model", *(f"dial {gap}" for gap in map(str, DIAL)))
-        self.found: dict[str, Any] = {place: {} for place in places}
+        self.found: dict[str, Any] = {"practised": [], **{place: {} for place in places}}
         if self.file.is_file():
             self.found |= json.loads(self.file.read_text(encoding="utf-8"))
 
@@ -106,6 +106,8 @@ class _Seed:
             write_json(self.file, self.found)
 
     def _practised(self, arm: str, world: World, before: Path | None) -> None:
+        if arm in self.found["practised"]:
+            return
         rate = LEARNING_RATE if before is None else GENTLY
         config = Practice(
             method="ppo",
@@ -117,6 +119,8 @@ class _Seed:
             save_every_s=60,
         )
         train_policy(world, arm, self.folder / arm, config, lambda *_: None, before=before)
+        self.found["practised"].append(arm)
+        write_json(self.file, self.found)
         say(f"seed {self.seed}: {arm} has practised")
 
     def _judge(self, arm: str, policy: Policy, count: int | None) -> None:
