@@ -5,10 +5,11 @@ import { Selecting } from './selecting.js';
 import { wiresOf } from './wires.js';
 
 const $ = (id) => document.getElementById(id);
-const NAMES = { box: ['x', 'y', 'z', 'to x', 'to y', 'to z'], sphere: ['x', 'y', 'z', 'r'] };
+const NAMES = { box: ['x', 'y', 'z', 'to x', 'to y', 'to z'], sphere: ['x', 'y', 'z', 'r'], plane: ['a', 'b', 'c', 'd'] };
 const SAID = {
   box: 'Press on a place and drag: a box around it. The wheel changes its size.', sphere: 'Press on a place and drag: a sphere around it. The wheel changes its size.',
   brush: 'Paint over what you mean. The wheel changes the brush; Shift adds to it.', object: 'Click an object.',
+  plane: 'Press on a place: all that is higher. In general, where a x + b y + c z > d.',
 };
 const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 

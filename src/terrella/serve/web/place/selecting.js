@@ -31,6 +31,9 @@ export class Selecting {
       if (number) this.on.choose({ object: number });
       else this.on.say('This belongs to no object; select it with a box, a sphere or the brush.');
       this.doing = { does: 'nothing' };
+    } else if (this.tool === 'plane') {
+      this.on.choose({ plane: [0, 0, 1, round(from[2])] });
+      this.doing = { does: 'nothing' };
     } else {
       this.doing = { does: this.tool, from, dabs: event.shiftKey && brushes ? this.on.dabs() : [] };
       if (brushes) this.dab(from);
