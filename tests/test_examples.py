@@ -29,6 +29,7 @@ def test_no_example_is_forgotten_here():
         "02_gym_env.py",
         "03_two_cameras.py",
         "04_controllers.py",
+        "05_quadruped.py",
     }
 
 
@@ -71,3 +72,21 @@ def test_a_robot_with_two_cameras_is_recorded(tmp_path):
     assert dataset.length == 40 and len(dataset.cameras) == 2
     assert set(dataset.camera_models) == {"rgb", "rgb.left"}
     assert dataset.world["action_units"] == ["m/s", "rad/s"]
+
+
+def test_a_quadruped_sees_where_a_post_is():
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
+    shown = example("05_quadruped.py")
+    try:
+        walker = shown["Walker"](EXAMPLES / "go1_gait", "green")
+        rng = terrella.make_rng(1)
+        state = walker.start(8, rng)
+        seen = walker.render(state, ("rgb", "depth", "post"))
+    except terrella.core.errors.TerrellaError as error:  # no files of the Go1, or no pictures here
+        pytest.skip(str(error))
+    found = [shown["seen_at"](rgb, depth, 1) for rgb, depth in zip(seen["rgb"], seen["depth"])]
+    ahead = seen["post"][:, 0] > 1.5 * seen["post"][:, 1].abs()
+    assert ahead.any() and all((post is not None) == bool(one) for post, one in zip(found, ahead) if one)
+    assert all((post - truth).norm() < 0.3 for post, truth in zip(found, seen["post"]) if post is not None)
+    after = walker.imagine(state, walker.spec.sample_action(8, rng), rng)
+    assert not after["done"].any()

@@ -25,6 +25,7 @@ class Agent:
     see:     what it observes of a state of the played world; None for all that a recording would hold.
     away:    how far a state is from the goal, in `unit`; None where it has no goal. near: where it counts as reached.
     futures: the policy's memory -> the futures that it considered last; None for a policy that considers none.
+    patience_s: of the world, within which it must have come nearer to its goal, or it gives up.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Agent:
     near: float = 0.0
     unit: str = ""
     futures: Callable[[Any], Futures] | None = None
+    patience_s: float = 12.0
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from .actions import action_of
 from .agent import Agent, Agents, Futures, seen_by
 
 NO_GOAL: dict[str, object] = {"at": None, "image": None}
-PATIENCE_S = 12.0  # of the world, in which an agent must have come nearer to its goal
 _NEARER = 0.97  # of the least distance so far counts as nearer
 
 
@@ -159,7 +158,7 @@ class Driver:
         self._since += 1
         if away < _NEARER * self._best:
             self._best, self._since = away, 0
-        elif self._since * self.spec.dt_s > PATIENCE_S:
+        elif self._since * self.spec.dt_s > agent.patience_s:
             best = f"{self._best:.1f} {agent.unit}" if agent.unit else f"{self._best:.3f}"
             self._end(f"the goal cannot be reached from here: {best} is the nearest that the agent came. You drive.")
             return True

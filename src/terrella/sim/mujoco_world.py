@@ -30,6 +30,7 @@ from .mujoco_pictures import Pictures, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
 from .mujoco_tasks import MARKER, Body, Free, Task, numbers
+from .mujoco_warp import WarpStepper
 
 FILES = (".xml", ".mjcf", ".urdf")
 FASTEST = 1e4  # m/s or rad/s: a world that moves faster is unstable
@@ -49,6 +50,7 @@ class MujocoWorld:
     lidar:      rays of a turn, or (rows, rays), that a site named "lidar" in the file sends out; lidar_m: how far, in m.
     pilot:      False for the controls themselves of a robot that has an autopilot (the drone's thrusts).
     threads:    that step worlds; default: as many as there are processors for this process.
+    device:     "cuda" steps on a GPU, by mujoco-warp in float32 (sim/mujoco_warp.py); states stay tensors of the CPU.
     parameters: names of `parameters_of` that each world has values of its own of: `state["parameters"]` [B, n].
     dumps:      folder for states that led to an unstable simulation; default: terrella-unstable-USER among temporary files.
 
@@ -75,6 +77,7 @@ class MujocoWorld:
         lidar_m: float = 20.0,
         pilot: bool = True,
         threads: int | None = None,
+        device: str = "",
         parameters: Sequence[str] = (),
         dumps: str | Path | None = None,
     ):
@@ -86,7 +89,7 @@ class MujocoWorld:
         self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it would begin anew in silence
         self.name = f"mujoco:{label}"
         self._steps = max(1, round((control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
-        self._threads = threads or _cores()
+        self._threads, self._device = threads or _cores(), device
         self._dumps, self._dumped = (
             Path(dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}"),
             0,
@@ -110,7 +113,11 @@ class MujocoWorld:
         checked(self.parameters, names)
         self.varied, changes = tuple(names), [self.parameters[name] for name in names]
         seen = {at: one for at, one in enumerate(changes) if one.seen}
-        self._stepper = Stepper(self.file, {at: one for at, one in enumerate(changes) if not one.seen}, self._threads)
+        stepped = {at: one for at, one in enumerate(changes) if not one.seen}
+        on_gpu = self._device not in ("", "cpu")
+        if on_gpu and stepped:
+            raise TerrellaError("physics that differs from world to world is for the CPU; leave device out.")
+        self._stepper = WarpStepper(self.file, self._device) if on_gpu else Stepper(self.file, stepped, self._threads)
         self._pictures = Pictures(copy(self._seen), seen, self._size)
         self.spec = self._describe()
 
