@@ -31,10 +31,11 @@ Axes = Literal["rdf", "rub", "flu"]
 def fit(
     data: Positional[str], out: str, config: SplatFit, watch: bool = False, port: Port = 8767, json: Json = False
 ) -> None:
-    """Make a place to walk in of a recording with depth and poses. Stop it with Ctrl-C at any time; the same command continues.
+    """Make a place to walk in of a recording or of pictures. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
-        data: The recording: a folder, or an address (hf://..., s3://...).
+        data: A recording with poses (a folder, or an address: hf://..., s3://...), a folder of pictures with a transforms.json or
+            COLMAP's sparse/0, or a folder of plain pictures or a video, of which COLMAP finds the poses.
         out: Folder of the run; the world lies in OUT/world.
         watch: Show the place on a page meanwhile, sharper every few seconds.
     """
@@ -48,6 +49,8 @@ def fit(
         f"{facts['held_out']} pictures kept from the fit: {ours:.1f} dB (+-{ours_by:.1f}); the nearest "
         f"picture instead: {copied:.1f} (+-{copied_by:.1f})\nwalk in it: terrella play {facts['world']}"
     )
+    if facts["left_out"]:
+        text += f"\nleft out, blurred or without overlap: {', '.join(facts['left_out'])}"
     result(facts, json, text)
 
 

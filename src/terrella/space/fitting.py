@@ -1,5 +1,5 @@
-"""Fits Gaussians to posed pictures with depth: they begin on the surfaces that depth shows, descend along their gradients, and
-those that fade move to where the pictures are still wrong.
+"""Fits Gaussians to posed pictures with depth (stereo.py finds it where there is none): they begin on the surfaces that depth
+shows, descend along their gradients, and those that fade move to where the pictures are still wrong.
 
 Densifying by error and relocating what has faded follow Kheradmand et al. 2024 (3DGS as MCMC), with places from depth.
 """
@@ -159,9 +159,12 @@ class Fit:
             self.first[name], self.second[name] = (torch.cat([m[name], blank]) for m in (self.first, self.second))
 
     def _where_wrong(self, rows: torch.Tensor, count: int, rng: torch.Generator) -> dict[str, torch.Tensor]:
-        """`count` Gaussians of the size of a pixel, drawn by the squared error of pictures `rows`; fewer where depth is unknown."""
+        """`count` Gaussians of the size of a pixel, drawn by the squared error of pictures `rows`, as far away as depth
+        says, or else what is drawn there; fewer where nothing is."""
         seen = rasterise(self.gaussians, self.views.pose[rows], self.views.camera, self.views.size)
         truth, depth = self.views.rgb[rows].float() / 255, self.views.depths(rows)
+        drawn = torch.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp_min(0.5), 0.0)
+        depth = torch.where(depth > 0, depth, drawn)
         wrong = (seen.rgb - truth).square().mean(1) * (depth > 0)
         if not wrong.any():
             return {name: leaf[:0] for name, leaf in self.leaves.items()}

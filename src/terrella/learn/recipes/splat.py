@@ -1,57 +1,32 @@
-"""space fit: a recording with depth and poses into a world of Gaussians; see space/fitting.py and worlds/splat.py."""
+"""space fit: a recording with poses, or pictures, into a world of Gaussians; see space/fitting.py and worlds/splat.py."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from ...core.errors import ContractError, DatasetError, TrainingError
-from ...data import Dataset
-from ...space.camera import FAR_M
+from ...core.errors import ContractError, TrainingError
 from ...space.files import replace_whole
-from ...space.fitting import Fit, FitConfig, Views, decibels, nearest_views, psnr
+from ...space.fitting import Fit, Views, decibels, nearest_views, psnr
 from ...space.occupancy import Body, Occupancy
 from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
 from ...worlds.splat import SplatConfig, SplatWorld
 from ...worlds.splat_folder import WORLD_FILE, check_free, save_splat
 from ..trainer import Report
+from .splat_views import SplatFit, read_views
 
 RESUME = "resume.safetensors"
-LOOK_S, LOOK_SHARE, LOOKED_AT = (
-    2.0,
-    20,
-    4,
-)  # seconds between looks, which cost a twentieth at most; pictures that measure one
+LOOK_S, LOOK_SHARE, LOOKED_AT = 2.0, 20, 4  # seconds between looks, at most a twentieth of the time; pictures of one
 HELD_OUT = 8  # every so-manyth picture is kept from the fit, to measure it
-
-
-@dataclass(frozen=True)
-class SplatFit:
-    """Settings of a fit.
-
-    Args:
-        name: Name of the world.
-        frames: Pictures that are taken from the recording, spread evenly over what is asked for.
-        episodes: The first so many episodes are used. Default: all.
-        box: Corners x0 y0 x1 y1 in metres: only pictures taken within, one room say.
-        save_every_s: Seconds between saves.
-    """
-
-    name: str = "place"
-    frames: int = 300
-    episodes: int | None = None
-    box: tuple[float, float, float, float] | None = None
-    save_every_s: float = 20.0
-    fit: FitConfig = field(default_factory=FitConfig)
 
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
@@ -68,7 +43,9 @@ def fit_splat(
     out, began = Path(out), time.monotonic()
     if config.frames < 16 or (config.episodes is not None and config.episodes < 1):
         raise TrainingError("--frames is 16 or more, --episodes 1 or more.")
-    views, spec = read_views(data, config)
+    if not 1e-4 <= config.scale <= 1e4 or not 32 <= config.longest <= 4096:
+        raise TrainingError("--scale is from 0.0001 to 10,000, --longest from 32 to 4096.")
+    views, spec, left_out = read_views(data, out, config)
     held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
     kept, asked = views.at(~held), views.at(held)
     try:
@@ -80,12 +57,12 @@ def fit_splat(
     finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
     if not finished:
         check_free(out / "world")
-    saved, looked, error = time.monotonic(), -np.inf, 0.0
+    saved, looked, error = time.monotonic(), -math.inf, 0.0
 
     def look() -> float:
         """Has the fit watched, and says when next."""
         if watch is None:
-            return np.inf
+            return math.inf
         start, now = time.monotonic(), fit.gaussians.each(torch.Tensor.detach)
         db = float(psnr(now, asked.at(torch.arange(len(asked))[:: max(len(asked) // LOOKED_AT, 1)])).mean())
         facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
@@ -111,46 +88,11 @@ def fit_splat(
     figures = _figures(fit, kept, asked)
     if not finished:  # else it may have been edited since
         _save(out / RESUME, fit, told)
-        save_splat(_world(fit.gaussians, kept, spec, config, {"data": str(data), **figures}), out / "world")
-    return {**figures, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
-
-
-def read_views(data: str | Path, config: SplatFit) -> tuple[Views, Mapping[str, Any]]:
-    """Pictures of a recording, and what it says of its world; DatasetError where it has no depth, poses or lens."""
-    dataset = Dataset(data)
-    missing = [name for name in ("rgb", "depth", "pose") if not dataset.has(name)]
-    lens = dataset.camera_models.get("rgb")
-    if missing or lens is None:
-        raise DatasetError(
-            f"{data} has no {', '.join(missing) or 'lens of its camera'}: a place is fitted to pictures with depth and poses."
+        save_splat(
+            _world(fit.gaussians, kept, spec, config, {"data": str(data), "left_out": left_out, **figures}),
+            out / "world",
         )
-    found: dict[str, list[np.ndarray]] = {"rgb": [], "depth": [], "pose": []}
-    episodes = range(len(dataset.episodes))[: config.episodes]
-    poses = [dataset.episode(number, ["pose"])["pose"] for number in episodes]
-    inside = [np.flatnonzero(_within(pose, config.box)) for pose in poses]
-    total = sum(map(len, inside))
-    if total < 16:
-        raise DatasetError(f"{data} has {total} pictures there, and a fit needs 16 or more; ask for more of it.")
-    chosen = np.linspace(0, total - 1, min(config.frames, total)).round().astype(int)
-    first = 0
-    for number, rows in zip(episodes, inside):
-        some = rows[chosen[(chosen >= first) & (chosen < first + len(rows))] - first]
-        first += len(rows)
-        if len(some):
-            arrays = dataset.episode(number, ["rgb", "depth", "pose"])
-            for name, parts in found.items():
-                parts.append(arrays[name][some])
-    rgb, depth, pose = (torch.from_numpy(np.concatenate(parts)) for parts in found.values())
-    depth = depth.float()
-    depth = torch.where(depth.isfinite() & (depth < 65), depth, FAR_M)
-    return Views(rgb.permute(0, 3, 1, 2).contiguous(), depth, pose.float(), lens.intrinsics), dataset.world
-
-
-def _within(pose: np.ndarray, box: tuple[float, float, float, float] | None) -> np.ndarray:
-    if box is None:
-        return np.ones(len(pose), bool)
-    x0, y0, x1, y1 = box
-    return (pose[:, 0] >= x0) & (pose[:, 0] <= x1) & (pose[:, 1] >= y0) & (pose[:, 1] <= y1)
+    return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
 def _figures(fit: Fit, kept: Views, asked: Views) -> dict[str, Any]:

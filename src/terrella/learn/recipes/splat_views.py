@@ -1,0 +1,134 @@
+"""What space fit fits: a recording, or pictures, with or without poses and depth, as posed views with depth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from ...core.errors import DatasetError
+from ...data import Dataset
+from ...space.camera import FAR_M
+from ...space.files import replace_whole
+from ...space.fitting import FitConfig, Views
+from ...space.pictures import is_pictures, posed_pictures
+from ...space.pictures.posed import FEWEST, to_views
+from ...space.stereo import with_depth
+
+DEPTH_FILE, PICTURES = "depth.safetensors", "pictures"
+KNOWN = 0.08  # share of the pixels whose depth neighbours agree on: with less the poses are wrong, or nothing overlaps
+
+
+@dataclass(frozen=True)
+class SplatFit:
+    """Settings of a fit.
+
+    Args:
+        name: Name of the world.
+        frames: Pictures that are taken of the recording, the folder or the video, spread evenly over what is asked for.
+        episodes: The first so many episodes are used. Default: all.
+        box: Corners x0 y0 x1 y1 in metres: only pictures taken within, one room say.
+        scale: Metres of a unit of the poses. Default: 1, and where COLMAP found them, such that the middle of what is seen is
+            3 m away: pictures alone do not say how large anything is.
+        longest: Pixels of the longer side of pictures; larger ones are made smaller. Recordings stay as they are.
+        save_every_s: Seconds between saves.
+    """
+
+    name: str = "place"
+    frames: int = 300
+    episodes: int | None = None
+    box: tuple[float, float, float, float] | None = None
+    scale: float = 1.0
+    longest: int = 480
+    save_every_s: float = 20.0
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[Views, Mapping[str, Any], list[str]]:
+    """Views with depth, what a recording says of its world, and the pictures that were left out; DatasetError where they are no
+    views of one place. Depth that had to be found, and poses, are kept in `out`."""
+    path, spec, left_out = Path(data), {}, []
+    if is_pictures(path):
+        shots, unplaced = posed_pictures(path, out / PICTURES, config.frames)
+        views, dull = to_views(shots, config.longest)
+        points, left_out = shots.points * config.scale, sorted({*unplaced, *dull})
+    else:
+        views, spec = _recorded(data, config)
+        points = None
+    pose = torch.cat([views.pose[:, :3] * config.scale, views.pose[:, 3:]], 1)
+    depth = torch.where(views.depth < FAR_M, views.depth * config.scale, FAR_M)
+    views = replace(views, pose=pose, depth=depth)
+    rows = torch.from_numpy(_within(pose.numpy(), config.box)).nonzero()[:, 0]
+    if len(rows) < FEWEST:
+        raise DatasetError(
+            f"{data} has {len(rows)} pictures there, and a fit needs {FEWEST} or more; ask for more of it."
+        )
+    views = views.at(rows)
+    if not bool((views.depths(torch.arange(0, len(views), max(len(views) // 20, 1))) > 0).any()):
+        views = _with_depth(views, points, out / DEPTH_FILE, f"{data} {replace(config, fit=FitConfig())}")
+        if float((views.depth < FAR_M).float().mean()) < KNOWN:
+            raise DatasetError(
+                f"the pictures of {data} do not agree on any surface: their poses are wrong, or they overlap too little, or they "
+                "were all taken from one spot."
+            )
+    return views, spec, left_out
+
+
+def _with_depth(views: Views, points: torch.Tensor | None, path: Path, told: str) -> Views:
+    """The views with depth by stereo, which is read again where it was found before."""
+    try:
+        with safe_open(str(path), "pt") as file:
+            if (file.metadata() or {}).get("told") == told and len(depth := file.get_tensor("depth")) == len(views):
+                return replace(views, depth=depth)
+    except (OSError, SafetensorError):
+        pass  # not yet
+    found = with_depth(views, points)
+    replace_whole(path, lambda file: save_file({"depth": found.depth}, file, metadata={"told": told}))
+    return found
+
+
+def _recorded(data: str | Path, config: SplatFit) -> tuple[Views, Mapping[str, Any]]:
+    """Pictures of a recording, and what it says of its world; DatasetError where it has no poses or lens."""
+    dataset = Dataset(data)
+    missing = [name for name in ("rgb", "pose") if not dataset.has(name)]
+    lens = dataset.camera_models.get("rgb")
+    if missing or lens is None:
+        raise DatasetError(
+            f"{data} has no {', '.join(missing) or 'lens of its camera'}: a place is fitted to pictures with poses. Of a folder of "
+            "plain pictures, or a video, poses are found."
+        )
+    names = ["rgb", "pose", *(["depth"] if dataset.has("depth") else [])]
+    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    episodes = range(len(dataset.episodes))[: config.episodes]
+    poses = [dataset.episode(number, ["pose"])["pose"] for number in episodes]
+    inside = [np.flatnonzero(_within(pose * config.scale, config.box)) for pose in poses]
+    total = sum(map(len, inside))
+    if total < 16:
+        raise DatasetError(f"{data} has {total} pictures there, and a fit needs 16 or more; ask for more of it.")
+    chosen = np.linspace(0, total - 1, min(config.frames, total)).round().astype(int)
+    first = 0
+    for number, rows in zip(episodes, inside):
+        some = rows[chosen[(chosen >= first) & (chosen < first + len(rows))] - first]
+        first += len(rows)
+        if len(some):
+            arrays = dataset.episode(number, names)
+            for name, parts in found.items():
+                parts.append(arrays[name][some])
+    whole = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in found.items()}
+    rgb, pose = whole["rgb"], whole["pose"]
+    depth = whole["depth"].float() if "depth" in whole else torch.full((len(rgb), 1, 1), FAR_M)
+    depth = torch.where(depth.isfinite() & (depth < 65), depth, FAR_M)
+    return Views(rgb.permute(0, 3, 1, 2).contiguous(), depth, pose.float(), lens.intrinsics), dataset.world
+
+
+def _within(pose: np.ndarray, box: tuple[float, float, float, float] | None) -> np.ndarray:
+    if box is None:
+        return np.ones(len(pose), bool)
+    x0, y0, x1, y1 = box
+    return (pose[:, 0] >= x0) & (pose[:, 0] <= x1) & (pose[:, 1] >= y0) & (pose[:, 1] <= y1)

@@ -1,0 +1,68 @@
+"""Pictures of a place, posed or plain, or a video, as posed views of one camera; learn/recipes/splat.py fits them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ...core.errors import DatasetError
+from . import colmap, transforms
+from .posed import FEWEST, Shots
+from .reading import ENDINGS, VIDEOS, blurred, read_picture, sharpness, video_pictures
+
+LONGEST = 1600  # pixels of pictures whose poses are looked for
+
+
+def is_pictures(path: Path) -> bool:
+    """Whether a path is a video, or a folder of pictures, with poses or without."""
+    if path.is_file():
+        return path.suffix.lower() in VIDEOS or path.name == transforms.FILE
+    return path.is_dir() and (
+        (path / transforms.FILE).exists() or colmap.model_of(path) is not None or bool(_pictures(path))
+    )
+
+
+def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str]]:
+    """Pictures with their poses, `frames` of them at most, and what was left out. Where no poses are there COLMAP finds them, and
+    leaves pictures and model in `work`, where the next call reads them."""
+    if path.name == transforms.FILE or (path / transforms.FILE).exists():
+        shots, out = transforms.read_transforms(path), []
+    elif path.is_dir() and colmap.model_of(path) is not None:
+        shots, out = colmap.read_colmap(path), []
+    else:
+        if colmap.model_of(work) is None:
+            sizes = _stage(path, work, frames)
+            colmap.place_pictures(work, film=path.is_file(), alike=sizes == 1)
+        shots = colmap.read_colmap(work)
+        names = {file.name for file in shots.files}
+        out = sorted(file.name for file in _pictures(work / "images") if file.name not in names)
+    rows = np.linspace(0, len(shots.files) - 1, min(frames, len(shots.files))).round().astype(int)
+    return shots.at(rows.tolist()), out
+
+
+def _stage(path: Path, work: Path, frames: int) -> int:
+    """Puts the sharp pictures of a folder or a video upright into WORK/images, under their names; how many sizes they have."""
+    if path.is_file():
+        named = {f"{k:05d}": one for k, one in enumerate(video_pictures(path, frames, LONGEST))}
+    else:
+        files = _pictures(path)
+        files = [files[k] for k in np.linspace(0, len(files) - 1, min(frames, len(files))).round().astype(int)]
+        named = {file.name: read_picture(file, longest=LONGEST) for file in files}
+    bad = blurred([sharpness(one) for one in named.values()])
+    kept = {name: one for (name, one), out in zip(named.items(), bad) if not out}
+    if len(kept) < FEWEST:
+        raise DatasetError(f"{path} has {len(kept)} sharp pictures, and a fit needs {FEWEST} or more; take more.")
+    shutil.rmtree(work, ignore_errors=True)
+    (work / "images").mkdir(parents=True)
+    for name, one in kept.items():
+        Image.fromarray(one).save(work / "images" / f"{name}.png", compress_level=1)
+    return len({one.shape for one in kept.values()})
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """Files of a folder (or of its images/) that say they are pictures, in the order of their names."""
+    home = folder / "images" if (folder / "images").is_dir() else folder
+    return sorted(file for file in home.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith("."))

@@ -1,0 +1,104 @@
+"""COLMAP through pycolmap: reads its models, and finds poses and points of plain pictures (x right, y down, z forward)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...core.errors import DatasetError
+from .posed import Lens, Shots, levelled, pose_of
+
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "0", ".")
+_MANY = 120  # pictures; of more, each is compared with its successors alone
+
+
+def _pycolmap() -> Any:
+    try:
+        import pycolmap  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise DatasetError(
+            "COLMAP's models and plain pictures need pycolmap: pip install 'terrella[colmap]'."
+        ) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    return pycolmap
+
+
+def model_of(folder: Path) -> Path | None:
+    """The folder of COLMAP's model in a folder of pictures."""
+    names = ("cameras.bin", "cameras.txt")
+    return next((folder / name for name in MODELS if any((folder / name / one).is_file() for one in names)), None)
+
+
+def read_colmap(folder: Path) -> Shots:
+    """The pictures that a model places, levelled by how they were held; DatasetError says what is wrong with it."""
+    colmap, model = _pycolmap(), model_of(folder)
+    if model is None:
+        raise DatasetError(f"{folder} has no model of COLMAP (sparse/0/cameras.bin); give the folder that holds one.")
+    try:
+        found = colmap.Reconstruction(str(model))
+    except (RuntimeError, ValueError, MemoryError) as error:
+        raise DatasetError(f"{model} cannot be read as a model of COLMAP; make it again.") from error
+    lenses = {number: _lens(camera) for number, camera in found.cameras.items()}
+    homes = [home for home in (folder / "images", folder, model.parent.parent / "images") if home.is_dir()]
+    placed = sorted((one for one in found.images.values() if one.has_pose), key=lambda one: one.name)
+    files, poses = [], []
+    for image in placed:
+        files.append(next((f for home in homes if (f := home / image.name).is_file()), homes[0] / image.name))
+        there = image.cam_from_world().inverse().matrix()
+        rot = np.stack([there[:, 2], -there[:, 0], -there[:, 1]], 1)
+        poses.append(pose_of(rot, there[:, 3], f"{model}: {image.name}"))
+    if not placed:
+        raise DatasetError(f"{model} places no picture; make it again.")
+    points = np.array([point.xyz for point in found.points3D.values()], np.float32).reshape(-1, 3)
+    points = torch.from_numpy(points[np.isfinite(points).all(1)])
+    return levelled(Shots(files, [lenses[one.camera_id] for one in placed], torch.stack(poses), points, False))
+
+
+def _lens(camera: Any) -> Lens:
+    focal = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+
+    def pixels(at: np.ndarray) -> np.ndarray:
+        return camera.img_from_cam(np.concatenate([at, np.ones((len(at), 1))], 1))
+
+    return Lens(camera.width, camera.height, focal, pixels)
+
+
+def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
+    """Finds poses and points of FOLDER/images and writes FOLDER/sparse/0; how many pictures were placed. `film`: they follow one
+    another; `alike`: they are of one camera. DatasetError where they do not fit together."""
+    colmap = _pycolmap()
+    colmap.set_random_seed(seed)
+    images, database, work = folder / "images", folder / "database.db", folder / "work"
+    database.unlink(missing_ok=True)
+    shutil.rmtree(work, ignore_errors=True)
+    count = len(list(images.iterdir()))
+    cameras = colmap.CameraMode.SINGLE if alike else colmap.CameraMode.AUTO
+    features = colmap.FeatureExtractionOptions()
+    features.max_image_size = 1600
+    plan = colmap.IncrementalPipelineOptions()
+    plan.random_seed, plan.multiple_models = seed, True
+    work.mkdir(parents=True)
+    try:
+        colmap.extract_features(database, images, camera_mode=cameras, extraction_options=features)
+        (colmap.match_sequential if film and count > _MANY else colmap.match_exhaustive)(database)
+        found = colmap.incremental_mapping(database, images, work, options=plan)
+        best = max(found.values(), key=lambda one: one.num_reg_images()) if found else None
+        placed = best.num_reg_images() if best else 0
+        if best is None or placed < 3:
+            raise DatasetError(
+                f"{placed} of {count} pictures could be placed: they overlap too little, are blurred, or were all taken "
+                "from one spot. Walk while you take them, so that each shows most of what its neighbours show."
+            )
+        model = folder / "sparse" / "0"
+        model.mkdir(parents=True, exist_ok=True)
+        best.write(str(model))
+    except RuntimeError as error:
+        raise DatasetError(f"COLMAP failed on these pictures ({error}); take others.".replace("\n", " ")) from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        database.unlink(missing_ok=True)
+    return placed

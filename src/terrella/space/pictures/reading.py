@@ -1,0 +1,97 @@
+"""Reads pictures that people have: of any mode, turned as EXIF says, 8 or 16 bits; what is none is refused in a sentence."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from ...core.errors import DatasetError
+
+ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
+SMALLEST, MOST_PIXELS = 32, 100_000_000
+BLURRED = 0.4  # of the usual sharpness of a set: less is left out
+
+
+def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.ndarray:
+    """uint8 [H, W, 3], made smaller where a side is above `longest`; `upright`: turned as its EXIF data say. DatasetError for what
+    is no picture, a tiny or a huge one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged EXIF data, of large pictures
+            with Image.open(path) as opened:
+                width, height = opened.size
+                if min(width, height) < SMALLEST or width * height > MOST_PIXELS:
+                    raise DatasetError(
+                        f"{path} is {width} x {height} pixels; a picture has {SMALLEST} a side or more, and "
+                        f"{MOST_PIXELS // 1_000_000} million at most. Scale it, or take it away."
+                    )
+                if opened.mode in ("RGB", "L"):
+                    opened.draft("RGB", (longest, longest))  # JPEGs decode faster when smaller
+                picture = ImageOps.exif_transpose(opened) if upright else opened.copy()
+    except DatasetError:
+        raise
+    except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise DatasetError(
+            f"{path} cannot be read as a picture; save it again as JPEG or PNG, or take it away."
+        ) from error
+    picture = _rgb(picture)
+    share = longest / max(picture.size)
+    if share < 1:
+        picture = picture.resize([max(round(side * share), 1) for side in picture.size], Image.Resampling.BOX)
+    return np.asarray(picture)
+
+
+def _rgb(picture: Image.Image) -> Image.Image:
+    """Any mode as RGB: 16 bits scaled to 8, what is transparent on black."""
+    if picture.mode.startswith(("I", "F")):
+        numbers = np.asarray(picture).astype(np.float64)
+        most = 65535 if picture.mode.startswith("I") and numbers.max() > 255 else max(float(numbers.max()), 1e-9)
+        picture = Image.fromarray((numbers.clip(0, most) * (255 / most)).round().astype(np.uint8))
+    if "A" in picture.mode or "transparency" in picture.info:
+        clear = picture.convert("RGBA")
+        picture = Image.alpha_composite(Image.new("RGBA", clear.size, (0, 0, 0, 255)), clear)
+    return picture.convert("RGB")
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Second differences over first ones: small for what is out of focus or shaken, however much or little there is to see."""
+    grey = picture[..., 1].astype(np.float32)
+    second, first = (sum(np.abs(np.diff(grey, order, axis)).mean() for axis in (0, 1)) for order in (2, 1))
+    return float(second / max(first, 0.25))
+
+
+def blurred(pictures_sharpness: list[float]) -> list[bool]:
+    """Which of a set are much less sharp than is usual in it."""
+    usual = float(np.median(pictures_sharpness)) if pictures_sharpness else 0.0
+    return [one < BLURRED * usual for one in pictures_sharpness]
+
+
+def video_pictures(path: Path, count: int, longest: int) -> list[np.ndarray]:
+    """`count` frames of a video at most, the sharpest of each of so many stretches of it: uint8 [H, W, 3] each."""
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with av.open(str(path)) as file:
+            stream = file.streams.video[0]
+            total = stream.frames or sum(packet.size > 0 for packet in file.demux(stream))
+        best: dict[int, tuple[float, np.ndarray]] = {}
+        with av.open(str(path)) as file:
+            for number, frame in enumerate(file.decode(file.streams.video[0])):
+                share = min(1.0, longest / max(frame.width, frame.height))
+                picture = frame.reformat(
+                    round(frame.width * share), round(frame.height * share), "rgb24", interpolation="AREA"
+                ).to_ndarray()
+                picture, clear = np.rot90(picture, round(frame.rotation / 90)), sharpness(picture)
+                stretch = number * count // max(total, count)
+                if clear > best.get(stretch, (-1.0,))[0]:
+                    best[stretch] = clear, np.ascontiguousarray(picture)
+    except (FFmpegError, IndexError, OSError, ValueError) as error:
+        raise DatasetError(f"{path} cannot be read as a video; save it again as MP4.") from error
+    if not best or min(next(iter(best.values()))[1].shape[:2]) < SMALLEST:
+        raise DatasetError(f"{path} has no pictures of {SMALLEST} pixels a side; give another video.")
+    return [best[stretch][1] for stretch in sorted(best)]

@@ -1,0 +1,94 @@
+"""transforms.json: posed pictures as nerfstudio, instant-ngp and NeRF's Blender sets write them (x right, y up, z back; z up)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...core.errors import DatasetError
+from ..files import ply
+from .posed import Lens, Shots, pose_of
+from .reading import ENDINGS, read_picture
+
+FILE = "transforms.json"
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+
+
+def read_transforms(path: Path) -> Shots:
+    """What a transforms.json, or the folder of one, says; DatasetError says what is wrong with it."""
+    path = path / FILE if path.is_dir() else path
+    try:
+        doc = json.loads(path.read_text())
+        frames = list(doc["frames"])
+        cameras: dict[tuple[Any, ...], Lens] = {}
+        files, lenses, poses = [], [], []
+        for frame in frames:
+            file = _file(path.parent, str(frame["file_path"]))
+            matrix = np.array(frame["transform_matrix"], float)
+            if matrix.shape not in ((4, 4), (3, 4)):
+                raise ValueError(f"the pose of {file.name} is no 4 x 4 matrix")
+            rot = np.stack([-matrix[:3, 2], -matrix[:3, 0], matrix[:3, 1]], 1)
+            poses.append(pose_of(rot, matrix[:3, 3], f"{path}: {file.name}"))
+            files.append(file)
+            lenses.append(_lens(doc | frame, file, cameras))
+        if not frames:
+            raise ValueError("it lists no frames")
+        points = _points(path.parent / doc["ply_file_path"]) if "ply_file_path" in doc else torch.zeros(0, 3)
+    except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
+        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(f"{path} cannot be read as posed pictures: {said}; write it again.") from error
+    return Shots(files, lenses, torch.stack(poses), points, True)
+
+
+def _file(folder: Path, name: str) -> Path:
+    """The picture of that name, which Blender's sets write without its ending."""
+    file = folder / name
+    if file.exists() or file.suffix.lower() in ENDINGS:
+        return file
+    return next((one for end in ENDINGS if (one := file.with_name(file.name + end)).exists()), file)
+
+
+def _lens(said: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens]) -> Lens:
+    """The lens of a frame; the same one for the same numbers."""
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
+    key = tuple(said.get(name) for name in names)
+    if key not in cameras:
+        model = str(said.get("camera_model", "OPENCV"))
+        if model not in _MODELS:
+            raise ValueError(f"cameras of the model {model} are not known, only {', '.join(_MODELS)}")
+        height, width = (said["h"], said["w"]) if "w" in said and "h" in said else read_picture(file).shape[:2]
+        width, height = int(width), int(height)
+        fx = said["fl_x"] if "fl_x" in said else 0.5 * width / np.tan(0.5 * float(said["camera_angle_x"]))
+        focal = [float(v) for v in (fx, said.get("fl_y", fx), said.get("cx", width / 2), said.get("cy", height / 2))]
+        bend = {name: float(said.get(name) or 0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        if min(width, height) < 8 or not all(map(np.isfinite, [*focal, *bend.values()])) or min(focal[:2]) <= 0:
+            raise ValueError(f"the camera of {file.name} has no sensible size or focal length")
+        fisheye = model == "OPENCV_FISHEYE"
+        cameras[key] = Lens(
+            width, height, (focal[0], focal[1], focal[2], focal[3]), lambda at: _opencv(at, focal, bend, fisheye)
+        )
+    return cameras[key]
+
+
+def _opencv(at: np.ndarray, focal: list[float], k: dict[str, float], fisheye: bool) -> np.ndarray:
+    """Tangents [N, 2] to pixels by OpenCV's models of distortion."""
+    r2 = (at**2).sum(1, keepdims=True)
+    if fisheye:
+        r = np.sqrt(np.maximum(r2, 1e-16))
+        t = np.arctan(r)
+        bent = at * t * (1 + t**2 * (k["k1"] + t**2 * (k["k2"] + t**2 * (k["k3"] + t**2 * k["k4"])))) / r
+    else:
+        x, y = at[:, :1], at[:, 1:]
+        skew = np.concatenate(
+            [2 * k["p1"] * x * y + k["p2"] * (r2 + 2 * x * x), k["p1"] * (r2 + 2 * y * y) + 2 * k["p2"] * x * y], 1
+        )
+        bent = at * (1 + r2 * (k["k1"] + r2 * (k["k2"] + r2 * k["k3"]))) + skew
+    return bent * focal[:2] + focal[2:]
+
+
+def _points(path: Path) -> torch.Tensor:
+    return ply.columns(ply.parse(path.read_bytes())["vertex"], "x", "y", "z")

@@ -1,0 +1,239 @@
+"""Pictures as people have them: read whatever their mode, posed ones undistorted, depth found, what is no place refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from terrella.cli import main
+from terrella.core.errors import DatasetError
+from terrella.space.camera import FAR_M, rotation
+from terrella.space.fitting import Views
+from terrella.space.pictures import posed_pictures
+from terrella.space.pictures.posed import to_views
+from terrella.space.pictures.reading import blurred, read_picture, sharpness
+from terrella.space.raster import rasterise
+from terrella.space.stereo import with_depth
+
+from .test_fitting import room, views
+
+LENS, SIZE = (0.5, 0.5, 0.5, 0.5), (48, 48)
+
+
+def bright_room():
+    """A room with much to see on its walls."""
+    scene = room(count=5000)
+    speckle = torch.rand(scene.sh.shape, generator=torch.Generator().manual_seed(1)) - 0.5
+    return type(scene)(scene.means, scene.quats, scene.scales * 0.8, scene.opacities, scene.sh + 2 * speckle)
+
+
+def walk(count=20) -> torch.Tensor:
+    """Poses side by side that look at one wall."""
+    pose = views(count).pose.clone()
+    at = torch.arange(count)
+    pose[:, 0], pose[:, 1], pose[:, 2] = 1.0, 1.2 + 1.6 * at / count, 1.0 + 0.2 * (at % 3)
+    pose[:, 3:] = torch.tensor([1.0, 0, 0, 0])
+    return pose
+
+
+def written(folder, pose=None, names="{:03d}.png", **camera):
+    """A folder with transforms.json of the room, as nerfstudio writes it."""
+    pose = walk() if pose is None else pose
+    seen = (rasterise(bright_room(), pose, LENS, SIZE).rgb.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1)
+    folder.mkdir()
+    frames = []
+    for number, (picture, one) in enumerate(zip(seen, pose)):
+        rot, matrix = rotation(one), torch.eye(4)
+        matrix[:3, :3] = torch.stack([-rot[:, 1], rot[:, 2], -rot[:, 0]], 1)
+        matrix[:3, 3] = one[:3]
+        Image.fromarray(picture.numpy()).save(folder / names.format(number))
+        frames.append({"file_path": names.format(number), "transform_matrix": matrix.tolist()})
+    doc = {"fl_x": 24, "fl_y": 24, "cx": 24, "cy": 24, "w": 48, "h": 48, **camera, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(doc))
+    return folder, doc
+
+
+def test_depth_is_found_where_pictures_show_something():
+    pose = walk()
+    seen = rasterise(bright_room(), pose, LENS, SIZE)
+    truth = seen.depth / seen.alpha.clamp_min(0.5)
+    blank = torch.full((20, 1, 1), FAR_M)
+    given = Views((seen.rgb.clamp(0, 1) * 255).byte(), blank, pose, LENS)
+    found = with_depth(given).depth
+    known = found < FAR_M
+    assert known.float().mean() > 0.3
+    assert ((found / truth - 1).abs()[known] < 0.2).float().mean() > 0.8
+    mixed = Views(given.rgb, blank, pose[torch.randperm(20, generator=torch.Generator().manual_seed(0))], LENS)
+    wrong = with_depth(mixed).depth
+    assert (wrong < FAR_M).float().mean() < 0.3 * known.float().mean()  # poses that do not fit the pictures
+
+
+def test_posed_pictures_become_views_and_a_world(tmp_path, capsys):
+    folder, doc = written(tmp_path / "set")
+    shots, out = posed_pictures(folder, tmp_path / "work", 100)
+    got, dull = to_views(shots, 480)
+    assert not out and not dull and got.size == (48, 48) and torch.allclose(got.pose, walk(), atol=1e-5)
+    assert got.camera == pytest.approx(LENS)
+    truth = rasterise(bright_room(), walk(), LENS, SIZE).rgb.clamp(0, 1) * 255
+    assert (got.rgb.float() - truth).abs().mean() < 3
+    fit = ["space", "fit", str(folder), "--steps", "60", "--gaussians", "1500", "--frames", "20", "--json"]
+    assert main([*fit, "--out", str(tmp_path / "run"), "--scale", "2"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["held_out_db"][0] > facts["nearest_picture_db"][0]
+    before = (tmp_path / "run" / "resume.safetensors").read_bytes()
+    assert main([*fit, "--out", str(tmp_path / "run"), "--scale", "2"]) == 0
+    assert (tmp_path / "run" / "resume.safetensors").read_bytes() == before
+
+
+def test_a_bent_lens_is_straightened(tmp_path):
+    folder, doc = written(tmp_path / "set", k1=-0.2, k2=0.03)
+    shots, _ = posed_pictures(folder, tmp_path / "work", 100)
+    lens = shots.lenses[0]
+    at = lens.pixels(np.array([[0.0, 0.0], [0.5, 0.0]]))
+    assert at[0] == pytest.approx([24, 24]) and at[1, 0] == pytest.approx(
+        24 + 24 * 0.5 * (1 - 0.2 * 0.25 + 0.03 * 0.0625)
+    )
+    left, top, right, bottom = lens.extent()
+    assert right > 0.9 and (lens.pixels(np.array([[right, bottom]])) <= 48.6).all()
+
+
+MODES = {
+    "16 bits": lambda rgb: Image.fromarray(rgb[..., 0].astype(np.uint16) * 257),
+    "CMYK": lambda rgb: Image.fromarray(rgb).convert("CMYK"),
+    "palette": lambda rgb: Image.fromarray(rgb).quantize(64),
+    "grey and alpha": lambda rgb: Image.fromarray(rgb).convert("LA"),
+    "float": lambda rgb: Image.fromarray(rgb[..., 0].astype(np.float32) / 255),
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_pictures_of_any_mode(tmp_path, mode):
+    rgb = np.full((40, 60, 3), 200, np.uint8)
+    rgb[:20] = 100
+    MODES[mode](rgb).save(tmp_path / "a.tif" if mode != "palette" else tmp_path / "a.png")
+    read = read_picture(tmp_path / "a.tif" if mode != "palette" else tmp_path / "a.png")
+    assert read.shape == (40, 60, 3) and read.dtype == np.uint8
+    assert 1.5 < read[30:].mean() / read[:10].mean() < 2.5
+
+
+def test_exif_turns_pictures_and_lenses_say_which_way(tmp_path):
+    rgb = np.zeros((40, 60, 3), np.uint8)
+    rgb[:20] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by a quarter
+    Image.fromarray(rgb).save(tmp_path / "a.jpg", exif=exif, quality=95)
+    assert read_picture(tmp_path / "a.jpg").shape == (60, 40, 3)
+    assert read_picture(tmp_path / "a.jpg", upright=False).shape == (40, 60, 3)
+    assert read_picture(tmp_path / "a.jpg")[:, 30:].mean() > 200  # what was above is at the right now
+
+
+def test_blur_is_told_from_little_to_see():
+    rng = np.random.default_rng(0)
+    sharp = np.repeat(np.repeat(rng.integers(0, 255, (30, 30, 3)), 4, 0), 4, 1).astype(np.uint8)
+    faint = (128 + (sharp.astype(float) - 128) * 0.2).astype(np.uint8)
+    from PIL import ImageFilter
+
+    shaken = np.asarray(Image.fromarray(sharp).filter(ImageFilter.GaussianBlur(6)))
+    assert blurred([sharpness(one) for one in (sharp, faint, sharp, shaken)]) == [False, False, False, True]
+
+
+def bad_json(folder, doc):
+    (folder / "transforms.json").write_text('{"frames": [')
+
+
+def no_rotation(folder, doc):
+    doc["frames"][3]["transform_matrix"][0][0] = 5.0
+
+
+def not_finite(folder, doc):
+    doc["frames"][3]["transform_matrix"][2][3] = float("nan")
+
+
+def no_focus(folder, doc):
+    doc["fl_x"] = 0
+
+
+def unknown_model(folder, doc):
+    doc["camera_model"] = "ORTHOPHOTO"
+
+
+def lost(folder, doc):
+    (folder / "003.png").unlink()
+
+
+def no_picture(folder, doc):
+    (folder / "003.png").write_bytes(b"nothing of the kind")
+
+
+def cut(folder, doc):
+    (folder / "003.png").write_bytes((folder / "003.png").read_bytes()[:300])
+
+
+def tiny(folder, doc):
+    Image.new("RGB", (5, 5)).save(folder / "003.png")
+
+
+def other_shape(folder, doc):
+    Image.new("RGB", (90, 40)).save(folder / "003.png")
+
+
+def few(folder, doc):
+    doc["frames"] = doc["frames"][:5]
+
+
+def wrong_poses(folder, doc):
+    for k, one in enumerate(doc["frames"]):  # each looks elsewhere, from far away
+        c, s = np.cos(2.4 * k), np.sin(2.4 * k)
+        one["transform_matrix"] = [[-s, 0, -c, 10.0 * k], [c, 0, -s, 3.0 * k * k], [0, 1, 0, 1], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        bad_json,
+        no_rotation,
+        not_finite,
+        no_focus,
+        unknown_model,
+        lost,
+        no_picture,
+        cut,
+        tiny,
+        other_shape,
+        few,
+        wrong_poses,
+    ],
+)
+def test_bad_pictures_are_one_sentence_and_leave_no_world(tmp_path, capsys, damage):
+    folder, doc = written(tmp_path / "set")
+    damage(folder, doc)
+    if damage is not bad_json:
+        (folder / "transforms.json").write_text(json.dumps(doc))
+    assert (
+        main(["space", "fit", str(folder), "--out", str(tmp_path / "run"), "--steps", "5", "--gaussians", "200"]) == 2
+    )
+    said = capsys.readouterr().err
+    assert "Traceback" not in said and not (tmp_path / "run" / "world").exists()
+
+
+def test_huge_pictures_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("terrella.space.pictures.reading.MOST_PIXELS", 1000)
+    Image.new("RGB", (60, 60)).save(tmp_path / "a.png")
+    with pytest.raises(DatasetError, match="60 x 60"):
+        read_picture(tmp_path / "a.png")
+
+
+def test_plain_pictures_without_overlap(tmp_path, capsys):
+    pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(0)
+    (tmp_path / "set").mkdir()
+    for k in range(16):
+        noise = rng.integers(0, 255, (12, 16, 3), np.uint8)
+        Image.fromarray(noise).resize((96, 72), Image.Resampling.BICUBIC).save(tmp_path / "set" / f"{k}.png")
+    assert main(["space", "fit", str(tmp_path / "set"), "--out", str(tmp_path / "run")]) == 2
+    assert "overlap too little" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "world").exists()
