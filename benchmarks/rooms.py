@@ -5,11 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from terrella.learn.recipes.splat import SplatFit, read_views
+from terrella.learn.recipes.splat_views import SplatFit, read_views
 from terrella.sim.mujoco_model import mujoco
 from terrella.space.camera import planar_pose, rotation
 from terrella.space.fitting import Views
@@ -26,7 +27,7 @@ def doom_room() -> Views:
             [sys.executable, "-c", "import sys; from terrella.cli import main; sys.exit(main())", *command],
             check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        return read_views(f"{folder}/maze", SplatFit(frames=68, episodes=1, box=(15.5, -9, 24, -2)))[0]
+        return read_views(f"{folder}/maze", Path(folder), SplatFit(frames=68, episodes=1, box=(15.5, -9, 24, -2)))[0]
 
 
 def mujoco_room(count: int = 112, seed: int = 0) -> Views:
