@@ -76,7 +76,7 @@ class Adaptation:
     """Squared error of the numbers; with unlabelled pictures a judge tells the two sets apart by the encoder's features, and
     the encoder goes against the judge, by `weight` in the end."""
 
-    def __init__(self, encoder: Encoder, learning_rate: float = 2e-3, weight: float = 0.3):
+    def __init__(self, encoder: Encoder, learning_rate: float = 2e-3, weight: float = 0.03):
         self.encoder, self.weight = encoder, weight
         self.judge = nn.Sequential(nn.Linear(2 * WIDTHS[-1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1))
         self.modules = {"encoder": encoder, "judge": self.judge}
