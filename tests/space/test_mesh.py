@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from terrella.cli import main
 from terrella.core.errors import ContractError
 from terrella.space.camera import planar_pose
 from terrella.space.files import AXES
@@ -100,3 +101,10 @@ def test_without_scikit_image_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
     with pytest.raises(ContractError, match=r"terrella\[mesh\]"):
         fused(room(count=500), planar_pose(*(torch.tensor([v]) for v in (2.0, 2.0, 1.4, 0.5))), 0.5)
+
+
+@pytest.mark.parametrize("name, option", [("a.glb", ["--axes", "rub"]), ("a.png", ["--compressed"]), ("a.spz", ["--compressed"]),
+                                          ("a.html", ["--cell", "0.2"]), ("a.ply", ["--seconds", "3"])])  # fmt: skip
+def test_options_of_other_files_are_refused(tmp_path, capsys, name, option):
+    assert main(["space", "export", str(tmp_path / "none"), str(tmp_path / name), *option]) == 2
+    assert option[0] in capsys.readouterr().err and not (tmp_path / name).exists()

@@ -20,7 +20,7 @@ from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
 from .say import Host, Json, Port, Token, result, say
-from .space_export import ENDINGS, Kind, write_other
+from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_other
 
 if TYPE_CHECKING:
     from ..serve.place import Place
@@ -103,8 +103,8 @@ def export(
     axes: Axes | None = None,
     compressed: bool = False,
     kind: Kind = "mesh",
-    cell: float = 0.05,
-    seconds: float = 8.0,
+    cell: float = CELL_M,
+    seconds: float = FILM_S,
     path: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -123,6 +123,9 @@ def export(
         seconds: Of the film.
         path: The film's way: a JSON list of [x, y, z, degrees]. Default: a look around from each start.
     """
+    usual = {"axes": None, "compressed": False, "kind": "mesh", "cell": CELL_M, "seconds": FILM_S, "path": None}
+    given = {"axes": axes, "compressed": compressed, "kind": kind, "cell": cell, "seconds": seconds, "path": path}
+    check_options(file, [name for name, value in given.items() if value != usual[name]])
     if file.suffix.lower() == ".html":
         from ..serve.place import PlacePage
 

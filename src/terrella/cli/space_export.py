@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json as json_text
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,8 +23,24 @@ from ..worlds.splat import SplatWorld
 
 ENDINGS = (".glb", ".png", ".mp4")
 Kind = Literal["mesh", "collider", "gaussians"]
+CELL_M, FILM_S = 0.05, 8.0  # unless said
+OPTIONS = {  # and the files that each is of
+    "axes": (".ply", ".spz"),
+    "compressed": (".ply",),
+    "kind": (".glb",),
+    "cell": (".glb",),
+    "seconds": (".mp4",),
+    "path": (".mp4",),
+}
 RATE = 30  # pictures of a film a second
 MOST_FACES = 5_000_000
+
+
+def check_options(file: Path, given: Sequence[str]) -> None:
+    """TerrellaError for options that do not belong to files that end so."""
+    for name in given:
+        if file.suffix.lower() not in OPTIONS[name]:
+            raise TerrellaError(f"--{name} is of {' and '.join(OPTIONS[name])} files; leave it out for {file.name}.")
 
 
 def write_other(
