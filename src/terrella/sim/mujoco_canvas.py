@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ class Canvas:
     """Draws worlds of one model in pictures of `size` (height, width), up to TILES x TILES of them before `read`."""
 
     def __init__(self, model: Any, size: tuple[int, int]):
+        self._gl: Any = None
         self._model, self._size, self._drawn = model, size, 0
         tiles = self._tiles = TILES if max(size) <= SMALL else 1
         height, width = tiles * size[0], tiles * size[1]
@@ -67,8 +69,16 @@ class Canvas:
         return np.ascontiguousarray(found)
 
     def close(self) -> None:
+        if self._gl is None:
+            return
+        gl, self._gl = self._gl, None
+        gl.make_current()  # else it would free what another canvas holds
         self._context.free()
-        self._gl.free()
+        gl.free()
+
+    def __del__(self):
+        with suppress(Exception):
+            self.close()
 
 
 def simplify(model: Any, size: tuple[int, int]) -> None:
