@@ -56,7 +56,9 @@ def test_what_lies_ahead_is_in_the_middle():
     assert light.max() > 0.3 and abs(row - 59.5) < 5 and abs(column - 79.5) < 5
 
 
-@pytest.mark.parametrize("wrong", [{"x": "nan"}, {"wide": "0"}, {"width": "100000"}, {"height": "tall"}])
+@pytest.mark.parametrize(
+    "wrong", [{"x": "nan"}, {"wide": "0"}, {"x": "1e300"}, {"tall": "1e-300"}, {"width": "100000"}, {"height": "tall"}]
+)
 def test_other_views_are_refused(wrong):
     with pytest.raises(ServeError, match="reload"):
         Frames(world(300).gaussians, world(300).objects, list).draw(view(**wrong))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import urllib.request
 from dataclasses import replace
 
@@ -23,10 +24,15 @@ def fetched(address: str) -> tuple[int, bytes]:
 def making():
     """A page of 300 Gaussians: its address, and what shows it others."""
     address: list[str] = []
-    with watched("127.0.0.1", 0, address.append) as show:
+    ready = threading.Event()
+
+    def on_ready(one: str) -> None:
+        address.append(one)
+        ready.set()
+
+    with watched("127.0.0.1", 0, on_ready) as show:
         show(lambda: shown_place(world(300)), {"step": 0, "steps": 100, "db": 12.0})
-        while not address:
-            pass
+        assert ready.wait(60)
         yield address[0], show
 
 

@@ -188,27 +188,27 @@ def few(folder, doc):
 def wrong_poses(folder, doc):
     for k, one in enumerate(doc["frames"]):  # each looks elsewhere, from far away
         c, s = np.cos(2.4 * k), np.sin(2.4 * k)
-        one["transform_matrix"] = [[-s, 0, -c, 10.0 * k], [c, 0, -s, 3.0 * k * k], [0, 1, 0, 1], [0, 0, 0, 1]]
+        one["transform_matrix"] = [[-s, 0, c, 10.0 * k], [c, 0, s, 3.0 * k * k], [0, 1, 0, 1], [0, 0, 0, 1]]
 
 
 @pytest.mark.parametrize(
-    "damage",
+    ("damage", "why"),
     [
-        bad_json,
-        no_rotation,
-        not_finite,
-        no_focus,
-        unknown_model,
-        lost,
-        no_picture,
-        cut,
-        tiny,
-        other_shape,
-        few,
-        wrong_poses,
+        (bad_json, "cannot be read as posed pictures"),
+        (no_rotation, "003.png: its pose is no rotation"),
+        (not_finite, "003.png: its pose is no rotation"),
+        (no_focus, "no sensible size or focal length"),
+        (unknown_model, "ORTHOPHOTO"),
+        (lost, "003.png cannot be read as a picture"),
+        (no_picture, "003.png cannot be read as a picture"),
+        (cut, "003.png cannot be read as a picture"),
+        (tiny, "003.png is 5 x 5 pixels"),
+        (other_shape, "003.png is 90 x 40"),
+        (few, "there are 5 posed pictures"),
+        (wrong_poses, "do not agree on any surface"),
     ],
 )
-def test_bad_pictures_are_one_sentence_and_leave_no_world(tmp_path, capsys, damage):
+def test_bad_pictures_are_one_sentence_and_leave_no_world(tmp_path, capsys, damage, why):
     folder, doc = written(tmp_path / "set")
     damage(folder, doc)
     if damage is not bad_json:
@@ -217,7 +217,7 @@ def test_bad_pictures_are_one_sentence_and_leave_no_world(tmp_path, capsys, dama
         main(["space", "fit", str(folder), "--out", str(tmp_path / "run"), "--steps", "5", "--gaussians", "200"]) == 2
     )
     said = capsys.readouterr().err
-    assert "Traceback" not in said and not (tmp_path / "run" / "world").exists()
+    assert why in said and "Traceback" not in said and not (tmp_path / "run" / "world").exists()
 
 
 def test_huge_pictures_are_refused(tmp_path, monkeypatch):

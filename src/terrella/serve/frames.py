@@ -15,7 +15,8 @@ from ..space.edits import Edit, edited
 from ..space.raster import Gaussians, rasterise
 
 NAMES = ("x", "y", "z", "heading", "pitch", "wide", "tall", "width", "height")
-SMALLEST, LARGEST, WIDEST = 8, 1280, 20.0
+SMALLEST, LARGEST, NARROWEST, WIDEST = 8, 1280, 1e-3, 20.0
+FARTHEST_M = 1e6
 
 
 class Frames:
@@ -32,9 +33,12 @@ class Frames:
             x, y, z, heading, pitch, wide, tall, width, height = (float(view[name]) for name in NAMES)
         except (KeyError, ValueError) as error:
             raise ServeError(f"a view is {', '.join(NAMES)}; reload the page.") from error
-        inside = all(map(math.isfinite, (x, y, z, heading, pitch))) and 0 < wide < WIDEST and 0 < tall < WIDEST
+        inside = all(abs(one) < FARTHEST_M for one in (x, y, z, heading, pitch))  # what is no number is not
+        inside = inside and all(NARROWEST < half < WIDEST for half in (wide, tall))
         if not inside or not all(SMALLEST <= size <= LARGEST for size in (width, height)):
-            raise ServeError(f"a view has finite numbers, and {SMALLEST} to {LARGEST} pixels a side; reload the page.")
+            raise ServeError(
+                f"a view has numbers below {FARTHEST_M:g}, and {SMALLEST} to {LARGEST} pixels a side; reload the page."
+            )
         c, s, cp, sp = math.cos(heading / 2), math.sin(heading / 2), math.cos(pitch / 2), -math.sin(pitch / 2)
         pose = torch.tensor([[x, y, z, c * cp, -s * sp, c * sp, s * cp]])
         with self._alone, torch.no_grad():

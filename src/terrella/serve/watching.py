@@ -25,22 +25,26 @@ class Newest:
     """The newest state that was shown: packed when a page asks for it, once."""
 
     def __init__(self):
-        self._lock, self._number, self._packed = threading.Lock(), 0, (0, b"", b"")
-        self._make: Callable[[], Place] | None = None
-        self._facts: Mapping[str, Any] = {}
+        self._lock, self._packed, self._page = threading.Lock(), (0, b"", b""), (0, b"")
+        self._newest: tuple[int, Callable[[], Place] | None, Mapping[str, Any]] = 0, None, {}
 
     def show(self, make: Callable[[], Place], facts: Mapping[str, Any]) -> None:
         """`make` gives the place as it is now; facts: `step`, `steps` and `db` (PSNR), for the page's head."""
-        self._make, self._facts, self._number = make, facts, self._number + 1
+        self._newest = self._newest[0] + 1, make, facts
 
     def html(self) -> bytes:
-        assert self._make is not None
-        return PlacePage(self._make()).html([], watch="/now")
+        """The page with the state of the moment, made once for each state."""
+        with self._lock:
+            number, make, _ = self._newest
+            assert make is not None
+            if self._page[0] != number:
+                self._page = number, PlacePage(make()).html([], watch="/now")
+            return self._page[1]
 
     def answer(self, after: int) -> tuple[bytes, bytes] | None:
         """What is said of the newest state, as JSON, and its columns in gzip; None where it is not newer than `after`."""
         with self._lock:
-            number, make, facts = self._number, self._make, self._facts
+            number, make, facts = self._newest
             if number <= after or make is None:
                 return None
             if self._packed[0] != number:
@@ -58,7 +62,7 @@ def watched(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator[S
 
     async def now(request: Request) -> Response:
         after = request.query_params.get("after", "0")
-        found = await run_in_threadpool(newest.answer, int(after) if after.isdecimal() else 0)
+        found = await run_in_threadpool(newest.answer, int(after[:18]) if after.isdecimal() else 0)
         if found is None:
             return Response(status_code=204)
         about, data = found

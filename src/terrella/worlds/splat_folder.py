@@ -23,6 +23,7 @@ from .additions import INVENTED, OBSERVED
 from .splat import SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
+MOST_ADDITIONS = 10_000_000
 WORLD_FILE, SCENE_FILE = "world.json", "scene.safetensors"
 EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # those in force; those taken back, the newest last
 
@@ -80,10 +81,17 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in said.items()}
         config = SplatConfig(body=body, **given)
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
-        if len(provenance) != len(tensors["means"]) or starts.ndim != 2 or starts.shape[1] != 7 or not len(starts):
-            raise ValueError("its parts do not fit one another")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
         solids, bodies = tensors.pop("solids", None), tensors.pop("bodies", None)
+        shapes = (
+            provenance.shape == objects.shape == tensors["means"].shape[:1] and starts.shape[1:] == (7,) and len(starts)
+        )
+        if not shapes or not starts.isfinite().all() or not 0 <= config.additions <= MOST_ADDITIONS:
+            raise ValueError("its parts do not fit one another")
+        if solids is not None and (solids.shape[1:] != (6,) or not solids.isfinite().all()):
+            raise ValueError("its solids are no boxes")
+        if bodies is not None and (solids is None or bodies.shape != solids.shape[:1]):
+            raise ValueError("its bodies are not those of its solids")
         edits = read_edits(path) if edits is None else edits
         after = edited(Gaussians(**tensors), edits, objects)
         provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
@@ -91,7 +99,7 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
             str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects,
             *((None, None) if edits else (solids, bodies)),  # edits move what they describe: then the Gaussians stop bodies
         )  # fmt: skip
-    except (OSError, SafetensorError, LookupError, TypeError, ValueError, ContractError) as error:
+    except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 
 

@@ -63,7 +63,7 @@ def fit_splat(
         """Has the fit watched, and says when next."""
         if watch is None:
             return math.inf
-        start, now = time.monotonic(), fit.gaussians.each(torch.Tensor.detach)
+        start, now = time.monotonic(), fit.gaussians.each(lambda part: part.detach().clone())
         db = float(psnr(now, asked.at(torch.arange(len(asked))[:: max(len(asked) // LOOKED_AT, 1)])).mean())
         facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
         watch(lambda: _world(now, kept, spec, config, {}), facts)

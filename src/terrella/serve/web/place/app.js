@@ -84,6 +84,7 @@ function run({ drawing, source, story, solid: first }) {
     made = ` · step ${about.step.toLocaleString('en')} of ${about.steps.toLocaleString('en')} · ${about.db.toFixed(1)} dB`;
     $('making').firstElementChild.style.width = `${(100 * about.step) / about.steps}%`;
     story.begin(source, []);
+    seen.stands = 1;
     take(source);
   }
 
@@ -177,7 +178,7 @@ function run({ drawing, source, story, solid: first }) {
   seen.stands = world.count / source.length;
   take(story.scene);
   greet();
-  if (seen.stands > 1) {
+  if (seen.stands > 1 && !world.watch) {  // who watches is given the newest whole
     $('edit').hidden = true;
     whole(source).then((all) => {
       source = all;
@@ -189,7 +190,7 @@ function run({ drawing, source, story, solid: first }) {
   }
   if (drawing.remote) {
     for (const id of ['edit', 'tint']) $(id).hidden = true;
-    toast('This browser has no WebGL2, so the server draws: walk as ever; editing needs a browser that has it.');
+    toast(world.watch ? 'This browser has no WebGL2: watch the fit in one that has it.' : 'This browser has no WebGL2, so the server draws: walk as ever; editing needs a browser that has it.');
   }
   if (world.watch) {
     $('making').hidden = false;
