@@ -13,7 +13,7 @@ from terrella.cli import main
 from terrella.core.errors import DatasetError
 from terrella.space.camera import FAR_M, rotation
 from terrella.space.fitting import Views
-from terrella.space.pictures import posed_pictures
+from terrella.space.pictures import is_pictures, posed_pictures
 from terrella.space.pictures.posed import to_views
 from terrella.space.pictures.reading import blurred, read_picture, sharpness
 from terrella.space.raster import rasterise
@@ -237,3 +237,11 @@ def test_plain_pictures_without_overlap(tmp_path, capsys):
     assert main(["space", "fit", str(tmp_path / "set"), "--out", str(tmp_path / "run")]) == 2
     assert "overlap too little" in capsys.readouterr().err
     assert not (tmp_path / "run" / "world").exists()
+
+
+def test_a_recording_with_a_picture_beside_its_data_is_no_folder_of_pictures(tmp_path):
+    Image.new("RGB", (60, 60)).save(tmp_path / "look.jpg")
+    assert is_pictures(tmp_path)
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    assert not is_pictures(tmp_path)

@@ -17,11 +17,15 @@ LONGEST = 1600  # pixels of pictures whose poses are looked for
 
 
 def is_pictures(path: Path) -> bool:
-    """Whether a path is a video, or a folder of pictures, with poses or without."""
+    """Whether a path is a video, or a folder of pictures, with poses or without; a recording, which may hold a picture beside its
+    data, is none."""
     if path.is_file():
         return path.suffix.lower() in VIDEOS or path.name == transforms.FILE
-    return path.is_dir() and (
-        (path / transforms.FILE).exists() or colmap.model_of(path) is not None or bool(_pictures(path))
+    recorded = (path / "meta" / "info.json").exists()
+    return (
+        path.is_dir()
+        and not recorded
+        and ((path / transforms.FILE).exists() or colmap.model_of(path) is not None or bool(_pictures(path)))
     )
 
 
