@@ -122,6 +122,13 @@ def test_the_verdict_comes_first(make, said):
     assert lines == as_dict(found)["verdict"] and len(table(found)[1]) == len(names) + 1
 
 
+def test_a_verdict_is_doubted_where_a_control_that_answers_to_nothing_ranks_as_well():
+    dream, real = drawn(True)
+    for control, doubted in ((dream, True), (drawn(False)[0], False)):
+        scores, names = scores_of(dream, real, control)
+        assert ("this proves little" in verdict(judge(scores, {}, names, 0))[0]) is doubted
+
+
 def test_successes_have_wilsons_intervals_and_curves_their_page():
     dream, real = ((scores > 0.5).double() for scores in drawn(True, 6, 40))
     scores, names = scores_of(dream, real, measure="success")

@@ -1,4 +1,5 @@
 """`terrella learn --practise`: collect, learn the world, practise in it, and again, each time by the policy that came of it.
+Choices and buttons are learned by PPO, which keeps to where the world knows what comes; axes along the world's own gradients.
 
 Every stage goes on where it was stopped, and what is over is noted in a file, so the same command goes on from anywhere.
 A round's practice begins with the policy that has earned most so far; of that and the last, the better one is the result.
@@ -19,8 +20,10 @@ import torch
 from .. import library, progress
 from ..act.actor import Actor
 from ..act.belief import BeliefPolicy, actor_of
+from ..act.named import Slipping
 from ..core.errors import TerrellaError
 from ..core.policy import Policy
+from ..core.spec import AXES
 from ..core.world import World, make_rng
 from ..data import Dataset, record
 from ..data.storage.durable import write_json
@@ -39,6 +42,8 @@ LEAST = 0.5  # of a round's frames are collected, whatever time that takes
 SMALL = 64  # pixels a side of pictures, unless it is said
 ENDLESS = 10**9  # steps: stages end with their time
 BATCH, SAVE_EVERY_S = 64, 20.0
+SLIPS = 0.1  # of a policy's actions are random ones while it collects: the world then knows what lies beside its paths
+TRUST = 0.1  # the uncertainty from which PPO takes the worst for granted
 TRIED = 10  # episodes in which the last policy is tried
 NOTES = "practise.json"
 
@@ -141,7 +146,11 @@ def _round(
     world, before = library.load(rounds.world(number)), done[-1]["frames"] if done else 0
     found = {"frames": Dataset(rounds.recording).length, "return": _earned(rounds.recording, before)}
     with progress.shown("practising") as report:
-        config = Practice(minutes=rounds.seconds("practising") / 60, batch=BATCH, seed=seed, save_every_s=SAVE_EVERY_S)
+        config = Practice(minutes=rounds.seconds("practising") / 60, seed=seed, save_every_s=SAVE_EVERY_S)
+        if world.spec.differentiable and world.spec.action_mode in AXES:
+            config = replace(config, batch=BATCH)
+        else:
+            config = replace(config, method="ppo", cautious=True, trust=TRUST)
         alike = number and "latent" not in seen_unless_said(world.spec)  # another world's latents mean something else
         earlier = rounds.policy(_best([*done, found])) if alike else None
         facts = train_policy(world, name, rounds.policy(number), config, report, rounds.recording, earlier)
@@ -149,7 +158,7 @@ def _round(
 
 
 def _collect(rounds: Rounds, number: int, real: World, upto: int, seed: int, report: Callable[..., None]) -> None:
-    """Records up to so many frames: by the explorer at first, then by the last policy, which draws its actions."""
+    """Records up to so many frames: by the explorer at first, then by the last policy, which draws its actions and slips."""
     began, most, rows = time.monotonic(), rounds.seconds("collecting"), 0
     least = upto - round((1 - LEAST) * rounds.asked["frames"] / ROUNDS)
 
@@ -164,7 +173,7 @@ def _collect(rounds: Rounds, number: int, real: World, upto: int, seed: int, rep
         return
     policy = actor_of(rounds.policy(number - 1), real.spec, library.load(rounds.world(number - 1)))
     record(
-        real, drawing(policy), rounds.recording, upto, make_rng(seed), told,
+        real, Slipping(drawing(policy), SLIPS, real.spec), rounds.recording, upto, make_rng(seed), told,
         pictures=stored_as(real.spec), enough=enough,
     )  # fmt: skip
 

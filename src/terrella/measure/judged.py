@@ -202,9 +202,16 @@ def _ranking(judged: Judged) -> str:
         return f"The dream ranks these {count} policies the wrong way round: {figure}."
     if not low > 0:
         return f"The dream cannot be seen to tell these {count} policies apart as reality does: {figure}."
-    if value >= ALIKE:
-        return f"The dream ranks these {count} policies as reality does: {figure}."
-    return f"The dream ranks these {count} policies somewhat as reality does: {figure}."
+    alike = "as reality does" if value >= ALIKE else "somewhat as reality does"
+    if _no_better(judged):
+        figure += ", but a control whose actions answer to nothing does so nearly as well: this proves little"
+    return f"The dream ranks these {count} policies {alike}: {figure}."
+
+
+def _no_better(judged: Judged) -> bool:
+    """Whether a dream that hears the actions of another episode ranks the policies nearly as well."""
+    dream, control = judged.dream, judged.control
+    return dream is not None and control is not None and control.spearman.value >= ALIKE * dream.spearman.value
 
 
 def _ranked(agreed: Agreement) -> str:
@@ -218,11 +225,11 @@ def _figures(arm: str, agreed: Agreement, judged: Judged) -> str:
 
 def _control(judged: Judged) -> str:
     agreed = judged.control
-    assert agreed is not None and judged.dream is not None
+    assert agreed is not None
     if not math.isfinite(agreed.spearman.value):
         return f"control (the dream hears the actions of another episode): gives all policies the same {judged.what}"
     words = f"control (the dream hears the actions of another episode): {_ranked(agreed)}"
-    if agreed.spearman.value >= ALIKE * judged.dream.spearman.value:
+    if _no_better(judged):
         return f"{words}: these policies are ranked nearly as well without their actions answering to anything"
     return words
 
