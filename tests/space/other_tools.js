@@ -39,7 +39,17 @@ async function three(url) {
   return { means: list('position'), covariances: list('covariance'), colours: rgba.filter((_, k) => k % 4 < 3), opacities: rgba.filter((_, k) => k % 4 === 3) };
 }
 
-/** The PlayCanvas engine. */
+/** PlayCanvas' parser of SPZ, which the engine keeps beside itself and which wants a decoder of zstd from whoever uses it. */
+async function readsSpz(pc, app) {
+  const { SpzParser } = await import('playcanvas/scripts/esm/parsers/spz-parser.mjs');
+  const { ZSTDDecoder } = await import('three/addons/libs/zstddec.module.js'), zstd = new ZSTDDecoder();
+  await zstd.init();
+  window.ZstdDecoderModule = async () => ({ decompress: (packed, size) => zstd.decode(packed, size) });
+  pc.WasmModule.setConfig('ZstdDecoderModule', { fallbackUrl: 'data:text/javascript,' });
+  app.loader.getHandler('gsplat').addParser(new SpzParser(app));
+}
+
+/** The PlayCanvas engine; of SPZ without turns and scales, which only its shaders unpack. */
 async function playcanvas(url) {
   const pc = await import('playcanvas'), canvas = document.createElement('canvas');
   const app = new pc.AppBase(canvas), options = new pc.AppOptions();
@@ -47,10 +57,16 @@ async function playcanvas(url) {
   options.componentSystems = [pc.GSplatComponentSystem];
   options.resourceHandlers = [pc.GSplatHandler];
   app.init(options);
+  if (url.endsWith('.spz')) await readsSpz(pc, app);
   const asset = new pc.Asset('file', 'gsplat', { url, filename: url.split('/').at(-1) });
   app.assets.add(asset);
   await new Promise((done, fail) => { asset.once('load', done); asset.once('error', (said) => fail(new Error(said))); app.assets.load(asset); });
-  const whole = asset.resource.gsplatData, data = whole.isCompressed || whole.isSog ? await whole.decompress() : whole, found = none();
+  const whole = asset.resource.gsplatData;
+  if (url.endsWith('.spz')) {
+    const shade = (byte) => 0.5 + 0.28209479177387814 / 0.15 * (byte / 255 - 0.5);
+    return { means: Array.from(whole.getCenters()), colours: Array.from(whole.colors, shade), opacities: Array.from(whole.alphas, (byte) => byte / 255) };
+  }
+  const data = whole.isCompressed || whole.isSog ? await whole.decompress() : whole, found = none();
   const prop = (name) => data.getProp(name);
   for (let k = 0; k < data.numSplats; k += 1) {
     found.means.push(...['x', 'y', 'z'].map((name) => prop(name)[k]));

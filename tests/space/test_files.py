@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import gzip
 import struct
+import tracemalloc
 
+import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 
 from terrella.core.errors import DatasetError
 from terrella.space.camera import rotation
-from terrella.space.files import read_scene, write_scene
+from terrella.space.files import read_scene, spz, write_scene
 from terrella.space.raster import rasterise
 from terrella.space.raster.move import quaternion, turned
 
 from .test_raster import LENS, POSES, cloud, parts
 
-CLOSE = {"a.ply": 1e-5, "a.spz": 0.12, "compressed.ply": 0.08}
+CLOSE = {"a.ply": 1e-5, "a.spz": 0.12, "a.4.spz": 0.12, "compressed.ply": 0.08}
 
 
 @pytest.mark.parametrize("name", CLOSE)
 @pytest.mark.parametrize("degree", [0, 3])
 def test_there_and_back(tmp_path, name, degree):
     scene = cloud(600, degree)
-    write_scene(scene, tmp_path / name, kind="compressed" if "compressed" in name else "")
+    write_scene(
+        scene, tmp_path / name, kind="compressed" if "compressed" in name else "", version=4 if ".4." in name else 3
+    )
     back = read_scene(tmp_path / name)
     assert len(back) == 600 and back.degree == degree and list(tmp_path.iterdir()) == [tmp_path / name]
     one, other = rasterise(scene, POSES, LENS, (40, 48)).rgb, rasterise(back, POSES, LENS, (40, 48)).rgb
@@ -47,6 +52,39 @@ def test_a_turned_scene_looks_the_same_from_a_turned_camera():
     )
 
 
+def spz_4(count: int, degree: int, streams: list[bytes], lie: int = 0) -> bytes:
+    """A file of version 4; the table says that each stream unpacks to `lie` bytes more than it does."""
+    zstd = pa.Codec("zstd")
+    packed = [zstd.compress(part, asbytes=True) for part in streams]
+    table = b"".join(struct.pack("<QQ", len(small), len(part) + lie) for small, part in zip(packed, streams))
+    return struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, 12, 0, len(streams), 32) + table + b"".join(packed)
+
+
+def test_harmonics_of_degree_4_are_left_out():
+    data = spz.encode(cloud(50, 3), 4)
+    *_, body = spz._streams(data)
+    ends = [50 * end for end in (0, 9, 10, 13, 16, 20, 65)]
+    *streams, sh = (body[a:b] for a, b in zip(ends, ends[1:]))
+    more = np.pad(np.frombuffer(sh, np.uint8).reshape(50, 45), ((0, 0), (0, 27)))
+    with pytest.warns(UserWarning, match="degree 4"):
+        found = spz.decode(spz_4(50, 4, [*streams, more.tobytes()]))
+    assert found.degree == 3 and all(map(torch.equal, parts(found), parts(spz.decode(data))))
+
+
+def test_a_long_count_in_a_short_file_asks_for_no_memory():
+    """Sixteen million points, as the table says, too; a megabyte at a time is unpacked."""
+    count = spz.MOST - 1
+    table = b"".join(struct.pack("<QQ", 20 if k < 4 else 0, count * size) for k, size in enumerate((9, 1, 3, 3, 4)))
+    data = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + table
+    data += 4 * pa.Codec("zstd").compress(bytes(1000), asbytes=True)[:20].ljust(20, b"\0")
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="stream"):
+        spz.decode(data)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10_000_000
+
+
 HEAD = b"ply\nformat binary_little_endian 1.0\n"
 BAD = {
     "empty": b"",
@@ -64,8 +102,18 @@ BAD = {
     + bytes(12),
     "gzip": gzip.compress(b"nothing much, but longer than sixteen bytes"),
     "cut gzip": gzip.compress(bytes(1000))[:20],
-    "spz 4": gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 4, 1, 0, 12, 0, 0)),
+    "spz 4 in gzip": gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 4, 1, 0, 12, 0, 0)),
     "many": gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**31, 3, 12, 0, 0)),
+    "4 short": b"NGSP",
+    "4 without table": spz_4(3, 0, [])[:32],
+    "4 of no version": struct.pack("<4sIIBBBBI12x", b"NGSP", 9, 1, 0, 12, 0, 5, 32),
+    "4 too many": struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 2**31, 0, 12, 0, 5, 32),
+    "4 of other streams": spz_4(1, 0, [bytes(9), bytes(1)]),
+    "4 whose streams are short": spz_4(1, 0, [bytes(n) for n in (9, 1, 3, 3, 4)], lie=3),
+    "4 of too many bytes": spz_4(1, 0, [bytes(n) for n in (9, 1, 3, 3, 400)]),
+    "4 cut": spz_4(1, 0, [bytes(n) for n in (9, 1, 3, 3, 4)])[:-5],
+    "4 that is no zstd": spz_4(1, 0, [bytes(n) for n in (9, 1, 3, 3, 4)])[:112] + bytes(80),
+    "4 that lies": spz_4(2, 0, [bytes(n) for n in (9, 1, 3, 3, 4)], lie=9),
     "short spz": gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 9, 3, 12, 0, 0)),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +15,7 @@ from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
 from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, replace_whole, write_scene
+from ..space.files.spz import Version
 from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
@@ -71,7 +73,7 @@ def import_(
     size: tuple[int, int] = (192, 256),
     json: Json = False,
 ) -> None:
-    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, or .spz of versions 1 to 3.
+    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, or .spz of versions 1 to 4.
 
     Args:
         file: The file.
@@ -88,7 +90,11 @@ def import_(
 
     if not 0 < scale < float("inf") or min(size) < 8 or max(size) > 4096:
         raise TerrellaError("--scale is above 0, and --size from 8 to 4096 pixels a side.")
-    gaussians = read_scene(file, axes)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        gaussians = read_scene(file, axes)
+    for warning in warned:
+        say(f"{file}: {warning.message}")
     if scale != 1:
         gaussians = turned(gaussians, torch.eye(3), scale)
     lens = (0.5, 0.5 * size[1] / size[0], 0.5, 0.5)
@@ -102,13 +108,14 @@ def export(
     file: Positional[Path],
     axes: Axes | None = None,
     compressed: bool = False,
+    spz: Version = 3,
     kind: Kind = "mesh",
     cell: float = CELL_M,
     seconds: float = FILM_S,
     path: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Write a world for other tools: Gaussians as .ply or .spz (version 3), .glb, a panorama (.png), a film (.mp4), a page (.html).
+    """Write a world for other tools: Gaussians as .ply or .spz, .glb, a panorama (.png), a film (.mp4), a page (.html).
 
     The page, to walk in and edit, is one file that draws by itself, also from a disk;
     it holds the place as it was before its edits, and these.
@@ -118,14 +125,17 @@ def export(
         file: The file to write; its ending says which kind.
         axes: Axes of the file; default: rdf for .ply and rub for .spz.
         compressed: SuperSplat's compressed kind of .ply.
+        spz: Version of an .spz: 3, which Spark opens, or 4, which PlayCanvas' engine opens.
         kind: What a .glb holds: a mesh with colours, the mesh of what stops bodies, or the Gaussians (KHR_gaussian_splatting).
         cell: Metres of a cell of the mesh.
         seconds: Of the film.
         path: The film's way: a JSON list of [x, y, z, degrees]. Default: a look around from each start.
     """
-    usual = {"axes": None, "compressed": False, "kind": "mesh", "cell": CELL_M, "seconds": FILM_S, "path": None}
-    given = {"axes": axes, "compressed": compressed, "kind": kind, "cell": cell, "seconds": seconds, "path": path}
-    check_options(file, [name for name, value in given.items() if value != usual[name]])
+    given = {
+        "axes": axes, "compressed": compressed, "spz": spz != 3, "kind": kind != "mesh", "cell": cell != CELL_M,
+        "seconds": seconds != FILM_S, "path": path,
+    }  # fmt: skip
+    check_options(file, [name for name, said in given.items() if said])
     if file.suffix.lower() == ".html":
         from ..serve.place import PlacePage
 
@@ -137,7 +147,7 @@ def export(
     if file.suffix.lower() in ENDINGS:
         result(write_other(opened, file, kind, cell, seconds, path), json)
         return
-    write_scene(opened.gaussians, file, axes, "compressed" if compressed else "")
+    write_scene(opened.gaussians, file, axes, "compressed" if compressed else "", spz)
     facts = {"gaussians": len(opened.gaussians), "bytes": file.stat().st_size, "file": str(file)}
     result(facts, json)
 

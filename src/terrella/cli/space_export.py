@@ -27,6 +27,7 @@ CELL_M, FILM_S = 0.05, 8.0  # unless said
 OPTIONS = {  # and the files that each is of
     "axes": (".ply", ".spz"),
     "compressed": (".ply",),
+    "spz": (".spz",),
     "kind": (".glb",),
     "cell": (".glb",),
     "seconds": (".mp4",),

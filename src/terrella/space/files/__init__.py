@@ -24,7 +24,7 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
-    """The Gaussians of a .ply (plain or compressed) or .spz (versions 1 to 3); `axes`: those of the file, by default rdf for PLY
+    """The Gaussians of a .ply (plain or compressed) or .spz (versions 1 to 4); `axes`: those of the file, by default rdf for PLY
     and rub for SPZ. What is not finite is left out. DatasetError says what is wrong with a file."""
     path = Path(path)
     try:
@@ -36,13 +36,13 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
             elements = ply.parse(data)
             found = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
             usual = "rdf"
-        elif data[:2] == b"\x1f\x8b":
+        elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
             found, usual = spz.decode(data), "rub"
         else:
-            raise ValueError("it begins neither as PLY nor as SPZ of version 1 to 3")
+            raise ValueError("it begins neither as PLY nor as SPZ")
     except (ValueError, KeyError, OverflowError) as error:
         said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ 3.") from error
+        raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ.") from error
     sound = torch.stack(
         [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(found).values()]
     )
@@ -52,8 +52,10 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     return turned(found.at(sound), _axes(axes or usual).T)
 
 
-def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None, kind: str = "") -> None:
-    """Writes a .ply or .spz (version 3); kind "compressed" makes the .ply SuperSplat's. The file is replaced whole."""
+def write_scene(
+    gaussians: Gaussians, path: str | Path, axes: str | None = None, kind: str = "", version: spz.Version = 3
+) -> None:
+    """Writes a .ply or .spz (of `version`); kind "compressed" makes the .ply SuperSplat's. The file is replaced whole."""
     path = Path(path)
     if path.suffix.lower() not in _USUAL:
         raise DatasetError(f"{path}: a place is written as .ply, .spz, .glb, .png or .mp4; give a name that ends so.")
@@ -63,7 +65,7 @@ def write_scene(gaussians: Gaussians, path: str | Path, axes: str | None = None,
         raise DatasetError(f"{path}: the compressed kind is one of .ply; SPZ is compressed by itself.")
     there = turned(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
     if path.suffix.lower() == ".spz":
-        data = spz.encode(there)
+        data = spz.encode(there, version)
     else:
         data = compressed.encode(there) if kind == "compressed" else ply.encode(there)
     replace_whole(path, lambda staged: staged.write_bytes(data))
