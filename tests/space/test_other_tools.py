@@ -190,7 +190,7 @@ def looks_right(file: Path, off_m: float = 0.012, axes: str | None = None) -> No
     assert one.std() > 0.1 and -10 * math.log10(float((one - other).square().mean()) + 1e-9) > 30
 
 
-THEIRS = {"b.ply": (), "b.compressed.ply": (), "b.spz": ("--spz-version", "3"), "b.4.spz": ()}
+THEIRS = {"b.ply": (), "b.compressed.ply": (), "b.spz": ("--spz-version", "3"), "b.4.spz": (), "b.sog": ()}
 
 
 @pytest.mark.parametrize("name", THEIRS)

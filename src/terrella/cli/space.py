@@ -73,10 +73,10 @@ def import_(
     size: tuple[int, int] = (192, 256),
     json: Json = False,
 ) -> None:
-    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, or .spz of versions 1 to 4.
+    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, .spz of versions 1 to 4, or .sog.
 
     Args:
-        file: The file.
+        file: The file; of a .sog that was unpacked its folder.
         out: Folder of the world.
         axes: The file's axes: rdf (x right, y down, z forward: usual in .ply), rub (x right, y up, z back: usual in .spz), or flu
             (x forward, y left, z up: ours).

@@ -1,4 +1,4 @@
-"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ; see glb.py for GLB."""
+"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ, SOG; see glb.py for GLB."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from ...core.errors import DatasetError
 from ..raster import Gaussians
 from ..raster.move import turned
-from . import compressed, ply, spz
+from . import compressed, ply, sog, spz
 
 # Axes of a file as ours (x forward, y left, z up); "rdf" is x right, y down, z forward, as training code writes PLY.
 AXES = {
@@ -24,13 +24,13 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
-    """The Gaussians of a .ply (plain or compressed) or .spz (versions 1 to 4); `axes`: those of the file, by default rdf for PLY
-    and rub for SPZ. What is not finite is left out. DatasetError says what is wrong with a file."""
+    """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4) or .sog (or its folder); `axes`: those of the file, by
+    default rub for SPZ and rdf for others. What is not finite is left out. DatasetError says what is wrong with a file."""
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = b"" if path.is_dir() else path.read_bytes()
     except OSError as error:
-        raise DatasetError(f"{path} cannot be read ({error.strerror}); give a .ply or .spz file.") from error
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); give a .ply, .spz or .sog file.") from error
     try:
         if data[:3] == b"ply":
             elements = ply.parse(data)
@@ -38,8 +38,12 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
             usual = "rdf"
         elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
             found, usual = spz.decode(data), "rub"
+        elif data[:2] == b"PK":
+            found, usual = sog.zipped(data), "rdf"
+        elif path.is_dir() or path.name == sog.META:
+            found, usual = sog.unzipped(path if path.is_dir() else path.parent), "rdf"
         else:
-            raise ValueError("it begins neither as PLY nor as SPZ")
+            raise ValueError("it is neither PLY nor SPZ nor SOG")
     except (ValueError, KeyError, OverflowError) as error:
         said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ.") from error

@@ -53,15 +53,15 @@ def _whole(rows: np.ndarray, name: str) -> np.ndarray:
 def unpacked_quats(packed: torch.Tensor) -> torch.Tensor:
     """Quaternions w, x, y, z [n, 4] of int64 [n]: which component is largest (2 bits), and the other three in 10 bits each."""
     three = torch.stack([((packed >> shift) & 1023) / 1023 - 0.5 for shift in (20, 10, 0)], 1) * 2**0.5
-    largest = (1 - three.square().sum(1)).clamp_min(0).sqrt()
-    whole, which = torch.zeros(len(packed), 4), packed >> 30
-    for k in range(4):
-        rows = which == k
-        others = [c for c in range(4) if c != k]
-        whole[rows, k] = largest[rows]
-        for at, c in enumerate(others):
-            whole[rows, c] = three[rows, at]
-    return whole
+    return whole_quats(three, packed >> 30)
+
+
+def whole_quats(three: torch.Tensor, which: torch.Tensor) -> torch.Tensor:
+    """Quaternions of length 1 [n, 4] of their three smaller components [n, 3] and the number of the largest, int64 [n]."""
+    whole = torch.zeros(len(three), 4)
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[which]
+    largest = (1 - three.square().sum(1, keepdim=True)).clamp_min(0).sqrt()
+    return whole.scatter(1, others, three).scatter(1, which[:, None], largest)
 
 
 def packed_quats(quats: torch.Tensor) -> torch.Tensor:
