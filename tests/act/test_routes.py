@@ -23,11 +23,11 @@ from terrella.act.planning import (
 from terrella.act.planning.routes import STRIDE_M, routes_to
 from terrella.core import Spec, State, check_world
 from terrella.core.errors import ContractError, ObservationError, PlanningError
-from terrella.core.spec import POSE
+from terrella.core.spec import POSE, WALKABLE
 from terrella.core.world import make_rng
 
 # A wall along x = 2 from y = -9 to y = 3, and places round its end.
-KNOWN = np.array([[x, y] for x in range(5) for y in range(-1, 5) if x != 2 or y > 3], np.float64)
+KNOWN = np.array([[x, y, 0, 1] for x in range(5) for y in range(-1, 5) if x != 2 or y > 3], np.float64)
 
 
 class Yard:
@@ -37,7 +37,7 @@ class Yard:
         self.spec = Spec(
             name="yard",
             action=spaces.Box(-1, 1, (2,), np.float32),
-            channels={"pose": POSE, "keyframes": spaces.Box(-np.inf, np.inf, (len(KNOWN) + 1, 4), np.float32)},
+            channels={"pose": POSE, "places": spaces.Box(-np.inf, np.inf, (len(KNOWN) + 1, 4), np.float32)},
             observes=("pose",),
             dt_s=0.1,
         )
@@ -62,13 +62,12 @@ class Yard:
         self.spec.check_channels(channels)
         zero = torch.zeros(state.batch, 1)
         shown = {"pose": lambda: torch.cat([state["at"], zero, zero + 1, zero, zero, zero], 1)}
-        rows = torch.from_numpy(np.c_[KNOWN, 0 * KNOWN[:, 0], 1 + 0 * KNOWN[:, 0]]).float()
-        table = torch.cat([rows, torch.zeros(1, 4)])
-        shown["keyframes"] = lambda: table.expand(state.batch, *table.shape)
+        table = torch.cat([torch.from_numpy(KNOWN).float(), torch.zeros(1, 4)])
+        shown["places"] = lambda: table.expand(state.batch, *table.shape)
         return {name: shown[name]() for name in channels}
 
 
-def walk(place, steps=120, shown=("pose", "keyframes")):
+def walk(place, steps=120, shown=("pose", "places")):
     world = Revealed(Yard())
     cost = distance_to(world, {"pose": torch.tensor([*place, *[torch.nan] * 5])})
     way = Navigator(Planner(world, cost, SearchConfig(samples=24, iterations=2, horizon=5)), place)
@@ -103,16 +102,16 @@ def test_ways_lead_round_the_wall_and_grow_shorter():
     assert math.dist(here, goal) <= STRIDE_M
 
 
-@pytest.mark.parametrize("shown", [("pose", "keyframes"), ("pose",)], ids=["seen", "remembered"])
+@pytest.mark.parametrize("shown", [("pose", "places"), ("pose",)], ids=["seen", "remembered"])
 def test_a_walker_goes_round_a_wall_that_its_planner_does_not_see_past(shown):
     trace = walk((4.0, 0.0), shown=shown)
     assert math.dist(trace[-1], (4.0, 0.0)) < 0.4 and max(y for _, y in trace) > 2.9
 
 
 def test_who_is_off_all_ways_goes_to_the_nearest_place_that_lies_on_one():
-    alone = np.array([[-4.0, 0.0]])  # as the first place that a camera remembers of a room nobody was in
+    alone = np.array([[-4.0, 0.0, 0, 1]])  # as the first place that a camera remembers of a room nobody was in
     target, left = routes_to(np.array([4.0, 0.0]), np.concatenate([KNOWN, alone])).target(
-        alone[0], np.array([4.0, 0.0])
+        alone[0, :2], np.array([4.0, 0.0])
     )
     assert target.tolist() == [0.0, 0.0] and math.isfinite(left)
 
@@ -121,6 +120,21 @@ def test_a_place_that_nobody_knows_is_refused_in_a_sentence():
     with pytest.raises(PlanningError, match="no way to that place is known"):
         walk((20.0, 20.0))
     assert not np.isfinite(routes_to(np.array([20.0, 20.0]), KNOWN).left_m).any()
+
+
+def test_where_one_can_stand_ways_go_from_cell_to_cell_and_never_through_a_thin_wall():
+    cells = np.array([[0.4 * x, 0.4 * y, 0, WALKABLE] for x in range(8) for y in range(8) if x not in (3, 4) or y == 7])
+    cells[cells[:, 0] > 1.4, 0] -= 0.2  # as near to each other as bodies on both sides of a wall of ten centimetres are
+    goal = cells[(cells[:, 0] > 1.4) & (cells[:, 1] == 0)][0, :2]
+    ways = routes_to(goal, cells)
+    here, trace = np.array([0.8, 0.0]), []
+    assert math.dist(here, goal) < STRIDE_M
+    while math.dist(here, goal) > 1e-6:
+        target, left = ways.target(here, goal)
+        assert left < 8 and math.dist(here, target) <= 0.9 + 1e-9
+        here = target
+        trace.append(target[1])
+    assert max(trace) > 2.3, "round the end of the wall"
 
 
 def test_a_place_that_could_not_be_walked_to_is_avoided():

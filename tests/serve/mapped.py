@@ -18,7 +18,7 @@ class Mapped(Panorama):
         super().__init__(**options)
         shown = {
             "known": spaces.Box(0, 1, self.size, np.float32),
-            "keyframes": spaces.Box(-np.inf, np.inf, (SLOTS, 4), np.float32),
+            "places": spaces.Box(-np.inf, np.inf, (SLOTS, 4), np.float32),
         }
         self.spec = replace(self.spec, name="mapped-panorama", channels={**self.spec.channels, **shown})
 
@@ -26,7 +26,7 @@ class Mapped(Panorama):
         batch, (height, width) = state.batch, self.size
         if name == "known":
             return (torch.arange(width) >= width // 2).float().expand(batch, height, width).clone()
-        if name == "keyframes":
+        if name == "places":
             slot = torch.arange(SLOTS).expand(batch, -1)
             held = slot <= (state["age"][:, None] // 20).clamp(max=SLOTS - 1)
             row = torch.stack([slot * 0.5, slot * 0.0, slot * 0.7, 1.0 + slot % 3], -1)

@@ -33,14 +33,14 @@ def test_show_is_read_and_junk_is_refused():
 def test_a_chart_tells_where_the_camera_and_the_keyframes_are():
     timeline = Timeline([Mapped()], seed=0)
     first = timeline.chart()
-    assert first["world"] == 0 and len(first["keyframes"]) == 4 and first["known"] == 0.5 and len(first["camera"]) == 3
+    assert first["world"] == 0 and len(first["places"]) == 4 and first["known"] == 0.5 and len(first["camera"]) == 3
     timeline.step(["KeyW"])
     second = timeline.chart()
-    assert second["keyframes"] == first["keyframes"] and second["camera"][0] == pytest.approx(0.1)
+    assert second["places"] == first["places"] and second["camera"][0] == pytest.approx(0.1)
     for _ in range(20):
         timeline.step(["ArrowLeft"])
     third = timeline.chart()
-    assert third["keyframes"][4:] == [0.5, 0.0, 0.7, 2.0]
+    assert third["places"][4:] == [0.5, 0.0, 0.7, 2.0]
     assert third["camera"][2] != second["camera"][2]
 
 
@@ -48,9 +48,9 @@ def test_the_past_has_its_own_map():
     timeline = Timeline([Mapped()], seed=0)
     for _ in range(45):
         timeline.step([])
-    assert len(timeline.chart()["keyframes"]) == 3 * 4
+    assert len(timeline.chart()["places"]) == 3 * 4
     timeline.stand_at(3)
-    assert len(timeline.chart()["keyframes"]) == 4
+    assert len(timeline.chart()["places"]) == 4
 
 
 def test_a_world_without_these_channels_has_no_map():
@@ -88,7 +88,7 @@ def inside(page) -> np.ndarray:
 
 def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 100)]).url)
-    until(page, f"terrella.map.shown && terrella.map.keyframes === {SLOTS}")
+    until(page, f"terrella.map.shown && terrella.map.places === {SLOTS}")
     assert page.locator("#map-known").text_content() == "50% from memory"
     assert page.locator("#map-kinds span").all_text_contents() == ["3 recorded", "3 observed", "2 imagined"]
     page.keyboard.down("KeyW")
@@ -113,12 +113,12 @@ def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):
 
 def test_rewinding_takes_the_map_along(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 50)]).url)
-    until(page, "terrella.map.keyframes >= 5")
+    until(page, "terrella.map.places >= 5")
     page.keyboard.press("KeyP")
     until(page, "terrella.state === 'paused'")
     box = page.locator("#timeline").bounding_box()
     page.mouse.click(box["x"] + 3, box["y"] + box["height"] / 2)
-    until(page, "terrella.state === 'rewound' && terrella.map.keyframes === 1")
+    until(page, "terrella.state === 'rewound' && terrella.map.places === 1")
 
 
 def test_inventions_can_be_tinted(serve_world, open_page):  # noqa: F811
@@ -154,7 +154,7 @@ def test_a_world_without_a_map_shows_no_button(serve_world, open_page):  # noqa:
 def test_a_world_that_fails_to_tell_what_it_remembers_plays_on(serve_world, open_page, capsys):  # noqa: F811
     class Broken(Mapped):
         def _channel(self, state, name):
-            if name == "keyframes":
+            if name == "places":
                 raise RuntimeError("it forgot")
             return super()._channel(state, name)
 

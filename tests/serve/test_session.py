@@ -170,7 +170,7 @@ def test_a_chart_tells_keyframes_only_when_they_changed():
         session.hear("show", Show(map=True, invented=False))
         charts = lambda: [event for event in socket.events if event["type"] == "chart"]  # noqa: E731
         await until(lambda: len(charts()) > 3)
-        told = [event["keyframes"] for event in charts() if "keyframes" in event]
+        told = [event["places"] for event in charts() if "places" in event]
         assert len(told) < len(charts()) and all(a != b for a, b in zip(told, told[1:]))
 
     play(scenario, Mapped())

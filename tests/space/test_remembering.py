@@ -148,7 +148,7 @@ def test_what_it_invented_stays_as_it_was_invented():
     there = world.render(away, ("rgb", "known"))
     again = hold(world, hold(world, away, 2, 12, rng), 1, 12, rng)
     assert likeness(world.render(again, ("rgb",))["rgb"], there["rgb"]) > 24
-    kinds = world.render(again, ("keyframes",))["keyframes"][0, :, 3]
+    kinds = world.render(again, ("places",))["places"][0, :, 3]
     assert (kinds == OBSERVED).sum() == 1 and (kinds == DREAMT).sum() > 5
 
 
@@ -307,7 +307,7 @@ def test_a_state_of_another_memory_around_a_world_is_adopted_or_refused():
     world, twin, other = (Remembering(Fickle(), memory_mb=size) for size in (2, 2, 1))
     state = hold(world, world.start(1, make_rng(0)), 1, 5)
     assert torch.equal(hold(twin, state, 2, 3)["rgb"], hold(world, state, 2, 3)["rgb"])
-    for verb in (lambda: other.render(state, ("keyframes",)), lambda: hold(other, state, 1, 1)):
+    for verb in (lambda: other.render(state, ("places",)), lambda: hold(other, state, 1, 1)):
         with pytest.raises(ContractError, match="layout"):
             verb()
 

@@ -106,7 +106,7 @@ def test_evidence_of_a_place_is_known_and_a_dream_elsewhere_is_not(world):
     turned = planar_pose(*shown["pose"][:, :3].unbind(-1), torch.tensor([math.pi]))
     away = alone.observe({"pose": turned}, state, rng)
     assert alone.render(away, ("known",))["known"].mean() < 0.1
-    kinds = alone.render(away, ("keyframes",))["keyframes"][0, :, 3]
+    kinds = alone.render(away, ("places",))["places"][0, :, 3]
     assert kinds[kinds > 0].tolist() == [2, 3], "one observed, one dreamt"
 
 

@@ -23,7 +23,7 @@ _NEVER = (
     "truncated",
     "uncertainty",
     "known",
-    "keyframes",
+    "places",
     "mosaic",
     "instruction",
     "latent",

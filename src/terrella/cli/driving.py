@@ -33,7 +33,7 @@ from .goals import placed, state_channel
 
 _REPLAN_S = 0.06  # of world time, in which a plan is acted on before the next is made
 _NEAR = 0.05  # of a range, within which a goal is reached
-_SHOWN = ("pose", "keyframes")  # beside what a planner's world observes: what ways are found by
+_SHOWN = ("pose", "places")  # beside what a planner's world observes: what ways are found by
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def carded(
 def arms_of(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
     """The world, with its memory and without where it has one; and more of which only memory is asked."""
     world = load_named(name, device, fast=fast)
-    if library.is_truth(name) or "pose" not in world.spec.observes or "keyframes" not in world.spec.channels:
+    if library.is_truth(name) or "pose" not in world.spec.observes or "places" not in world.spec.channels:
         return {"world": world}, {}
     if quick:
         return {"memory": world}, {}

@@ -96,7 +96,7 @@ def views_of(goal: str, wanted: Mapping[str, torch.Tensor], world: World, real: 
 
     Of a recording, the views that were taken near where the world has been. PlanningError or ObservationError for what cannot be.
     """
-    walked = {"pose", "keyframes"} <= set(world.spec.channels) and "pose" in real.channels
+    walked = {"pose", "places"} <= set(world.spec.channels) and "pose" in real.channels
     if is_recording(goal):
         if not walked:
             raise PlanningError(
@@ -130,7 +130,7 @@ def _poses(folder: str) -> torch.Tensor:
 
 def _places(world: World) -> torch.Tensor:
     """Where a camera was that the world remembers [N, 2], metres."""
-    held = world.render(world.start(1, make_rng(0)), ("keyframes",))["keyframes"][0].cpu()
+    held = world.render(world.start(1, make_rng(0)), ("places",))["places"][0].cpu()
     return held[held[:, 3] > 0, :2]
 
 

@@ -24,7 +24,7 @@ _WELL_KNOWN = {
     "reward": (np.float32, 0),
     "done": (np.bool_, 0),
     "known": (np.float32, 2),
-    "keyframes": (np.float32, 2),
+    "places": (np.float32, 2),
     "mosaic": (np.uint8, 3),
     "instruction": (np.float32, 1),
 }

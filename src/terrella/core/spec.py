@@ -23,6 +23,8 @@ REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 DONE = spaces.Box(0, 1, (), np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
 POSE = spaces.Box(-np.inf, np.inf, (7,), np.float32)
 POSE_UNIT = "m, quaternion wxyz of T_world_cam"
+PLACES_UNIT = "x and y in m, heading in rad, kind"
+WALKABLE = 4  # the kind of place where one can stand (core/world.py)
 NO_MOUNT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 BUTTONS, CHOICE = "buttons", "choice"

@@ -13,10 +13,11 @@ from .state import State
 # name -> tensor that leads with the batch axis. A name is a kind, or a kind and which one of it ("rgb.wrist"). rgb: uint8
 # [B, H, W, 3]; depth: float32 [B, h, w], metres along the optical axis; pose: float32 [B, 7] = x, y, z in metres and
 # quaternion w, x, y, z of T_world_cam, world z up, camera x forward, y left, z up; reward: float32 [B]; done: bool [B];
-# known: float32 [B, H, W] in 0..1, the share of memory in each pixel of rgb, the rest being invented; keyframes: float32
-# [B, N, 4] = x, y in metres, heading in radians, kind (0 empty, 1 recorded, 2 observed, 3 imagined); mosaic: uint8 [B, H',
-# W', 4] = red, green, blue and 255 (0 where nothing was seen), the pictures joined by how they scrolled, rgb in the middle;
-# instruction: float32 [B, D], the embedding of a task's text. A goal is a mapping of channels, too.
+# known: float32 [B, H, W] in 0..1, the share of memory in each pixel of rgb, the rest being invented; places: float32
+# [B, N, 4] = x, y in metres, heading in radians, kind (0 empty, a keyframe that was 1 recorded, 2 observed, 3 imagined, or 4
+# a place where one can stand); mosaic: uint8 [B, H', W', 4] = red, green, blue and 255 (0 where nothing was seen), the
+# pictures joined by how they scrolled, rgb in the middle; instruction: float32 [B, D], the embedding of a task's text. A goal
+# is a mapping of channels, too.
 Observation = Mapping[str, torch.Tensor]
 
 

@@ -21,7 +21,12 @@ ACTION, REWARD, DONE = "action", "next.reward", "next.done"
 POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 NAME = re.compile(r"\w[\w.-]{0,200}")  # of a feature, and so of a file and a folder
 MOST_AXES = 5
-ESTIMATES = ("uncertainty", "known", "keyframes")  # what a learned world says of itself, which nobody learns from
+ESTIMATES = (
+    "uncertainty",
+    "known",
+    "places",
+    "keyframes",
+)  # what a learned world says of itself, which nobody learns from
 RENAMED = {"cast": "objects"}  # channel of old recordings -> what it is called now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
 _IMAGES = "observation.images."

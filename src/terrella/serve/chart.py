@@ -1,8 +1,8 @@
 """What a world remembers, for the page: its map, and its pictures with what it invented tinted.
 
-It knows no kind of world: one with the channels `pose` and `keyframes` [N, 4] (x, y in metres, heading in radians, kind: 0
-empty, 1 recorded, 2 observed, 3 imagined) has a map of places, one with `mosaic` [H', W', 4] a map that is a picture; one with
-`known` [H, W] in 0..1 can be tinted.
+It knows no kind of world: one with the channels `pose` and `places` [N, 4] (x, y in metres, heading in radians, kind: 0
+empty, 1 recorded, 2 observed, 3 imagined, 4 where one can stand) has a map of places, one with `mosaic` [H', W', 4] a map
+that is a picture; one with `known` [H, W] in 0..1 can be tinted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FINEST, QUALITY = 640, 85  # pixels across the image of a mosaic, at most; of it
 
 def mapped(spec: Spec) -> str:
     """Which kind of map the world has; "" for none."""
-    if {"pose", "keyframes"} <= set(spec.channels):
+    if {"pose", "places"} <= set(spec.channels):
         return PLACES
     return MOSAIC if {"rgb", "mosaic"} <= set(spec.channels) else ""
 
@@ -45,14 +45,14 @@ def chart(world: World, state: State) -> dict:
 
 def _places(world: World, state: State) -> dict:
     """camera [x, y, heading], to the millimetre; known, the share of the picture that memory knew (None where the world does not
-    say); keyframes, x, y, heading and kind of each, to the centimetre, in one flat list without the empty slots."""
-    wanted = ["pose", "keyframes", *(["known"] if knows_share(world.spec) else [])]
+    say); places, x, y, heading and kind of each, to the centimetre, in one flat list without the empty slots."""
+    wanted = ["pose", "places", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
-    held = seen["keyframes"][seen["keyframes"][:, 3] > 0]
+    held = seen["places"][seen["places"][:, 3] > 0]
     return {
         "camera": [round(number, 3) for number in (*seen["pose"][:2].tolist(), float(yaw(seen["pose"])))],
         "known": round(float(seen["known"].mean()), 3) if "known" in seen else None,
-        "keyframes": held.flatten().double().round(decimals=2).tolist(),
+        "places": held.flatten().double().round(decimals=2).tolist(),
     }
 
 

@@ -206,10 +206,10 @@ def encode_event(kind: str, **body) -> str:
     the decision to the plan's end.
 
     chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
-    that memory reconstructs, or null), and where they have changed since the last chart, keyframes: x, y, heading and kind
-    (1 recorded, 2 observed, 3 imagined) of each, in one flat list. Of a flat world: world, step, and where it has changed,
-    mosaic: size [width, height in pixels] of what was seen around the picture in its middle, view, the size of that, and in base64
-    image, a JPEG, and mask, a PNG that is clear where nothing was seen.
+    that memory reconstructs, or null), and where they have changed since the last chart, places: x, y, heading and kind
+    (1 recorded, 2 observed, 3 imagined, 4 where one can stand) of each, in one flat list. Of a flat world: world, step, and
+    where it has changed, mosaic: size [width, height in pixels] of what was seen around the picture in its middle, view, the
+    size of that, and in base64 image, a JPEG, and mask, a PNG that is clear where nothing was seen.
     """
     return json.dumps({"type": kind, **body}, allow_nan=False)
 

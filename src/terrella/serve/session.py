@@ -295,7 +295,7 @@ class Session:
         self._chart_due = time.perf_counter() + EVERY_S[timeline.mapped]
         found = await self._extra(timeline.chart)
         if found is not None:
-            large = {name: found.pop(name) for name in ("keyframes", "mosaic") if name in found}
+            large = {name: found.pop(name) for name in ("places", "mosaic") if name in found}
             news = {name: value for name, value in large.items() if value != self._charted.get(name)}
             self._charted |= news
             await self._event("chart", **found, **news)

@@ -117,7 +117,7 @@ class Memory:
         return (held["memory_kind"] > EMPTY).sum(1)
 
     def table(self, held: Held) -> torch.Tensor:
-        """float32 [B, capacity, 4]: x, y in metres, heading in radians, kind; the channel `keyframes`."""
+        """float32 [B, capacity, 4]: x, y in metres, heading in radians, kind; the channel `places`."""
         return keyframe_table(held["memory_pose"], held["memory_kind"])
 
     # -- keeping ------------------------------------------------------------------------------------------------------

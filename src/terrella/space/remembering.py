@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core.errors import ContractError, ObservationError
-from ..core.spec import POSE, POSE_UNIT, Camera, Spec, shape_of
+from ..core.spec import PLACES_UNIT, POSE, POSE_UNIT, Camera, Spec, shape_of
 from ..core.state import State
 from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
@@ -105,7 +105,7 @@ class Remembering:
         show = {
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
-            "keyframes": lambda: self.memory.table(state),
+            "places": lambda: self.memory.table(state),
             **{name: lambda name=name: state[name] for name in ("pose", "depth", "reward", "done") if name in state},
         }
         theirs = [name for name in channels if name not in show]
@@ -193,13 +193,13 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
 
 def _spec(spec: Spec, memory: Memory, camera: Intrinsics, estimates: bool) -> Spec:
     """The spec of a world that remembers: with the pose and the depth that memory goes by; `known` [H, W], 1 where memory
-    reconstructs what is shown and 0 where it is invented; and `keyframes` [N, 4] (keyframe_table), in which it can be inspected."""
+    reconstructs what is shown and 0 where it is invented; and `places` [N, 4] (keyframe_table), in which it can be inspected."""
     channels, units = {"pose": POSE, **spec.channels}, {"pose": POSE_UNIT, **spec.units}
     if "depth" in channels or estimates:  # of the pictures' size
         channels["depth"], units["depth"] = spaces.Box(0, np.inf, memory.size, np.float32), "m"
     channels["known"] = spaces.Box(0, 1, memory.size, np.float32)
-    channels["keyframes"] = spaces.Box(-np.inf, np.inf, (memory.capacity, 4), np.float32)
-    units["keyframes"] = "x and y in m, heading in rad, kind"
+    channels["places"] = spaces.Box(-np.inf, np.inf, (memory.capacity, 4), np.float32)
+    units["places"] = PLACES_UNIT
     return replace(spec, channels=channels, units=units, cameras={**spec.cameras, "rgb": Camera(camera, memory.size)})
 
 

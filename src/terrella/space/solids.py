@@ -49,6 +49,11 @@ class Solids:
         bears = (off < _FOOT_M) & (top <= feet[:, None] + body.step_m) & (top > feet[:, None] - _DEEPEST_M)
         return torch.where(bears, top, -torch.inf).amax(1)
 
+    def surface(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+        """The same, and nan where there is none."""
+        found = self.highest(place, body)
+        return torch.where(found > -torch.inf, found, torch.nan)
+
     def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor:
         """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever
         stands in something already may only come less deep into it."""

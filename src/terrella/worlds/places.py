@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import ObservationError
+from ..core.spec import PLACES_UNIT
 from ..core.state import State
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import floor_plan
@@ -66,7 +67,7 @@ class KeyframeScene:
 
     @cached_property
     def _table(self) -> torch.Tensor:
-        """The recordings' part of the channel `keyframes`."""
+        """The recordings' part of the channel `places`."""
         kinds = torch.full((len(self.recorded),), RECORDED, device=self.device)
         return keyframe_table(self.recorded.pose, kinds)
 
@@ -100,8 +101,8 @@ class KeyframeScene:
         if self.config.moving:
             shows["things"] = spaces.Box(0, 1, (height, width), np.bool_)  # pyright: ignore
         if count := len(self.recorded) + self.own.capacity:
-            shows["keyframes"] = spaces.Box(-np.inf, np.inf, (count, 4), np.float32)
-            units["keyframes"] = "x and y in m, heading in rad, kind"
+            shows["places"] = spaces.Box(-np.inf, np.inf, (count, 4), np.float32)
+            units["places"] = PLACES_UNIT
         return Channels(shows, units, ("rgb", "depth"), ("things",) * self.config.moving)
 
     # -- evidence -----------------------------------------------------------------------------------------------------
@@ -283,7 +284,7 @@ class KeyframeScene:
             "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
             "known": lambda: state["known"].float() / 255,
             "things": lambda: state["things"] > 0.5,
-            "keyframes": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
+            "places": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
         }
 
     def _lasting(self, state: State) -> torch.Tensor:

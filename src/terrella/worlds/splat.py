@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import ObservationError, TerrellaError
-from ..core.spec import POSE, POSE_UNIT, Camera, Spec
+from ..core.spec import PLACES_UNIT, POSE, POSE_UNIT, WALKABLE, Camera, Spec
 from ..core.state import State
 from ..core.world import Observation
 from ..space.camera import Intrinsics, rotation, yaw
@@ -23,6 +23,7 @@ from ..space.occupancy import Body, Occupancy
 from ..space.raster import Drawing, Gaussians, rasterise
 from ..space.raster.move import multiplied
 from ..space.solids import Solids
+from ..space.walkable import walkable
 from .additions import OBSERVED, Additions
 from .parts import check_prior, picture_of
 
@@ -36,6 +37,7 @@ _PUSH = torch.tensor(
     [[1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1]]
 ).float()
 GRAVITY = 9.81  # m/s^2
+MOST_PLACES = 8192  # that the channel `places` tells
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class SplatWorld:
 
     rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
     none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
-    goes UP lifts off; who comes DOWN to the floor walks again. What pictures with depth show is fused into the place of that
-    episode alone (space/fusing.py); floors and walls stay.
+    goes UP lifts off; who comes DOWN to the floor walks again. `places` says where one can walk to (kind 4). What pictures
+    with depth show is fused into the place of that episode alone (space/fusing.py); floors and walls stay.
     """
 
     def __init__(
@@ -103,12 +105,18 @@ class SplatWorld:
                 "ids": spaces.Box(-1, 2**24, (height, width), np.int32),
                 "known": spaces.Box(0, 1, (height, width), np.float32),
                 "uncertainty": spaces.Box(0, 1, (), np.float32),
+                "places": spaces.Box(-np.inf, np.inf, (MOST_PLACES, 4), np.float32),
                 **poses,
             },
             observes=("pose",),
             may_observe=("rgb", "depth"),
             dt_s=self.config.dt_s,
-            units={"depth": "m", "pose": POSE_UNIT, **dict.fromkeys(poses, POSE_UNIT.replace("cam", "body"))},
+            units={
+                "depth": "m",
+                "pose": POSE_UNIT,
+                "places": PLACES_UNIT,
+                **dict.fromkeys(poses, POSE_UNIT.replace("cam", "body")),
+            },
             action_names=buttons,
             keys={k: [float(one == name) for one in buttons] for k, name in KEYS.items() if name in buttons},
             cameras={"rgb": Camera(self.config.camera, self.config.size)},
@@ -125,6 +133,14 @@ class SplatWorld:
         """What stops who walks, but for what can be pushed."""
         still = ~torch.isin(self.bodies, torch.tensor(self.things, dtype=torch.int32))
         return Solids(self.solids[still]) if len(self.solids) else self.occupancy
+
+    @cached_property
+    def places(self) -> torch.Tensor:
+        """The channel `places` [MOST_PLACES, 4]: where one can walk to from where episodes begin; zeros for the rest."""
+        found = walkable(self.collider, self.starts[:, :3], self.config.body, MOST_PLACES)
+        table = torch.zeros(MOST_PLACES, 4)
+        table[: len(found), :2], table[: len(found), 3] = found[:, :2], WALKABLE
+        return table
 
     @cached_property
     def rigid(self) -> Any:
@@ -220,13 +236,16 @@ class SplatWorld:
         return torch.maximum(level, Solids(self.rigid.boxes(state["bodies"])).highest(place, low))
 
     def render(self, state: State, channels: Sequence[str]) -> Observation:
-        """The asked channels; of the rest only `pose` and `bodies` cost no drawing."""
+        """The asked channels; `pose`, `bodies` and `places` cost no drawing."""
         self.spec.check_channels(channels)
-        if not set(channels) - {"pose", "bodies"}:
-            return {name: state[name] for name in channels}
-        shown = [self._seen(state, entry, channels) for entry in range(state.batch)]
-        drawn = {name: torch.cat([one[name] for one in shown]) for name in shown[0]}
-        return {name: drawn[name] if name in drawn else state[name] for name in channels}
+        found = {name: state[name] for name in channels if name in state}
+        if "places" in channels:
+            found["places"] = self.places.expand(state.batch, -1, -1)
+        drawn = [name for name in channels if name not in found]
+        if drawn:
+            shown = [self._seen(state, entry, drawn) for entry in range(state.batch)]
+            found |= {name: torch.cat([one[name] for one in shown]) for name in drawn}
+        return {name: found[name] for name in channels}
 
     def _seen(self, state: State, entry: int, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         """What has to be drawn of the channels for one entry of a state."""
@@ -234,7 +253,7 @@ class SplatWorld:
         scene = self._ridden(scene, state, entry)
         with torch.no_grad():
             seen = rasterise(scene, state["pose"][entry][None], self.config.camera, self.config.size)
-        return {name: _shown(seen, provenance, name) for name in channels if name not in state}
+        return {name: _shown(seen, provenance, name) for name in channels}
 
     def _ridden(self, scene: Gaussians, state: State, entry: int) -> Gaussians:
         """The Gaussians of things where these are."""

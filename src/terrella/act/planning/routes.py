@@ -1,4 +1,5 @@
-"""Routes to a place that is further off than a planner sees: over places where a camera was before, planned stretch by stretch."""
+"""Routes to a place that is further off than a planner sees: over places where a camera was before, or where one can stand, planned
+stretch by stretch."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from ...core.errors import PlanningError
+from ...core.spec import WALKABLE
 from ...core.world import Observation, World
 from ...space.camera import yaw
 from .costs import Cost, distance_to
@@ -22,7 +24,8 @@ class NoRoute(PlanningError):
 
 NEAR_M, FACING = 0.5, 0.35  # metres, and radians of heading, within which a place is reached
 STRIDE_S = 0.115  # for which a walker holds a move
-STRIDE_M = 1.6  # between two known places that lie on one way; walls seldom stand between such
+STRIDE_M = 1.6  # between two places that a camera knows and that lie on one way; walls seldom stand between such
+STEP_M, AHEAD_M = 0.45, 0.9  # places where one can stand: from one to the next, nothing between; walked to at once
 CELL_M = 0.4  # places nearer to each other are one
 _STUCK_STEPS, _STUCK_M = 45, 0.35  # who has not come further than this in so many steps tries another way
 _DETOUR_M = 4.0  # by which a place that could not be walked to counts as further
@@ -33,29 +36,31 @@ _ANEW_STEPS = 70  # after which ways are looked for among the places that are kn
 @dataclass(frozen=True)
 class Routes:
     """Known places [N, 2] in metres, how far each is from the goal along them [N] (inf: no way is known), and the next one on the
-    way there, -1 for the goal itself."""
+    way there, -1 for the goal itself. stride_m: between two of them at most; ahead_m: of a way, what is walked to at once."""
 
     places: np.ndarray
     left_m: np.ndarray
     onward: np.ndarray = field(repr=False)
+    stride_m: float = STRIDE_M
+    ahead_m: float = math.inf
 
     def target(self, here: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
         """The place [2] to walk to next from `here`: as far along the best way as a stride reaches; and what is left to go."""
         straight = float(np.linalg.norm(goal - here))
-        if straight <= STRIDE_M or not len(self.places):
+        if straight <= self.stride_m or not len(self.places):
             return goal, straight
         away = np.linalg.norm(self.places - here, axis=1)
         leads = np.isfinite(self.left_m)
         if not leads.any():
             return goal, math.inf
-        near = leads & (away <= STRIDE_M)
+        near = leads & (away <= self.stride_m)
         if not near.any():
             near = leads & (away <= away[leads].min() + 1e-6)  # off all ways: to the nearest place on one
         total = np.where(near, away + self.left_m, np.inf)
         at = int(total.argmin())
         left = float(total[at])
-        while self.onward[at] >= 0 and away[self.onward[at]] <= STRIDE_M:
-            at = int(self.onward[at])
+        while (on := self.onward[at]) >= 0 and away[on] <= STRIDE_M and left - self.left_m[on] <= self.ahead_m:
+            at = int(on)
         return (goal if self.onward[at] < 0 and away[at] < 2 * CELL_M else self.places[at]), left
 
 
@@ -73,36 +78,41 @@ class Walk:
 
 
 def routes_to(goal: np.ndarray, known: np.ndarray, avoided: tuple[tuple[float, float], ...] = ()) -> Routes:
-    """Dijkstra (1959) from the goal [2] over known places [N, 2]; places near `avoided` ones count as further off."""
-    cells = np.round(known / CELL_M).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    places = known[np.sort(first)].astype(np.float64)
+    """Dijkstra (1959) from the goal [2] over known places [N, 4] (x, y, heading, kind); places near `avoided` ones count as further
+    off."""
+    walkable = bool(len(known)) and bool((known[:, 3] == WALKABLE).all())
+    stride, ahead = (STEP_M, AHEAD_M) if walkable else (STRIDE_M, math.inf)
+    known = known[:, :2]
+    if not walkable:
+        _, first = np.unique(np.round(known / CELL_M).astype(np.int64), axis=0, return_index=True)
+        known = known[np.sort(first)]
+    places = known.astype(np.float64)
     toll = np.zeros(len(places))
     for spot in avoided:
         toll += _DETOUR_M * (np.linalg.norm(places - np.asarray(spot), axis=1) < 0.8)
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     start = np.linalg.norm(places - goal, axis=1)
     left, onward = np.full(len(places), np.inf), np.full(len(places), -1)
-    queue = [(float(start[at]), at, -1) for at in np.flatnonzero(start <= STRIDE_M).tolist()]
+    queue = [(float(start[at]), at, -1) for at in np.flatnonzero(start <= stride).tolist()]
     heapq.heapify(queue)
     while queue:
         far, at, after = heapq.heappop(queue)
         if far >= left[at]:
             continue
         left[at], onward[at] = far, after
-        for other in np.flatnonzero(apart[at] <= STRIDE_M).tolist():
-            further = far + apart[at, other] + toll[other]
+        apart = np.linalg.norm(places - places[at], axis=1)
+        for other in np.flatnonzero(apart <= stride).tolist():
+            further = far + apart[other] + toll[other]
             if further < left[other]:
                 heapq.heappush(queue, (float(further), other, at))
-    return Routes(places, left, onward)
+    return Routes(places, left, onward, stride, ahead)
 
 
 class Navigator:
     """Walks to `place`, x and y in metres, in a world with the channel `pose`; there it turns to `heading` radians, if one is
     given.
 
-    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Routes lead over the places of the
-    channel `keyframes`, seen or remembered by the planner's world; without any, straight on. PlanningError where none is known.
+    planner: plans for a goal in `pose`, that of the next place on the way in place of its own. Routes lead over those of the
+    channel `places`, seen or remembered by the planner's world; without any, straight on. PlanningError where none is known.
     """
 
     def __init__(self, planner: Planner, place: tuple[float, float], heading: float | None = None):
@@ -139,14 +149,14 @@ class Navigator:
         return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
 
     def _known(self, observation: Observation, walk: Walk, entry: int) -> np.ndarray:
-        """The places [N, 2] where a camera was, as they are seen, or as the planner's world remembers them."""
-        if "keyframes" in observation:
-            held = observation["keyframes"][entry]
-        elif "keyframes" in self.planner.world.spec.channels and walk.thought.prior is not None:
-            held = self.planner.world.render(walk.thought.prior, ("keyframes",))["keyframes"][0]
+        """The places [N, 4] that are known, as they are seen, or as the planner's world remembers them."""
+        if "places" in observation:
+            held = observation["places"][entry]
+        elif "places" in self.planner.world.spec.channels and walk.thought.prior is not None:
+            held = self.planner.world.render(walk.thought.prior, ("places",))["places"][0]
         else:
-            return np.zeros((0, 2))
-        return held[held[:, 3] > 0, :2].double().cpu().numpy()
+            return np.zeros((0, 4))
+        return held[held[:, 3] > 0].double().cpu().numpy()
 
     def _noted(self, walk: Walk, here: np.ndarray) -> Walk:
         """Notices who does not get on: the place walked to is then avoided."""

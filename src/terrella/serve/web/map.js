@@ -1,4 +1,4 @@
-// The map of what a world remembers: its keyframes as small cones of sight, where the camera is, and its path.
+// The map of what a world knows: its keyframes as small cones of sight, floors as dots, where the camera is, and its path.
 
 const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274'], NAMES = ['', 'recorded', 'observed', 'imagined'];
 const NEAR_M = 40, LONGEST = 6000, STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20];
@@ -15,8 +15,8 @@ export class MemoryMap {
   }
 
   /** A chart event (see serve/protocol.py); `length` is how many steps are remembered of the way. */
-  show({ step, camera, known, keyframes }) {
-    if (keyframes) this.take(keyframes);
+  show({ step, camera, known, places }) {
+    if (places) this.take(places);
     if (step < this.step) this.path = this.path.filter((place) => place.step <= step);
     const last = this.path[this.path.length - 1];
     const jumped = last && Math.hypot(camera[0] - last.x, camera[1] - last.y) > 3;  // a new episode, or it was set elsewhere
@@ -44,7 +44,7 @@ export class MemoryMap {
     if (node.textContent !== text) node.textContent = text;
   }
 
-  /** The part of the world that the map shows: all keyframes near the camera, and the camera. */
+  /** The part of the world that the map shows: all places near the camera, and the camera. */
   fit(width, height, ratio) {
     const [x, y] = this.camera;
     let [x0, x1, y0, y1] = [x - 2, x + 2, y - 2, y + 2];
@@ -91,7 +91,7 @@ export class MemoryMap {
     }
   }
 
-  /** What changes seldom: the ground, the keyframes, the scale. */
+  /** What changes seldom: the ground, the places, the scale. */
   drawLayer(width, height, ratio) {
     this.layer = Object.assign(document.createElement('canvas'), { width, height });
     const context = this.layer.getContext('2d'), { scale } = this.box;

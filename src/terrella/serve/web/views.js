@@ -85,6 +85,6 @@ export class Views {
   /** Figures for tests. */
   get figures() {
     const { map, places, mosaic } = this;
-    return { shown: !$('map').hidden, step: map.step, camera: places.camera, keyframes: places.keys.length, path: places.path.length, size: mosaic.size };
+    return { shown: !$('map').hidden, step: map.step, camera: places.camera, places: places.keys.length, path: places.path.length, size: mosaic.size };
   }
 }
