@@ -36,6 +36,7 @@ from ..measure import (
     words_of,
     write_report,
 )
+from ..worlds.splat import SplatWorld
 from .named import Device, Fast, device_of, load_named
 from .say import Json, Seed, result, say
 
@@ -113,7 +114,8 @@ def carded(
 def arms_of(name: str, device: str, fast: bool, quick: bool) -> tuple[dict[str, World], dict[str, World]]:
     """The world, with its memory and without where it has one; and more of which only memory is asked."""
     world = load_named(name, device, fast=fast)
-    if library.is_truth(name) or "pose" not in world.spec.observes or "places" not in world.spec.channels:
+    remembers = {"places", "known"} <= set(world.spec.channels) and not isinstance(world, SplatWorld)
+    if library.is_truth(name) or "pose" not in world.spec.observes or not remembers:
         return {"world": world}, {}
     if quick:
         return {"memory": world}, {}

@@ -1,6 +1,7 @@
-// The map of what a world knows: its keyframes as small cones of sight, floors as dots, where the camera is, and its path.
+// The map of what a world knows: its keyframes as small cones of sight, floors as tiles, where the camera is, and its path.
 
-const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274'], NAMES = ['', 'recorded', 'observed', 'imagined'];
+const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274', '#4a5366'];
+const NAMES = ['', 'recorded', 'observed', 'imagined', 'walkable'], WALKABLE = 4;
 const NEAR_M = 40, LONGEST = 6000, STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20];
 
 export class MemoryMap {
@@ -102,6 +103,12 @@ export class MemoryMap {
       const [u, v] = this.at(x, y);
       if (u < -reach || u > width + reach || v < -reach || v > height + reach) continue;
       context.fillStyle = COLOURS[kind] ?? '#ffffff';
+      if (kind === WALKABLE) {  // a tile of floor
+        const side = 0.38 * scale;
+        context.globalAlpha = 0.6;
+        context.fillRect(u - side / 2, v - side / 2, side, side);
+        continue;
+      }
       context.globalAlpha = kind === 1 ? 0.16 : 0.42;
       context.beginPath();
       context.moveTo(u, v);
