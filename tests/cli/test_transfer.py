@@ -53,6 +53,25 @@ def test_a_pair_is_carried_over_and_goes_on_where_it_was(tmp_path, capsys, few):
     assert code == 2 and "another experiment" in err and "dial" in err
 
 
+def test_what_one_installation_began_another_continues(tmp_path, capsys, few, monkeypatch):
+    import shutil
+
+    from terrella.cli import transfer
+
+    words = ["transfer", "--practice", 1, "--episodes", 2, "--seeds", 1, "--out", tmp_path / "t", "--json"]
+    arms = ["--arms", "nominal"]
+    first = json.loads(ran(capsys, *words, *arms)[1])
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(transfer.BUNDLED, elsewhere)
+    monkeypatch.setattr(transfer, "BUNDLED", elsewhere)
+    again = json.loads(ran(capsys, *words, *arms)[1])
+    assert again["gap"].startswith(str(elsewhere)) and again["arms"] == first["arms"]
+    ranges = elsewhere / "arm_randomised.toml"
+    ranges.write_text(ranges.read_text().replace("0.7, 1.1", "0.8, 1.1"))  # of the same name, and yet another
+    code, _, err = ran(capsys, *words, *arms)
+    assert code == 2 and "another experiment (randomise" in err and "hash" not in err
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [

@@ -185,11 +185,13 @@ def check_pair(asked: Experiment) -> None:
 
 
 def same_as_before(folder: Path, asked: Experiment) -> None:
-    """Notes what is asked in the folder; TerrellaError where it holds something else, or another real one."""
+    """Notes what is asked in the folder; TerrellaError where it holds something else, or another real one. Files are what they
+    hold, not where they lie: what one installation began, another continues."""
     file, mine = folder / "asked.json", {name: value for name, value in asdict(asked).items() if name not in FREE}
+    mine["contents"] = _contents(asked)
     if file.is_file():
         before = json_text.loads(file.read_text(encoding="utf-8"))
-        other = [f"{name} {before.get(name)}, not {value}" for name, value in mine.items() if before.get(name) != value]
+        other = [f"{name} {before.get(name)}, not {mine[name]}" for name in _different(before, mine)]
         if other:
             raise TerrellaError(
                 f"{folder} holds another experiment ({'; '.join(other)}); repeat it, or give another --out."
@@ -197,6 +199,29 @@ def same_as_before(folder: Path, asked: Experiment) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     write_json(file, mine)
+
+
+def _contents(asked: Experiment) -> dict[str, str]:
+    """sha256 of what the simulator is and of what is randomised; the real one and its gap have theirs, `hash`."""
+    ranges = real_hash(asked.sim, asked.randomise, 1.0) if asked.randomise else ""
+    return {"sim": real_hash(asked.sim, "", 0.0), "randomise": ranges}
+
+
+def _different(before: Mapping[str, Any], mine: Mapping[str, Any]) -> list[str]:
+    """The names under which another experiment was asked for. Folders of before there were `contents` are told by file names."""
+    held, found = before.get("contents", {}), []
+    for name, value in mine.items():
+        was = before.get(name)
+        if name in ("real", "gap"):
+            same = before.get("hash") == mine["hash"]
+        elif name in held:
+            same = held[name] == mine["contents"][name]
+        else:
+            same = (
+                name == "contents" or was == value or (name == "randomise" and Path(str(was)).name == Path(value).name)
+            )
+        found += [] if same else [name]
+    return found
 
 
 def _report(folder: Path, asked: Experiment, found: Mapping[int, Mapping[str, Any]], json: bool) -> None:
