@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from terrella.cli import main
-from terrella.cli.space import place_of
+from terrella.cli.space import compared_with, place_of
 from terrella.library import load
 from terrella.serve.door import make_server, open_port
 from terrella.serve.place import PAGE, PlacePage, build_place, bundled
@@ -102,7 +102,7 @@ def test_the_page_says_only_what_it_should(tmp_path):
     page = PlacePage(place_of(str(tmp_path / "w")))
     text = page.html([{"select": {"all": True}, "do": "delete", "note": "</script><script>"}]).decode()
     assert "unsafe" not in page.policy and "http" not in page.policy
-    assert text.count("</script>") == 4 and "<title>a &lt;room&gt;" in text and "{{" not in text
+    assert text.count("</script>") == 5 and "<title>a &lt;room&gt;" in text and "{{" not in text
 
 
 def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
@@ -248,6 +248,49 @@ def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened,
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "again.html")]) == 0
     again = opened((tmp_path / "again.html").as_uri())
     assert np.array_equal(rows(again.evaluate(COLUMNS)["means"]), rows(after.gaussians.means))
+
+    for name, least in (("taken.ply", 40), ("taken.spz", 30)):  # exported, imported again, and compared
+        assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / name)]) == 0
+        assert main(["space", "import", str(tmp_path / name), "--out", str(tmp_path / f"{name}.w")]) == 0
+        html = PlacePage(place_of(str(tmp_path / "w")), compared_with(str(tmp_path / f"{name}.w")))
+        (tmp_path / f"{name}.html").write_bytes(html.html(read_edits(tmp_path / "w")))
+        beside = opened((tmp_path / f"{name}.html").as_uri())
+        beside.keyboard.press("KeyB")
+        until(beside, "terrella.idle && (terrella.compare.db ?? 0) > 0")
+        assert least < beside.evaluate("Math.min(terrella.compare.db, 99)") <= 99, name
+
+
+def test_a_place_is_compared_with_what_it_was_and_with_another(tmp_path, opened):
+    page = opened(exported(tmp_path, 3000))
+    page.keyboard.press("KeyB")
+    assert not page.evaluate("terrella.compare.open") and "not edited" in page.inner_text("#toast")
+    page.evaluate("terrella.stand([1.0, 2.0, 1.6], 0.2, -0.3)")
+    page.evaluate(
+        "terrella.editor.change(() => terrella.story.add({ select: { all: 0 }, do: 'recolour', colour: [1, 0, 0] }))"
+    )
+    page.keyboard.press("KeyB")
+    until(page, "terrella.idle && terrella.compare.db !== null")
+    assert 3 < page.evaluate("terrella.compare.db") < 25 and page.inner_text("#other-name") == "before its edits"
+    before = page.evaluate("document.getElementById('other').style.clipPath")
+    page.mouse.move(160, 45)
+    page.mouse.down()
+    page.mouse.move(240, 45, steps=3)
+    page.mouse.up()
+    assert abs(page.evaluate("terrella.compare.at") - 0.75) < 0.02
+    assert page.evaluate("document.getElementById('other').style.clipPath") != before
+    page.keyboard.press("Control+z")
+    until(page, "terrella.idle && terrella.compare.db === Infinity")
+    assert page.inner_text("#compare-db") == "the same"
+    page.keyboard.press("KeyB")
+    assert page.evaluate("document.getElementById('compare').hidden")
+
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "other.ply")]) == 0
+    html = PlacePage(place_of(str(tmp_path / "w")), compared_with(str(tmp_path / "other.ply"))).html([])
+    (tmp_path / "beside.html").write_bytes(html)
+    page = opened((tmp_path / "beside.html").as_uri())
+    page.keyboard.press("KeyB")
+    until(page, "terrella.idle && terrella.compare.db !== null")
+    assert page.inner_text("#other-name") == "other.ply" and page.evaluate("terrella.compare.db") > 40
 
 
 def test_a_server_keeps_the_edits(tmp_path, opened, serving):

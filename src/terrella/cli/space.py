@@ -153,12 +153,18 @@ def export(
 
 
 def view(
-    world: Positional[str], port: Port = 8767, host: Host = "127.0.0.1", token: Token = None, json: Json = False
+    world: Positional[str],
+    beside: str | None = None,
+    port: Port = 8767,
+    host: Host = "127.0.0.1",
+    token: Token = None,
+    json: Json = False,
 ) -> None:
     """Walk in a place and edit it by hand, on a page that your browser draws. Edits that are saved there are the world's own.
 
     Args:
         world: A world of Gaussians: its folder, or the run that made it.
+        beside: Another world of Gaussians, or a file of them (as `space import` reads them), that the page compares it with.
     """
     from ..serve.place import serve_place
 
@@ -170,7 +176,14 @@ def view(
     def ready(address: str) -> None:
         result({"address": address, "gaussians": len(place.gaussians)}, json, f"{place.name}: open {address}")
 
-    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready)
+    other = None if beside is None else compared_with(beside)
+    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready, other)
+
+
+def compared_with(name: str) -> Place:
+    """What a page compares a place with: a world of Gaussians as its edits have it, or a file in the axes usual for its kind."""
+    file = Path(name)
+    return shown_place(world_of(read_scene(file), file.name, {}, SplatConfig()) if file.is_file() else open_splat(name))
 
 
 def place_of(world: str) -> Place:

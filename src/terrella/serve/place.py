@@ -65,10 +65,15 @@ class Place:
 
 
 class PlacePage:
-    """The page of a place. It loads nothing from anywhere: `policy` is its Content-Security-Policy."""
+    """The page of a place, to compare with `beside` if that is given. It loads nothing from anywhere: `policy` is its
+    Content-Security-Policy."""
 
-    def __init__(self, place: Place):
-        self._place = place
+    def __init__(self, place: Place, beside: Place | None = None):
+        self._place, self._beside, packed = place, None, b""
+        if beside is not None:
+            packed = gzip.compress(_packed(beside, torch.ones(len(beside.gaussians), dtype=torch.bool)), 6, mtime=0)
+            self._beside = {"count": len(beside.gaussians), "name": beside.name}
+        self._compared = base64.b64encode(packed).decode()
         first = len(place.gaussians) if len(place.gaussians) <= WHOLE else FIRST
         self._packed, *parts = packed_place(place, first)
         self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
@@ -88,11 +93,11 @@ class PlacePage:
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits),
-            "objects": list(place.names), "samples": samples().tolist(),
+            "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside,
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
-            "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data, "rest": self._rest,
+            "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data, "rest": self._rest, "beside": self._compared,
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
         return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
@@ -178,10 +183,12 @@ def build_place(
     save: Callable[[str], None],
     host: str = "127.0.0.1",
     token: str | None = None,
+    beside: Place | None = None,
 ) -> Starlette:
     """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
-    saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows."""
-    page, alone, frames = PlacePage(place), threading.Lock(), Frames(place.gaussians, place.objects, edits)
+    saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows.
+    `beside` is what the place can be compared with."""
+    page, alone, frames = PlacePage(place, beside), threading.Lock(), Frames(place.gaussians, place.objects, edits)
 
     def kept(content: bytes) -> None:
         told = json.loads(content)
@@ -223,11 +230,12 @@ def serve_place(
     host: str = "127.0.0.1",
     token: str | None = None,
     on_ready: Callable[[str], None] | None = None,
+    beside: Place | None = None,
 ) -> None:
-    """Serves the page of a place until interrupted; `edits` and `save` as `build_place` has them.
+    """Serves the page of a place until interrupted; `edits`, `save` and `beside` as `build_place` has them.
 
     On any address but this machine's own a token is mandatory, for the page can change the place: where none is given one is
     made, and the address carries it. ServeError where the port is taken.
     """
-    build = lambda token: build_place(place, edits, save, host, token)  # noqa: E731
+    build = lambda token: build_place(place, edits, save, host, token, beside)  # noqa: E731
     serve_page(build, host, port, token, on_ready, websockets=False)

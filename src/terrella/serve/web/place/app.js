@@ -2,6 +2,7 @@
 
 import { Boxes } from './boxes.js';
 import { axes, matrices } from './camera.js';
+import { Compare } from './compare.js';
 import { Drawing, NEAR } from './draw.js';
 import { Editor } from './editor.js';
 import { follow } from './follow.js';
@@ -60,6 +61,7 @@ function run({ drawing, source, story, solid: first }) {
     moved: wake, tool: (name, event) => editor.open && editor.selecting.handle(name, event),
     look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
   });
+  const compare = new Compare(redraw);
   const editor = new Editor(story, drawing, world.objects, {
     changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep,
   });
@@ -88,6 +90,16 @@ function run({ drawing, source, story, solid: first }) {
     take(source);
   }
 
+  /** Draws beside the place another one, or itself as it was before its edits; or no more. */
+  async function contrast() {
+    if (compare.open) { compare.show(null); return; }
+    if (seen.stands > 1) { toast('The rest of the place comes first.'); return; }
+    if (!world.beside && !story.edits.length) { toast('It was not edited. `terrella space view PLACE --beside OTHER` compares it with another place or file.'); return; }
+    if (world.beside) seen.beside ??= unpackScene(new Reader(await inflate(decoded($('beside').textContent))), world.beside.count);
+    seen.sorted = '';
+    compare.show(seen.beside ?? source, world.beside?.name ?? 'before its edits');
+  }
+
   function lens() {
     const aspect = innerWidth / innerHeight, wide = Math.min(WIDEST, TALL * aspect);
     return { wide, tall: wide / aspect };
@@ -107,8 +119,8 @@ function run({ drawing, source, story, solid: first }) {
     Object.assign(seen, { last: time, before: seen.last, dirty: seen.dirty || (seen.moves && !moves), moves });  // at rest it is drawn once more
     if (moves && !drawing.remote) adapt(time - seen.before); else if (seen.share < 1 && !seen.dirty && !sorter.busy) Object.assign(seen, { share: Math.min(1, 3 * seen.share), dirty: true });
     sort();
-    if ((moves || seen.dirty) && drawing.ready) paint();  // till it is ordered, what is on the screen stays
-    if (moves || seen.dirty || sorter.busy) requestAnimationFrame(frame); else { seen.running = false; figures(); }
+    if ((moves || seen.dirty) && drawing.ready && compare.ready) paint();  // till it is ordered, what is on the screen stays
+    if (moves || seen.dirty || sorter.busy || compare.busy || seen.share < 1) requestAnimationFrame(frame); else { seen.running = false; figures(); }
   }
 
   /** Coarser while it moves where the browser draws slowly, and sharper and sharper when it stands still. */
@@ -126,6 +138,7 @@ function run({ drawing, source, story, solid: first }) {
     if (key === seen.sorted) return;
     seen.sorted = key;
     sorter.ask({ ...sight(), most });
+    compare.ask({ ...sight(), most });
     seen.dirty = true;
   }
 
@@ -136,7 +149,9 @@ function run({ drawing, source, story, solid: first }) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     seen.dirty = false;
     drawing.clear();
-    drawing.paint({ ...matrices(walker.eye, lens()), eye: walker.eye, lens: lens(), moves: seen.moves }, [0, 0, width, height], editor.wires);
+    const view = { ...matrices(walker.eye, lens()), eye: walker.eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
+    drawing.paint(view, part, editor.wires);
+    compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
     seen.painted += 1;
     seen.times.push(performance.now());
@@ -157,9 +172,9 @@ function run({ drawing, source, story, solid: first }) {
   const tint = () => { drawing.tint = 1 - drawing.tint; $('legend').hidden = !drawing.tint; flip('tint', !!drawing.tint); };
   const showMap = () => { $('minimap').hidden = !$('minimap').hidden; flip('map-open', !$('minimap').hidden); };
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
-  const does = { home, fly, edit: () => editor.toggle(), tint, 'map-open': showMap, full };
+  const does = { home, fly, edit: () => editor.toggle(), tint, compared: contrast, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
@@ -189,19 +204,19 @@ function run({ drawing, source, story, solid: first }) {
     }).catch((error) => toast(error.message));
   }
   if (drawing.remote) {
-    for (const id of ['edit', 'tint']) $(id).hidden = true;
+    for (const id of ['edit', 'tint', 'compared']) $(id).hidden = true;
     toast(world.watch ? 'This browser has no WebGL2: watch the fit in one that has it.' : 'This browser has no WebGL2, so the server draws: walk as ever; editing needs a browser that has it.');
   }
   if (world.watch) {
     $('making').hidden = false;
-    $('edit').hidden = true;
+    $('edit').hidden = $('compared').hidden = true;
     follow(world.watch, { newer, over: () => { $('making').hidden = true; toast('Nothing newer comes: the fit is done, or was stopped.'); } });
   }
 
   // the state of the page, for whoever drives it by a script
   window.terrella = {
-    story, editor, drawing, walker, sorter, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
-    get idle() { return !seen.running && !seen.dirty && drawing.ready && seen.stands === 1; }, get eye() { return walker.eye; },
+    story, editor, drawing, walker, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
+    get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {
       paint();
