@@ -1,9 +1,10 @@
-"""stable-worldmodel's own harness judges planners in a latent world that `terrella train latent` learned of TwoRoom's pictures.
+"""stable-worldmodel's own harness judges planners in a latent world that `terrella train latent` learned of pictures.
 
-    make judge                                                       # all of it, in an environment of its own
+    make judge                                                       # all of it, in an environment of its own: TwoRoom
+    make judge ARGS="--task push --out judged/push"                  # PushT
     make judge ARGS="--starts 400 --seeds 5 --arms reaching"         # more starts, some of the arms
 
-It records TwoRoom's own noisy expert, trains a world and a goal-conditioned policy on pictures and actions alone, and plays starts
+It records the task's own recorder, trains a world and a goal-conditioned policy on pictures and actions alone, and plays starts
 of other episodes. A table in Markdown, success with Wilson's interval: by the published protocol (50 starts, a goal 25 steps ahead
 in the recording, 50 steps, CEM of 300 plans in 30 rounds), and with starts whose goal is not already reached. What stands there
 already (a recording, a run) is not made again.
@@ -22,9 +23,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import judge_world as two_room
 import numpy as np
 import torch
+from judge_harness import Acting, Held, Recorded, Task, evaluated
+from judge_tasks import TASKS
 from stable_worldmodel import PlanConfig
 from stable_worldmodel.policy import BasePolicy, RandomPolicy, WorldModelPolicy
 from stable_worldmodel.solver import CEMSolver
@@ -36,7 +38,6 @@ from terrella.core import World
 from terrella.measure.statistics import wilson
 
 OFFSET, BUDGET, BLOCK, HORIZON = 25, 50, 5, 5
-PUBLISHED = "LeWM 87, DINO-WM 100, a random floor of about 26 (the papers' own training and starts)"
 
 
 def command(*words: str) -> float:
@@ -54,29 +55,20 @@ def _times() -> tuple[float, float]:
     return used.ru_utime, used.ru_stime
 
 
-def prepared(folder: Path, episodes: int, seed: int, steps: list[str]) -> tuple[World, GoalActor, dict[str, float]]:
-    """The recording, the world and the policy of a seed; made where they are missing. And the processor seconds of training."""
+def prepared(
+    task: Task, folder: Path, episodes: int, seed: int, steps: list[str], reach: list[str]
+) -> tuple[World, GoalActor, dict[str, float]]:
+    """The world and the policy of a seed, made where they are missing, and the processor seconds of training."""
     recording, run, goals, notes = (folder / f"{name}-{seed}" for name in ("recording", "world", "goals", "cost.json"))
     spent = json.loads(notes.read_text()) if notes.exists() else {}
     if not (recording / "meta" / "info.json").exists():
-        with two_room.Recorded(recording) as writer:
-            two_room.collect(writer, episodes, 1000 * seed)
+        with Recorded(task, recording) as writer:
+            task.collect(writer, episodes, 1000 * seed)
     if not (run / "world" / "world.json").exists():
         words = ("train", "latent", str(recording), "--out", str(run), "--seed", str(seed), *steps)
         spent["world"] = command(*words)
     if not (goals / "policy" / "policy.json").exists():
-        words = (
-            "--in",
-            str(run),
-            "--from",
-            str(recording),
-            "--out",
-            str(goals),
-            "--seed",
-            str(seed),
-            "--steps",
-            "1000",
-        )
+        words = ("--in", str(run), "--from", str(recording), "--out", str(goals), "--seed", str(seed), *reach)
         spent["goals"] = command("train", "goals", *words)
     notes.write_text(json.dumps(spent))
     world = terrella.load(run)
@@ -91,7 +83,7 @@ def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], Ba
         return WorldModelPolicy(solver, PlanConfig(HORIZON, HORIZON, action_block=BLOCK, warm_start=True))
 
     def ours(make: Callable[[Cost], Any]) -> Callable[[], BasePolicy]:
-        return lambda: two_room.Acting(lambda goals: make(distance_to(world, {"rgb": goals}, "last")), seed)
+        return lambda: Acting(lambda goals: make(distance_to(world, {"rgb": goals}, "last")), seed)
 
     varied = GoalActor(actor.network, world.spec, varied=True)
     config = SearchConfig("icem", samples=64, iterations=5, horizon=HORIZON, block=BLOCK)
@@ -106,21 +98,20 @@ def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], Ba
     }
 
 
-def judged(held: two_room.Held, policy: BasePolicy, count: int, seed: int, unsolved: bool) -> dict[str, Any]:
-    """Success over `count` starts: of all, strictly (see `two_room.evaluated`), strictly of those with a goal in the other
-    room; and the milliseconds of a decision."""
+def judged(held: Held, policy: BasePolicy, count: int, seed: int, unsolved: bool) -> dict[str, Any]:
+    """Success over `count` starts: of all, by honest ways, by those of the hard goals; and the milliseconds of a decision."""
     starts = held.starts(OFFSET, count, seed, unsolved)
     began = time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):
-        reached, strictly = two_room.evaluated(policy, held, starts, OFFSET, BUDGET)
-    other = held.crossing(*starts, OFFSET)
+        reached, strictly = evaluated(policy, held, starts, OFFSET, BUDGET)
+    hard = held.task.hard(*held.goals(starts, OFFSET))
     ms = float(np.median(getattr(policy, "ms", [np.nan])))
     return {
         "reached": int(reached.sum()),
         "strictly": int(strictly.sum()),
         "of": count,
-        "crossed": int(strictly[other].sum()),
-        "crossings": int(other.sum()),
+        "hard_reached": int(strictly[hard].sum()),
+        "hard": int(hard.sum()),
         "ms": None if np.isnan(ms) else round(ms, 2),
         "processor_s": round(time.process_time() - began, 1),
     }
@@ -135,22 +126,21 @@ def _share(reached: int, count: int) -> str:
 
 def line(name: str, rows: list[dict[str, Any]]) -> str:
     """A row of the table: all seeds together."""
-    total = {key: sum(row[key] for row in rows) for key in ("reached", "strictly", "of", "crossed", "crossings")}
+    total = {key: sum(row[key] for row in rows) for key in ("reached", "strictly", "of", "hard_reached", "hard")}
     ms = [row["ms"] for row in rows if row["ms"] is not None]
     shares = ", ".join(f"{100 * row['reached'] / row['of']:.1f}" for row in rows)
     taken = f"{np.median(ms):.1f}" if ms else ""
     whole, strictly = (_share(total[key], total["of"]) for key in ("reached", "strictly"))
-    crossed = _share(total["crossed"], total["crossings"])
-    return f"| {name} | {whole} | {shares} | {strictly} | {crossed} of {total['crossings']} | {taken} |"
+    hard = _share(total["hard_reached"], total["hard"])
+    return f"| {name} | {whole} | {shares} | {strictly} | {hard} of {total['hard']} | {taken} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS, default="rooms")
     parser.add_argument("--out", type=Path, default=Path("judged"))
-    parser.add_argument("--episodes", type=int, default=300, help="of the expert, that are recorded to learn from")
-    parser.add_argument(
-        "--held", type=int, default=200, help="further episodes of the expert, whose rows are starts and goals"
-    )
+    parser.add_argument("--episodes", type=int, default=300, help="that are recorded to learn from")
+    parser.add_argument("--held", type=int, default=200, help="further episodes, whose rows are starts and goals")
     parser.add_argument("--starts", type=int, default=50)
     parser.add_argument("--seeds", type=int, default=1, help="each with its own recording, training, starts and draws")
     parser.add_argument(
@@ -159,20 +149,27 @@ def main() -> None:
     parser.add_argument(
         "--train", nargs="*", default=["steps", "1200"], help="words for `terrella train latent`, without --"
     )
+    parser.add_argument(
+        "--reach", nargs="*", default=["steps", "1000"], help="words for `terrella train goals`, without --"
+    )
     asked = parser.parse_args()
+    task = TASKS[asked.task]
     torch.set_num_threads(1)
     asked.out.mkdir(parents=True, exist_ok=True)
-    more = [f"--{word}" if number % 2 == 0 else word for number, word in enumerate(asked.train)]
-    trained = [prepared(asked.out, asked.episodes, seed, more) for seed in range(asked.seeds)]
-    with two_room.Held() as held:
-        two_room.collect(held, asked.held, 777_000)
+    train, reach = (
+        [f"--{word}" if number % 2 == 0 else word for number, word in enumerate(words)]
+        for words in (asked.train, asked.reach)
+    )
+    trained = [prepared(task, asked.out, asked.episodes, seed, train, reach) for seed in range(asked.seeds)]
+    with Held(task) as held:
+        task.collect(held, asked.held, 777_000)
     for seed, (_, _, spent) in enumerate(trained):
         took = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent.items())
         print(f"Training of seed {seed} took {took} processor minutes.", flush=True)
     found: dict[str, dict[str, list]] = {}
     for kind, unsolved in (("published protocol", False), ("unsolved starts", True)):
-        print(f"\n{kind}: a goal {OFFSET} steps ahead, {BUDGET} steps; published: {PUBLISHED}\n")
-        print("| | success % | by seed | strictly | strictly, in the other room | ms a decision |")
+        print(f"\n{kind}: a goal {OFFSET} steps ahead, {BUDGET} steps; published: {task.published}\n")
+        print(f"| | success % | by seed | strictly | strictly, {task.hard_means} | ms a decision |")
         print("| --- | --- | --- | --- | --- | --- |")
         for name in asked.arms:
             rows = [

@@ -1,10 +1,12 @@
-"""stable-worldmodel's TwoRoom as `judge.py` needs it: its expert's episodes as a recording, and starts taken from others.
+"""stable-worldmodel's own harness as `judge.py` needs it: a task's episodes as a recording, and starts of others.
 
 Imported in the environment of `make judge` alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,45 +23,58 @@ for _name in ("nms", "qnms"):
     _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 import stable_worldmodel as swm  # noqa: E402
-from stable_worldmodel.envs.two_room import ExpertPolicy  # noqa: E402
 from stable_worldmodel.policy import BasePolicy  # noqa: E402
 
-ENVIRONMENT, SIZE, LONGEST = "swm/TwoRoom-v1", (64, 64), 100
-REACHED = 16.0  # pixels of 224: what TwoRoom calls reached
-WALL = 112.0  # where the wall between the rooms stands
-DOOR_MARGIN = 1.75  # pixels beside a door that TwoRoom still lets through
+SIZE, LONGEST = (64, 64), 100
 AT_ONCE = 25  # episodes that are collected side by side
 
 
-def opened(count: int) -> Any:
-    """`count` TwoRooms side by side, in stable-worldmodel's own harness."""
-    return swm.World(ENVIRONMENT, num_envs=count, image_shape=SIZE, max_episode_steps=LONGEST)
+@dataclass(frozen=True)
+class Task:
+    """What differs between environments. States are arrays [..., S] of the environment's own `state`.
 
+    recorder(seed) collects what is learned from; solved(states, goals): whether goals count as reached already;
+    hard(states, goals): of the kind that `hard_means` names; kept(way [T, S], goal, environment): whether a way was an honest one.
+    """
 
-def collect(writer: Any, episodes: int, seed: int) -> None:
-    """Episodes of the expert that comes with TwoRoom, as noisy as its authors record it."""
-    world = opened(AT_ONCE)
-    world.set_policy(ExpertPolicy(action_noise=2.0, action_repeat_prob=0.05, seed=seed))
-    world.collect(writer=writer, episodes=episodes, seed=seed)
-    world.close()
+    environment: str
+    goal: str
+    action_names: tuple[str, ...]
+    recorder: Callable[[int], BasePolicy]
+    solved: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    hard: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    hard_means: str
+    kept: Callable[[np.ndarray, np.ndarray, Any], bool]
+    published: str
+
+    def opened(self, count: int) -> Any:
+        """`count` environments side by side, in stable-worldmodel's own harness."""
+        return swm.World(self.environment, num_envs=count, image_shape=SIZE, max_episode_steps=LONGEST)
+
+    def collect(self, writer: Any, episodes: int, seed: int) -> None:
+        """Episodes of the recorder."""
+        world = self.opened(AT_ONCE)
+        world.set_policy(self.recorder(seed))
+        world.collect(writer=writer, episodes=episodes, seed=seed)
+        world.close()
 
 
 class Recorded:
     """A writer for `World.collect`: pictures and actions, and nothing else, become a recording of Terrella's."""
 
-    def __init__(self, out: Path):
+    def __init__(self, task: Task, out: Path):
         box = spaces.Box(0, 255, (*SIZE, 3), np.uint8)
         spec = Spec(
-            f"gym:stable_worldmodel:{ENVIRONMENT}",
+            f"gym:stable_worldmodel:{task.environment}",
             spaces.Box(-1, 1, (2,), np.float32),
             {"rgb": box, "done": DONE},
             (),
             0.1,
-            action_names=("right", "down"),
+            action_names=task.action_names,
             max_episode_steps=LONGEST,
         )
         layout = Layout.of(spec)
-        self._recorder = Recorder(out, Layout(**{**vars(layout), "pictures": "png"}), "reach the target", "discard")
+        self._recorder = Recorder(out, Layout(**{**vars(layout), "pictures": "png"}), task.goal, "discard")
 
     def __enter__(self) -> Recorded:
         return self
@@ -82,8 +97,8 @@ class Recorded:
 class Held(swm.data.Dataset):
     """Episodes that nobody trained on, kept in memory: where evaluation begins, and what its goals are."""
 
-    def __init__(self) -> None:
-        self.held: list[dict[str, np.ndarray]] = []
+    def __init__(self, task: Task) -> None:
+        self.task, self.held = task, list[dict[str, np.ndarray]]()
 
     @property
     def column_names(self) -> list[str]:
@@ -104,23 +119,23 @@ class Held(swm.data.Dataset):
         return found | {"pixels": found["pixels"].permute(0, 3, 1, 2)}
 
     def starts(self, offset: int, count: int, seed: int, unsolved: bool) -> tuple[list[int], list[int]]:
-        """`count` (episode, row) with a goal `offset` rows later, drawn without repetition; `unsolved`: further than REACHED."""
+        """`count` (episode, row) with a goal `offset` rows later, drawn without repetition; `unsolved`: not reached already."""
         found = [
             (number, row)
             for number, one in enumerate(self.held)
             for row in range(len(one["state"]) - offset)
-            if not unsolved or np.linalg.norm(one["state"][row + offset] - one["state"][row]) >= REACHED
+            if not (unsolved and self.task.solved(one["state"][row], one["state"][row + offset]))
         ]
         if len(found) < count:
             raise SystemExit(f"{len(found)} starts were collected, and {count} are asked for: collect more.")
         chosen = np.random.default_rng(seed).permutation(len(found))[:count]
         return [found[at][0] for at in chosen], [found[at][1] for at in chosen]
 
-    def crossing(self, episodes: list[int], rows: list[int], offset: int) -> np.ndarray:
-        """bool: whose goal is in the other room."""
-        states = [self.held[number]["state"] for number in episodes]
-        x = [(one[row][0] < WALL) != (one[row + offset][0] < WALL) for one, row in zip(states, rows)]
-        return np.array(x)
+    def goals(self, starts: tuple[list[int], list[int]], offset: int) -> tuple[np.ndarray, np.ndarray]:
+        """The states [n, S] at starts, and those of their goals."""
+        states = [self.held[number]["state"] for number in starts[0]]
+        pairs = [(one[row], one[row + offset]) for one, row in zip(states, starts[1])]
+        return np.stack([first for first, _ in pairs]), np.stack([last for _, last in pairs])
 
 
 class Acting(BasePolicy):
@@ -152,31 +167,30 @@ CALLABLES = [
 
 
 class _Watched(BasePolicy):
-    """A policy, and where the agent was at each of its decisions: places, each [n, 2] in pixels of 224."""
+    """A policy, and the states at each of its decisions, each [n, S]."""
 
     def __init__(self, policy: Any):
         super().__init__()
-        self.policy, self.places = policy, []
+        self.policy, self.states = policy, []
 
     def set_env(self, env: Any) -> None:
         super().set_env(env)
         self.policy.set_env(env)
 
     def get_action(self, infos: dict, **kwargs: Any) -> np.ndarray:
-        self.places.append(_places(infos))
+        self.states.append(_states(infos))
         return self.policy.get_action(infos, **kwargs)
 
 
-def _places(infos: dict) -> np.ndarray:
-    return np.array(infos["state"][:, -1, :2], np.float64)
+def _states(infos: dict) -> np.ndarray:
+    return np.array(infos["state"][:, -1], np.float64)
 
 
 def evaluated(
     policy: Any, held: Held, starts: tuple[list[int], list[int]], offset: int, budget: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """bool [n] twice: which starts reached their goals, by stable-worldmodel's own `evaluate`; and strictly, by a way that nowhere
-    cuts the wall, and into the goal's own room (within REACHED may be through the wall)."""
-    world, watched = opened(len(starts[0])), _Watched(policy)
+    """bool [n] twice: which starts reached their goals, by stable-worldmodel's own `evaluate`; and by an honest way (Task.kept)."""
+    world, watched = held.task.opened(len(starts[0])), _Watched(policy)
     world.set_policy(watched)
     np.random.seed(0)
     found = world.evaluate(
@@ -187,20 +201,9 @@ def evaluated(
         eval_budget=budget,
         callables=CALLABLES,
     )
-    goals = np.stack([held.held[number]["state"][row + offset][:2] for number, row in zip(*starts)])
-    ways = np.stack([*watched.places, _places(world.infos)], 1)
-    rooms = [one.unwrapped for one in world.envs.envs]
+    goals = held.goals(starts, offset)[1]
+    ways = np.stack([*watched.states, _states(world.infos)], 1)
+    played = [one.unwrapped for one in world.envs.envs]
     world.close()
     reached = np.asarray(found["episode_successes"], bool)
-    valid = [keeps_to_the_door(way, room) for way, room in zip(ways, rooms)]
-    return reached, reached & valid & ((ways[:, -1, 0] < WALL) == (goals[:, 0] < WALL))
-
-
-def keeps_to_the_door(way: np.ndarray, room: Any) -> bool:
-    """Whether a way [steps, 2] is in the wall's stripe only where a door is (with the margin that TwoRoom itself leaves)."""
-    shares = np.linspace(0, 1, 6)[:, None, None]
-    x, y = np.moveaxis(way[None, :-1] * (1 - shares) + way[None, 1:] * shares, 2, 0)
-    inside = abs(x - WALL) <= room.wall_thickness // 2
-    doors = zip(room.door_positions[: room.num_doors].tolist(), room.door_sizes[: room.num_doors].tolist())
-    open_ = np.any([abs(y - centre) <= half + DOOR_MARGIN for centre, half in doors], axis=0)
-    return not bool((inside & ~open_).any())
+    return reached, reached & [held.task.kept(way, goal, one) for way, goal, one in zip(ways, goals, played)]
