@@ -1,7 +1,7 @@
 """stable-worldmodel's own harness judges planners in a latent world that `terrella train latent` learned of pictures.
 
     make judge                                                       # all of it, in an environment of its own: TwoRoom
-    make judge ARGS="--task push --out judged/push"                  # PushT
+    make judge ARGS="--task push --out judged/push"                  # PushT; push-numbers sees its state in place of pictures
     make judge ARGS="--starts 400 --seeds 5 --arms reaching"         # more starts, some of the arms
 
 It records the task's own recorder, trains a world and a goal-conditioned policy on pictures and actions alone, and plays starts
@@ -75,7 +75,7 @@ def prepared(
     return world, GoalActor.load(goals, world.spec), spent
 
 
-def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], BasePolicy]]:
+def arms(task: Task, world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], BasePolicy]]:
     """Who is judged, by name."""
 
     def cem() -> BasePolicy:
@@ -83,7 +83,7 @@ def arms(world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], Ba
         return WorldModelPolicy(solver, PlanConfig(HORIZON, HORIZON, action_block=BLOCK, warm_start=True))
 
     def ours(make: Callable[[Cost], Any]) -> Callable[[], BasePolicy]:
-        return lambda: Acting(lambda goals: make(distance_to(world, {"rgb": goals}, "last")), seed)
+        return lambda: Acting(task, lambda goals: make(distance_to(world, goals, "last")), seed)
 
     varied = GoalActor(actor.network, world.spec, varied=True)
     config = SearchConfig("icem", samples=64, iterations=5, horizon=HORIZON, block=BLOCK)
@@ -173,7 +173,7 @@ def main() -> None:
         print("| --- | --- | --- | --- | --- | --- |")
         for name in asked.arms:
             rows = [
-                judged(held, arms(world, actor, seed)[name](), asked.starts, 42 + seed, unsolved)
+                judged(held, arms(task, world, actor, seed)[name](), asked.starts, 42 + seed, unsolved)
                 for seed, (world, actor, _) in enumerate(trained)
             ]
             found.setdefault(kind, {})[name] = rows

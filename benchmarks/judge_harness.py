@@ -34,7 +34,8 @@ class Task:
     """What differs between environments. States are arrays [..., S] of the environment's own `state`.
 
     recorder(seed) collects what is learned from; solved(states, goals): whether goals count as reached already;
-    hard(states, goals): of the kind that `hard_means` names; kept(way [T, S], goal, environment): whether a way was an honest one.
+    hard(states, goals): of the kind that `hard_means` names; kept(way [T, S], goal, environment): whether a way was an honest one;
+    numbers(states): what is seen in place of pictures, None where that is pictures.
     """
 
     environment: str
@@ -46,6 +47,11 @@ class Task:
     hard_means: str
     kept: Callable[[np.ndarray, np.ndarray, Any], bool]
     published: str
+    numbers: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def seen(self, pictures: np.ndarray, states: np.ndarray) -> dict[str, np.ndarray]:
+        """Pictures [n, H, W, 3] and states [n, S] as channels."""
+        return {"rgb": pictures} if self.numbers is None else {"observation": self.numbers(states).astype(np.float32)}
 
     def opened(self, count: int) -> Any:
         """`count` environments side by side, in stable-worldmodel's own harness."""
@@ -60,14 +66,16 @@ class Task:
 
 
 class Recorded:
-    """A writer for `World.collect`: pictures and actions, and nothing else, become a recording of Terrella's."""
+    """A writer for `World.collect`: what is seen and actions, and nothing else, become a recording of Terrella's."""
 
     def __init__(self, task: Task, out: Path):
-        box = spaces.Box(0, 255, (*SIZE, 3), np.uint8)
+        self._task, box = task, spaces.Box(0, 255, (*SIZE, 3), np.uint8)
+        if task.numbers is not None:
+            box = spaces.Box(-np.inf, np.inf, task.numbers(np.zeros(7)).shape, np.float32)
         spec = Spec(
             f"gym:stable_worldmodel:{task.environment}",
             spaces.Box(-1, 1, (2,), np.float32),
-            {"rgb": box, "done": DONE},
+            {"rgb" if task.numbers is None else "observation": box, "done": DONE},
             (),
             0.1,
             action_names=task.action_names,
@@ -84,13 +92,15 @@ class Recorded:
 
     def write_episodes(self, episodes: Any) -> None:
         for episode in episodes:
+            shown = self._task.seen(np.stack(episode["pixels"]), np.stack(episode["state"]))
             last = len(episode["pixels"]) - 1
-            for row, rgb in enumerate(episode["pixels"]):
+            for row in range(last + 1):
+                seen = {name: values[row] for name, values in shown.items()}
                 if row == last:
-                    self._recorder.add({"rgb": rgb})
+                    self._recorder.add(seen)
                     break
                 done = bool(episode["terminated"][row + 1])
-                self._recorder.add({"rgb": rgb}, episode["action"][row], 0.0, done)
+                self._recorder.add(seen, episode["action"][row], 0.0, done)
             self._recorder.end_episode()
 
 
@@ -139,25 +149,29 @@ class Held(swm.data.Dataset):
 
 
 class Acting(BasePolicy):
-    """A policy of Terrella's in stable-worldmodel's harness. policy_of(goals [B, H, W, 3]) gives one for these goals.
+    """A policy of Terrella's in stable-worldmodel's harness. policy_of(goals by channel [B, ...]) gives one for these goals.
     `ms`: of each decision, an episode's share of a batch."""
 
-    def __init__(self, policy_of: Any, seed: int):
+    def __init__(self, task: Task, policy_of: Any, seed: int):
         super().__init__()
-        self._policy_of, self._seed, self._policy, self.ms = policy_of, seed, None, []
+        self._task, self._policy_of, self._seed, self._policy, self.ms = task, policy_of, seed, None, []
 
     def get_action(self, infos: dict, **kwargs: Any) -> np.ndarray:
         import time
 
-        seen = {"rgb": torch.from_numpy(infos["pixels"][:, -1])}
+        seen = self._seen(infos, "pixels", "state")
         if self._policy is None:
-            self._policy = self._policy_of(torch.from_numpy(infos["goal"][:, -1]))
+            self._policy = self._policy_of(self._seen(infos, "goal", "goal_state"))
             self._rng = torch.Generator().manual_seed(self._seed)
             self._memory = self._policy.begin(len(infos["pixels"]), self._rng)
         began = time.perf_counter()
         action, self._memory = self._policy.act(seen, self._memory, self._rng)
         self.ms.append(1e3 * (time.perf_counter() - began) / len(action))
         return action.detach().cpu().numpy().astype(np.float32)
+
+    def _seen(self, infos: dict, pictures: str, states: str) -> dict[str, torch.Tensor]:
+        found = self._task.seen(infos[pictures][:, -1], np.asarray(infos[states], np.float64)[:, -1])
+        return {name: torch.from_numpy(value) for name, value in found.items()}
 
 
 CALLABLES = [

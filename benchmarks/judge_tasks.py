@@ -6,6 +6,7 @@ Imported in the environment of `make judge` alone.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,12 @@ def _round(agent: np.ndarray, goal: np.ndarray, middle: np.ndarray) -> np.ndarra
     return way / np.linalg.norm(way)
 
 
+def places(states: np.ndarray) -> np.ndarray:
+    """Where PushT's pusher and its block are, and how the block is turned: [..., 6], for who sees numbers."""
+    angle = states[..., 4:5]
+    return np.concatenate([states[..., :4], 100 * np.sin(angle), 100 * np.cos(angle)], -1)
+
+
 TASKS = {
     "rooms": Task(
         "swm/TwoRoom-v1",
@@ -129,3 +136,4 @@ TASKS = {
         "LeWM 96, DINO-WM 74 to 90, of LeWM learned from weak recordings 30 to 40 (people's recordings, the papers' own starts)",
     ),
 }
+TASKS["push-numbers"] = replace(TASKS["push"], numbers=places)

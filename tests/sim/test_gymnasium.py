@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,7 @@ from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
 from terrella.core.spec import POSE, POSE_UNIT
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
+from terrella.sim.opening import follow
 
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
 
@@ -449,3 +451,15 @@ def test_mujocos_state_is_copied_where_that_is_asked_for():
     assert "a_batch_equals_its_singles" in check_world(world, steps=6)
     assert not terrella.load("gym:Reacher-v5", rgb=False).spec.forkable  # several episodes are processes, as before
     world.close()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "config", "drawn_by"),
+    [(["side", "track"], {"distance": 4.0}, 1), (["track"], {"trackbodyid": 1}, -1), (["side"], None, -1)],
+    ids=["has a camera that follows", "follows already", "has none"],
+)
+def test_who_runs_in_a_mujoco_environment_stays_in_the_picture(cameras, config, drawn_by):
+    model = SimpleNamespace(ncam=len(cameras), camera=lambda number: SimpleNamespace(name=cameras[number]))
+    renderer = SimpleNamespace(camera_id=-1, default_cam_config=config, model=model)
+    follow(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
+    assert renderer.camera_id == drawn_by

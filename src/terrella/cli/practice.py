@@ -21,7 +21,7 @@ from ..core.world import World, make_rng
 from ..learn.growth import Scaled
 from ..learn.recipes.policy import Practice, train_policy
 from ..measure.statistics import Figure, mean_interval
-from .beside import STEPS, check_alike, open_real
+from .beside import STEPS, check_alike, open_copied, open_real
 from .named import Device, Environment, load_named
 from .say import Json, result
 
@@ -65,7 +65,7 @@ def policy(
         raise TerrellaError("--grow lets the ranges of a file grow: say which with --randomise FILE.")
     if environment.randomise is not None and not library.is_truth(world):
         raise TerrellaError(f"{world} was learned and is as it is; --randomise is for simulators (mujoco:NAME).")
-    inside = environment.open(world) if library.is_truth(world) else load_named(world, device)
+    inside = open_copied(world, environment) if library.is_truth(world) else load_named(world, device)
     outside = None if tried.real is None else open_real(tried.real, environment, inside.spec)
     if outside is not None:
         check_alike(inside.spec, outside.spec)

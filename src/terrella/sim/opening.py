@@ -36,6 +36,7 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
             if rgb and "rgb_array" in (built.metadata.get("render_modes") or ()):
                 built.close()
                 built = gymnasium.make(env, render_mode="rgb_array", **options)
+                follow(built)
             return built, f"gym:{env}"
         except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound) as error:
             said = _ended(error).replace("mean: ", "mean ")
@@ -45,6 +46,17 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
             raise TerrellaError(f"Gymnasium cannot make '{env}': {said}{hint}") from error
         except (gymnasium.error.Error, TypeError) as error:
             raise TerrellaError(f"Gymnasium cannot make '{env}': {error}") from error
+
+
+def follow(env: gymnasium.Env) -> None:
+    """Has a MuJoCo environment drawn by its model's camera `track` where its own view follows nothing, so that who runs stays in
+    the picture."""
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is None or renderer.camera_id != -1 or "trackbodyid" in (renderer.default_cam_config or {}):
+        return
+    cameras = [renderer.model.camera(number).name for number in range(renderer.model.ncam)]
+    if "track" in cameras:
+        renderer.camera_id = cameras.index("track")
 
 
 @contextmanager
