@@ -23,7 +23,7 @@ from ..act.belief import BeliefPolicy, actor_of
 from ..act.named import Slipping
 from ..core.errors import TerrellaError
 from ..core.policy import Policy
-from ..core.spec import AXES
+from ..core.spec import AXES, shape_of
 from ..core.world import World, make_rng
 from ..data import Dataset, record
 from ..data.storage.durable import write_json
@@ -186,13 +186,13 @@ def drawing(policy: Policy) -> Policy:
 
 
 def _opened(name: str, environment: Environment) -> World:
-    """The environment, without pictures where it shows numbers."""
-    world = environment.open(name)
+    """The environment; one that shows numbers is asked for no pictures, and so needs no display."""
     if not name.startswith("gym:"):
-        return world
-    if "observation" in world.spec.channels:
-        return environment.open(name, rgb=False)
-    return world if environment.size else replace(environment, size=(SMALL, SMALL)).open(name)
+        return environment.open(name)
+    blind = environment.open(name, rgb=False)
+    if "observation" in blind.spec.channels and len(shape_of(blind.spec.channels["observation"])) < 3:
+        return blind
+    return (environment if environment.size else replace(environment, size=(SMALL, SMALL))).open(name)
 
 
 def _earned(recording: Path, since: int) -> float:

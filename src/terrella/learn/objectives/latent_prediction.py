@@ -26,7 +26,7 @@ LONE, BLIND = 0.2, 0.3  # shares of clips that begin without a past, and of thos
 LEAST_UNIT = 1e-3  # deviations, that a number counts as changing in a step
 DRAWN = 24  # latents a step that the decoder learns from
 # Shares of the loss.
-OF_NUMBERS, OF_OUTCOME, OF_INVERSE = 1.0, 0.3, 0.05
+OF_NUMBERS, OF_OUTCOME, OF_INVERSE = 1.0, 0.3, 1.0
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,11 @@ class LatentPrediction:
             costs["done"] = F.binary_cross_entropy_with_logits(found.done, done)
             parts |= {name: parts.get(name, 0.0) + cost / 2 for name, cost in costs.items()}
         found = network.inverse(real[:, :-1].flatten(0, 1), after.flatten(0, 1))
-        return parts | {"inverse": action_loss(found, acts, self.controls)}
+        return parts | {"inverse": action_loss(found, acts, self.controls) / self._blind(acts)}
+
+    def _blind(self, acts: torch.Tensor) -> torch.Tensor | float:
+        """What `action_loss` is of axes for who does not look: small where actions are, and yet all there is to know of them."""
+        return acts.var(0).mean().clamp_min(1e-4) if self.controls.kind == AXES else 1.0
 
 
 def action_loss(found: torch.Tensor, acts: torch.Tensor, controls: Controls) -> torch.Tensor:
