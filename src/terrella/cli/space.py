@@ -15,6 +15,7 @@ from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
 from ..space.edits import DEEDS, edited
 from ..space.files import read_scene, replace_whole, write_scene
+from ..space.files.gltf_scene import GLTF_ENDINGS, Scene, read_gltf
 from ..space.files.spz import Version
 from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
@@ -22,6 +23,7 @@ from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
 from .say import Host, Json, Port, Token, result, say
+from .space_build import COUNT, of_scene
 from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_other
 
 if TYPE_CHECKING:
@@ -73,7 +75,8 @@ def import_(
     size: tuple[int, int] = (192, 256),
     json: Json = False,
 ) -> None:
-    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, .spz of versions 1 to 4, or .sog.
+    """Make a world of a file of Gaussians: .ply, SuperSplat's compressed .ply, .spz of versions 1 to 4, .sog, or .glb; or of the
+    triangles of a .glb or .gltf.
 
     Args:
         file: The file; of a .sog that was unpacked its folder.
@@ -90,6 +93,10 @@ def import_(
 
     if not 0 < scale < float("inf") or min(size) < 8 or max(size) > 4096:
         raise TerrellaError("--scale is above 0, and --size from 8 to 4096 pixels a side.")
+    if file.suffix.lower() in GLTF_ENDINGS and axes is None:
+        scene = read_gltf(file, scale)
+        if isinstance(scene, Scene):
+            return of_scene(scene, file, out, COUNT, size, json)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         gaussians = read_scene(file, axes)

@@ -1,4 +1,4 @@
-"""The command `terrella space build`: words or a layout as a place to walk in."""
+"""The command `terrella space build`: words, a layout or a scene of triangles as a place to walk in."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import json as json_text
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from .say import Json, result
 
-LAYOUT_FILE = "layout.json"
+if TYPE_CHECKING:
+    from ..space.files.gltf_scene import Scene
+    from ..space.raster import Gaussians
+
+LAYOUT_FILE, COUNT = "layout.json", 120_000
 
 
 def build(
@@ -20,15 +24,16 @@ def build(
     text: str | None = None,
     *,
     out: Path,
-    gaussians: int = 120_000,
+    gaussians: int = COUNT,
     seed: int | None = None,
     size: tuple[int, int] = (192, 256),
     json: Json = False,
 ) -> None:
-    """Make a place to walk in: of a layout.json (rooms, doors, windows, stairs, furniture), or of words. Same seed, same bytes.
+    """Make a place to walk in: of a layout.json (rooms, doors, windows, stairs, furniture), of triangles of another tool (.glb,
+    .gltf), or of words. Same seed, same bytes.
 
     Args:
-        layout: The layout.
+        layout: The layout, or the .glb or .gltf.
         text: Words instead: "a long room with two pillars and a red door". The layout that they became lies in OUT/layout.json.
         out: Folder of the world.
         gaussians: About how many.
@@ -36,13 +41,16 @@ def build(
         size: Height and width of the pictures.
     """
     from ..core.errors import TerrellaError
+    from ..space.files.gltf_scene import GLTF_ENDINGS, read_gltf
     from ..space.layout import build as built
     from ..space.layout import read_plan, understood
 
     if (layout is None) == (text is None):
-        raise TerrellaError('give a layout.json, or --text "a long room with two pillars and a red door".')
+        raise TerrellaError('give a layout.json or a .glb, or --text "a long room with two pillars and a red door".')
     if not 1000 <= gaussians <= 2_000_000 or min(size) < 8 or max(size) > 4096:
         raise TerrellaError("--gaussians is from 1,000 to 2,000,000, and --size from 8 to 4096 pixels a side.")
+    if layout is not None and layout.suffix.lower() in GLTF_ENDINGS:
+        return of_scene(read_gltf(layout), layout, out, gaussians, size, json)
     unknown: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     if text is not None:
@@ -92,3 +100,30 @@ def _save(place: Any, name: str, text: str | None, size: tuple[int, int], out: P
         SplatWorld(name, place.gaussians, origin, starts, config, card, place.objects, place.solids, place.bodies), out
     )
     replace_whole(out / LAYOUT_FILE, lambda file: file.write_text(json_text.dumps(said, indent=1) + "\n"))
+
+
+def of_scene(
+    scene: Scene | Gaussians, file: Path, out: Path, gaussians: int, size: tuple[int, int], json: bool
+) -> None:
+    """Make a place to walk in of the triangles of a file."""
+    from ..core.errors import DatasetError
+    from ..space.files.gltf_scene import Scene
+    from ..space.layout.meshes import of_triangles
+    from ..space.occupancy import Body
+    from ..worlds.splat import SplatConfig
+    from ..worlds.splat_folder import save_splat, world_of
+
+    if not isinstance(scene, Scene):
+        raise DatasetError(f"{file} holds Gaussians; `terrella space import` makes a world of them.")
+    config = SplatConfig((0.5, 0.5 * size[1] / size[0], 0.5, 0.5), size, body=Body(eye_m=1.65, step_m=0.35))
+    found, objects, solids = of_triangles(scene, gaussians)
+    names = list(scene.names)
+    world = world_of(found, file.stem, {"file": file.name, "objects": names}, config, objects, solids)
+    save_splat(world, out)
+    facts = {
+        "world": str(out), "gaussians": len(found), "triangles": len(scene.corners), "objects": names, "lights": len(scene.lights),
+        "boxes": None if solids is None else len(solids),
+    }  # fmt: skip
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    text = f"{len(found):,} Gaussians of {len(scene.corners):,} triangles, {len(scene.lights)} light(s): {shown}"
+    result(facts, json, f"{text}\nwalk in it: terrella play {out}")

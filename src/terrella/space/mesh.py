@@ -44,7 +44,7 @@ def fused(gaussians: Gaussians, eyes: torch.Tensor, cell_m: float = 0.05) -> Mes
     for eye, view in zip(eyes, views):
         for first in range(0, len(places), 500_000):
             part = slice(first, first + 500_000)
-            depth, _, far = _seen(view, eye, places[part])
+            depth, _, far = seen(view, eye, places[part])
             ahead = depth - far
             counts = (depth > 0) & (ahead > -reach)
             near = counts / far.clamp_min(0.5)  # far views know less
@@ -57,7 +57,7 @@ def fused(gaussians: Gaussians, eyes: torch.Tensor, cell_m: float = 0.05) -> Mes
     return Mesh(vertices, faces, _colours(vertices, eyes, views, 2 * cell_m))
 
 
-def _seen(view: Drawing, eye: torch.Tensor, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def seen(view: Drawing, eye: torch.Tensor, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """What a panorama shows towards places [N, 3]: distance [N] (0: nothing), colour [N, 3], and how far the places are [N]."""
     heading = 2 * math.atan2(float(eye[6]), float(eye[3]))
     x, y, z = (places - eye[:3]).unbind(1)
@@ -73,7 +73,7 @@ def _seen(view: Drawing, eye: torch.Tensor, places: torch.Tensor) -> tuple[torch
 def _colours(vertices: torch.Tensor, eyes: torch.Tensor, views: list[Drawing], slack: float) -> torch.Tensor:
     total, weight = torch.zeros(len(vertices), 3), torch.zeros(len(vertices), 1)
     for eye, view in zip(eyes, views):
-        depth, colour, far = _seen(view, eye, vertices)
+        depth, colour, far = seen(view, eye, vertices)
         counts = (((depth - far).abs() < slack) / far.square().clamp_min(0.1))[:, None] + 1e-6
         total, weight = total + counts * colour, weight + counts
     return ((total / weight).clamp(0, 1) * 255).round().to(torch.uint8)

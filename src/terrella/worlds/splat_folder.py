@@ -145,11 +145,18 @@ def write_edits(path: Path, edits: Sequence[Edit], undone: Sequence[Edit] = ()) 
         replace_whole(path / name, lambda file, text=text: file.write_text(text))
 
 
-def world_of(gaussians: Gaussians, name: str, card: dict[str, Any], config: SplatConfig) -> SplatWorld:
+def world_of(
+    gaussians: Gaussians,
+    name: str,
+    card: dict[str, Any],
+    config: SplatConfig,
+    objects: torch.Tensor | None = None,
+    solids: torch.Tensor | None = None,
+) -> SplatWorld:
     """A world of Gaussians of which nobody said where one stands in them: in the free place with a floor that is nearest to their
     middle, looking eight ways."""
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
-    world = SplatWorld(name, gaussians, observed, torch.zeros(1, 7), config, card)
+    world = SplatWorld(name, gaussians, observed, torch.zeros(1, 7), config, card, objects, solids)
     some = gaussians.means[:: max(len(gaussians) // 100_000, 1)]
     low, middle, high = torch.quantile(some, torch.tensor([0.05, 0.5, 0.95]), dim=0)
     rng = torch.Generator().manual_seed(0)
@@ -158,8 +165,9 @@ def world_of(gaussians: Gaussians, name: str, card: dict[str, Any], config: Spla
     places = torch.cat([middle[None], wide])
     level = world.occupancy.surface(places, config.body)
     grounded = torch.cat([places[:, :2], (level + config.body.eye_m)[:, None]], 1)
-    stands = level.isfinite() & ~world.occupancy.blocked(grounded.nan_to_num(), config.body)
+    stands = level.isfinite() & ~world.collider.blocked(grounded.nan_to_num(), config.body)
     places = torch.where(stands[:, None], grounded, places)
     order = (places - middle).norm(dim=1) + 1e3 * ~stands
     x, y, z = places[order.argmin()].expand(8, 3).unbind(1)
-    return SplatWorld(name, gaussians, observed, planar_pose(x, y, z, torch.arange(8) * (torch.pi / 4)), config, card)
+    starts = planar_pose(x, y, z, torch.arange(8) * (torch.pi / 4))
+    return SplatWorld(name, gaussians, observed, starts, config, card, objects, solids)

@@ -1,4 +1,4 @@
-"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ, SOG; see glb.py for GLB."""
+"""Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ, SOG, GLB (written by glb.py)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ...core.errors import DatasetError
 from ..raster import Gaussians
 from ..raster.move import turned
 from . import compressed, ply, sog, spz
+from .gltf_scene import GLTF_ENDINGS, read_gltf
 
 # Axes of a file as ours (x forward, y left, z up); "rdf" is x right, y down, z forward, as training code writes PLY.
 AXES = {
@@ -24,13 +25,21 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
-    """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4) or .sog (or its folder); `axes`: those of the file, by
-    default rub for SPZ and rdf for others. What is not finite is left out. DatasetError says what is wrong with a file."""
+    """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb (KHR_gaussian_splatting);
+    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite is left out. DatasetError
+    says what is wrong with a file."""
     path = Path(path)
+    if path.suffix.lower() in GLTF_ENDINGS:
+        found = read_gltf(path)
+        if not isinstance(found, Gaussians):
+            raise DatasetError(f"{path} holds triangles and no Gaussians; `terrella space build` makes a world of it.")
+        return _sound(found, path, axes or "rub")
     try:
         data = b"" if path.is_dir() else path.read_bytes()
     except OSError as error:
-        raise DatasetError(f"{path} cannot be read ({error.strerror}); give a .ply, .spz or .sog file.") from error
+        raise DatasetError(
+            f"{path} cannot be read ({error.strerror}); give a .ply, .spz, .sog or .glb file."
+        ) from error
     try:
         if data[:3] == b"ply":
             elements = ply.parse(data)
@@ -47,13 +56,18 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     except (ValueError, KeyError, OverflowError) as error:
         said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ.") from error
+    return _sound(found, path, axes or usual)
+
+
+def _sound(found: Gaussians, path: Path, axes: str) -> Gaussians:
+    """Those whose numbers are finite, in our axes."""
     sound = torch.stack(
         [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(found).values()]
     )
     sound = sound.all(0) & (found.quats.norm(dim=1) > 0)
     if not sound.any():
         raise DatasetError(f"{path} has no Gaussian whose numbers are finite; export it again.")
-    return turned(found.at(sound), _axes(axes or usual).T)
+    return turned(found.at(sound), _axes(axes).T)
 
 
 def write_scene(

@@ -237,13 +237,18 @@ def _brightness(plan, blocks, boxes, cells, texels, bare, light) -> np.ndarray:
     sun = _sun(plan, blocks, boxes, points, cells.normals)
     coarse = _between(cells, texels, bare, _texel_sun(plan, blocks, boxes, texels), boxes)
     falls = np.maximum(falls - coarse, 0) + sun
+    return exposed(own, falls, glow > 0)
+
+
+def exposed(own: np.ndarray, falls: np.ndarray, shines: np.ndarray) -> np.ndarray:
+    """Colours [N, 3] as a camera shows surfaces of the colours `own` on which so much light falls [N, 3]; those that shine, bool
+    [N], as they are."""
     shown = own**2.2 * falls
-    dull = glow == 0
-    middle = np.exp(np.log(np.maximum(falls[dull].mean(1), 1e-4)).mean()) if dull.any() else 1.0
+    middle = np.exp(np.log(np.maximum(falls[~shines].mean(1), 1e-4)).mean()) if not shines.all() else 1.0
     shown = shown * (0.62 / middle)
     mapped = shown * (1 + shown / 9) / (1 + shown * 0.78)  # Reinhard's curve with a white point
     pictured = np.clip(mapped, 0, 1) ** (1 / 2.2)
-    pictured[~dull] = own[~dull]
+    pictured[shines] = own[shines]
     return pictured
 
 

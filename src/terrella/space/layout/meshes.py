@@ -1,0 +1,87 @@
+"""A scene of triangles as a place to walk in: flat Gaussians on pieces of them, lit, and boxes that stop bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..camera import rotation
+from ..files.gltf_scene import Scene
+from ..raster import Gaussians
+from ..raster.gaussians import plain_sh
+from ..raster.move import multiplied
+from .bake import FINEST_M, OPACITY, THIN_M, exposed
+from .mesh_light import falling
+from .mesh_solids import solids_of
+from .pieces import pieces
+
+_WIDE = 2.4  # deviations of a Gaussian beside those of the piece that it stands for
+_INNER = (
+    np.array([[i + 1 / 3, j + 1 / 3, 4 - i - j - 2 / 3] for i in range(4) for j in range(4 - i)]) / 4
+)  # in a triangle
+_SEEN = 0.02  # opacity
+
+
+def of_triangles(scene: Scene, count: int = 120_000) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
+    """Gaussians, about `count` and at least one a triangle; int32 [N], which thing of the scene each belongs to; and boxes
+    float32 [S, 6] that stop bodies, None where they would be too many: then what the Gaussians fill stops them."""
+    corners, face = pieces(scene.corners, count, 2 * FINEST_M)
+    colours, opacities, glow, unlit = _surface(scene, corners, face)
+    kept = opacities > _SEEN
+    corners, face = corners[kept], face[kept]
+    normals = np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3])
+    areas = np.linalg.norm(normals, axis=1)
+    normals = normals / areas[:, None]
+    bare = _flat(corners[..., :3], normals, opacities[kept])
+    falls = falling(scene.lights, bare, normals, areas / 2, glow[kept])
+    glows = glow[kept].sum(1) > 0
+    own = np.clip(np.where(glows[:, None], np.maximum(glow, colours)[kept], colours[kept]), 0, 1) ** (1 / 2.2)
+    shown = torch.from_numpy(exposed(own, falls, glows | unlit[kept]).astype(np.float32))
+    lit = Gaussians(bare.means, bare.quats, bare.scales, bare.opacities, plain_sh(shown))
+    solids = solids_of(scene.corners[..., :3], scene.things)
+    return lit, torch.from_numpy(scene.things[face]), None if solids is None else torch.from_numpy(solids)
+
+
+def _surface(
+    scene: Scene, corners: np.ndarray, face: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each piece its colour and its opacity, its glow (all linear) and whether its colour holds its light."""
+    tint, glow = corners[..., 3:7].mean(1), np.zeros((len(face), 3), np.float32)
+    unlit, which = np.zeros(len(face), np.bool_), scene.material[face]
+    for k, material in enumerate(scene.materials):
+        rows = np.flatnonzero(which == k)
+        tint[rows] *= np.array(material.colour, np.float32)
+        glow[rows], unlit[rows] = material.glow, material.unlit
+        if material.picture is not None and len(rows):
+            height, width = material.picture.shape[:2]
+            u, v = np.moveaxis(_INNER.astype(np.float32) @ corners[rows, :, 7:9], -1, 0)
+            u, v = u * material.placed[0] + material.placed[2], v * material.placed[1] + material.placed[3]
+            at = ((np.nan_to_num(part) % 1 * side).astype(int) % side for part, side in ((v, height), (u, width)))
+            found = (material.picture[tuple(at)] / np.float32(255)).astype(np.float32)
+            found[..., :3] **= 2.2
+            tint[rows] *= found.mean(1)
+        if material.cut:
+            tint[rows, 3] = tint[rows, 3] >= material.cut
+        elif not material.see_through:
+            tint[rows, 3] = 1
+    tint = np.clip(np.nan_to_num(tint), 0, 1)
+    return tint[:, :3], tint[:, 3], np.clip(np.nan_to_num(glow), 0, 1e6), unlit
+
+
+def _flat(corners: np.ndarray, normals: np.ndarray, opacities: np.ndarray) -> Gaussians:
+    """A grey Gaussian a triangle [P, 3, 3], as wide along its plane as the triangle is."""
+    places, way = torch.from_numpy(corners).float(), torch.from_numpy(normals).float()
+    middle = places.mean(1)
+    up = torch.where(way[:, 2:] < 0, -way, way)
+    zero = torch.zeros(len(up))
+    lying = torch.stack([1 + up[:, 2], -up[:, 1], up[:, 0], zero], 1)  # turns z to `up`
+    lying = lying / lying.norm(dim=1, keepdim=True)
+    x, y, _ = ((places - middle[:, None]) @ rotation(torch.cat([middle, lying], 1))).unbind(2)
+    xx, xy, yy = ((a * b).sum(1) / 12 for a, b in ((x, x), (x, y), (y, y)))
+    half = torch.atan2(2 * xy, xx - yy) / 4
+    mean, off = (xx + yy) / 2, (((xx - yy) / 2).square() + xy.square()).sqrt()
+    wide = _WIDE * torch.stack([mean + off, (mean - off).clamp_min(0)], 1).sqrt()
+    scales = torch.cat([wide.clamp_min(THIN_M), torch.full((len(up), 1), THIN_M)], 1)
+    quats = multiplied(lying, torch.stack([half.cos(), zero, zero, half.sin()], 1))
+    grey = plain_sh(torch.full((len(up), 3), 0.5))
+    return Gaussians(middle - THIN_M * way, quats, scales, OPACITY * torch.from_numpy(opacities).float(), grey)
