@@ -94,6 +94,14 @@ def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "out.spz"), "--json"]) == 0
     assert json.loads("{" + capsys.readouterr().out.partition("{")[2])["gaussians"] == 1500
     assert len(read_scene(tmp_path / "out.spz")) == 1500
+    for name, more in (("again.spz", []), ("again.4.spz", ["--spz", "4"]), ("again.ply", [])):  # and ours come back
+        assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / name), *more]) == 0
+        assert (
+            main(["space", "import", str(tmp_path / name), "--out", str(tmp_path / f"of {name}"), "--size", "24", "32"])
+            == 0
+        )
+        off = terrella.load(tmp_path / f"of {name}").gaussians.means - world.gaussians.means
+        assert off.abs().max() < 1e-3
     (tmp_path / "bad.ply").write_bytes(b"ply\n")
     assert main(["space", "import", str(tmp_path / "bad.ply"), "--out", str(tmp_path / "b")]) == 2
     assert not (tmp_path / "b").exists()

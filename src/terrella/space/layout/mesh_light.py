@@ -36,7 +36,9 @@ def falling(
             nearest, _, distance = seen(rasterise(gaussians, eye[None], None, (256, 512)), eye, points)
             far = np.maximum(distance.numpy(), 0.1)
             way = (points.numpy() - light.place) / far[:, None]
-            slack = _SLACK / np.maximum(np.abs((normals * way).sum(1)), 0.1)  # a pixel is deep where the side is seen edgewise
+            slack = _SLACK / np.maximum(
+                np.abs((normals * way).sum(1)), 0.1
+            )  # a pixel is deep where the side is seen edgewise
             lit = (nearest.numpy() == 0) | (far < nearest.numpy() * (1 + slack) + _SLACK_M)
         share = np.abs((normals * way).sum(1)) / far**2 * lit
         if own is not None:
