@@ -91,6 +91,8 @@ UNSOUND = {
     "mass = {even = [1, 2]}": "is one of uniform",
     "mass = {uniform = [1]}": "takes 2 numbers",
     "delay = {uniform = [0, 3]}": "whole steps",
+    "textures = 2": "cannot be randomised safely from 2 to 2.*within 0 to 1",
+    '"camera.roll" = 3': "within -0.5 to 0.5 rad",
     '"noise.done" = 0.1': "float numbers",
     "mass": "no TOML",
     "": "declares no distribution",
@@ -193,3 +195,72 @@ def test_masses_multiply_in_any_order():
 @needs_mujoco
 def test_parameters_that_would_do_nothing_are_not_offered():
     assert "strength" not in load("mujoco:ant", cameras=()).parameters  # no actuator of its is limited
+
+
+@needs_mujoco
+def test_looks_differ_by_world_and_change_nothing_else(tmp_path):
+    """Each alone: drawn again the same, at nothing as in the file, bodies where they were."""
+    plain = load("mujoco:ant", size=(24, 32), segmentation=True)
+    start = plain.start(3, make_rng(2))
+    try:
+        nominal = plain.render(start, ("rgb", "segmentation", "pose"))
+    except TerrellaError as error:
+        pytest.skip(str(error))
+    looks = {
+        "textures": (0.9, 1.0),
+        "colours": (0.9, 1.0),
+        "light.tilt": (0.5, 0.8),
+        "camera.roll": (0.2, 0.5),
+    }
+    for name, limits in looks.items():
+        told = {name: Distribution("uniform", limits)}
+        world = Randomised(plain, told)
+        state = world.start(3, make_rng(2))
+        seen = world.render(state, ("rgb", "segmentation", "pose"))
+        changed = (seen["rgb"].int() - nominal["rgb"].int()).abs().amax(-1) > 8
+        assert changed.flatten(1).any(1).all(), name
+        assert torch.equal(world.render(state, ("rgb",))["rgb"], seen["rgb"])
+        assert torch.equal(state["physics"], start["physics"])
+        if not name.startswith("camera"):
+            assert torch.equal(seen["segmentation"], nominal["segmentation"])
+            assert torch.equal(seen["pose"], nominal["pose"])
+        else:
+            moved = seen["pose"] - nominal["pose"]
+            assert moved[:, :3].abs().max() < 1e-6 and moved[:, 3:].abs().max() > 0.05
+        none = Randomised(plain, told, scale=0.0)
+        assert torch.equal(none.render(none.start(3, make_rng(2)), ("rgb",))["rgb"], nominal["rgb"])
+
+
+@needs_mujoco
+def test_what_is_seen_goes_together_in_any_order():
+    """Turns of a camera and shifts of colours: the same picture whichever the file declares first."""
+    told = {
+        "camera.yaw": 0.3,
+        "red": 0.2,
+        "light.tilt": 0.5,
+        "light.turn": 2.0,
+        "camera.roll": 0.4,
+        "colours": 0.5,
+        "textures": 0.8,
+    }
+    declared = [(name, Distribution("constant", (value,))) for name, value in told.items()]
+    shown = []
+    for order in (declared, declared[::-1]):
+        world = Randomised(load("mujoco:ant", size=(24, 32)), dict(order))
+        try:
+            shown.append(world.render(world.start(1, make_rng(2)), ("rgb",))["rgb"])
+        except TerrellaError as error:
+            pytest.skip(str(error))
+    assert torch.equal(*shown)
+
+
+@needs_mujoco
+def test_patterns_tile_and_differ():
+    from terrella.sim.mujoco_looks import PATTERNS, pattern
+
+    rng = np.random.default_rng(0)
+    made = [pattern(at, rng).astype(int) for at in range(PATTERNS)]
+    for at, one in enumerate(made):
+        assert all(np.abs(one - other).mean() > 10 for other in made[:at])
+        if at % 4 == 3:  # clouds: no seam where the last row meets the first
+            assert np.abs(one[0] - one[-1]).max() <= 2 * np.abs(np.diff(one, axis=0)).max()

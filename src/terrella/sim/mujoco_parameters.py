@@ -24,7 +24,7 @@ Model = Any  # mujoco.MjModel
 class Parameter:
     """One number of a world. nominal: as the file has it; low, high: within which the physics stays sound; unit: "x" where it
     multiplies what the file says. change(model, file, value) sets it in a fresh copy of the file's model, after whatever else was
-    changed there; what is only seen is set in one model again and again."""
+    changed there; of what is only seen, in a model of which SEEN is as in the file."""
 
     nominal: float
     low: float
@@ -101,10 +101,50 @@ def _colour(axis: int) -> Parameter:
     return Parameter(0.0, -1.0, 1.0, "", "added to this share of all colours", change, True)
 
 
-DISTRACTORS = Parameter(
-    0.0, 0.0, 20.0, "", "balls and boxes that stand about: how many, and after the point where and how they look",
-    lambda model, file, value: None, True,
-)  # fmt: skip
+def _turned_camera(axis: int) -> Parameter:
+    """About an axis of its own: its right, its up, or the one along which it looks."""
+    own = np.eye(3)[axis]
+
+    def change(model: Model, file: Model, value: float) -> None:
+        turn, after = np.empty(4), np.empty(4)
+        mujoco.mju_axisAngle2Quat(turn, own, value)
+        for quat in model.cam_quat:
+            mujoco.mju_mulQuat(after, quat, turn)
+            quat[:] = after
+
+    return Parameter(0.0, -0.5, 0.5, "rad", "turned about its own " + ("right", "up", "back")[axis], change, True)
+
+
+def _turned_lights(axis: int, reach: float, what: str) -> Parameter:
+    """Those that hang in the world, with where they shine to, about the middle of the model."""
+    about = np.eye(3)[axis]
+
+    def change(model: Model, file: Model, value: float) -> None:
+        turn, after, middle = np.empty(4), np.empty(3), model.stat.center
+        mujoco.mju_axisAngle2Quat(turn, about, value)
+        for at in _hung(model):
+            mujoco.mju_rotVecQuat(after, model.light_pos[at] - middle, turn)
+            model.light_pos[at] = middle + after
+            mujoco.mju_rotVecQuat(after, model.light_dir[at], turn)
+            model.light_dir[at] = after
+
+    return Parameter(0.0, -reach, reach, "rad", what, change, True)
+
+
+def _hung(model: Model) -> np.ndarray:
+    fixed = model.light_mode == int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
+    return np.flatnonzero(fixed & (model.light_bodyid == 0))
+
+
+def _dressed(high: float, what: str) -> Parameter:
+    """What is changed in the scene that is drawn, by sim/mujoco_looks.py: the model stays as it is."""
+    return Parameter(0.0, 0.0, high, "", what, lambda model, file, value: None, True)
+
+
+SEEN = ("cam_pos", "cam_quat", "cam_fovy", "light_pos", "light_dir", "light_diffuse", "geom_rgba", "mat_rgba")
+TEXTURES = _dressed(1.0, "share of the surfaces that wear a texture; which ones and which, its digits tell")
+COLOURS = _dressed(1.0, "how far each surface's colour goes to one of its own; to which, its digits tell")
+DISTRACTORS = _dressed(20.0, "balls and boxes that stand about: how many, and after the point where and how they look")
 
 
 def parameters_of(model: Model) -> Mapping[str, Parameter]:
@@ -126,7 +166,11 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "camera.z": _camera("cam_pos", 2, 1.0, "m", "moved along its body's z"),
         "camera.fov": _camera("cam_fovy", None, 0.0, "x", "field of view"),
         "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
-        "red": _colour(0), "green": _colour(1), "blue": _colour(2), "distractors": DISTRACTORS,
+        "camera.pitch": _turned_camera(0), "camera.yaw": _turned_camera(1), "camera.roll": _turned_camera(2),
+        "light.turn": _turned_lights(2, float(np.pi), "the lights, about the vertical"),
+        "light.tilt": _turned_lights(0, 0.8, "the lights, about the world's x"),
+        "red": _colour(0), "green": _colour(1), "blue": _colour(2),
+        "textures": TEXTURES, "colours": COLOURS, "distractors": DISTRACTORS,
     }  # fmt: skip
     acts = {
         "damping": "dof_damping", "armature": "dof_armature", "joint_friction": "dof_frictionloss",
@@ -135,6 +179,8 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
     for name, field in acts.items():
         if not np.any(getattr(model, field)):  # twice nothing is nothing
             del found[name]
+    if not _hung(model).size:
+        del found["light.turn"], found["light.tilt"]
     bodies = {model.body(at).name: at for at in range(1, model.nbody) if model.body_mass[at] > 0}
     return found | {f"mass.{name}": _one_mass(at) for name, at in bodies.items() if name}
 

@@ -19,8 +19,9 @@ import numpy as np
 from ..core.errors import TerrellaError
 from ..core.spec import Camera
 from .mujoco_canvas import Canvas, simplify
+from .mujoco_looks import Looks, put
 from .mujoco_model import mujoco
-from .mujoco_parameters import DISTRACTORS, Models, Parameter
+from .mujoco_parameters import SEEN, Models, Parameter
 
 MARK, MARK_M = (1.0, 0.25, 0.2, 1.0), 0.03  # the marker's colour and radius
 HINT = "set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts, and install libegl1 or libosmesa6"
@@ -41,14 +42,16 @@ class Pictures:
         self._model = model
         self._data = mujoco.MjData(model)
         self._made: dict[str, Canvas | mujoco.Renderer] = {}
-        self._about = next((at for at, one in changes.items() if one is DISTRACTORS), None)
+        self._looks = Looks(model, changes)
         self._mark: np.ndarray | None = None
-        self._distractors = 0.0
+        self._row = np.zeros(0)
 
     def put(self, physics: np.ndarray, row: np.ndarray, mark: np.ndarray | None = None) -> None:
         """Stands at a world: its state, its values of the parameters, and the point [3], m, that is marked."""
-        self._mark, self._distractors = mark, 0.0 if self._about is None else float(row[self._about])
+        self._mark, self._row = mark, row
         if self._columns:
+            for name in SEEN:
+                getattr(self._model, name)[:] = getattr(self._models.file, name)
             self._models.changed(self._model, row[self._columns])
         mujoco.mj_setState(self._model, self._data, physics, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         for derive in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
@@ -92,16 +95,10 @@ class Pictures:
         return np.where(geoms >= 0, self._model.geom_bodyid[geoms], -1).astype(np.int32)
 
     def _furnish(self, scene: mujoco.MjvScene) -> None:
-        """Puts what is looked at and touched by nobody into the scene: the marker, and distractors."""
+        """Dresses the scene as the world has it, and puts the marker into it, which is looked at and touched by nobody."""
+        self._looks.dress(scene, self._row)
         if self._mark is not None:
-            _put(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, MARK_M), self._mark, MARK)
-        count = int(self._distractors)
-        rng = np.random.default_rng(np.float64(self._distractors).view(np.uint64))
-        for _ in range(count):
-            kind = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX)[rng.integers(2)]
-            size = self._model.stat.extent * rng.uniform(0.02, 0.08, 3)
-            at = self._model.stat.center + self._model.stat.extent * rng.uniform(-0.8, 0.8, 3)
-            _put(scene, kind, size, at, (*rng.uniform(0, 1, 3), 1.0))
+            put(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, MARK_M), self._mark, MARK)
 
     def close(self) -> None:
         while self._made:
@@ -123,13 +120,6 @@ class Pictures:
                 first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
                 raise TerrellaError(f"MuJoCo cannot draw without a display ({first}): {HINT}.") from error
         return self._made[name]
-
-
-def _put(scene: mujoco.MjvScene, kind: int, size: np.ndarray, at: np.ndarray, colour: tuple[float, ...]) -> None:
-    if scene.ngeom < scene.maxgeom:
-        geom, upright = scene.geoms[scene.ngeom], np.eye(3).ravel()
-        mujoco.mjv_initGeom(geom, kind, size, np.asarray(at, np.float64), upright, np.asarray(colour, np.float32))
-        scene.ngeom += 1
 
 
 def _blind() -> bool:

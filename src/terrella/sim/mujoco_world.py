@@ -24,8 +24,9 @@ from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
 from ..core.state import State
 from .mujoco_lidar import SITE, Lidar
+from .mujoco_looks import patterned
 from .mujoco_model import BALL, FREE, SLIDE, bare, compiled, complete, mujoco, read
-from .mujoco_parameters import checked, parameters_of
+from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_pictures import Pictures, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
@@ -112,13 +113,14 @@ class MujocoWorld:
         """Lets worlds differ by these parameters, and makes what steps and draws them."""
         checked(self.parameters, names)
         self.varied, changes = tuple(names), [self.parameters[name] for name in names]
-        seen = {at: one for at, one in enumerate(changes) if one.seen}
+        seen = {names.index(name): one for name, one in self.parameters.items() if name in names and one.seen}
         stepped = {at: one for at, one in enumerate(changes) if not one.seen}
         on_gpu = self._device not in ("", "cpu")
         if on_gpu and stepped:
             raise TerrellaError("physics that differs from world to world is for the CPU; leave device out.")
         self._stepper = WarpStepper(self.file, self._device) if on_gpu else Stepper(self.file, stepped, self._threads)
-        self._pictures = Pictures(copy(self._seen), seen, self._size)
+        drawn = patterned(self._source, self.name) if TEXTURES in changes else copy(self._seen)
+        self._pictures = Pictures(drawn, seen, self._size)
         self.spec = self._describe()
 
     def varying(self, names: Sequence[str]) -> MujocoWorld:
