@@ -21,7 +21,7 @@ from terrella.space.edits import edited
 from terrella.space.occupancy import Body, Occupancy
 from terrella.space.raster import rasterise
 from terrella.worlds.splat import SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import checked_edits, read_edits, save_splat, source_of, write_edits
+from terrella.worlds.splat_folder import checked_edits, merging, read_edits, save_splat, write_edits
 
 from ..space.test_fitting import LENS, SIZE, room
 from .test_page import until as within
@@ -55,6 +55,11 @@ def world(count: int) -> SplatWorld:
     full = room(count=count)
     full = replace(full, scales=full.scales * min(1, (6000 / count) ** 0.5))  # as dense as the small one
     return SplatWorld("a <room>", full, seen, starts, SplatConfig(LENS, SIZE), card, objects)
+
+
+def walled_by(full: SplatWorld, boxes: torch.Tensor) -> SplatWorld:
+    """A world with known walls."""
+    return SplatWorld("walls", full.gaussians, full.provenance, full.starts, full.config, solids=boxes)
 
 
 @pytest.fixture
@@ -102,7 +107,7 @@ def test_the_page_says_only_what_it_should(tmp_path):
     page = PlacePage(place_of(str(tmp_path / "w")))
     text = page.html([{"select": {"all": True}, "do": "delete", "note": "</script><script>"}]).decode()
     assert "unsafe" not in page.policy and "http" not in page.policy
-    assert text.count("</script>") == 5 and "<title>a &lt;room&gt;" in text and "{{" not in text
+    assert text.count("</script>") == 6 and "<title>a &lt;room&gt;" in text and "{{" not in text
 
 
 def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
@@ -139,6 +144,55 @@ def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
     assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(place.gaussians.means))
 
 
+def merged(tmp_path, count: int, edits=()):
+    """A world's folder that another one was merged into, after which it was edited."""
+    save_splat(world(count), tmp_path / "w")
+    save_splat(world(600), tmp_path / "other")
+    lines = [merging(tmp_path / "w", tmp_path / "other", (6, 0.3, 0.1), 33), *edits]
+    write_edits(tmp_path / "w", lines)
+    return tmp_path / "w"
+
+
+def test_what_was_merged_is_on_the_page(tmp_path, opened):
+    folder = merged(tmp_path, 3000, [{"select": {"object": 4}, "do": "duplicate", "by": [0, 0, 1]}])
+    assert main(["space", "export", str(folder), str(tmp_path / "place.html")]) == 0
+    page, after = opened((tmp_path / "place.html").as_uri()), load(folder)
+    assert isinstance(after, SplatWorld) and len(after.gaussians) == 3640
+    for _ in range(2):
+        there = page.evaluate(COLUMNS)
+        assert np.abs(rows(there["means"]) - rows(after.gaussians.means)).max() < 1e-6
+        assert sorted(there["objects"]) == sorted(after.objects.tolist())
+        assert sum(there["seen"]) == int(after.provenance.sum())
+        for many in (3600, 3000):
+            page.evaluate("document.getElementById('undo').click()")
+            assert page.evaluate("terrella.story.scene.length") == many
+        page.evaluate("document.getElementById('redo').click(); document.getElementById('redo').click()")
+    page.evaluate("terrella.editor.choose({ object: 4 })")
+    assert page.evaluate("document.getElementById('count').textContent") == "40 selected: table"
+    points = after.gaussians.means[3000:3200] + torch.tensor([0.0, 0.0, 1.0])
+    wish = 0.6 * torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) - 0.3
+    theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
+    body = after.config.body
+    mine = torch.cat([after.collider.moved(points, wish, body), after.collider.floor(points, body)[:, None]], 1)
+    assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
+
+
+def test_known_walls_of_merged_places_are_met_as_in_python(tmp_path, opened):
+    boxes, full = (
+        torch.tensor([[-1, -1, -0.2, 5, 5, 0], [1, 1, 0, 2, 2, 0.3], [0, 3, 0, 4, 3.2, 2]]).float(),
+        world(600),
+    )
+    for name in ("w", "other"):
+        save_splat(walled_by(full, boxes), tmp_path / name)
+    write_edits(tmp_path / "w", [merging(tmp_path / "w", tmp_path / "other", (9, 1, 0.1), -90)])
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page, after = opened((tmp_path / "place.html").as_uri()), load(tmp_path / "w")
+    assert isinstance(after, SplatWorld) and len(after.solids) == 6
+    assert np.allclose(page.evaluate("terrella.solid.boxes"), after.solids)
+    page.evaluate("terrella.editor.change(() => terrella.story.undo())")
+    assert len(page.evaluate("terrella.solid.boxes")) == 3
+
+
 def test_bodies_move_as_they_do_in_python(tmp_path, opened):
     page, place, body = opened(exported(tmp_path, 6000)), world(6000), Body()
     rng = torch.Generator().manual_seed(1)
@@ -155,8 +209,7 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     boxes = torch.tensor(
         [[-1, -1, -0.2, 5, 5, 0], [4, -1, 0, 4.2, 5, 3], [1, 1, 0, 2, 2, 0.3], [0, 3, 0, 4, 3.2, 2]]
     ).float()
-    full, body = world(600), Body()
-    walled = SplatWorld("walls", full.gaussians, full.provenance, full.starts, full.config, solids=boxes)
+    body, walled = Body(), walled_by(world(600), boxes)
     save_splat(walled, tmp_path / "w")
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
     page, rng = opened((tmp_path / "place.html").as_uri()), torch.Generator().manual_seed(2)
@@ -184,6 +237,9 @@ def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser
     after = edited(world(4000).gaussians, EDITS[:1])
     assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(after.gaussians.means))
     assert page.evaluate("!terrella.story.unsaved && !document.getElementById('edit').hidden")
+    assert main(["space", "export", str(merged(tmp_path, 4000)), str(tmp_path / "both.html")]) == 0
+    page = opened((tmp_path / "both.html").as_uri())
+    assert page.evaluate("terrella.story.scene.length") == 4600
 
 
 def test_far_gaussians_are_fewer_and_stand_for_more(tmp_path, opened):
@@ -296,7 +352,7 @@ def test_a_place_is_compared_with_what_it_was_and_with_another(tmp_path, opened)
 def test_a_server_keeps_the_edits(tmp_path, opened, serving):
     save_splat(world(1500), tmp_path / "w")
     folder = tmp_path / "w"
-    save = lambda text: write_edits(folder, checked_edits(source_of(folder), text))  # noqa: E731
+    save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
     url = serving(build_place(place_of(str(folder)), lambda: read_edits(folder), save))
     page = opened(url)
     page.evaluate("terrella.editor.choose({ object: 1 })")
@@ -314,6 +370,18 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
     status, said = page.evaluate(post, "")  # a page that was opened before those edits
     assert status == 422 and "edited elsewhere" in said
     assert len(read_edits(folder)) == 1
+
+    write_edits(folder, [])
+    merged(tmp_path, 1500)
+    page.reload()
+    until(page, "!!window.terrella && terrella.story.scene.length === 2100")
+    for clicked, left in (("undo", 0), ("redo", 1)):
+        page.evaluate(f"document.getElementById('{clicked}').click(); document.getElementById('save').click()")
+        until(page, "!terrella.story.unsaved")
+        assert len(read_edits(folder)) == left
+    foreign = post.replace('{"do": 1}', '{"do": "merge", "place": "/", "sha256": "0", "by": [0, 0, 0], "degrees": 0}')
+    status, said = page.evaluate(foreign, page.evaluate("terrella.story.saved"))
+    assert status == 422 and "merges nothing new" in said
 
 
 @pytest.fixture

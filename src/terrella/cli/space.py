@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from .. import progress
 from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
-from ..space.edits import DEEDS, edited
+from ..space.edits import DEEDS, Edit, edited
 from ..space.files import read_scene, replace_whole, write_scene
 from ..space.files.gltf_scene import GLTF_ENDINGS, Scene, read_gltf
 from ..space.files.spz import Version
@@ -21,7 +21,17 @@ from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
-from ..worlds.splat_folder import UNDONE_FILE, checked_edits, read_edits, save_splat, source_of, world_of, write_edits
+from ..worlds.splat_folder import (
+    UNDONE_FILE,
+    checked_edits,
+    merging,
+    other_of,
+    read_edits,
+    save_splat,
+    source_of,
+    world_of,
+    write_edits,
+)
 from .say import Host, Json, Port, Token, result, say
 from .space_build import COUNT, of_scene
 from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_other
@@ -178,7 +188,7 @@ def view(
     folder, place = folder_of(world), place_of(world)
 
     def save(text: str) -> None:
-        write_edits(folder, checked_edits(source_of(folder), text))
+        write_edits(folder, checked_edits(folder, text))
 
     def ready(address: str) -> None:
         result({"address": address, "gaussians": len(place.gaussians)}, json, f"{place.name}: open {address}")
@@ -196,19 +206,20 @@ def compared_with(name: str) -> Place:
 def place_of(world: str) -> Place:
     """What a page shows of a world of Gaussians: as it was before its edits."""
     open_splat(world)  # refuses what is none
-    return shown_place(source_of(folder_of(world)))
+    other = other_of(folder_of(world))
+    return shown_place(source_of(folder_of(world)), lambda edit: shown_place(other(edit), walked=False))
 
 
-def shown_place(source: SplatWorld) -> Place:
-    """A world of Gaussians as a page takes it."""
+def shown_place(source: SplatWorld, other: Callable[[Edit], Place] | None = None, walked: bool = True) -> Place:
+    """A world of Gaussians as a page takes it; `other` opens what an edit merges. Where nobody walks no floors and walls are read
+    off the Gaussians."""
     from ..serve.place import Place
 
-    config, named = source.config, source.card.get("objects", [])
-    collider = Solids(source.solids) if len(source.solids) else source.occupancy
-    seen, names = source.provenance == OBSERVED, [str(one) for one in named] if isinstance(named, list) else []
+    config, seen = source.config, source.provenance == OBSERVED
+    collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
     return Place(
         source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
-        config.keep, config.dt_s, names,
+        config.keep, config.dt_s, source.object_names, other,
     )  # fmt: skip
 
 
@@ -224,6 +235,7 @@ def edit(
     scale: float | None = None,
     recolour: tuple[float, float, float] | None = None,
     delete: bool = False,
+    merge: str | None = None,
     undo: bool = False,
     redo: bool = False,
     replay: Path | None = None,
@@ -243,44 +255,61 @@ def edit(
         scale: By a factor about its middle.
         recolour: To one colour (red green blue, 0 to 1).
         delete: Take it away.
+        merge: Add all of this other world of Gaussians: with --turn first turned about its origin, with --move then moved.
         undo: Take the last edit back.
         redo: Do again what was taken back last.
         replay: Take the edits of this file (one that the page saved) in place of those that the world has.
     """
-    from ..core.errors import TerrellaError
+    from ..core.errors import CheckpointError, TerrellaError
 
-    folder, opened = folder_of(world), open_splat(world)
+    folder = folder_of(world)
     edits, undone = read_edits(folder), read_edits(folder, UNDONE_FILE)
     given = {"box": box, "sphere": sphere, "plane": plane, "object": object}
     places = {name: list(v) if isinstance(v, tuple) else v for name, v in given.items() if v is not None}
     asked: dict[str, Any] = {
         "move": move, "duplicate": duplicate, "turn": turn, "scale": scale, "recolour": recolour, "delete": delete or None,
     }  # fmt: skip
-    deeds = [name for name, value in asked.items() if value is not None]
+    deeds = [name for name, value in asked.items() if value is not None and not (merge and name in ("move", "turn"))]
+    deeds += ["merge"] * (merge is not None)
     if len(places) > 1 or len(deeds) + undo + redo + (replay is not None) != 1:
         raise TerrellaError(
             "an edit is of one place (--box, --sphere, --plane or --object) and does one thing (--move, --delete, ...)."
         )
     if delete and not places:
         raise TerrellaError("say what to delete: --box, --sphere, --plane or --object.")
-    if places and not deeds:
-        raise TerrellaError("--undo, --redo and --replay are of the whole place; leave the selection out.")
+    if places and (merge or not deeds):
+        raise TerrellaError("--merge, --undo, --redo and --replay are of the whole place; leave the selection out.")
     if undo and not edits or redo and not undone:
         raise TerrellaError(f"{world} has no edit to {'undo' if undo else 'redo'}.")
     if replay is not None:
-        write_edits(folder, checked_edits(source_of(folder), read_text(replay)))
+        write_edits(folder, checked_edits(folder, read_text(replay)))
     elif undo:
         write_edits(folder, edits[:-1], [*undone, edits[-1]])
-    elif redo:
-        write_edits(folder, [*edits, undone[-1]], undone[:-1])
     else:
-        new: dict[str, Any] = {"select": places or {"all": True}, "do": deeds[0]}
-        name = DEEDS[deeds[0]][0]
-        if name:
-            new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
-        edited(opened.gaussians, [new], opened.objects)  # refuses what cannot be done
-        write_edits(folder, [*edits, new])
-    result({"edits": len(read_edits(folder)), "gaussians": len(open_splat(world).gaussians)}, json)
+        opened = open_splat(world)
+        if redo:
+            new = undone[-1]
+        elif merge is not None:
+            if Path(merge).is_file():
+                raise TerrellaError(
+                    f"{merge} is a file; `terrella space import` or `space build` makes a world of it first."
+                )
+            open_splat(merge)  # refuses what is none
+            new = merging(folder, folder_of(merge), move or (0.0, 0.0, 0.0), turn or 0.0)
+        else:
+            new = {"select": places or {"all": True}, "do": deeds[0]}
+            if name := DEEDS[deeds[0]][0]:
+                new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
+        edited(opened.gaussians, [new], opened.objects, other_of(folder))  # refuses what cannot be done
+        write_edits(folder, [*edits, new], undone[:-1] if redo else ())
+    facts = {"edits": len(read_edits(folder))}
+    try:
+        facts["gaussians"] = len(open_splat(world).gaussians)
+    except CheckpointError as error:
+        if not undo:
+            raise
+        say(str(error))  # an edit before that one, to be taken back next
+    result(facts, json)
 
 
 def read_text(path: Path) -> str:

@@ -21,11 +21,11 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ..core.errors import ServeError
+from ..core.errors import ServeError, TerrellaError
 from .guard import Guard, is_loopback
 
 WEB = Path(__file__).parent / "web"
@@ -86,7 +86,10 @@ def application(
 
     def show(request: Request) -> Response:
         if made is not None and request.url.path == "/":
-            return Response(made(), media_type="text/html")
+            try:
+                return Response(made(), media_type="text/html")
+            except TerrellaError as error:
+                return PlainTextResponse(str(error), 500)
         content, kind = contents[request.url.path]
         return Response(content, media_type=kind)
 

@@ -11,7 +11,7 @@ import simplejpeg
 import torch
 
 from ..core.errors import ServeError
-from ..space.edits import Edit, edited
+from ..space.edits import Contents, Edit, edited
 from ..space.raster import Gaussians, rasterise
 
 NAMES = ("x", "y", "z", "heading", "pitch", "wide", "tall", "width", "height")
@@ -20,11 +20,18 @@ FARTHEST_M = 1e6
 
 
 class Frames:
-    """Pictures of Gaussians, objects int32 [N], after the `edits` of the moment; one is drawn at a time."""
+    """Pictures of Gaussians, objects int32 [N], after the `edits` of the moment, of which `other` opens what they merge; one
+    is drawn at a time."""
 
-    def __init__(self, gaussians: Gaussians, objects: torch.Tensor, edits: Callable[[], Sequence[Edit]]):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        objects: torch.Tensor,
+        edits: Callable[[], Sequence[Edit]],
+        other: Callable[[Edit], Contents] | None = None,
+    ):
         self._source, self._objects, self._edits, self._alone = gaussians, objects, edits, threading.Lock()
-        self._scene, self._done = gaussians, "[]"
+        self._scene, self._done, self._other = gaussians, "[]", other
 
     def draw(self, view: Mapping[str, str]) -> bytes:
         """A JPEG from an eye at x, y, z (metres) that looks along `heading` and `pitch` (radians, upwards); half of what it sees at
@@ -44,7 +51,7 @@ class Frames:
         with self._alone, torch.no_grad():
             told = json.dumps(list(edits := self._edits()))
             if told != self._done:
-                self._scene, self._done = edited(self._source, edits, self._objects).gaussians, told
+                self._scene, self._done = edited(self._source, edits, self._objects, self._other).gaussians, told
             lens = (0.5 / wide, 0.5 / tall, 0.5, 0.5)
             seen = rasterise(self._scene, pose, lens, (round(height), round(width))).rgb[0]
         picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous()

@@ -25,7 +25,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
-from ..space.edits import Edit
+from ..space.edits import Edit, merges
 from ..space.files.compressed import packed_quats
 from ..space.occupancy import Body, Occupancy, samples
 from ..space.raster import Gaussians
@@ -49,7 +49,7 @@ _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.
 class Place:
     """What the page shows: Gaussians before all edits, of which `seen` bool [N] were observed, and objects int32 [N] says to which
     object each belongs (0: none) of those that `names` lists; starts [S, 7] poses; what is solid and who walks; pace and keep as a
-    SplatConfig has them, and dt_s of a step."""
+    SplatConfig has them, and dt_s of a step; `other` opens the place that an edit merges."""
 
     name: str
     gaussians: Gaussians
@@ -62,6 +62,7 @@ class Place:
     keep: Sequence[float]
     dt_s: float
     names: Sequence[str] = ()
+    other: Callable[[Edit], Place] | None = None
 
 
 class PlacePage:
@@ -74,6 +75,7 @@ class PlacePage:
             packed = gzip.compress(_packed(beside, torch.ones(len(beside.gaussians), dtype=torch.bool)), 6, mtime=0)
             self._beside = {"count": len(beside.gaussians), "name": beside.name}
         self._compared = base64.b64encode(packed).decode()
+        self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # what merges brought to it so far
         first = len(place.gaussians) if len(place.gaussians) <= WHOLE else FIRST
         self._packed, *parts = packed_place(place, first)
         self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
@@ -88,19 +90,35 @@ class PlacePage:
         """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
         file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile. `frames`: the
         address that draws for browsers that cannot."""
-        place = self._place
+        place, merged = self._place, [self._brought(edit) for edit in merges(edits)]
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
-            "boxes": place.collider.boxes.tolist() if isinstance(place.collider, Solids) else [], "edits": list(edits),
+            "boxes": _boxes(place), "edits": list(edits), "merged": [told for told, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside,
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
             "world": json.dumps(about).replace("<", "\\u003c"), "data": self._data, "rest": self._rest, "beside": self._compared,
+            "merged": " ".join(data for _, data in merged),
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
         return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
+
+    def _brought(self, edit: Edit) -> tuple[dict[str, Any], str]:
+        """What a merge brings, as the page has it: what is said of it, and its Gaussians."""
+        key = edit["place"], edit["sha256"]
+        if key not in self.merged and self._place.other:
+            other = self._place.other(edit)
+            packed = gzip.compress(_packed(other, torch.ones(len(other.gaussians), dtype=torch.bool)), 6, mtime=0)
+            told = {
+                "sha256": key[1],
+                "count": len(other.gaussians),
+                "boxes": _boxes(other),
+                "objects": list(other.names),
+            }
+            self.merged[key] = told, base64.b64encode(packed).decode()
+        return self.merged[key]
 
 
 def packed_place(place: Place, first: int) -> tuple[dict[str, Any], bytes, bytes]:
@@ -171,6 +189,10 @@ def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]
     return about, np.packbits(solid.ravel()).tobytes() + within[solid].tobytes()
 
 
+def _boxes(place: Place) -> list[list[float]]:
+    return place.collider.boxes.tolist() if isinstance(place.collider, Solids) else []
+
+
 def _by_bytes(numbers: np.ndarray, kind: str) -> bytes:
     """All first bytes, then all second ones: they compress better so."""
     flat = np.ascontiguousarray(numbers).ravel().astype(kind)
@@ -188,13 +210,20 @@ def build_place(
     """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
     saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows.
     `beside` is what the place can be compared with."""
-    page, alone, frames = PlacePage(place, beside), threading.Lock(), Frames(place.gaussians, place.objects, edits)
+    page, alone, frames = (
+        PlacePage(place, beside),
+        threading.Lock(),
+        Frames(place.gaussians, place.objects, edits, place.other),
+    )
 
     def kept(content: bytes) -> None:
         told = json.loads(content)
         with alone:
             if [json.loads(line) for line in told["saved"].splitlines() if line] != list(edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
+            lines = [json.loads(line) for line in told["lines"].splitlines() if line]
+            if any((edit["place"], edit["sha256"]) not in page.merged for edit in merges(lines)):
+                raise ServeError("this page merges nothing new; `terrella space edit PLACE --merge OTHER` does.")
             save(told["lines"])
 
     async def keep(request: Request) -> PlainTextResponse:

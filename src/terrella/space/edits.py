@@ -4,7 +4,11 @@
 
 select: box; sphere [x, y, z, radius]; brush [x, y, z, radius, x, y, z, radius, ...], where one went over it with spheres; plane
 [a, b, c, d], where a x + b y + c z > d; object, its number; all true. do: move or duplicate (by, metres); turn (degrees about the
-vertical through the middle); scale (factor, about the middle); recolour (colour, 0 to 1); delete.
+vertical through the middle); scale (factor, about the middle); recolour (colour, 0 to 1); delete. One edit selects nothing:
+
+    {"do": "merge", "place": "../other", "sha256": "...", "by": [dx, dy, dz], "degrees": 90}
+
+adds all of another place, turned about the vertical through its origin, then moved; its objects are numbered on from the first's.
 
 The page edits with the same language (serve/web/place/edits.js). Both compute places in double precision and keep them in
 single, so that they choose the same Gaussians.
@@ -13,9 +17,9 @@ single, so that they choose the same Gaussians.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -31,37 +35,92 @@ DEEDS = {
 }  # fmt: skip
 MOST_DABS = 10_000  # spheres of a brush
 MOST_GAUSSIANS = 20_000_000  # of a place that was edited
+FARTHEST_M = 10_000.0  # from the origin: farther away single precision does not hold a millimetre
 Edit = Mapping[str, Any]
+
+
+class Contents(Protocol):
+    """What a merge takes of another place: Gaussians, and objects int32 [N]."""
+
+    @property
+    def gaussians(self) -> Gaussians: ...
+    @property
+    def objects(self) -> torch.Tensor: ...
 
 
 @dataclass(frozen=True)
 class Edited:
-    """The Gaussians after edits; origin int64 [N], which of the first ones each still is, -1 for those that an edit made or
-    changed; objects int32 [N], the number of the object that each belongs to, 0 for none. A duplicate is a new object."""
+    """The Gaussians after edits; origin int64 [N], which of the first ones, followed by those of all merged places, each still is,
+    -1 for those that an edit made or changed; objects int32 [N], the number of the object that each belongs to, 0 for none. A
+    duplicate is a new object. raised: by how much each merge raised the numbers of its objects."""
 
     gaussians: Gaussians
     origin: torch.Tensor
     objects: torch.Tensor
+    raised: tuple[int, ...] = ()
 
 
-def edited(gaussians: Gaussians, edits: Sequence[Edit], objects: torch.Tensor | None = None) -> Edited:
-    """Edits done one after another; objects int32 [N], by default none. ContractError for what is no edit."""
-    origin = torch.arange(len(gaussians))
+def edited(
+    gaussians: Gaussians,
+    edits: Sequence[Edit],
+    objects: torch.Tensor | None = None,
+    other: Callable[[Edit], Contents] | None = None,
+) -> Edited:
+    """Edits done one after another; objects int32 [N], by default none; `other` opens the place that a merge names. ContractError
+    for what is no edit."""
+    origin, known, raised = torch.arange(len(gaussians)), len(gaussians), []
     objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
     for edit in edits:
-        chosen = selected(gaussians, edit, objects)
-        done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
+        if edit.get("do") == "merge":
+            if other is None:
+                raise ContractError("a merge needs the other place; give `other`, which opens it.")
+            came, chosen = other(edit), torch.zeros(len(gaussians), dtype=torch.bool)
+            done, fresh = _placed(came.gaussians, edit), known + torch.arange(len(came.gaussians))
+            raised.append(int(objects.max()) if len(objects) else 0)
+            belong = torch.where(came.objects > 0, came.objects + raised[-1], 0).int()
+            known += len(done)
+        else:
+            chosen = selected(gaussians, edit, objects)
+            done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
+            fresh = torch.full((len(done),), -1)
         if edit["do"] == "duplicate":
             belong = torch.full_like(belong, int(objects.max()) + 1)
             chosen = torch.zeros_like(chosen)  # what was duplicated stays, too
         if not (done.means.isfinite().all() and done.scales.isfinite().all()):
             raise ContractError(f"'{edit['do']}' leads out of all numbers; take smaller ones.")
         if len(gaussians) + len(done) > MOST_GAUSSIANS:
-            raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; duplicate less.")
+            raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; add less.")
         gaussians = join([gaussians.at(~chosen), done])
-        origin = torch.cat([origin[~chosen], origin.new_full((len(done),), -1)])
+        origin = torch.cat([origin[~chosen], fresh])
         objects = torch.cat([objects[~chosen], belong[: len(done)]])
-    return Edited(gaussians, origin, objects)
+    return Edited(gaussians, origin, objects, tuple(raised))
+
+
+def merges(edits: Sequence[Edit]) -> list[Edit]:
+    """Those that bring another place."""
+    return [edit for edit in edits if edit.get("do") == "merge"]
+
+
+def placed_boxes(boxes: torch.Tensor, edit: Edit) -> torch.Tensor | None:
+    """Upright boxes [K, 6] (low and high corners) of a merged place; None where it was turned by no quarter."""
+    quarters = edit["degrees"] / 90
+    if quarters != round(quarters):
+        return None
+    for _ in range(round(quarters) % 4):
+        x0, y0, z0, x1, y1, z1 = boxes.unbind(1)
+        boxes = torch.stack([-y1, x0, z0, -y0, x1, z1], 1)
+    return boxes + _numbers(edit["by"], 3, "by").repeat(2)
+
+
+def _placed(some: Gaussians, edit: Edit) -> Gaussians:
+    """The Gaussians of a merged place."""
+    by, degrees = _numbers(edit.get("by"), 3, "by"), _numbers(edit.get("degrees"), 1, "degrees")
+    there = _turned(some, float(degrees), torch.zeros(3).double(), by.double())
+    if (there.means.abs() > FARTHEST_M).any(1).float().mean() > 0.001:
+        raise ContractError(
+            f"what is merged reaches farther than {FARTHEST_M / 1000:g} km; scale it first, or delete what lies far away."
+        )
+    return there
 
 
 def selected(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:
@@ -103,11 +162,7 @@ def _done(some: Gaussians, edit: Edit) -> Gaussians:
     if deed in ("move", "duplicate"):
         return replace(some, means=(means + numbers.double()).float())
     if deed == "turn":
-        c, s = math.cos(math.radians(float(numbers))), math.sin(math.radians(float(numbers)))
-        x, y, z = (means - middle).unbind(1)
-        around = torch.stack([c * x - s * y, s * x + c * y, z], 1) + middle
-        rot = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        return replace(turned(some, rot), means=around.float())
+        return _turned(some, float(numbers), middle, middle)
     if deed == "scale":
         if not float(numbers) > 0:
             raise ContractError("a place is scaled by a factor above 0.")
@@ -118,6 +173,15 @@ def _done(some: Gaussians, edit: Edit) -> Gaussians:
             raise ContractError("a colour is red, green and blue from 0 to 1.")
         return replace(some, sh=torch.cat([plain_sh(numbers.expand(len(some), 3)), 0 * some.sh[:, 1:]], 1))
     return some.at(torch.zeros(len(some), dtype=torch.bool))
+
+
+def _turned(some: Gaussians, degrees: float, middle: torch.Tensor, to: torch.Tensor) -> Gaussians:
+    """Turned about the vertical through `middle`, which comes to lie at `to`, both float64 [3]."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    x, y, z = (some.means.double() - middle).unbind(1)
+    around = torch.stack([c * x - s * y, s * x + c * y, z], 1) + to
+    rot = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return replace(turned(some, rot), means=around.float())
 
 
 def _numbers(given: Any, count: int, name: str) -> torch.Tensor:

@@ -123,6 +123,12 @@ class SplatWorld:
             card={"kind": "splat", **self.card},
         )
 
+    @property
+    def object_names(self) -> list[str]:
+        """Of the objects 1, 2, ..., as far as they are known."""
+        named = self.card.get("objects")
+        return [str(one) for one in named] if isinstance(named, list) else []
+
     @cached_property
     def occupancy(self) -> Occupancy:
         """What the Gaussians fill."""

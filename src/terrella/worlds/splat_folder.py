@@ -3,8 +3,12 @@ of a file."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import io
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from ..core.errors import CheckpointError, ContractError
 from ..space.camera import planar_pose
-from ..space.edits import Edit, edited
+from ..space.edits import Edit, Edited, edited, merges, placed_boxes
 from ..space.files import replace_whole
 from ..space.occupancy import Body
 from ..space.raster import Gaussians
@@ -92,24 +96,108 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
             raise ValueError("its solids are no boxes")
         if bodies is not None and (solids is None or bodies.shape != solids.shape[:1]):
             raise ValueError("its bodies are not those of its solids")
-        edits = read_edits(path) if edits is None else edits
-        after = edited(Gaussians(**tensors), edits, objects)
-        provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
-        return SplatWorld(
-            str(about["name"]), after.gaussians, provenance, starts, config, dict(about["card"]), after.objects,
-            *((None, None) if edits else (solids, bodies)),  # edits move what they describe: then the Gaussians stop bodies
+        world = SplatWorld(
+            str(about["name"]), Gaussians(**tensors), provenance, starts, config, dict(about["card"]), objects, solids, bodies
         )  # fmt: skip
+        edits = read_edits(path) if edits is None else edits
+        return _after(world, edits, other_of(path)) if edits else world
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 
 
-def source_of(path: str | Path) -> SplatWorld:
-    """The world as it was before all edits."""
+def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], SplatWorld]) -> SplatWorld:
+    """A world after edits."""
+    after = edited(source.gaussians, edits, source.objects, other)
+    merged = [other(edit) for edit in merges(edits)]
+    provenance = torch.cat([source.provenance, *(one.provenance for one in merged)])
+    provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
+    card, names = dict(source.card), source.object_names
+    for lift, one in zip(after.raised, merged):
+        names = [*names, *[""] * lift][:lift] + one.object_names
+    return SplatWorld(
+        source.name, after.gaussians, provenance, source.starts, source.config, {**card, "objects": names} if merged else card,
+        after.objects, *_solids(source, edits, merged, after),
+    )  # fmt: skip
+
+
+def _solids(
+    source: SplatWorld, edits: Sequence[Edit], merged: Sequence[SplatWorld], after: Edited
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """Boxes and bodies after edits; none where edits moved what they describe, or a place has none: then the Gaussians stop
+    bodies."""
+    solids, bodies = [source.solids], [source.bodies]
+    for edit, one, lift in zip(merges(edits), merged, after.raised):
+        boxes = placed_boxes(one.solids, edit)
+        solids.append(torch.zeros(0, 6) if boxes is None else boxes)
+        bodies.append(torch.where(one.bodies > 0, one.bodies + lift, 0).int())
+    if len(merged) < len(edits) or not all(len(part) for part in solids):
+        return None, None
+    return torch.cat(solids), torch.cat(bodies)
+
+
+def source_of(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld:
+    """The world as it was before all edits; None: after its own."""
     try:
         about = json.loads((Path(path) / WORLD_FILE).read_text())
-    except (OSError, ValueError) as error:
+        if about["kind"] != KIND:
+            raise ValueError(f"it is of the kind {about['kind']}")
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise CheckpointError(f"{path} is no world of Gaussians ({error}); give the folder that holds one.") from error
-    return load_splat(path, about, [])
+    return load_splat(path, about, edits)
+
+
+def merging(path: Path, other: Path, by: Sequence[float] = (0, 0, 0), degrees: float = 0) -> Edit:
+    """The edit that merges the world in the folder `other`, as it is now with its edits, into that in `path`: turned to the left
+    about the vertical through its origin, then moved by metres. ContractError for a place in itself."""
+    path, other = path.resolve(), other.resolve()
+    if path in _within(other):
+        raise ContractError(f"{other.name} is {path.name} itself, or has it merged; --duplicate makes a second one.")
+    try:
+        told = Path(os.path.relpath(other, path))
+    except ValueError:  # on another drive
+        told = other
+    return {"do": "merge", "place": told.as_posix(), "sha256": _digest(other), "by": list(by), "degrees": degrees}
+
+
+def _within(path: Path) -> list[Path]:
+    """A world's folder, and those of all that it merges."""
+    return [path, *(one for edit in merges(read_edits(path)) for one in _within((path / edit["place"]).resolve()))]
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of what a world says, holds and edits: through the lines of its merges of what it merges, too."""
+    whole = hashlib.sha256()
+    for file in (path / WORLD_FILE, path / SCENE_FILE, path / EDITS_FILE):
+        with file.open("rb") if file.exists() or file.name != EDITS_FILE else io.BytesIO() as stream:
+            whole.update(hashlib.file_digest(stream, "sha256").digest())
+    return whole.hexdigest()
+
+
+def other_of(path: str | Path) -> Callable[[Edit], SplatWorld]:
+    """What opens the world that a merge of the one in `path` names, with its edits, each once. CheckpointError where it is gone or
+    was changed."""
+
+    @functools.cache
+    def opened(place: str, sha256: str) -> SplatWorld:
+        folder = Path(os.path.normpath(Path(path).resolve() / place))
+        try:
+            fault = "" if _digest(folder) == sha256 else "was changed"
+        except OSError:
+            fault = "is not there"
+        if fault:
+            raise CheckpointError(
+                f"{folder}, which {path} has merged, {fault}; put it back as it was, or take the merge back "
+                f"(terrella space edit {path} --undo) and merge anew."
+            )
+        return source_of(folder, None)
+
+    def other(edit: Edit) -> SplatWorld:
+        told = edit.get("place"), edit.get("sha256")
+        if not isinstance(told[0], str) or not isinstance(told[1], str):
+            raise ContractError(f"a merge names a `place` and its `sha256`; got {told!r:.80}.")
+        return opened(*told)
+
+    return other
 
 
 def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
@@ -122,14 +210,19 @@ def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
 
 def parse_edits(text: str) -> list[Edit]:
     """Edits of lines of JSON; ValueError for a line that is none."""
-    return [json.loads(line) for line in text.splitlines() if line.strip()]
+    edits = [json.loads(line) for line in text.splitlines() if line.strip()]
+    if not all(isinstance(edit, dict) for edit in edits):
+        raise ValueError("a line is no edit")
+    return edits
 
 
-def checked_edits(source: SplatWorld, text: str) -> list[Edit]:
-    """The edits of a text of lines of JSON, after they were tried on `source`; ContractError where they do not fit it."""
+def checked_edits(path: Path, text: str) -> list[Edit]:
+    """The edits of a text of lines of JSON, after they were tried on the world in `path` as it was before all edits;
+    ContractError where they do not fit it."""
+    source = source_of(path)
     try:
         edits = parse_edits(text)
-        edited(source.gaussians, edits, source.objects)
+        edited(source.gaussians, edits, source.objects, other_of(path))
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise ContractError(f"these are no edits ({error}); give the lines of a world.edits.jsonl.") from error
     return edits

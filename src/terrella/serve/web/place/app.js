@@ -32,7 +32,7 @@ const ready = await open().catch((error) => {
 async function open() {
   const drawing = world.frames && !document.createElement('canvas').getContext('webgl2') ? new Remote(canvas, world.frames, toast) : new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
-  const story = new Story(source, []);
+  const story = new Story(source, [], source.length === world.count ? await others() : undefined);
   try { story.begin(source, world.edits); } catch (error) { if (source.length === world.count) throw error; }  // the rest comes
   return { drawing, source, story, solid };
 }
@@ -40,13 +40,23 @@ async function open() {
 /** What comes first of a place: Gaussians that are spread over all, and what is solid. */
 async function unpacked(about, packed) {
   const reader = new Reader(await inflate(packed)), solid = world.boxes.length ? new Boxes(world.boxes) : Solid.unpack(reader, about.solid);
-  return { source: unpackScene(reader, about.first), solid };
+  return { source: unpackScene(reader, { ...world, count: about.first }), solid };
+}
+
+/** The scenes that edits merge, as soon as the page is there. */
+async function others() {
+  const found = new Map();
+  while (!$('end')) await new Promise((done) => { setTimeout(done, 20); });
+  const packed = $('merged').textContent.split(' ');
+  $('merged').remove();
+  for (const [at, about] of world.merged.entries()) found.set(about.sha256, unpackScene(new Reader(await inflate(decoded(packed[at]))), about));
+  return found;
 }
 
 /** All Gaussians, as soon as the rest of the page is there. */
 async function whole(source) {
   while (!$('end') || !seen.painted) await new Promise((done) => { setTimeout(done, 50); });
-  const rest = unpackScene(new Reader(await inflate(decoded($('rest').textContent))), world.count - source.length);
+  const rest = unpackScene(new Reader(await inflate(decoded($('rest').textContent))), { count: world.count - source.length });
   $('rest').remove();
   return joined(source, rest);
 }
@@ -62,7 +72,7 @@ function run({ drawing, source, story, solid: first }) {
     look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
   });
   const compare = new Compare(redraw);
-  const editor = new Editor(story, drawing, world.objects, {
+  const editor = new Editor(story, drawing, {
     changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep,
   });
 
@@ -70,7 +80,7 @@ function run({ drawing, source, story, solid: first }) {
   function take(scene) {
     drawing.set(scene, seen.stands);
     sorter.set(scene);
-    solid = scene === source ? first : Solid.of(scene, world.samples);
+    solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : Solid.of(scene, world.samples);
     map.layer = null;
     seen.sorted = '';
     $('what').textContent = `${seen.stands > 1 ? `${scene.length.toLocaleString('en')} of ${world.count.toLocaleString('en')}` : scene.length.toLocaleString('en')} Gaussians${made}`;
@@ -95,7 +105,7 @@ function run({ drawing, source, story, solid: first }) {
     if (compare.open) { compare.show(null); return; }
     if (seen.stands > 1) { toast('The rest of the place comes first.'); return; }
     if (!world.beside && !story.edits.length) { toast('It was not edited. `terrella space view PLACE --beside OTHER` compares it with another place or file.'); return; }
-    if (world.beside) seen.beside ??= unpackScene(new Reader(await inflate(decoded($('beside').textContent))), world.beside.count);
+    if (world.beside) seen.beside ??= unpackScene(new Reader(await inflate(decoded($('beside').textContent))), world.beside);
     seen.sorted = '';
     compare.show(seen.beside ?? source, world.beside?.name ?? 'before its edits');
   }
@@ -195,8 +205,9 @@ function run({ drawing, source, story, solid: first }) {
   greet();
   if (seen.stands > 1 && !world.watch) {  // who watches is given the newest whole
     $('edit').hidden = true;
-    whole(source).then((all) => {
+    whole(source).then(async (all) => {
       source = all;
+      story.others = await others();
       story.begin(source, world.edits);
       seen.stands = 1;
       $('edit').hidden = !!drawing.remote;

@@ -15,8 +15,8 @@ const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 
 export class Editor {
   /** on: changed(scene), marked(mask), redraw(), eye(), lens(), say(text), keep(lines) -> promise. */
-  constructor(story, drawing, names, on) {
-    Object.assign(this, { story, drawing, names, on, chosen: null, mask: null, open: false });
+  constructor(story, drawing, on) {
+    Object.assign(this, { story, drawing, on, chosen: null, mask: null, open: false });
     this.selecting = new Selecting({
       scene: () => story.scene, eye: on.eye, lens: on.lens, mask: () => this.mask, choose: (chosen) => this.choose(chosen), say: on.say,
       dabs: () => [...(this.chosen?.brush ?? [])], preview: (shift) => this.preview({ move: shift }), move: (by) => this.act({ do: 'move', by }),
@@ -34,9 +34,6 @@ export class Editor {
     $('redo').onclick = () => this.change(() => story.redo());
     $('save').onclick = () => this.save();
     $('open').onchange = () => this.read($('open').files[0]);
-    const any = story.source.objects.some(Boolean), object = document.querySelector('[data-tool=object]');
-    object.disabled = !any;
-    object.title = any ? '' : 'This place has no objects of their own';
     this.take('sphere');
     this.show();
   }
@@ -125,7 +122,10 @@ export class Editor {
 
   show() {
     const { story, chosen, mask } = this, kind = chosen && Object.keys(chosen)[0];
-    $('count').textContent = !chosen ? 'Nothing selected' : `${(mask?.count ?? 0).toLocaleString('en')} selected${kind === 'object' ? `: ${this.names[chosen.object - 1] ?? `object ${chosen.object}`}` : ''}`;
+    const any = story.scene.objects.some(Boolean), object = document.querySelector('[data-tool=object]');
+    object.disabled = !any;
+    object.title = any ? '' : 'This place has no objects of their own';
+    $('count').textContent = !chosen ? 'Nothing selected' : `${(mask?.count ?? 0).toLocaleString('en')} selected${kind === 'object' ? `: ${story.scene.names[chosen.object - 1] || `object ${chosen.object}`}` : ''}`;
     $('tool-said').textContent = SAID[this.selecting.tool] + (mask ? MOVES : '');
     $('drop-chosen').hidden = !chosen;
     $('deeds').disabled = !mask;

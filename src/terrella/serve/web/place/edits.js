@@ -1,7 +1,8 @@
 // The language of edits, as space/edits.py speaks it: places are computed in double precision and kept in single.
 
-import { Scene } from './scene.js';
+import { joined } from './scene.js';
 
+const MOST_OBJECTS = 65535;
 const single = (numbers) => [numbers].flat().map(Math.fround);
 
 /** Which Gaussians {kind: numbers} selects: 1 or 0 for each, and their `count`. */
@@ -35,14 +36,15 @@ export function middleOf(scene, mask) {
   return low.map((value, a) => (value + high[a]) / 2);
 }
 
-/** The scene after an edit; an Error where nothing is selected. What was changed counts as not seen. */
-export function edited(scene, edit) {
+/** The scene after an edit; an Error where nothing is selected. What was changed counts as not seen. others: a Map of what merges bring. */
+export function edited(scene, edit, others) {
+  if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
   if (!mask.count) throw new Error('nothing lies there; choose another place.');
   if (edit.do === 'delete') return scene.at(numbers(mask, 0));
   if (edit.do === 'duplicate') {
     const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
-    const fresh = scene.objects.reduce((most, number) => Math.max(most, number), 0) + 1, [dx, dy, dz] = single(by);
+    const fresh = highest(scene.objects) + 1, [dx, dy, dz] = single(by);
     for (let k = many; k < both.length; k += 1) {
       both.seen[k] = 0;
       both.objects[k] = fresh;
@@ -51,10 +53,32 @@ export function edited(scene, edit) {
     return both;
   }
   const after = scene.copy(), middle = middleOf(scene, mask);
-  const change = { move: () => moved(after, single(by)), turn: () => turned(after, single(degrees)[0], middle), scale: () => scaled(after, single(factor)[0], middle), recolour: () => recoloured(after, single(colour)) }[edit.do]();
+  const change = { move: () => moved(after, single(by)), turn: () => turned(after, single(degrees)[0], middle, middle), scale: () => scaled(after, single(factor)[0], middle), recolour: () => recoloured(after, single(colour)) }[edit.do]();
   for (let k = 0; k < after.length; k += 1) if (mask[k]) { change(k); after.seen[k] = 0; }
   return after;
 }
+
+/** The scene and all of another one: turned about the vertical through its origin, then moved; its objects are numbered on. */
+function merged(scene, other, by, degrees) {
+  if (!other) throw new Error('this page does not hold the place that is merged; `terrella space edit PLACE --merge OTHER` merges it.');
+  const part = other.copy(), turn = turned(part, degrees, [0, 0, 0], by), raised = highest(scene.objects);
+  if (raised + highest(other.objects) > MOST_OBJECTS) throw new Error('a page shows no more than 65,535 objects.');
+  for (let k = 0; k < part.length; k += 1) {
+    turn(k);
+    if (part.objects[k]) part.objects[k] += raised;
+  }
+  const names = [...Array.from({ length: raised }, (_, k) => scene.names[k]), ...other.names], known = scene.boxes && other.boxes && degrees % 90 === 0;
+  return Object.assign(joined(scene, part), { names, boxes: known ? [...scene.boxes, ...placed(other.boxes, by, degrees / 90)] : null });
+}
+
+/** Boxes turned by so many quarters, then moved. */
+function placed(boxes, [dx, dy, dz], quarters) {
+  const left = ([x0, y0, z0, x1, y1, z1]) => [-y1, x0, z0, -y0, x1, z1];
+  for (let turn = 0; turn < ((quarters % 4) + 4) % 4; turn += 1) boxes = boxes.map(left);
+  return boxes.map(([x0, y0, z0, x1, y1, z1]) => [x0 + dx, y0 + dy, z0 + dz, x1 + dx, y1 + dy, z1 + dz]);
+}
+
+const highest = (objects) => objects.reduce((most, number) => Math.max(most, number), 0);
 
 /** Numbers of those whose mask is `value`; of all where it is -1. */
 function numbers(mask, value) {
@@ -71,12 +95,14 @@ function shift(means, k, dx, dy, dz) {
 
 const moved = (scene, [dx, dy, dz]) => (k) => shift(scene.means, k, dx, dy, dz);
 
-function turned({ means, quats }, degrees, [mx, my]) {
+/** Turned about the vertical through a place, which comes to lie at `to`. */
+function turned({ means, quats }, degrees, [mx, my, mz], to) {
   const angle = degrees * (Math.PI / 180), c = Math.cos(angle), s = Math.sin(angle), ch = Math.cos(angle / 2), sh = Math.sin(angle / 2);
   return (k) => {
     const x = means[3 * k] - mx, y = means[3 * k + 1] - my, [w, qx, qy, qz] = quats.subarray(4 * k, 4 * k + 4);
-    means[3 * k] = c * x - s * y + mx;
-    means[3 * k + 1] = s * x + c * y + my;
+    means[3 * k] = c * x - s * y + to[0];
+    means[3 * k + 1] = s * x + c * y + to[1];
+    means[3 * k + 2] += to[2] - mz;
     quats.set([ch * w - sh * qz, ch * qx - sh * qy, ch * qy + sh * qx, ch * qz + sh * w], 4 * k);
   };
 }
@@ -92,6 +118,7 @@ const recoloured = ({ colours }, colour) => (k) => colours.set(colour, 3 * k);
 
 /** An edit in words. */
 export function told(edit) {
+  if (edit.do === 'merge') return `merge ${edit.place.split('/').at(-1)} at ${edit.by.join(' ')} m${edit.degrees ? `, turned by ${edit.degrees}°` : ''}`;
   const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? `object ${edit.select.object}` : `a ${kind}`;
   const more = { move: () => `by ${edit.by.join(' ')} m`, duplicate: () => `${edit.by.join(' ')} m away`, turn: () => `by ${edit.degrees}°`, scale: () => `× ${edit.factor}`, recolour: () => '', delete: () => '' }[edit.do]();
   return `${edit.do} ${what} ${more}`.trim();

@@ -2,16 +2,19 @@
 
 const UNPACKED = { means: 3, quats: 4, scales: 3, colours: 3, opacities: 1 };
 
-/** N Gaussians: means, quats (w x y z), scales, colours and opacities as float32, metres; seen 1 or 0, objects: numbers, 0 for none. */
+/**
+ * N Gaussians: means, quats (w x y z), scales, colours and opacities as float32, metres; seen 1 or 0, objects: numbers, 0 for none,
+ * whose names 1, 2, ... `names` lists; boxes, as boxes.js has them, where they are what stops bodies, else null.
+ */
 export class Scene {
-  constructor(columns) {
-    Object.assign(this, columns);
+  constructor(columns, names = [], boxes = null) {
+    Object.assign(this, columns, { names, boxes });
     this.length = this.opacities.length;
   }
 
   /** Its columns copied, for an edit to write into. */
   copy() {
-    return new Scene(Object.fromEntries(Scene.columns.map((name) => [name, this[name].slice()])));
+    return new Scene(Object.fromEntries(Scene.columns.map((name) => [name, this[name].slice()])), this.names);
   }
 
   /** Those whose numbers `keep` lists, in its order; a number may come twice. */
@@ -22,7 +25,7 @@ export class Scene {
       for (let at = 0; at < keep.length; at += 1) for (let part = 0; part < wide; part += 1) to[at * wide + part] = from[keep[at] * wide + part];
       columns[name] = to;
     }
-    return new Scene(columns);
+    return new Scene(columns, this.names);
   }
 }
 Scene.columns = [...Object.keys(UNPACKED), 'seen', 'objects'];
@@ -34,7 +37,7 @@ export function joined(one, other) {
     both.set(one[name]);
     both.set(other[name], one[name].length);
     return [name, both];
-  })));
+  })), one.names, one.boxes);
 }
 
 /** base64 as bytes. */
@@ -56,12 +59,12 @@ export class Reader {
   }
 }
 
-export function unpackScene(reader, count) {
+export function unpackScene(reader, { count, objects, boxes }) {
   const means = reader.take(3 * count, Float32Array), packed = reader.take(count, Uint32Array);
   const scales = Float32Array.from(reader.take(3 * count), (byte) => Math.exp(byte / 16 - 10));
   const colours = Float32Array.from(reader.take(3 * count), (byte) => byte / 204);
   const opacities = Float32Array.from(reader.take(count), (byte) => byte / 255);
-  return new Scene({ means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Uint16Array) });
+  return new Scene({ means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Uint16Array) }, objects, boxes?.length ? boxes : null);
 }
 
 /** Which of w, x, y, z is largest in 2 bits, the three others in 10 each. */

@@ -3,8 +3,9 @@
 import { edited } from './edits.js';
 
 export class Story {
-  constructor(source, edits) {
-    Object.assign(this, { edits: [], undone: [], scene: source });
+  /** others: a Map of the scenes that edits merge, by their sha256. */
+  constructor(source, edits, others = new Map()) {
+    Object.assign(this, { edits: [], undone: [], scene: source, others });
     this.begin(source, edits);
   }
 
@@ -21,12 +22,12 @@ export class Story {
 
   /** Takes these edits in place of those in force; an Error leaves all as it was. */
   replay(edits, undone = []) {
-    const scene = edits.reduce(edited, this.source);
+    const scene = edits.reduce((before, edit) => edited(before, edit, this.others), this.source);
     Object.assign(this, { edits: [...edits], undone, scene });
   }
 
   add(edit) {
-    this.scene = edited(this.scene, edit);
+    this.scene = edited(this.scene, edit, this.others);
     this.edits.push(edit);
     this.undone = [];
   }
