@@ -11,13 +11,14 @@ import torch
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
+from terrella.serve.frames import NAMES, Frames
 from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
 from terrella.space.occupancy import Body
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
 from terrella.worlds.splat import SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import other_of, save_splat, source_of
+from terrella.worlds.splat_folder import other_of, read_edits, save_splat, source_of
 
 from ..space.test_raster import cloud
 
@@ -105,6 +106,12 @@ def test_it_is_undone_redone_and_edited_as_anything_else(two):
     assert edit(path / "a", "--merge", str(path / "b"), "--move", "20", "0", "0") == 0
     merged, first = opened(path / "a"), (path / "a" / "world.edits.jsonl").read_bytes()
     assert len(merged.gaussians) == 60 + len(there.gaussians)
+    view = dict.fromkeys(NAMES, "0") | {"x": "14", "wide": "1", "tall": "1", "width": "32", "height": "32"}
+    source, mine = source_of(path / "a"), other_of(path / "a")
+    with_it, without = (
+        Frames(source.gaussians, source.objects, edits, mine) for edits in (lambda: read_edits(path / "a"), list)
+    )
+    assert with_it.draw(view) != without.draw(view)
     assert edit(path / "a", "--undo") == 0 and len(opened(path / "a").gaussians) == 60
     assert edit(path / "a", "--redo") == 0
     again = opened(path / "a")
@@ -156,6 +163,10 @@ def test_what_cannot_be_merged(two, capsys):
     assert edit(path / "a", "--merge", str(path / "b"), "--move", "1e7", "0", "0") == 2
     assert "farther than 10 km" in capsys.readouterr().err
     assert not (path / "a" / "world.edits.jsonl").exists()
+    made(path / "c", boxes=False)
+    assert edit(path / "a", "--merge", str(path / "c"), "--move", "900", "900", "900") == 0
+    assert "read in cells of" in capsys.readouterr().err
+    assert edit(path / "a", "--undo") == 0
     assert edit(path / "b", "--merge", str(path / "a")) == 0
     assert edit(path / "a", "--merge", str(path / "b")) == 2  # a within b within a
     assert "has it merged" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from ..space.edits import DEEDS, Edit, edited
 from ..space.files import read_scene, replace_whole, write_scene
 from ..space.files.gltf_scene import GLTF_ENDINGS, Scene, read_gltf
 from ..space.files.spz import Version
+from ..space.occupancy import extent
 from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
@@ -39,6 +40,7 @@ from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_ot
 if TYPE_CHECKING:
     from ..serve.place import Place
 
+COARSE_M = 0.3  # cells that are wider let nobody through doors
 Axes = Literal["rdf", "rub", "flu"]
 
 
@@ -260,7 +262,7 @@ def edit(
         redo: Do again what was taken back last.
         replay: Take the edits of this file (one that the page saved) in place of those that the world has.
     """
-    from ..core.errors import CheckpointError, TerrellaError
+    from ..core.errors import TerrellaError
 
     folder = folder_of(world)
     edits, undone = read_edits(folder), read_edits(folder, UNDONE_FILE)
@@ -290,26 +292,44 @@ def edit(
         if redo:
             new = undone[-1]
         elif merge is not None:
-            if Path(merge).is_file():
-                raise TerrellaError(
-                    f"{merge} is a file; `terrella space import` or `space build` makes a world of it first."
-                )
-            open_splat(merge)  # refuses what is none
-            new = merging(folder, folder_of(merge), move or (0.0, 0.0, 0.0), turn or 0.0)
+            new = _merging(folder, merge, move or (0.0, 0.0, 0.0), turn or 0.0)
         else:
             new = {"select": places or {"all": True}, "do": deeds[0]}
             if name := DEEDS[deeds[0]][0]:
                 new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
         edited(opened.gaussians, [new], opened.objects, other_of(folder))  # refuses what cannot be done
         write_edits(folder, [*edits, new], undone[:-1] if redo else ())
-    facts = {"edits": len(read_edits(folder))}
+    result(_after(world, merge, undo), json)
+
+
+def _merging(folder: Path, merge: str, by: tuple[float, float, float], degrees: float) -> Edit:
+    """The edit that merges the world of that name; TerrellaError for what is none."""
+    from ..core.errors import TerrellaError
+
+    if Path(merge).is_file():
+        raise TerrellaError(f"{merge} is a file; `terrella space import` or `space build` makes a world of it first.")
+    open_splat(merge)
+    return merging(folder, folder_of(merge), by, degrees)
+
+
+def _after(world: str, merge: str | None, undo: bool) -> dict[str, int]:
+    """What is said of a world after an edit."""
+    from ..core.errors import CheckpointError
+
+    facts = {"edits": len(read_edits(folder_of(world)))}
     try:
-        facts["gaussians"] = len(open_splat(world).gaussians)
+        after = open_splat(world)
     except CheckpointError as error:
         if not undo:
             raise
         say(str(error))  # an edit before that one, to be taken back next
-    result(facts, json)
+        return facts
+    if merge and not len(after.solids) and (cell_m := extent(after.gaussians.means)[2]) > COARSE_M:
+        say(
+            f"{world} is so large now that floors and walls are read in cells of {cell_m:.1f} m; --undo takes that back, and "
+            f"--scale makes {merge} smaller first."
+        )
+    return {**facts, "gaussians": len(after.gaussians)}
 
 
 def read_text(path: Path) -> str:

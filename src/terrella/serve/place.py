@@ -90,7 +90,7 @@ class PlacePage:
         """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
         file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile. `frames`: the
         address that draws for browsers that cannot."""
-        place, merged = self._place, [self._brought(edit) for edit in merges(edits)]
+        place, merged = self._place, list({_key(edit): self._brought(edit) for edit in merges(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
@@ -107,7 +107,7 @@ class PlacePage:
 
     def _brought(self, edit: Edit) -> tuple[dict[str, Any], str]:
         """What a merge brings, as the page has it: what is said of it, and its Gaussians."""
-        key = edit["place"], edit["sha256"]
+        key = _key(edit)
         if key not in self.merged and self._place.other:
             other = self._place.other(edit)
             packed = gzip.compress(_packed(other, torch.ones(len(other.gaussians), dtype=torch.bool)), 6, mtime=0)
@@ -119,6 +119,11 @@ class PlacePage:
             }
             self.merged[key] = told, base64.b64encode(packed).decode()
         return self.merged[key]
+
+
+def _key(edit: Edit) -> tuple[str, str]:
+    """What a merge brings, and how it was then."""
+    return edit["place"], edit["sha256"]
 
 
 def packed_place(place: Place, first: int) -> tuple[dict[str, Any], bytes, bytes]:
@@ -222,7 +227,7 @@ def build_place(
             if [json.loads(line) for line in told["saved"].splitlines() if line] != list(edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
             lines = [json.loads(line) for line in told["lines"].splitlines() if line]
-            if any((edit["place"], edit["sha256"]) not in page.merged for edit in merges(lines)):
+            if any(_key(edit) not in page.merged for edit in merges(lines)):
                 raise ServeError("this page merges nothing new; `terrella space edit PLACE --merge OTHER` does.")
             save(told["lines"])
 

@@ -51,11 +51,7 @@ class Occupancy:
         noise = samples()
         turn = rotation(torch.cat([torch.zeros_like(some.means), some.quats], 1))
         points = some.means[:, None] + (noise[None] * some.scales[:, None].clamp_max(1.0)) @ turn.mT
-        edges = torch.tensor([0.001, 0.999])
-        step = max(len(some) // 1_000_000, 1)
-        low, high = torch.quantile(some.means[::step], edges, dim=0)
-        low, high = low - 0.5, high + 0.5
-        cell_m = max(cell_m, float(((high - low).prod() / MOST_CELLS) ** (1 / 3)))
+        low, high, cell_m = extent(some.means, cell_m)
         size = ((high - low) / cell_m).ceil().long().clamp_min(1)
         points = points.flatten(0, 1)
         at = ((points - low) / cell_m).floor().long()
@@ -117,6 +113,15 @@ class Occupancy:
         at = ((points - self.origin) / self.cell_m).floor().long()
         size = torch.tensor(self.solid.shape)
         return at.clamp_min(0).minimum(size - 1).unbind(-1), ((at >= 0) & (at < size)).all(-1)
+
+
+def extent(means: torch.Tensor, cell_m: float = 0.1) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Between which corners [3] the cubes around places [N, 3] lie, and how wide a cube is: as wide as asked, or wider where they
+    would be too many."""
+    step = max(len(means) // 1_000_000, 1)
+    low, high = torch.quantile(means[::step], torch.tensor([0.001, 0.999]), dim=0)
+    low, high = low - 0.5, high + 0.5
+    return low, high, max(cell_m, float(((high - low).prod() / MOST_CELLS) ** (1 / 3)))
 
 
 def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
