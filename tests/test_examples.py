@@ -29,7 +29,7 @@ def test_no_example_is_forgotten_here():
         "02_gym_env.py",
         "03_two_cameras.py",
         "04_controllers.py",
-        "05_quadruped.py",
+        "05_robot.py",
     }
 
 
@@ -74,19 +74,29 @@ def test_a_robot_with_two_cameras_is_recorded(tmp_path):
     assert dataset.world["action_units"] == ["m/s", "rad/s"]
 
 
-def test_a_quadruped_sees_where_a_post_is():
+@pytest.mark.parametrize("body", ["g1", "go1"])
+def test_a_robot_sees_where_a_post_is(body):
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
-    shown = example("05_quadruped.py")
+    shown = example("05_robot.py")
     try:
-        walker = shown["Walker"](EXAMPLES / "go1_gait", "green")
+        walker = shown["Walker"](body, EXAMPLES / f"{body}_gait")
         rng = terrella.make_rng(1)
         state = walker.start(8, rng)
-        seen = walker.render(state, ("rgb", "depth", "post"))
+        seen = walker.render(state, ("rgb", "depth", "posts"))
     except terrella.core.errors.TerrellaError as error:  # no files of the Go1, or no pictures here
         pytest.skip(str(error))
-    found = [shown["seen_at"](rgb, depth, 1) for rgb, depth in zip(seen["rgb"], seen["depth"])]
-    ahead = seen["post"][:, 0] > 1.5 * seen["post"][:, 1].abs()
+    found = [shown["seen_at"](rgb, depth, 1, walker.body) for rgb, depth in zip(seen["rgb"], seen["depth"])]
+    green = seen["posts"][:, 1]
+    ahead = green[:, 0] > 1.5 * green[:, 1].abs()
     assert ahead.any() and all((post is not None) == bool(one) for post, one in zip(found, ahead) if one)
-    assert all((post - truth).norm() < 0.3 for post, truth in zip(found, seen["post"]) if post is not None)
+    assert all((post - truth).norm() < 0.3 for post, truth in zip(found, green) if post is not None)
     after = walker.imagine(state, walker.spec.sample_action(8, rng), rng)
     assert not after["done"].any()
+
+
+def test_an_instruction_names_posts_in_order():
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")
+    understood = example("05_robot.py")["understood"]
+    assert understood("Walk to the BLUE one, then to red!")["posts"].tolist() == [[2, 0]]
+    with pytest.raises(terrella.core.errors.ContractError, match="no post"):
+        understood("make tea")

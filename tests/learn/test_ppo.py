@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from terrella.core import Spec, State, make_rng, rollout
 from terrella.core.errors import TerrellaError
 from terrella.core.spec import REWARD
 from terrella.learn.growth import Growth
+from terrella.learn.objectives.ppo import PARTS, PASSES, Pace
 from terrella.learn.recipes.policy import Practice, train_policy
 
 
@@ -62,6 +65,25 @@ def test_it_learns_what_pays_and_goes_on_exactly(tmp_path):
     assert again["practised_steps"] == 20 * 64 * 8
     weights = (Actor.load(tmp_path / name, world.spec).network.state_dict() for name in ("run", "again"))
     assert all(torch.equal(a, b) for a, b in zip(*(one.values() for one in weights)))
+
+
+def test_a_rate_that_moves_the_policy_too_far_is_lowered_and_comes_back():
+    pace = Pace()
+    for _ in range(3):
+        pace.change(parts=1)
+    assert float(pace.share) == pytest.approx(1.5**-3)
+    pace.change(parts=2 * PARTS)
+    assert float(pace.share) == pytest.approx(1.5**-3), "some passes are what is wanted"
+    for _ in range(100):
+        pace.change(PASSES * PARTS)
+    assert float(pace.share) == 1.0
+
+
+def test_a_rate_far_too_high_does_not_stay_so(tmp_path):
+    config = Practice(method="ppo", steps=12, batch=64, horizon=8, hidden=32, learning_rate=0.3)
+    train_policy(Hold(), "hold", tmp_path / "run", config, lambda *_: None)
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert log[-1]["pace"] < 0.7
 
 
 def test_it_is_exported_with_its_normalisation(tmp_path):

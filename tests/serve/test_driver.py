@@ -11,12 +11,13 @@ from gymnasium import spaces
 from PIL import Image
 
 from terrella.act.planning import Planner, Revealed, SearchConfig, distance_to, imagined
-from terrella.core.errors import PlanningError, ProtocolError, ServeError
+from terrella.core.errors import ContractError, PlanningError, ProtocolError, ServeError
 from terrella.core.policy import Idle, Reactive
 from terrella.core.spec import Spec
 from terrella.core.world import make_rng
 from terrella.serve.actions import action_of, keys_of
 from terrella.serve.agent import Agent, Agents
+from terrella.serve.driver import NO_GOAL
 from terrella.serve.picture import picture_of
 from terrella.serve.protocol import GOAL_MARK, Goal, parse_message
 from terrella.serve.timeline import Timeline
@@ -268,7 +269,7 @@ def test_a_place_is_driven_to_at_once_a_picture_when_the_agent_is_let(tmp_path):
     timeline.seek(Goal(at=(1.5, -2.0)))
     timeline.step()
     assert driver.on and place_of(asked[-1]) == (1.5, -2.0) and bool(asked[-1]["pose"][0, 2:].isnan().all())
-    assert driver.mark == {"at": [1.5, -2.0], "image": None}
+    assert driver.mark == NO_GOAL | {"at": [1.5, -2.0]}
     timeline.seek(Goal(here=True))
     assert not driver.on and driver.mark["at"] is None and driver.mark["image"]
     timeline.step(["KeyW"])
@@ -282,10 +283,62 @@ def test_a_place_is_driven_to_at_once_a_picture_when_the_agent_is_let(tmp_path):
     assert driver.on and set(asked[-1]) == {"rgb"} and asked[-1]["rgb"].shape == (1, 48, 64, 3)
     timeline.seek(Goal())
     timeline.step()
-    assert not driver.on and driver.goal == {} and driver.mark == {"at": None, "image": None}
+    assert not driver.on and driver.goal == {} and driver.mark == NO_GOAL
+
+
+def north_or_south(words: str):
+    """An instruction as a goal."""
+    if not {"north", "south"} & set(words.split()):
+        raise ContractError(f"'{words}' names neither north nor south.")
+    return {"pose": torch.tensor([[0.0, 3.0 if "north" in words else -3.0, *[torch.nan] * 5]])}
+
+
+def test_an_instruction_is_driven_at_once_and_forgotten_when_it_is_done():
+    far, asked = [5.0], []
+
+    def make(goal):
+        asked.append(goal)
+        reactive = Reactive(lambda seen, rng: pressing("MOVE_FORWARD"))
+        return Agent("a walker", reactive, away=lambda state: far[0], near=0.5)
+
+    timeline = Timeline([Mapped()], 0, policy=Agents(make, words=north_or_south))
+    driver = timeline.driver
+    timeline.seek(Goal(words="go north"))
+    timeline.step()
+    assert driver.on and place_of(asked[-1]) == (0.0, 3.0) and driver.mark == NO_GOAL | {"words": "go north"}
+    with pytest.raises(ContractError, match="neither"):
+        timeline.seek(Goal(words="make tea"))
+    assert driver.on and driver.mark["words"] == "go north"
+    far[0] = 0.1
+    timeline.step()
+    assert not driver.on and driver.mark == NO_GOAL and "reached" in driver.said
+
+
+def test_an_instruction_is_typed_on_the_page(serve_world, open_page):  # noqa: F811
+    words = []
+
+    def said(text):
+        words.append(text)
+        return north_or_south(text)
+
+    agents = Agents(lambda goal: Agent("a walker", Reactive(lambda seen, rng: pressing("MOVE_FORWARD"))), words=said)
+    page = open_page(serve_world([Panorama(dt_s=1 / 100)], policy=agents).url)
+    page.click("#words")
+    page.keyboard.type("go south by G M")
+    page.keyboard.press("Enter")
+    until(page, "terrella.agent.goalWords === 'go south by G M'")
+    assert words == ["go south by G M"] and page.input_value("#words") == "go south by G M"
+    page.click("#words")
+    page.fill("#words", "make tea")
+    page.keyboard.press("Enter")
+    until(page, "document.getElementById('toast').textContent.includes('neither')")
+    page.click("#goal-forget")
+    until(page, "!terrella.agent.goalWords && !document.getElementById('words').value")
 
 
 def test_goals_that_nobody_can_seek_are_refused():
+    with pytest.raises(ServeError, match="no instructions"):
+        Timeline([Mapped()], 0, policy=walker()).seek(Goal(words="go north"))
     for agents, kind in ((None, "no place"), (walker(), "no place")):
         with pytest.raises(ServeError, match=kind):
             Timeline([Mapped()], 0, policy=agents).seek(Goal(at=(0.0, 0.0)))
@@ -296,7 +349,18 @@ def test_goals_that_nobody_can_seek_are_refused():
 
 
 @pytest.mark.parametrize(
-    "junk", ['"at": 3', '"at": [1]', '"at": [1, NaN]', '"at": [1, "2"]', '"here": 1', '"at": [1e30, 0]']
+    "junk",
+    [
+        '"at": 3',
+        '"at": [1]',
+        '"at": [1, NaN]',
+        '"at": [1, "2"]',
+        '"here": 1',
+        '"at": [1e30, 0]',
+        '"words": 3',
+        '"words": "\\u0000"',
+        f'"words": "{"a" * 201}"',
+    ],
 )
 def test_a_goal_that_is_none_is_named(junk):
     with pytest.raises(ProtocolError):

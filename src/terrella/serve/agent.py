@@ -43,12 +43,14 @@ class Agents:
     """make:     the agent for a goal, channel -> [1, ...]; {} for none. TerrellaError for a goal that none can seek.
     places:   it takes goals {"pose": x, y, and NaN for the rest}. pictures: goals that hold a picture, alone or with all
               else that the world showed with it.
+    words:    an instruction that somebody types -> a goal; TerrellaError for words that say nothing that can be sought.
     at_once:  it drives from the beginning, and again as soon as a person lets go of the controls; others must be let.
     """
 
     make: Callable[[Observation], Agent]
     places: bool = False
     pictures: bool = False
+    words: Callable[[str], Observation] | None = None
     at_once: bool = False
 
 

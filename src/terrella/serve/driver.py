@@ -20,7 +20,7 @@ from ..core.world import Observation, World
 from .actions import action_of
 from .agent import Agent, Agents, Futures, seen_by
 
-NO_GOAL: dict[str, object] = {"at": None, "image": None}
+NO_GOAL: dict[str, object] = {"at": None, "image": None, "words": None}
 _NEARER = 0.97  # of the least distance so far counts as nearer
 
 
@@ -74,7 +74,7 @@ class Driver:
         """Takes a goal, {} for none, and drives to it `now`, or when it is let. mark: how the page shows it."""
         if goal and self.agents is None:
             raise ServeError("there is no agent here that could seek a goal.")
-        self.goal, self.mark, self._agent, self.away = goal, mark or NO_GOAL, None, None
+        self.goal, self.mark, self._agent, self.away = goal, NO_GOAL | (mark or {}), None, None
         self._ms.clear()
         self.forget()
         self.said, self.on = "", bool(goal) and now
@@ -126,8 +126,8 @@ class Driver:
         self.forget()
 
     def _end(self, said: str) -> None:
-        """The agent is done. With a place, too; a picture stays the goal until it is taken away."""
-        if self.mark["at"] is not None:
+        """The agent is done. With a place and an instruction, too; a picture stays the goal until it is taken away."""
+        if self.mark["at"] is not None or self.mark["words"]:
             self.seek({})
         self.stop(said)
 

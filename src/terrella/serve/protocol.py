@@ -21,6 +21,7 @@ GOAL_MARK = b"\x00"  # no image file begins with it
 MAX_HELD = 16  # keys held at once
 MAX_KEYS = 256  # of a world
 MAX_NAME = 40  # letters of an action's name
+MAX_WORDS = 200  # letters of an instruction
 MAX_CAMERAS = 16  # shown at once
 U32 = 2**32 - 1
 
@@ -51,11 +52,12 @@ class Controls:
 @dataclass(frozen=True)
 class Goal:
     """What the agent is to reach: the place `at` on the map, x and y in metres; `here`: the moment shown, as soon as a person lets
-    it drive; `picture`: the bytes of an image file. Nothing of these: no goal any more."""
+    it drive; `picture`: the bytes of an image file; `words`: an instruction. Nothing of these: no goal any more."""
 
     at: tuple[float, float] | None = None
     here: bool = False
     picture: bytes = b""
+    words: str = ""
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,10 @@ def _goal(body: dict) -> Goal:
     if at is not None and (not isinstance(at, list) or len(at) != 2):
         raise ProtocolError("'at' must be a place, a list of x and y in metres.")
     place = None if at is None else (_finite(at[0], "at"), _finite(at[1], "at"))
-    return Goal(place, "here" in body and _switch(body, "here"))
+    words = body.get("words", "")
+    if not isinstance(words, str) or not words.isprintable() or len(words) > MAX_WORDS:
+        raise ProtocolError(f"'words' must be an instruction of at most {MAX_WORDS} letters.")
+    return Goal(place, "here" in body and _switch(body, "here"), words=words.strip())
 
 
 def _rebound(body: dict) -> Rebound:
@@ -200,7 +205,8 @@ def encode_event(kind: str, **body) -> str:
 
     agent: whether it is driving, its name, said: the last thing to know of it, thinks_ms of its longer decisions, away from its
     goal in unit (or null), and whether it considers futures. acted: its action of the last step as held keys and, of axes, as
-    numbers; nothing of either where the person acts. goal: the place `at` on the map, or image, a JPEG in base64, or null for both.
+    numbers; nothing of either where the person acts. goal: the place `at` on the map, or image, a JPEG in base64, or words; null
+    for what it is not.
     futures: step at which they were asked for, and plans, the chosen one first, then others down to the worst: the cost of each
     (null where that is no number) and image, a JPEG in base64 of as many frames as `frames` says side by side, from the moment of
     the decision to the plan's end.

@@ -133,6 +133,7 @@ class Sessions:
             goals={
                 "places": bool(self._agents and self._agents.places),
                 "pictures": bool(self._agents and self._agents.pictures),
+                "words": bool(self._agents and self._agents.words),
             },
         )
 

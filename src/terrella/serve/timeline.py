@@ -216,7 +216,11 @@ class Timeline:
                     "the agent here walks to no place: it takes a world that tells its pose, and can be planned in."
                 )
             pose = torch.tensor([[*goal.at, *[torch.nan] * 5]])
-            return self.driver.seek({"pose": pose}, {"at": list(goal.at), "image": None})
+            return self.driver.seek({"pose": pose}, {"at": list(goal.at)})
+        if goal.words:
+            if agents is None or agents.words is None:
+                raise ServeError("the agent here takes no instructions.")
+            return self.driver.seek(agents.words(goal.words), {"words": goal.words})
         if not goal.here and not goal.picture:
             return self.driver.seek({})
         if agents is None or not agents.pictures:
@@ -226,8 +230,7 @@ class Timeline:
             seen = {"rgb": picture_of(goal.picture, (height, width), MAX_DROPPED_PIXELS, "this picture")[None]}
         else:
             seen = self.worlds[0].render((self.shown.states or self._states)[0], self.spec.recorded)
-        mark = {"at": None, "image": strip_of(seen["rgb"])}
-        self.driver.seek(seen, mark, now=not goal.here)
+        self.driver.seek(seen, {"image": strip_of(seen["rgb"])}, now=not goal.here)
 
     @torch.inference_mode()
     def sync(self) -> Moment:

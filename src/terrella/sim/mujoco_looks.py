@@ -98,7 +98,7 @@ class Looks:
             if geom.objtype != int(mujoco.mjtObj.mjOBJ_GEOM) or not 0 <= geom.objid < count:
                 continue
             if worn[geom.objid]:
-                self._wear(geom, kinds[geom.objid])
+                self._wear(geom, int(kinds[geom.objid]))
             if colours is not None:
                 geom.rgba[:3] += colours[0] * (tints[geom.objid] - geom.rgba[:3])
 

@@ -114,8 +114,9 @@ class Pictures:
                     simplify(model, self.size)
                     model.vis.global_.offheight = max(self.size[0], int(model.vis.global_.offheight))
                     model.vis.global_.offwidth = max(self.size[1], int(model.vis.global_.offwidth))
-                    atexit.register(_closed, weakref.ref(self))  # at the exit itself it is too late
                 self._made[name] = make()
+                if len(self._made) == 1:  # before what MuJoCo has registered by now, which ends EGL
+                    atexit.register(_closed, weakref.ref(self))
             except Exception as error:
                 first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
                 raise TerrellaError(f"MuJoCo cannot draw without a display ({first}): {HINT}.") from error

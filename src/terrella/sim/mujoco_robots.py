@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+
 from ..core.errors import TerrellaError
 from ..similar import did_you_mean
 from .mujoco_model import FREE, add_floor, mujoco, read
 from .mujoco_pilot import Multirotor
-from .mujoco_tasks import Free, Hold, Reach, Task, VelocityTracking
+from .mujoco_tasks import Free, Hold, Reach, Stepping, Task, VelocityTracking
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
@@ -41,9 +43,10 @@ class Servo:
 @dataclass(frozen=True)
 class Robot:
     """file: inside a wheel, PACKAGE/PATH; servos: by pattern of a joint's name, the first that fits; height: of the free body at
-    rest, m; pose: of the joints at rest, by pattern; touching: geoms that collide, by pattern, all where it is ""; adds: what the
-    spec gets besides; step_s, control_s: seconds of a step of physics and of control; keys, units: of its actions, where the file
-    does not say; pilot: makes controls of actions, in place of a person who cannot."""
+    rest, m; pose: of the joints at rest, by pattern; still: hinges that are held in it, by pattern; touching: geoms that collide,
+    by pattern, all where it is ""; adds: what the spec gets besides; step_s, control_s: seconds of a step of physics and of
+    control; keys, units: of its actions, where the file does not say; pilot: makes controls of actions, in place of a person who
+    cannot."""
 
     file: str
     what: str
@@ -51,6 +54,7 @@ class Robot:
     servos: Mapping[str, Servo] = field(default_factory=dict)
     height: float | None = None
     pose: Mapping[str, float] = field(default_factory=dict)
+    still: str = ""
     touching: str = ""
     adds: Callable[[mujoco.MjSpec], None] = lambda spec: None
     step_s: float | None = None
@@ -67,6 +71,8 @@ class Robot:
             spec.option.timestep = self.step_s
         if self.touching:
             self._touch(spec)
+        for joint in [one for one in spec.joints if re.fullmatch(self.still, one.name)] if self.still else ():
+            self._hold(spec, joint)
         if self.servos:
             for joint in spec.joints:
                 self._drive(spec, joint)
@@ -91,6 +97,14 @@ class Robot:
             if geom.conaffinity:
                 geom.condim, geom.priority, geom.friction = 3, 1, [0.8, 0.02, 0.01]
 
+    def _hold(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
+        """A hinge becomes part of its body, turned as it is at rest."""
+        turn, body, turned = np.empty(4), joint.parent, np.empty(4)
+        mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis, np.float64), self.rest(joint.name))
+        mujoco.mju_mulQuat(turned, np.asarray(body.quat, np.float64), turn)
+        body.quat = turned
+        spec.delete(joint)
+
     def _drive(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
         servo = next((one for pattern, one in self.servos.items() if re.fullmatch(pattern, joint.name)), None)
         if servo is None or joint.type == FREE:
@@ -103,15 +117,17 @@ class Robot:
         made.ctrllimited, made.ctrlrange = True, [rest - servo.reach, rest + servo.reach]
 
 
-def _feet(*sites: str) -> Callable[[mujoco.MjSpec], None]:
-    """Force sensors, in N, of the geoms that lie within these sites."""
+def _feet(*sites: str, size: float = 0.03, moving: bool = False) -> Callable[[mujoco.MjSpec], None]:
+    """Sensors of these sites: the force, in N, on the geoms that lie within `size` m of them; where and how fast they are."""
+    kinds = {"foot": mujoco.mjtSensor.mjSENS_TOUCH}
+    if moving:
+        kinds |= {"place": mujoco.mjtSensor.mjSENS_FRAMEPOS, "speed": mujoco.mjtSensor.mjSENS_FRAMELINVEL}
 
     def add(spec: mujoco.MjSpec) -> None:
         for site in sites:
-            spec.site(site).size = [0.03] * 3  # a little larger than the foot: what touches is inside
-            spec.add_sensor(
-                name=f"foot_{site}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
-            )
+            spec.site(site).size = [size] * 3  # a little larger than the foot: what touches is inside
+            for kind, sensor in kinds.items():
+                spec.add_sensor(name=f"{kind}_{site}", type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
     return add
 
@@ -161,6 +177,7 @@ ROBOTS: Mapping[str, Robot] = {
         {".*_calf_joint": Servo(35.0, 1.0, 35.5, 0.0091, 0.7), ".*_thigh_joint": Servo(35.0, 1.0, 23.7, 0.004, 0.7), ".*": _LEG},
         0.29,
         {".*R_hip_joint": 0.1, ".*L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8},
+        "",
         r".*_foot_collision|(trunk|head)_collision|.*_thigh_collision1",
         _feet("FR", "FL", "RR", "RL"),
         0.005,
@@ -168,21 +185,23 @@ ROBOTS: Mapping[str, Robot] = {
     ),
     "g1": Robot(
         ZOO + "unitree_g1/xmls/g1.xml",
-        "Unitree G1, a humanoid that follows a commanded velocity",
-        VelocityTracking(forward=(0.2, 0.8)),
+        "Unitree G1, a humanoid that walks with a commanded velocity, its waist and arms held",
+        Stepping(),
         {
-            ".*(hip|knee).*": Servo(100.0, 5.0, 88.0, 0.01, 0.7),
+            ".*hip_(pitch|yaw).*": Servo(100.0, 2.0, 88.0, 0.01, 0.7),
+            ".*hip_roll.*": Servo(100.0, 2.0, 139.0, 0.025, 0.5),
+            ".*knee.*": Servo(150.0, 4.0, 139.0, 0.025, 0.8),
             ".*ankle.*": Servo(40.0, 2.0, 50.0, 0.007, 0.5),
-            ".*waist.*": _BODY,
-            ".*": Servo(20.0, 1.5, 25.0, 0.0036, 0.7),
         },
-        0.76,
+        0.78,
         {
-            ".*_hip_pitch_joint": -0.312, ".*_knee_joint": 0.669, ".*_ankle_pitch_joint": -0.363, ".*_elbow_joint": 0.6,
+            ".*_hip_pitch_joint": -0.2, ".*_knee_joint": 0.42, ".*_ankle_pitch_joint": -0.23, ".*_elbow_joint": 0.6,
             "left_shoulder_roll_joint": 0.2, ".*_shoulder_pitch_joint": 0.2, "right_shoulder_roll_joint": -0.2,
         },
-        r".*foot\d_collision|.*(torso|pelvis|head).*collision",
-        step_s=0.005,
+        ".*_(waist|shoulder|elbow|wrist)_.*|waist_.*",
+        r".*foot[26]_collision|.*(torso|pelvis|head).*collision",
+        _feet("left_foot", "right_foot", size=0.12, moving=True),
+        0.005,
         max_steps=1000,
     ),
     "yam": Robot(

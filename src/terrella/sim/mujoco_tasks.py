@@ -122,22 +122,26 @@ class VelocityTracking:
     def judge(
         self, body: Body, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        height, tilt = self.fallen[1], self.fallen[0]
+        up, qpos = motion(body, after["physics"])[2], after["physics"][:, body.qpos]
+        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * body.home[2])
+        return self._worth(body, before, after).clamp_min(0.0).float(), fallen, {"command": after["command"]}
+
+    def _worth(self, body: Body, before: Tensors, after: Tensors) -> torch.Tensor:
+        """What a step is worth [B]."""
         physics, command, weights = after["physics"], after["command"], self.weights
         qpos, (velocity, spin, up) = physics[:, body.qpos], motion(body, physics)
         missed = (velocity[:, :2] - command[:, :2]).square().sum(1)
         turned = (spin[:, 2] - command[:, 2]).square()
         span = (body.high - body.low) / 2
         jerk = ((after["ctrl"] - before["ctrl"]) / span).square().sum(1)
-        reward = (
+        return (
             weights["alive"] + weights["velocity"] * torch.exp(-missed / 0.25) - weights["slow"] * missed.sqrt()
             + weights["turning"] * torch.exp(-turned / 0.25)
             - weights["bounce"] * velocity[:, 2].square() - weights["roll"] * spin[:, :2].square().sum(1)
             - weights["tilt"] * up[:, :2].square().sum(1) - weights["jerk"] * jerk
             - weights["pose"] * (qpos[:, 7:] - body.home[7:]).square().sum(1)
         )  # fmt: skip
-        tilt, height = self.fallen
-        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * body.home[2])
-        return reward.clamp_min(0.0).float(), fallen, {"command": command}
 
     def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
         if name == "command":
@@ -149,6 +153,46 @@ class VelocityTracking:
         meant = (state["ctrl"] - body.rest) / ((body.high - body.low) / 2)
         away = qpos[:, 7:] - body.home[7:]
         return torch.cat([velocity, spin, up, state["command"], away, 0.1 * qvel[:, 6:], meant], 1).float()
+
+
+@dataclass(frozen=True)
+class Stepping(VelocityTracking):
+    """The same on two legs, which take turns by a clock that is seen (Siekmann et al. 2021, "Sim-to-real learning of all common
+    bipedal gaits via periodic reward composition"): a foot stands for `standing` of each `period_s`, and else is lifted `lift_m`.
+
+    feet: their sites, of which the robot has sensors foot_, place_ and speed_; straight: columns of joints that stay as at rest.
+    """
+
+    forward: tuple[float, float] = (0.2, 0.8)
+    feet: tuple[str, str] = ("left_foot", "right_foot")
+    period_s: float = 0.8
+    standing: float = 0.55
+    lift_m: float = 0.08
+    straight: tuple[int, ...] = (1, 2, 7, 8)
+
+    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+        found = super().channels(body)
+        return found | {"observation": (numbers(found["observation"][0].shape[0] + 2), "")}
+
+    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+        seen = super().see(body, state, name)
+        angle = 2 * torch.pi * self._phase(state)
+        return (
+            seen if name != "observation" else torch.cat([seen, angle.sin()[:, None], angle.cos()[:, None]], 1).float()
+        )
+
+    def _phase(self, state: Tensors) -> torch.Tensor:
+        return (state["physics"][:, 0] / self.period_s).remainder(1.0)
+
+    def _worth(self, body: Body, before: Tensors, after: Tensors) -> torch.Tensor:
+        worth, sensors, phase = super()._worth(body, before, after), after["sensors"], self._phase(after)
+        for at, foot in enumerate(self.feet):
+            load, place, speed = (sensors[:, body.sensors[f"{kind}_{foot}"]] for kind in ("foot", "place", "speed"))
+            down, stands = load[:, 0] > 1.0, (phase + 0.5 * at).remainder(1.0) < self.standing
+            lifted = (place[:, 2] - self.lift_m).square()
+            worth = worth + 0.3 * (down == stands) - 20.0 * lifted * ~stands - 0.2 * speed.square().sum(1) * down
+        joints = (after["physics"][:, body.qpos][:, 7:] - body.home[7:])[:, list(self.straight)]
+        return worth - joints.square().sum(1)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,27 @@ from .outcome import two_hot
 CLIP = 0.2  # how far the share of an action may move within a batch
 PASSES, PARTS = 5, 4  # over a batch, in so many parts
 FARTHEST = 0.03  # nats that the policy may have moved from what it was (its KL divergence), after which the passes end
+SLOWER, FASTER, SLOWEST = (
+    1 / 1.5,
+    1.05,
+    0.02,
+)  # of the learning rate, where it moved too far in the first pass, or not in any
+
+
+class Pace(nn.Module):
+    """The share of the learning rate that is taken: less after a batch whose first pass already moved the policy too far (as in
+    Rudin et al. 2021, "Learning to walk in minutes"), more again after one that moved it little."""
+
+    share: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("share", torch.ones(()))
+
+    def change(self, parts: int) -> None:
+        """After a batch that ended after so many of its parts."""
+        factor = SLOWER if parts < PARTS else FASTER if parts == PASSES * PARTS else 1.0
+        self.share.mul_(factor).clamp_(SLOWEST, 1.0)
 
 
 class Ppo:
@@ -26,23 +47,29 @@ class Ppo:
         self, actor: ActorNetwork, critic: Critic, wanted: Wanted, learning_rate: float, more: Mapping[str, nn.Module]
     ):
         self.actor, self.critic, self.wanted = actor, critic, wanted
-        self.modules = {"actor": actor, "critic": critic, **more}
-        rate = warmed(learning_rate, 10, 0.1)
+        self.pace = Pace()
+        self.modules = {"actor": actor, "critic": critic, "pace": self.pace, **more}
+        whole = warmed(learning_rate, 10, 0.1)
+        rate = lambda now: whole(now) * float(self.pace.share)  # noqa: E731
         self.learners = {"actor": adamw((actor,), rate), "critic": adamw((critic,), rate)}
 
     def losses(self, batch: Imagined, now: Now) -> Iterator[Loss]:
         seen, drawn, returns, better, weights, before = self._judged(batch)
         count = len(drawn)
-        facts = {"reward": (batch.reward.flatten() * weights).sum() / weights.sum(), "steps": weights.sum() / count}
-        for _ in range(PASSES):
-            for part in torch.from_numpy(now.rng.permutation(count)).to(drawn.device).chunk(PARTS):
+        facts = {
+            "reward": (batch.reward.flatten() * weights).sum() / weights.sum(),
+            "steps": weights.sum() / count,
+            "pace": self.pace.share.clone(),
+        }
+        for done in range(PASSES):
+            for at, part in enumerate(torch.from_numpy(now.rng.permutation(count)).to(drawn.device).chunk(PARTS)):
                 here = {name: value[part] for name, value in seen.items()}
                 share, distribution = weights[part] / weights[part].sum().clamp_min(1.0), self.actor(here)
                 moved = distribution.log_prob(drawn[part]) - before[part]
                 ratio = moved.clamp(-20, 20).exp()
                 far = ((ratio.detach() - 1 - moved.detach()) * share).sum()
                 if far > FARTHEST:
-                    return
+                    return self.pace.change(done * PARTS + at)
                 worth = torch.minimum(ratio * better[part], ratio.clamp(1 - CLIP, 1 + CLIP) * better[part])
                 entropy = distribution.entropy(drawn[part])
                 parts = {**facts, "entropy": (entropy.detach() * share).sum(), "moved": far}
@@ -50,6 +77,7 @@ class Ppo:
                 target = two_hot(returns[part], self.critic.bins)
                 surprise = -((target * self.critic(here).log_softmax(1)).sum(1) * share).sum()
                 yield Loss("critic", surprise, {"critic": surprise})
+        self.pace.change(PASSES * PARTS)
 
     @torch.no_grad()
     def _judged(self, batch: Imagined) -> tuple:

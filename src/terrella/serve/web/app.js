@@ -391,7 +391,7 @@ window.terrella = Object.freeze({
   get seed() { return status.seed; },
   get axes() { return [...controls.axes.values]; },
   get driving() { return !!status.driving; },
-  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count, goal: goal.at, goalPicture: !!goal.shown }; },
+  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count, goal: goal.at, goalPicture: !!goal.shown, goalWords: goal.told }; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
   get map() { return views.figures; },

@@ -1,4 +1,4 @@
-// What the agent is to reach: a place that is clicked on the map, or a picture that is remembered or dropped.
+// What the agent is to reach: a place that is clicked on the map, a picture that is remembered or dropped, or an instruction.
 
 const $ = (id) => document.getElementById(id);
 const FORGET_M = 0.6;  // a click so near to the goal takes it away
@@ -6,16 +6,21 @@ const FORGET_M = 0.6;  // a click so near to the goal takes it away
 export class Goal {
   /** send(message); map: the map of places (map.js); say(sentence); quiet() lets go of all controls; go(): play goes on. */
   constructor(hooks) {
-    Object.assign(this, hooks, { places: false, pictures: false, at: null, shown: '' });
+    Object.assign(this, hooks, { places: false, pictures: false, words: false, at: null, shown: '', told: '' });
     $('goal-keep').onclick = () => { this.keep(); $('goal-keep').blur(); };
     $('goal-forget').onclick = () => this.send({ type: 'goal' });
     this.map.canvas.addEventListener('click', (event) => this.click(event));
+    $('words').onkeydown = (event) => {
+      if (event.code === 'Enter' || event.code === 'NumpadEnter') this.tell($('words').value.trim());
+      if (event.code === 'Enter' || event.code === 'NumpadEnter' || event.code === 'Escape') $('words').blur();
+    };
   }
 
   /** Takes what a greeting says. */
   take({ goals }) {
     Object.assign(this, goals);
     $('goal-keep').hidden = !this.pictures;
+    $('goal').classList.toggle('asks', this.words);
     $('map').classList.toggle('walkable', this.places);
     $('drop').classList.toggle('two', this.pictures);
   }
@@ -25,6 +30,14 @@ export class Goal {
     if (!this.pictures) return;
     this.send({ type: 'goal', here: true });
     this.say('Remembered as the goal: go elsewhere, and let the agent drive (G) to come back.');
+  }
+
+  /** An instruction is the goal. */
+  tell(words) {
+    if (!words) return;
+    this.quiet();
+    this.send({ type: 'goal', words });
+    this.go();
   }
 
   click(event) {
@@ -37,11 +50,14 @@ export class Goal {
   }
 
   /** An event `goal` (see serve/protocol.py). */
-  async show({ at, image }) {
+  async show({ at, image, words }) {
     this.at = at;
+    this.told = words ?? '';
     this.map.goal = at;
     this.map.draw();
     $('goal').classList.toggle('show', !!image);
+    $('goal').classList.toggle('told', !!words);
+    if (document.activeElement !== $('words')) $('words').value = words ?? '';
     this.shown = image ?? '';
     if (!image) return;
     const picture = await createImageBitmap(new Blob([Uint8Array.from(atob(image), (letter) => letter.charCodeAt(0))], { type: 'image/jpeg' }));
