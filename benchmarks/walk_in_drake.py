@@ -162,8 +162,10 @@ def episode(walker: Walker, world, policy, state, steps: int) -> tuple[bool, boo
     walker.begin(physics[0, body.qpos].numpy(), physics[0, body.qvel].numpy())
     for step in range(steps):
         action, memory = policy.act({"observation": task.see(body, state, "observation")}, memory, rng)
-        qpos, qvel = walker.move(action.double().numpy()[0], (step + 1) * world.spec.dt_s)
+        now_s = (step + 1) * world.spec.dt_s
+        qpos, qvel = walker.move(action.double().numpy()[0], now_s)
         physics = physics.clone()
+        physics[0, 0] = now_s
         physics[0, body.qpos], physics[0, body.qvel] = torch.from_numpy(qpos), torch.from_numpy(qvel)
         after = state.replace(physics=physics, ctrl=action.double())
         _, fallen, _ = task.judge(body, dict(state.items()), dict(after.items()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from terrella.library import load
 if find_spec("mujoco") is None:
     pytest.skip("mujoco is not installed: pip install 'terrella[mujoco]'", allow_module_level=True)
 
+from terrella.sim.mujoco_model import mujoco
+from terrella.sim.mujoco_robots import robot_of
+from terrella.sim.mujoco_tasks import Stepping, VelocityTracking
 from terrella.sim.mujoco_world import MujocoWorld
 
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
@@ -296,3 +300,53 @@ def test_a_gpu_steps_as_the_cpu_does_or_it_is_said_why_not():
         action = slow.spec.sample_action(3, rng)
         state, here = fast.imagine(state, action, rng), slow.imagine(here, action, rng)
     assert torch.allclose(state["physics"], here["physics"], atol=1e-3)
+
+
+BIPED = """<mujoco><option timestep="0.005"/><worldbody>
+ <geom type="plane" size="5 5 .1"/><body name="trunk" pos="0 0 .5"><freejoint/><geom type="box" size=".1 .1 .1" mass="5" contype="0" conaffinity="0"/>
+ <body name="l" pos="0 .1 -.1"><joint name="l" type="slide" axis="0 0 1" range="-.3 .3"/>
+  <geom name="l" type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/><site name="left_foot" pos="0 0 -.4" size=".2"/></body>
+ <body name="r" pos="0 -.1 -.1"><joint name="r" type="slide" axis="0 0 1" range="-.3 .3"/>
+  <geom name="r" type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/><site name="right_foot" pos="0 0 -.4" size=".2"/></body>
+</body></worldbody><actuator><position joint="l" kp="3000" kv="80"/><position joint="r" kp="3000" kv="80"/></actuator>
+<sensor>%s</sensor></mujoco>"""
+SOLES = "".join(
+    f'<touch name="foot_{foot}" site="{foot}"/><framepos name="place_{foot}" objtype="site" objname="{foot}"/>'
+    f'<framelinvel name="speed_{foot}" objtype="site" objname="{foot}"/>'
+    for foot in ("left_foot", "right_foot")
+)
+
+
+def test_legs_are_paid_for_taking_turns_by_a_clock_that_is_seen(tmp_path):
+    (tmp_path / "biped.xml").write_text(BIPED % SOLES)
+    task = Stepping(forward=(0.0, 0.0), turning=(0.0, 0.0), noise=0.0, straight=())
+    world = MujocoWorld(str(tmp_path / "biped.xml"), task=task, cameras=())
+    plain = MujocoWorld(str(tmp_path / "biped.xml"), task=VelocityTracking(), cameras=())
+    clock = world.spec.channels["observation"].shape[0] - plain.spec.channels["observation"].shape[0]
+    state, rng, paid = world.start(3, make_rng(0)), make_rng(0), torch.zeros(3)
+    moves = torch.tensor(
+        [[0.0, 0.0], [0.0, 0.1], [0.1, 0.0]]
+    )  # stands, lifts the right foot first, the left foot first
+    for step in range(38):
+        if step > 2:
+            paid += state["reward"]
+        state = world.imagine(state, moves if step < 19 else moves.flip(1), rng)
+    seen = world.render(state, ("observation",))["observation"][:, -2:]
+    angle = 2 * np.pi * float(state["physics"][0, 0]) / task.period_s
+    assert clock == 2 and torch.allclose(seen[0], torch.tensor([np.sin(angle), np.cos(angle)]).float(), atol=1e-5)
+    assert not state["done"].any()
+    assert paid[1] > paid[0] + 1 and paid[1] > paid[2] + 3  # the left foot stands during the first half
+
+
+def test_hinges_that_are_held_stay_as_they_are_at_rest():
+    robot = replace(robot_of("hopper"), pose={"leg_joint": 0.4})
+    free, held = robot.spec("hopper").compile(), replace(robot, still="leg_joint").spec("hopper").compile()
+    assert held.nq == free.nq - 1
+    poses = []
+    for model, extra in ((free, [0.4]), (held, [])):
+        data = mujoco.MjData(model)
+        if extra:
+            data.qpos[model.joint("leg_joint").qposadr] = extra
+        mujoco.mj_kinematics(model, data)
+        poses.append(data.xpos.copy())
+    assert np.allclose(*poses, atol=1e-6)

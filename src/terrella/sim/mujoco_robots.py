@@ -98,11 +98,16 @@ class Robot:
                 geom.condim, geom.priority, geom.friction = 3, 1, [0.8, 0.02, 0.01]
 
     def _hold(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
-        """A hinge becomes part of its body, turned as it is at rest."""
-        turn, body, turned = np.empty(4), joint.parent, np.empty(4)
+        """A hinge becomes part of its body, turned as it is at rest; what drives it goes."""
+        turn, turned, at, about = np.empty(4), np.empty(4), np.empty(3), np.asarray(joint.pos, np.float64)
+        body = joint.parent
         mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis, np.float64), self.rest(joint.name))
+        mujoco.mju_rotVecQuat(at, about, turn)
+        mujoco.mju_rotVecQuat(at, about - at, np.asarray(body.quat, np.float64))
         mujoco.mju_mulQuat(turned, np.asarray(body.quat, np.float64), turn)
-        body.quat = turned
+        body.pos, body.quat = body.pos + at, turned
+        for driver in [one for one in spec.actuators if one.target == joint.name]:
+            spec.delete(driver)
         spec.delete(joint)
 
     def _drive(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
@@ -172,21 +177,23 @@ _BODY = Servo(100.0, 5.0, 88.0, 0.01, 0.6)
 ROBOTS: Mapping[str, Robot] = {
     "go1": Robot(
         ZOO + "unitree_go1/xmls/go1.xml",
-        "Unitree Go1, a quadruped that follows a commanded velocity",
-        VelocityTracking(),
+        "Unitree Go1, a quadruped that trots with a commanded velocity",
+        Stepping(
+            feet={"FR": 0.0, "RL": 0.0, "FL": 0.5, "RR": 0.5}, period_s=0.5, standing=0.5, lift_m=0.1, straight=(0, 3, 6, 9)
+        ),
         {".*_calf_joint": Servo(35.0, 1.0, 35.5, 0.0091, 0.7), ".*_thigh_joint": Servo(35.0, 1.0, 23.7, 0.004, 0.7), ".*": _LEG},
         0.29,
         {".*R_hip_joint": 0.1, ".*L_hip_joint": -0.1, ".*_thigh_joint": 0.9, ".*_calf_joint": -1.8},
         "",
         r".*_foot_collision|(trunk|head)_collision|.*_thigh_collision1",
-        _feet("FR", "FL", "RR", "RL"),
+        _feet("FR", "FL", "RR", "RL", moving=True),
         0.005,
         max_steps=1000,
     ),
     "g1": Robot(
         ZOO + "unitree_g1/xmls/g1.xml",
         "Unitree G1, a humanoid that walks with a commanded velocity, its waist and arms held",
-        Stepping(),
+        Stepping(forward=(0.2, 0.8)),
         {
             ".*hip_(pitch|yaw).*": Servo(100.0, 2.0, 88.0, 0.01, 0.7),
             ".*hip_roll.*": Servo(100.0, 2.0, 139.0, 0.025, 0.5),

@@ -20,11 +20,13 @@ MARKER = "marker"  # of a state, where a task keeps one: a point [B, 3], m, that
 
 @dataclass(frozen=True)
 class Body:
-    """What a task knows of the robot. qpos, qvel: slices of the state's columns; home: qpos [nq] and ctrl [nu] at rest; low, high:
+    """What a task knows of the robot. qpos, qvel: slices of the state's columns; hinges: which of those [n] each are of hinges and
+    slides, so of no body that moves freely; home: qpos [nq] and ctrl [nu] at rest; low, high:
     [nu] of the controls; sensors: name -> slice of the sensors' columns; step_s: seconds of a control step."""
 
     qpos: slice
     qvel: slice
+    hinges: tuple[torch.Tensor, torch.Tensor]
     home: torch.Tensor
     rest: torch.Tensor
     low: torch.Tensor
@@ -157,14 +159,14 @@ class VelocityTracking:
 
 @dataclass(frozen=True)
 class Stepping(VelocityTracking):
-    """The same on two legs, which take turns by a clock that is seen (Siekmann et al. 2021, "Sim-to-real learning of all common
+    """The same with legs that take turns by a clock that is seen (Siekmann et al. 2021, "Sim-to-real learning of all common
     bipedal gaits via periodic reward composition"): a foot stands for `standing` of each `period_s`, and else is lifted `lift_m`.
 
-    feet: their sites, of which the robot has sensors foot_, place_ and speed_; straight: columns of joints that stay as at rest.
+    feet: sites, of which the robot has sensors foot_, place_ and speed_, and by which share of the period each is ahead; straight:
+    columns of joints that stay as at rest.
     """
 
-    forward: tuple[float, float] = (0.2, 0.8)
-    feet: tuple[str, str] = ("left_foot", "right_foot")
+    feet: Mapping[str, float] = field(default_factory=lambda: {"left_foot": 0.0, "right_foot": 0.5})
     period_s: float = 0.8
     standing: float = 0.55
     lift_m: float = 0.08
@@ -186,18 +188,20 @@ class Stepping(VelocityTracking):
 
     def _worth(self, body: Body, before: Tensors, after: Tensors) -> torch.Tensor:
         worth, sensors, phase = super()._worth(body, before, after), after["sensors"], self._phase(after)
-        for at, foot in enumerate(self.feet):
+        for foot, ahead in self.feet.items():
             load, place, speed = (sensors[:, body.sensors[f"{kind}_{foot}"]] for kind in ("foot", "place", "speed"))
-            down, stands = load[:, 0] > 1.0, (phase + 0.5 * at).remainder(1.0) < self.standing
+            down, stands = load[:, 0] > 1.0, (phase + ahead).remainder(1.0) < self.standing
             lifted = (place[:, 2] - self.lift_m).square()
-            worth = worth + 0.3 * (down == stands) - 20.0 * lifted * ~stands - 0.2 * speed.square().sum(1) * down
+            steps = 0.6 * (down == stands) - 40.0 * lifted * ~stands - 0.4 * speed.square().sum(1) * down
+            worth = worth + steps / len(self.feet)
         joints = (after["physics"][:, body.qpos][:, 7:] - body.home[7:])[:, list(self.straight)]
         return worth - joints.square().sum(1)
 
 
 @dataclass(frozen=True)
 class Reach:
-    """A hand goes to a point, drawn evenly in a box in front of the arm when an episode begins; reward: minus the distance in m."""
+    """A hand goes to a point, drawn evenly in a box in front of the arm when an episode begins; reward: minus the distance in m.
+    The observation is the arm's own: its joints, their speeds, the goal, and what is between it and the hand."""
 
     rewards = True
     hand: str = "hand"
@@ -206,8 +210,11 @@ class Reach:
 
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
         _check_hand(body, self.hand)
-        width = len(body.home) + body.qvel.stop - body.qvel.start + 6
-        return {"observation": (numbers(width), ""), "goal": (numbers(3), "m"), "hand": (numbers(3), "m")}
+        return {
+            "observation": (numbers(sum(map(len, body.hinges)) + 6), ""),
+            "goal": (numbers(3), "m"),
+            "hand": (numbers(3), "m"),
+        }
 
     def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
         low, high = torch.tensor(self.low), torch.tensor(self.high)
@@ -225,7 +232,8 @@ class Reach:
         if name != "observation":
             return state["goal"] if name == "goal" else hand.float()
         physics, goal = state["physics"], state["goal"]
-        return torch.cat([physics[:, body.qpos], physics[:, body.qvel], goal, hand - goal], 1).float()
+        at, speed = (physics[:, part][:, own] for part, own in zip((body.qpos, body.qvel), body.hinges))
+        return torch.cat([at, speed, goal, hand - goal], 1).float()
 
 
 @dataclass(frozen=True)

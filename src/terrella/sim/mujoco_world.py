@@ -383,10 +383,20 @@ def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int
         )
         for at in range(model.nsensor)
     }
+    own = (model.jnt_type != int(FREE)) & (model.jnt_type != int(BALL))
+    hinges = torch.from_numpy(model.jnt_qposadr[own]).long(), torch.from_numpy(model.jnt_dofadr[own]).long()
     plain = (torch.from_numpy(np.asarray(part, np.float64)) for part in (home[0], rest, low, high))
     at_home, at_rest, lowest, highest = plain
     return Body(
-        slice(1, ends[0]), slice(*ends), at_home, at_rest, lowest, highest, sensors, steps * float(model.opt.timestep)
+        slice(1, ends[0]),
+        slice(*ends),
+        hinges,
+        at_home,
+        at_rest,
+        lowest,
+        highest,
+        sensors,
+        steps * float(model.opt.timestep),
     )
 
 
