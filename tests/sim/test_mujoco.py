@@ -302,12 +302,12 @@ def test_a_gpu_steps_as_the_cpu_does_or_it_is_said_why_not():
     assert torch.allclose(state["physics"], here["physics"], atol=1e-3)
 
 
-BIPED = """<mujoco><option timestep="0.005"/><worldbody>
- <geom type="plane" size="5 5 .1"/><body name="trunk" pos="0 0 .5"><freejoint/><geom type="box" size=".1 .1 .1" mass="5" contype="0" conaffinity="0"/>
- <body name="l" pos="0 .1 -.1"><joint name="l" type="slide" axis="0 0 1" range="-.3 .3"/>
-  <geom name="l" type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/><site name="left_foot" pos="0 0 -.4" size=".2"/></body>
- <body name="r" pos="0 -.1 -.1"><joint name="r" type="slide" axis="0 0 1" range="-.3 .3"/>
-  <geom name="r" type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/><site name="right_foot" pos="0 0 -.4" size=".2"/></body>
+BIPED = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 .1"/>
+ <body pos="0 0 .5"><freejoint/><geom type="box" size=".1 .1 .1" mass="5" contype="0" conaffinity="0"/>
+  <body pos="0 .1 -.1"><joint name="l" type="slide" axis="0 0 1" range="-.3 .3"/><site name="left_foot" pos="0 0 -.4" size=".2"/>
+   <geom type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/></body>
+  <body pos="0 -.1 -.1"><joint name="r" type="slide" axis="0 0 1" range="-.3 .3"/><site name="right_foot" pos="0 0 -.4" size=".2"/>
+   <geom type="box" size=".15 .2 .05" pos="0 0 -.35" mass=".5" contype="0"/></body>
 </body></worldbody><actuator><position joint="l" kp="3000" kv="80"/><position joint="r" kp="3000" kv="80"/></actuator>
 <sensor>%s</sensor></mujoco>"""
 SOLES = "".join(
