@@ -19,7 +19,7 @@ if find_spec("mujoco") is None:
 
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import robot_of
-from terrella.sim.mujoco_tasks import Stepping, VelocityTracking
+from terrella.sim.mujoco_tasks import Reach, Stepping, VelocityTracking
 from terrella.sim.mujoco_world import MujocoWorld
 
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
@@ -350,3 +350,17 @@ def test_hinges_that_are_held_stay_as_they_are_at_rest():
         mujoco.mj_kinematics(model, data)
         poses.append(data.xpos.copy())
     assert np.allclose(*poses, atol=1e-6)
+
+
+def test_a_reaching_arm_sees_its_own_joints_and_nothing_that_lies_about(arm):
+    world = MujocoWorld(str(arm), task=Reach(hand="tip"), cameras=())
+    assert world.spec.channels["observation"].shape == (8,)  # a joint, its speed, the goal, what is left to it
+    state = world.start(2, make_rng(0))
+    moved = state["physics"].clone()
+    moved[1] = moved[0]
+    moved[1, world.body.qpos][1:4] += 0.3  # the ball
+    state = state.replace(
+        physics=moved, goal=state["goal"][:1].expand(2, 3), sensors=state["sensors"][:1].expand(2, -1)
+    )
+    seen = world.render(state, ("observation", "qpos"))
+    assert torch.equal(*seen["observation"]) and not torch.equal(*seen["qpos"])
