@@ -381,7 +381,34 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
         assert len(read_edits(folder)) == left
     foreign = post.replace('{"do": 1}', '{"do": "merge", "place": "/", "sha256": "0", "by": [0, 0, 0], "degrees": 0}')
     status, said = page.evaluate(foreign, page.evaluate("terrella.story.saved"))
-    assert status == 422 and "merges nothing new" in said
+    assert status == 422 and "opened beside, nothing else" in said
+
+
+def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, serving):
+    for name, many in (("w", 1500), ("other", 600)):
+        save_splat(world(many), tmp_path / name)
+    folder, merge = tmp_path / "w", merging(tmp_path / "w", tmp_path / "other")
+    save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
+    beside = compared_with(str(tmp_path / "other"))
+    url = serving(build_place(place_of(str(folder)), lambda: read_edits(folder), save, beside=beside, merge=merge))
+    page = opened(url)
+    page.keyboard.press("KeyE")
+    for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
+        page.locator(f"#merging input[aria-label={label}]").fill(value)
+    page.click("#merge")
+    until(page, "terrella.story.scene.length === 2100")
+    page.keyboard.press("Control+z")
+    until(page, "terrella.story.scene.length === 1500")
+    page.keyboard.press("Control+Shift+Z")
+    page.evaluate("document.getElementById('save').click()")
+    until(page, "!terrella.story.unsaved")
+    assert read_edits(folder) == [{**merge, "by": [4, -1.5, 0], "degrees": 90}]
+    there, after = page.evaluate(COLUMNS), load(folder)
+    assert isinstance(after, SplatWorld) and np.allclose(rows(there["means"]), rows(after.gaussians.means), atol=1e-5)
+    page.reload()
+    until(page, "!!window.terrella && terrella.story.scene.length === 2100")
+    alone = opened(serving(build_place(place_of(str(folder)), list, save)))
+    assert not alone.is_visible("#merging")
 
 
 @pytest.fixture

@@ -183,7 +183,8 @@ def view(
 
     Args:
         world: A world of Gaussians: its folder, or the run that made it.
-        beside: Another world of Gaussians, or a file of them (as `space import` reads them), that the page compares it with.
+        beside: Another world of Gaussians, or a file of them (as `space import` reads them), that the page compares it with; a
+            world can be merged there, too.
     """
     from ..serve.place import serve_place
 
@@ -196,7 +197,18 @@ def view(
         result({"address": address, "gaussians": len(place.gaussians)}, json, f"{place.name}: open {address}")
 
     other = None if beside is None else compared_with(beside)
-    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready, other)
+    merge = None if beside is None or Path(beside).is_file() else _mergeable(folder, beside)
+    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready, other, merge)
+
+
+def _mergeable(folder: Path, other: str) -> Edit | None:
+    """The edit that merges a world; None where one of them holds the other."""
+    from ..core.errors import ContractError
+
+    try:
+        return merging(folder, folder_of(other))
+    except ContractError:
+        return None
 
 
 def compared_with(name: str) -> Place:

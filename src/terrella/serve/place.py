@@ -66,16 +66,17 @@ class Place:
 
 
 class PlacePage:
-    """The page of a place, to compare with `beside` if that is given. It loads nothing from anywhere: `policy` is its
-    Content-Security-Policy."""
+    """The page of a place, to compare with `beside` if that is given, and to merge with it if `merge` says how an edit does. It
+    loads nothing from anywhere: `policy` is its Content-Security-Policy."""
 
-    def __init__(self, place: Place, beside: Place | None = None):
-        self._place, self._beside, packed = place, None, b""
+    def __init__(self, place: Place, beside: Place | None = None, merge: Edit | None = None):
+        self._place, self._beside, self._compared = place, None, ""
+        self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # what merges bring to it
         if beside is not None:
-            packed = gzip.compress(_packed(beside, torch.ones(len(beside.gaussians), dtype=torch.bool)), 6, mtime=0)
-            self._beside = {"count": len(beside.gaussians), "name": beside.name}
-        self._compared = base64.b64encode(packed).decode()
-        self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # what merges brought to it so far
+            told, self._compared = _whole(beside)
+            self._beside = {**told, "name": beside.name, "merge": merge}
+            if merge is not None:
+                self.merged[_key(merge)] = {**told, "sha256": merge["sha256"]}, self._compared
         first = len(place.gaussians) if len(place.gaussians) <= WHOLE else FIRST
         self._packed, *parts = packed_place(place, first)
         self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
@@ -109,21 +110,21 @@ class PlacePage:
         """What a merge brings, as the page has it: what is said of it, and its Gaussians."""
         key = _key(edit)
         if key not in self.merged and self._place.other:
-            other = self._place.other(edit)
-            packed = gzip.compress(_packed(other, torch.ones(len(other.gaussians), dtype=torch.bool)), 6, mtime=0)
-            told = {
-                "sha256": key[1],
-                "count": len(other.gaussians),
-                "boxes": _boxes(other),
-                "objects": list(other.names),
-            }
-            self.merged[key] = told, base64.b64encode(packed).decode()
+            told, packed = _whole(self._place.other(edit))
+            self.merged[key] = {**told, "sha256": key[1]}, packed
         return self.merged[key]
 
 
 def _key(edit: Edit) -> tuple[str, str]:
     """What a merge brings, and how it was then."""
     return edit["place"], edit["sha256"]
+
+
+def _whole(place: Place) -> tuple[dict[str, Any], str]:
+    """What scene.js unpacks of a place that comes in one: what is said of it, and its columns in gzip and base64."""
+    packed = gzip.compress(_packed(place, torch.ones(len(place.gaussians), dtype=torch.bool)), 6, mtime=0)
+    told = {"count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names)}
+    return told, base64.b64encode(packed).decode()
 
 
 def packed_place(place: Place, first: int) -> tuple[dict[str, Any], bytes, bytes]:
@@ -211,12 +212,13 @@ def build_place(
     host: str = "127.0.0.1",
     token: str | None = None,
     beside: Place | None = None,
+    merge: Edit | None = None,
 ) -> Starlette:
     """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
     saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows.
-    `beside` is what the place can be compared with."""
+    `beside` is what the place can be compared with, and merged with as `merge` says."""
     page, alone, frames = (
-        PlacePage(place, beside),
+        PlacePage(place, beside, merge),
         threading.Lock(),
         Frames(place.gaussians, place.objects, edits, place.other),
     )
@@ -228,7 +230,9 @@ def build_place(
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
             lines = [json.loads(line) for line in told["lines"].splitlines() if line]
             if any(_key(edit) not in page.merged for edit in merges(lines)):
-                raise ServeError("this page merges nothing new; `terrella space edit PLACE --merge OTHER` does.")
+                raise ServeError(
+                    "this page merges what it was opened beside, nothing else: `terrella space view PLACE --beside OTHER`."
+                )
             save(told["lines"])
 
     async def keep(request: Request) -> PlainTextResponse:
@@ -265,11 +269,12 @@ def serve_place(
     token: str | None = None,
     on_ready: Callable[[str], None] | None = None,
     beside: Place | None = None,
+    merge: Edit | None = None,
 ) -> None:
-    """Serves the page of a place until interrupted; `edits`, `save` and `beside` as `build_place` has them.
+    """Serves the page of a place until interrupted; `edits`, `save`, `beside` and `merge` as `build_place` has them.
 
     On any address but this machine's own a token is mandatory, for the page can change the place: where none is given one is
     made, and the address carries it. ServeError where the port is taken.
     """
-    build = lambda token: build_place(place, edits, save, host, token, beside)  # noqa: E731
+    build = lambda token: build_place(place, edits, save, host, token, beside, merge)  # noqa: E731
     serve_page(build, host, port, token, on_ready, websockets=False)

@@ -105,9 +105,15 @@ function run({ drawing, source, story, solid: first }) {
     if (compare.open) { compare.show(null); return; }
     if (seen.stands > 1) { toast('The rest of the place comes first.'); return; }
     if (!world.beside && !story.edits.length) { toast('It was not edited. `terrella space view PLACE --beside OTHER` compares it with another place or file.'); return; }
-    if (world.beside) seen.beside ??= unpackScene(new Reader(await inflate(decoded($('beside').textContent))), world.beside);
+    const other = (await beside()) ?? source;
     seen.sorted = '';
-    compare.show(seen.beside ?? source, world.beside?.name ?? 'before its edits');
+    compare.show(other, world.beside?.name ?? 'before its edits');
+  }
+
+  /** What it is compared with, or is merged with, where the page has one. */
+  async function beside() {
+    if (world.beside) seen.beside ??= unpackScene(new Reader(await inflate(decoded($('beside').textContent))), world.beside);
+    return seen.beside;
   }
 
   function lens() {
@@ -198,6 +204,15 @@ function run({ drawing, source, story, solid: first }) {
   addEventListener('resize', () => { map.layer = null; redraw(); });
   addEventListener('beforeunload', (event) => { if (story.unsaved) event.preventDefault(); });
   setInterval(figures, 400);
+  const merges = world.beside?.merge;
+  $('merging').hidden = !merges;
+  $('merge').title = merges ? `All of ${world.beside.name}, turned by ° about its origin, then moved by x y z in metres` : '';
+  $('merge').onclick = async () => {
+    const [x, y, z, degrees] = [...$('merging').querySelectorAll('input')].map((input) => Number(input.value));
+    if (![x, y, z, degrees].every(Number.isFinite)) { toast('A merge takes metres and degrees, such as 1.25.'); return; }
+    story.others.set(merges.sha256, await beside());
+    editor.change(() => story.add({ ...merges, by: [x, y, z], degrees }));
+  };
   offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
 
   seen.stands = world.count / source.length;
