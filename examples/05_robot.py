@@ -23,7 +23,7 @@ from gymnasium import spaces
 import terrella
 from terrella.act.planning import Cost, Planner, SearchConfig, Thought, imagined
 from terrella.core import State, chance
-from terrella.core.errors import ContractError
+from terrella.core.errors import ContractError, TerrellaError
 from terrella.core.policy import Random
 from terrella.data import record
 from terrella.learn.recipes.latent import LatentTraining, train_latent
@@ -339,4 +339,9 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, help="where walks and world are kept; default: runs/robot-BODY")
     parser.add_argument("--to", choices=list(POSTS), default="red")
     parser.add_argument("--port", type=int, default=8765)
-    main(**vars(parser.parse_args()))
+    try:
+        main(**vars(parser.parse_args()))
+    except TerrellaError as error:
+        raise SystemExit(f"\n{error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("\nstopped; the same command goes on.") from None
