@@ -78,6 +78,8 @@ def test_what_one_installation_began_another_continues(tmp_path, capsys, few, mo
         (("--sim", "mujoco:arm", "--real", "mujoco:ant"), "takes actions in"),
         (("--sim", "mujoco:reacher", "--real", "mujoco:reacher", "--arms", "nominal"), "has no channel 'success'"),
         (("--sim", "mujoco:ant"), "say what stands for reality"),
+        (("--real", "gym:Reacher-v5"), "between robots in MuJoCo"),
+        (("--sim", "gym:CartPole-v1"), "between robots in MuJoCo"),
         (("--dial", "3"), "from 0 to 1"),
         (("--arms", "nominal", "wishful"), "--arms are some of"),
     ],

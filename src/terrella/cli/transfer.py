@@ -96,6 +96,7 @@ def transfer(
         out: Folder for the page, the figures and the policies; default: transfers/NAME.
         workers: Seeds that run at once, each a process of its own.
     """
+    _check_robot(sim)
     if real is not None and not library.is_truth(real):
         from .transfer_recorded import transfer_recorded
 
@@ -156,9 +157,17 @@ def opened_real(name: str, gap: str, dial: float, look: str = "") -> Any:
 
     if not 0 <= dial <= 1:
         raise TerrellaError(f"--dial is the share of the gap, from 0 to 1; got {dial:g}.")
+    _check_robot(name)
     world = library.load(name, cameras=None if look else (), size=PICTURE, threads=1)
     told = {key: one for file in (gap, look) if file for key, one in randomised.read(file).items()}
     return randomised.Randomised(world, told, dial) if told else world
+
+
+def _check_robot(name: str) -> None:
+    if not name.startswith("mujoco:"):
+        raise TerrellaError(
+            f"policies are carried over between robots in MuJoCo; '{name}' is no mujoco:NAME or mujoco:FILE.xml."
+        )
 
 
 def real_hash(name: str, gap: str, dial: float, look: str = "") -> str:

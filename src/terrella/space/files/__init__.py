@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,8 +27,8 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb (KHR_gaussian_splatting);
-    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite is left out. DatasetError
-    says what is wrong with a file."""
+    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite is left out, with a
+    warning that counts it. DatasetError says what is wrong with a file."""
     path = Path(path)
     if path.suffix.lower() in GLTF_ENDINGS:
         found = read_gltf(path)
@@ -67,6 +68,11 @@ def _sound(found: Gaussians, path: Path, axes: str) -> Gaussians:
     sound = sound.all(0) & (found.quats.norm(dim=1) > 0)
     if not sound.any():
         raise DatasetError(f"{path} has no Gaussian whose numbers are finite; export it again.")
+    if lost := int((~sound).sum()):
+        warnings.warn(
+            f"{lost:,} of its {len(sound):,} Gaussians are left out: not finite, or with a quaternion of 0.",
+            stacklevel=3,
+        )
     return turned(found.at(sound), _axes(axes).T)
 
 

@@ -84,7 +84,9 @@ def read_gltf(path: str | Path, scale: float = 1.0) -> Scene | Gaussians:
         Image.DecompressionBombError,
     ) as error:
         said = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
-        raise DatasetError(f"{path} cannot be opened as glTF: {said.splitlines()[0].rstrip('.')}.") from error
+        raise DatasetError(
+            f"{path} cannot be opened as glTF: {said.splitlines()[0].rstrip('.')}; export it again."
+        ) from error
 
 
 def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
