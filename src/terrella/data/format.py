@@ -95,7 +95,10 @@ class Layout:
     def _feature(self, sensor: Sensor) -> dict:
         shape, names = list(sensor.shape), list(sensor.names) or None
         if not shape or min(shape) < 1:
-            raise DatasetError(f"{sensor.name} has shape {tuple(shape)}; a row needs numbers of a fixed shape.")
+            why = (
+                "this world has nothing to drive" if sensor.name == "action" else "a row needs numbers of a fixed shape"
+            )
+            raise DatasetError(f"{sensor.name} has shape {tuple(shape)}: {why}.")
         if sensor.kind == "points":
             raise DatasetError(f"{sensor.name} has any number of points, which no row can hold: keep it as a stream.")
         if sensor.kind == "depth":

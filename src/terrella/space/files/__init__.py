@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from ...core.errors import DatasetError
+from ..edits import FARTHEST_M
 from ..raster import Gaussians
 from ..raster.move import turned
 from . import compressed, ply, sog, spz
@@ -27,8 +28,8 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb (KHR_gaussian_splatting);
-    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite is left out, with a
-    warning that counts it. DatasetError says what is wrong with a file."""
+    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite or farther than 10 km is
+    left out, with a warning that counts it. DatasetError says what is wrong with a file."""
     path = Path(path)
     if path.suffix.lower() in GLTF_ENDINGS:
         found = read_gltf(path)
@@ -61,16 +62,16 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
 
 
 def _sound(found: Gaussians, path: Path, axes: str) -> Gaussians:
-    """Those whose numbers are finite, in our axes."""
+    """Those whose numbers are finite and whose places are not absurd, in our axes."""
     sound = torch.stack(
         [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(found).values()]
     )
-    sound = sound.all(0) & (found.quats.norm(dim=1) > 0)
+    sound = sound.all(0) & (found.quats.norm(dim=1) > 0) & (found.means.abs() < FARTHEST_M).all(1)
     if not sound.any():
-        raise DatasetError(f"{path} has no Gaussian whose numbers are finite; export it again.")
+        raise DatasetError(f"{path} has no Gaussian with finite numbers within 10 km; export it again.")
     if lost := int((~sound).sum()):
         warnings.warn(
-            f"{lost:,} of its {len(sound):,} Gaussians are left out: not finite, or with a quaternion of 0.",
+            f"{lost:,} of its {len(sound):,} Gaussians are left out: not finite, farther than 10 km, or with a quaternion of 0.",
             stacklevel=3,
         )
     return turned(found.at(sound), _axes(axes).T)
