@@ -74,7 +74,7 @@ def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
     return spec
 
 
-def add_floor(spec: mujoco.MjSpec) -> None:
+def add_floor(spec: mujoco.MjSpec, sky: bool = True) -> None:
     """A chequered plane at height 0, named "floor", lit, and a sky where there is none."""
     texture = spec.add_texture(
         name="terrella_floor", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
@@ -86,7 +86,7 @@ def add_floor(spec: mujoco.MjSpec) -> None:
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="terrella_floor"
     )
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.2, -1], castshadow=False)
-    if not any(one.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for one in spec.textures):
+    if sky and not any(one.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for one in spec.textures):
         spec.add_texture(
             name="terrella_sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
             rgb1=[0.42, 0.53, 0.64], rgb2=[0.8, 0.84, 0.87], width=64, height=384,

@@ -46,7 +46,7 @@ class Robot:
     rest, m; pose: of the joints at rest, by pattern; still: hinges that are held in it, by pattern; touching: geoms that collide,
     by pattern, all where it is ""; adds: what the spec gets besides; step_s, control_s: seconds of a step of physics and of
     control; keys, units: of its actions, where the file does not say; pilot: makes controls of actions, in place of a person who
-    cannot."""
+    cannot; sky: whether it is drawn under one."""
 
     file: str
     what: str
@@ -63,6 +63,7 @@ class Robot:
     keys: Mapping[str, list[float]] = field(default_factory=dict)
     units: tuple[str, ...] = ()
     pilot: type[Multirotor] | None = None
+    sky: bool = True
 
     def spec(self, name: str) -> mujoco.MjSpec:
         """The robot's file with what is added to it. TerrellaError where the wheel is not installed."""
@@ -77,7 +78,7 @@ class Robot:
             for joint in spec.joints:
                 self._drive(spec, joint)
         if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
-            add_floor(spec)
+            add_floor(spec, self.sky)
             if self.touching:
                 spec.geom("floor").contype, spec.geom("floor").conaffinity = 1, 0
         self.adds(spec)
@@ -247,8 +248,10 @@ ROBOTS: Mapping[str, Robot] = {
         GYMNASIUM + "humanoid.xml", "Gymnasium's humanoid, with motors", VelocityTracking(fallen=(1.2, 0.6)), max_steps=1000
     ),
     "hopper": Robot(GYMNASIUM + "hopper.xml", "Gymnasium's hopper, one leg in a plane"),
-    "arm": Robot(OWN + "arm.xml", "an arm of two joints in a vertical plane that holds its hand at a point", Hold(), max_steps=150),
-    "arm-real": Robot(OWN + "arm_real.xml", "the same arm with another integrator", Hold(), max_steps=150),
+    "arm": Robot(
+        OWN + "arm.xml", "an arm of two joints in a vertical plane that holds its hand at a point", Hold(), max_steps=150, sky=False
+    ),
+    "arm-real": Robot(OWN + "arm_real.xml", "the same arm with another integrator", Hold(), max_steps=150, sky=False),
     "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),
 }  # fmt: skip
 
