@@ -318,6 +318,9 @@ SOLES = "".join(
 
 
 def test_legs_are_paid_for_taking_turns_by_a_clock_that_is_seen(tmp_path):
+    (tmp_path / "blind.xml").write_text(BIPED % "")
+    with pytest.raises(TerrellaError, match="lacks: foot_left_foot, place_left_foot"):
+        MujocoWorld(str(tmp_path / "blind.xml"), task=Stepping(), cameras=())
     (tmp_path / "biped.xml").write_text(BIPED % SOLES)
     task = Stepping(forward=(0.0, 0.0), turning=(0.0, 0.0), noise=0.0, straight=())
     world = MujocoWorld(str(tmp_path / "biped.xml"), task=task, cameras=())

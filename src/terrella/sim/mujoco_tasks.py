@@ -174,6 +174,11 @@ class Stepping(VelocityTracking):
 
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
         found = super().channels(body)
+        wanted = [f"{kind}_{foot}" for foot in self.feet for kind in ("foot", "place", "speed")]
+        if missing := [name for name in wanted if name not in body.sensors]:
+            raise TerrellaError(
+                f"steps are judged by sensors that the file lacks: {', '.join(missing)} (touch, framepos and framelinvel of its feet)."
+            )
         return found | {"observation": (numbers(found["observation"][0].shape[0] + 2), "")}
 
     def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
