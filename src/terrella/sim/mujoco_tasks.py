@@ -177,7 +177,7 @@ class Stepping(VelocityTracking):
         wanted = [f"{kind}_{foot}" for foot in self.feet for kind in ("foot", "place", "speed")]
         if missing := [name for name in wanted if name not in body.sensors]:
             raise TerrellaError(
-                f"steps are judged by sensors that the file lacks: {', '.join(missing)} (touch, framepos and framelinvel of its feet)."
+                f"steps are judged by sensors that the file lacks: {', '.join(missing)} (touch, framepos, framelinvel)."
             )
         return found | {"observation": (numbers(found["observation"][0].shape[0] + 2), "")}
 
