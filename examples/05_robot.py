@@ -280,7 +280,7 @@ def sketch(world, state, colours) -> torch.Tensor:
 
 def learned(name: str, gait: Path, out: Path, frames: int, steps: int):
     """The world beside the robot: what a command does to where a post is and to the speed, from recorded walks."""
-    if not (out / "run" / "world").exists():
+    if not (out / "run" / "validation.json").exists():
         walker = Walker(name, gait, draws=False)
         record(walker, Random(walker.spec, (5, 20)), out / "walks", frames, terrella.make_rng(0), told)
         small = LatentTraining(

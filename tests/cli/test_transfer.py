@@ -49,6 +49,10 @@ def test_a_pair_is_carried_over_and_goes_on_where_it_was(tmp_path, capsys, few):
     assert told["hash"] in (tmp_path / "t" / "transfer.html").read_text()
     again = json.loads(ran(capsys, *asked, "--arms", "nominal")[1])
     assert again["arms"]["nominal"] == told["arms"]["nominal"]
+    # What is asked for bit by bit comes to the same.
+    bits = [tmp_path / "bits" if word == tmp_path / "t" else word for word in asked]
+    ran(capsys, *bits, "--arms", "nominal")
+    assert json.loads(ran(capsys, *bits, "--arms", "nominal", "model")[1]) | {"page": ""} == told | {"page": ""}
     code, _, err = ran(capsys, *asked, "--dial", "0.5")
     assert code == 2 and "another experiment" in err and "dial" in err
 
@@ -81,6 +85,7 @@ def test_what_one_installation_began_another_continues(tmp_path, capsys, few, mo
         (("--real", "gym:Reacher-v5"), "between robots in MuJoCo"),
         (("--sim", "gym:CartPole-v1"), "between robots in MuJoCo"),
         (("--dial", "3"), "from 0 to 1"),
+        (("--real-episodes",), "are 1 or more"),
         (("--arms", "nominal", "wishful"), "--arms are some of"),
     ],
 )
@@ -113,7 +118,7 @@ def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeyp
     code, out, _ = ran(capsys, *words, "--arms", "nominal", "--camera")
     told = json.loads(out)
     assert code == 0 and told["arms"] == plain["arms"] and told["look_hash"] != told["hash"]
-    assert {"nominal", "visual", "nominal, adversarial encoder"} < set(told["camera"]) and len(told["errors"]) == 4
+    assert {"nominal", "visual", "nominal, adversarial encoder"} < set(told["camera"]) == set(told["errors"])
     code, _, err = ran(capsys, *words, "--look", "x.toml")
     assert code == 2 and "--camera" in err
 
@@ -132,6 +137,19 @@ def test_a_recording_stands_for_reality(tmp_path, capsys, few):
     assert code == 0 and set(told["open_loop"]) == {"simulator", "model 2", "stands still"} and told["held_out"] == 2
     assert told["open_loop"]["simulator"]["10"]["value"] < 0.1 * told["open_loop"]["stands still"]["10"]["value"]
     assert told["action_error"]["simulator"]["value"] < 0.5 * told["action_error"]["random"]["value"]
+    for ignored in (("--dial", "0.5"), ("--arms", "nominal"), ("--camera",)):
+        code, _, err = ran(capsys, *words, *ignored)
+        assert code == 2 and "leave them out" in err
+    record(
+        load("mujoco:arm", cameras=()),
+        Random(real.spec, (1, 9)),
+        tmp_path / "other",
+        120,
+        make_rng(0),
+        max_episode_steps=30,
+    )
+    code, _, err = ran(capsys, "transfer", "--real", tmp_path / "other", *words[3:])
+    assert code == 2 and "other settings" in err  # the folder's residual is of the first recording
     code, _, err = ran(capsys, *words, "--sim", "mujoco:ant")
     assert code == 2 and "actions" in err and err.count("\n") == 1
     about = tmp_path / "set" / "meta" / "terrella.json"

@@ -38,6 +38,6 @@ def test_the_gap_that_is_recovered():
 def test_arms_with_a_camera():
     one = {0: torch.tensor([1, 0, 0, 0])}
     camera = {"nominal": one, "model 10, oracle encoder": {0: torch.ones(4)}, "visual": {0: torch.tensor([1, 1, 0, 0])}}
-    found = transferred({"nominal": one}, {}, {}, camera, {"oracle": [0.01, 0.02]})
+    found = transferred({"nominal": one}, {}, {}, camera, {"model 10, oracle encoder": [0.01, 0.02]})
     assert "visual, in 50%" in verdict(found)[-1]
     assert camera_table(found)[1][1][2] == "0.010 to 0.020" and "visual" in transferred_page("a", found, {})

@@ -15,6 +15,7 @@ from ..act.planning.episodes import play
 from ..core.errors import TerrellaError
 from ..core.spec import BUTTONS, CHOICE
 from ..core.world import World, make_rng
+from ..learn.recipes.policy import device_of
 from ..measure.acceleration import Meter, Pace, horizon, pace
 from ..measure.statistics import Figure, ratio_interval
 from .beside import STEPS, check_alike, sound
@@ -91,7 +92,9 @@ def retained(real: World, agent: str, reference: str, episodes: int, seed: int) 
 
 
 def _numbers(name: str) -> World:
-    return library.load(name, cameras=()) if name.startswith("mujoco:") else library.load(name)
+    if not name.startswith("mujoco:"):
+        return library.load(name)
+    return library.load(name, cameras=(), threads=torch.get_num_threads())
 
 
 def _limited(world: World) -> bool:
@@ -107,7 +110,10 @@ def _median(paces: list[Pace]) -> Pace:
 def _facts(world: str, beside: str | None, mine: World, found: dict[str, list[Pace]]) -> dict[str, object]:
     best = {arm: max(paces, key=lambda pace: pace.aggregate) for arm, paces in found.items()}
     facts: dict[str, object] = {"world": world, "beside": beside, "control_step_s": mine.spec.dt_s}
-    facts |= {"threads": torch.get_num_threads(), "joules": Meter().how}
+    facts |= {
+        "threads": torch.get_num_threads(),
+        "joules": Meter().how + ("" if device_of(mine).type == "cpu" else ", without the GPU"),
+    }
     facts |= {f"{arm}_paces": [{**asdict(one), "stream": one.stream} for one in paces] for arm, paces in found.items()}
     facts |= {f"{arm}_best": asdict(one) for arm, one in best.items()}
     if beside is not None:

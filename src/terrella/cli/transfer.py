@@ -97,15 +97,19 @@ def transfer(
         workers: Seeds that run at once, each a process of its own.
     """
     _check_robot(sim)
+    if not real_episodes or min(episodes, seeds, practice, workers, *real_episodes) < 1:
+        raise TerrellaError("--episodes, --seeds, --practice, --workers and --real-episodes are 1 or more.")
     if real is not None and not library.is_truth(real):
         from .transfer_recorded import transfer_recorded
 
+        if gap or look or looks or camera or dial != 1 or set(arms) != set(ARMS):
+            raise TerrellaError(
+                f"{real} is a recording, which has no --gap, --dial, --look, --looks, --camera and --arms; leave them out."
+            )
         return transfer_recorded(sim, Path(real), randomise, max(real_episodes, default=1), out, seed, json)
     wrong = [arm for arm in arms if arm not in ARMS]
     if wrong or "nominal" not in arms:
         raise TerrellaError(f"--arms are some of {', '.join(ARMS)}, nominal among them; got {', '.join(arms)}.")
-    if min(episodes, seeds, practice, workers, *real_episodes) < 1:
-        raise TerrellaError("--episodes, --seeds, --practice, --workers and --real-episodes are 1 or more.")
     bundled = sim == "mujoco:arm"
     if gap is None and real is None and not bundled:
         raise TerrellaError(
@@ -131,7 +135,7 @@ def transfer(
     mark = real_hash(real_name, gap_file, dial)
     asked = Experiment(
         sim, real_name, gap_file, dial, ranges, episodes, practice, real_episodes, success, arms, mark,
-        look_file, looks_file, real_hash(real_name, gap_file, dial, look_file) if camera else "",
+        look_file, looks_file, _looks_hash(sim, looks_file, real_hash(real_name, gap_file, dial, look_file)) if camera else "",
     )  # fmt: skip
     check_pair(asked)
     folder = out or Path("transfers") / sim.partition(":")[2].replace("/", "-")
@@ -178,6 +182,11 @@ def real_hash(name: str, gap: str, dial: float, look: str = "") -> str:
     return hashlib.sha256(json_text.dumps([inside, told, dial if told else 0], sort_keys=True).encode()).hexdigest()
 
 
+def _looks_hash(sim: str, looks: str, real: str) -> str:
+    """sha256 of how the real one looks, whose own is `real`, and of the looks that are randomised."""
+    return hashlib.sha256(f"{real} {real_hash(sim, '', 0.0, looks)}".encode()).hexdigest()
+
+
 def check_pair(asked: Experiment) -> None:
     """TerrellaError where the two cannot be a pair, or where nobody could say what success is."""
     sim, real = library.load(asked.sim, cameras=(), threads=1), opened_real(asked.real, asked.gap, asked.dial)
@@ -191,6 +200,14 @@ def check_pair(asked: Experiment) -> None:
     for channel in ("observation", "qpos", "qvel"):
         if sim.spec.channels[channel].shape != real.spec.channels[channel].shape:
             raise TerrellaError(f"{asked.sim} and {asked.real} are no pair: their '{channel}' have different lengths.")
+    fitted = [arm for arm in ("model", "identified") if arm in asked.arms]
+    if fitted:
+        from ..sim.trials import inner
+
+        try:
+            inner(sim)
+        except TerrellaError as error:
+            raise TerrellaError(f"{error} Leave {' and '.join(fitted)} out of --arms.") from error
 
 
 def same_as_before(folder: Path, asked: Experiment) -> None:
@@ -222,7 +239,7 @@ def _different(before: Mapping[str, Any], mine: Mapping[str, Any]) -> list[str]:
     for name, value in mine.items():
         was = before.get(name)
         if name in ("real", "gap"):
-            same = before.get("hash") == mine["hash"]
+            same = was == value or before.get("hash") == mine["hash"]
         elif name in held:
             same = held[name] == mine["contents"][name]
         else:

@@ -91,4 +91,5 @@ def arms_of(policies: Sequence[str], adapted: str) -> dict[str, tuple[str, str]]
     found = {"nominal": ("nominal", "nominal"), "visual": ("nominal", "randomised")}
     if "randomised" in policies:
         found["both"] = ("randomised", "randomised")
-    return found | {f"{best}, {name} encoder": (best, name) for name in ENCODERS}
+    more = {f"{best}, {name} encoder": (best, name) for name in ENCODERS}
+    return found | {arm: pair for arm, pair in more.items() if pair not in found.values()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 
 from .. import library
 from ..core.errors import DatasetError
-from ..core.spec import Spec, neutral_action
+from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data import Dataset
 from ..data.channels import check_game
@@ -19,7 +20,7 @@ from ..measure.statistics import Figure, mean_interval
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld
 from ..sim.randomised import Randomised, read
-from ..sim.trials import PAST, Trials, inner, placed
+from ..sim.trials import PAST, Trials, idle, inner, placed
 from .beside import sound
 from .evaluate import table_lines
 from .say import result
@@ -45,7 +46,7 @@ def transfer_recorded(
         rough = Randomised(world, read(randomise))
         found = identify(rough, learned, seed)
         worlds["identified"] = Randomised(world, found.around(rough.distributions), 1.0)
-    worlds[f"model {len(learned.actions)}"] = fitted(world, learned, folder / "residual", seed)
+    worlds[f"model {len(learned.actions)}"] = fitted(world, learned, folder / "residual", seed, _mark(world, learned))
     rows: dict[str, dict[int, Figure]] = {name: open_loop(one, held, seed) for name, one in worlds.items()}
     rows[STILL] = open_loop(None, held, seed)
     steps = sorted({step for row in rows.values() for step in row})
@@ -64,6 +65,14 @@ def transfer_recorded(
     plain = _plain(whole)
     write_json(folder / "transfer.json", plain)
     result(plain, json, "\n".join([*table_lines(heads, lines), "", f"the figures: {folder / 'transfer.json'}"]))
+
+
+def _mark(world: MujocoWorld, learned: Trials) -> str:
+    """sha256 of a simulator and of what a model of it learns from."""
+    found = hashlib.sha256(world.fingerprint().encode())
+    for value in vars(learned).values():
+        found.update(value.contiguous().numpy().tobytes())
+    return found.hexdigest()
 
 
 def check_recording(dataset: Dataset, spec: Spec) -> None:
@@ -106,14 +115,14 @@ def read_trials(dataset: Dataset, world: MujocoWorld) -> Trials:
 
     known = torch.tensor([[step < len(one["action"]) - 1 for step in range(rows - 1)] for one in found])
     low, high = (torch.as_tensor(limit) for limit in spec.action_limits)
-    return Trials(padded("qpos", rows), padded("qvel", rows), padded("action", rows - 1).clamp(low, high), known)
+    actions = padded("action", rows - 1).clamp(low, high)
+    return Trials(padded("qpos", rows), padded("qvel", rows), actions, known, idle(spec, len(found)))
 
 
 def _halves(trials: Trials, count: int) -> tuple[Trials, Trials]:
     """Episodes to learn from, at most `count` and half of all, and those after the first half, which are held out."""
     half = len(trials.actions) // 2
-    rest = Trials(trials.qpos[half:], trials.qvel[half:], trials.actions[half:], trials.known[half:])
-    return trials.first(min(count, half)), rest
+    return trials[: min(count, half)], trials[half:]
 
 
 @torch.no_grad()
@@ -167,10 +176,9 @@ def agreement(world: World, held: Trials, seed: int) -> Figure:
 
 def _floors(world: World, held: Trials, seed: int) -> dict[str, Figure]:
     actions = held.actions[held.known]
-    idle = torch.from_numpy(neutral_action(world.spec)).expand_as(actions)
     return {
         RANDOM: _apart(world, world.spec.sample_action(len(actions), make_rng(seed)), actions, seed),
-        IDLE: _apart(world, idle, actions, seed),
+        IDLE: _apart(world, idle(world.spec, len(actions)), actions, seed),
     }
 
 

@@ -108,10 +108,12 @@ class RayWorkers:
 
     def close(self) -> None:
         actors = getattr(self, "_actors", [])
-        if actors:
-            self._ray.wait([actor.clear.remote() for actor in actors], num_returns=len(actors), timeout=CLEAR_S)
-        for actor in actors:
-            self._ray.kill(actor)
-        self._asked.clear()
-        if getattr(self, "_ours", False):
-            self._ray.shutdown()
+        try:
+            if actors:
+                self._ray.wait([actor.clear.remote() for actor in actors], num_returns=len(actors), timeout=CLEAR_S)
+        finally:
+            for actor in actors:
+                self._ray.kill(actor)
+            self._asked.clear()
+            if getattr(self, "_ours", False):
+                self._ray.shutdown()

@@ -1,7 +1,8 @@
 """Corrected: a simulator and, around it, a learned model of how the real robot differs: each step is put right by what was seen.
 
 A world model of few real episodes: the simulator says most, a small ensemble the rest (residual physics, Zeng et al. 2019;
-neural-augmented simulation, Golemo et al. 2018).
+neural-augmented simulation, Golemo et al. 2018). Play is told by a bank of play operators (Prandtl and Ishlinskii's model of
+hysteresis): few episodes do not teach a network to remember so far back.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from torch import nn
 from ..core.state import State
 from ..core.world import make_rng
 from .mujoco_world import MujocoWorld
-from .trials import PAST, Trials, placed
+from .trials import PAST, PLAYS, Trials, driven, idle, placed
 
 MEMBERS, HIDDEN = 4, 64
 _PAST = "corrected.past"
@@ -33,7 +34,7 @@ class Residual(nn.Module):
 
     def __init__(self, joints: int, actions: int):
         super().__init__()
-        width, out = 4 * joints + (PAST + 1) * actions, 2 * joints
+        width, out = 4 * joints + (PAST + 1) * (1 + len(PLAYS)) * actions, 2 * joints
         self.members = nn.ModuleList(
             nn.Sequential(
                 nn.Linear(width, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, out)
@@ -62,28 +63,28 @@ class Residual(nn.Module):
         self.high.copy_(targets.amax(0))
 
 
-def inputs_of(qpos: torch.Tensor, qvel: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-    """qpos [B, n], qvel [B, n] and the last actions [B, PAST + 1, nu], the newest last, as a Residual takes them."""
-    return torch.cat([qpos, qpos.cos(), qpos.sin(), qvel, actions.flatten(1)], 1).float()
+def inputs_of(qpos: torch.Tensor, qvel: torch.Tensor, drives: torch.Tensor) -> torch.Tensor:
+    """qpos [B, n], qvel [B, n] and the last drives [B, PAST + 1, 1 + PLAYS, nu], the newest last, as a Residual takes them."""
+    return torch.cat([qpos, qpos.cos(), qpos.sin(), qvel, drives.flatten(1)], 1).float()
 
 
 @torch.no_grad()
 def residuals(world: MujocoWorld, trials: Trials) -> tuple[torch.Tensor, torch.Tensor]:
     """Inputs [R, ...] and targets [R, nq + nv] of a Residual: by how much each real step went beyond the simulator's."""
     known = trials.known.flatten()
-    past, actions = trials.past().flatten(0, 1)[known], trials.actions.flatten(0, 1)[known]
+    drives, actions = trials.drives().flatten(0, 1)[known], trials.actions.flatten(0, 1)[known]
     (qpos, qvel), (qpos1, qvel1) = (
         (trials.qpos[:, part].flatten(0, 1)[known], trials.qvel[:, part].flatten(0, 1)[known])
         for part in (slice(None, -1), slice(1, None))
     )
-    state = placed(world, world.start(len(qpos), make_rng(0)), past[:, :0], qpos, qvel)
+    state = placed(world, world.start(len(qpos), make_rng(0)), actions[:, None][:, :0], qpos, qvel)
     physics = world.imagine(state, actions, make_rng(0))["physics"]
     away = [qpos1 - physics[:, world.body.qpos], qvel1 - physics[:, world.body.qvel]]
-    return inputs_of(qpos, qvel, torch.cat([past, actions[:, None]], 1)), torch.cat(away, 1).float()
+    return inputs_of(qpos, qvel, drives), torch.cat(away, 1).float()
 
 
 class Corrected:
-    """`Corrected(world, residual)`: the same world, each step of which is put right. Its state also holds the last actions."""
+    """`Corrected(world, residual)`: the same world, each step of which is put right. Its state also holds the last drives."""
 
     def __init__(self, world: MujocoWorld, residual: Residual):
         self.world, self.residual = world, residual.eval().requires_grad_(False)
@@ -92,8 +93,8 @@ class Corrected:
         )
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        none = torch.zeros(batch, PAST, *(self.spec.action.shape or ()))
-        return self.world.start(batch, rng).replace(**{_PAST: none})
+        before = idle(self.spec, batch)[:, None, None].repeat(1, PAST, 1 + len(PLAYS), 1)
+        return self.world.start(batch, rng).replace(**{_PAST: before})
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         return prior if prior is not None and not observation else self._first(observation, rng)
@@ -104,13 +105,14 @@ class Corrected:
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         moved, body = self.world.imagine(state, action, rng), self.world.body
-        actions = torch.cat([state[_PAST], self.spec.check_action(action, state.batch)[:, None]], 1)
+        now = driven(self.spec.check_action(action, state.batch), state[_PAST][:, -1])
+        drives = torch.cat([state[_PAST], now[:, None]], 1)
         before, after = state["physics"], moved["physics"]
-        more = self.residual.found(inputs_of(before[:, body.qpos], before[:, body.qvel], actions))
+        more = self.residual.found(inputs_of(before[:, body.qpos], before[:, body.qvel], drives))
         more = torch.where(state["done"][:, None], 0.0, more)
         qpos, qvel = more.tensor_split([len(body.home)], 1)
         moved = self.world.replaced(state, moved, after[:, body.qpos] + qpos, after[:, body.qvel] + qvel)
-        return moved.replace(**{_PAST: actions[:, 1:]})
+        return moved.replace(**{_PAST: drives[:, 1:]})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         return self.world.render(state, channels)

@@ -77,9 +77,10 @@ def _errors(world: Randomised, trials: Trials, rows: torch.Tensor, values: torch
     state = placed(world, state, past[:, -PAST:], trials.qpos[episode, first], trials.qvel[episode, first])
     body, error, rng = inner(world).body, torch.zeros(len(each), dtype=torch.float64), make_rng(0)
     of_qpos, of_qvel = (seen[:, :-1][trials.known].std(0).clamp_min(1e-6) for seen in (trials.qpos, trials.qvel))
-    for step in range(min(STEPS, trials.known.shape[1])):
+    steps = min(STEPS, trials.known.shape[1])
+    for step in range(steps):
         state = world.imagine(state, trials.actions[episode, first + step], rng)
         away = (state["physics"][:, body.qpos] - trials.qpos[episode, first + step + 1]) / of_qpos
         speed = (state["physics"][:, body.qvel] - trials.qvel[episode, first + step + 1]) / of_qvel
         error += away.square().mean(1) + speed.square().mean(1)
-    return (error / STEPS).view(count, -1).mean(1).sqrt()
+    return (error / steps).view(count, -1).mean(1).sqrt()

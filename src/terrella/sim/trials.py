@@ -9,30 +9,55 @@ import torch
 from ..core.errors import TerrellaError
 from ..core.policy import Policy
 from ..core.rollouts import rollout
+from ..core.spec import Spec, neutral_action
 from ..core.state import State
 from ..core.world import World, make_rng
 from .mujoco_world import MujocoWorld
 
-PAST = 4  # actions before a row, which tell what is late or has play
+PAST = 4  # actions before a row, which tell what is late
+PLAYS = (1 / 32, 1 / 16, 1 / 8, 1 / 4)  # in units of actions: what a drive with so much play would follow
 
 
 @dataclass(frozen=True)
 class Trials:
     """N episodes of T steps. qpos [N, T + 1, nq], qvel [N, T + 1, nv], actions [N, T, nu]; known [N, T]: whether the step was
-    made (an episode may end before the others). Float32, in the units of the model."""
+    made (an episode may end before the others); idle [N, nu]: what stands for actions before the first. Float32, in the units of
+    the model."""
 
     qpos: torch.Tensor
     qvel: torch.Tensor
     actions: torch.Tensor
     known: torch.Tensor
+    idle: torch.Tensor
 
-    def first(self, count: int) -> Trials:
-        return Trials(self.qpos[:count], self.qvel[:count], self.actions[:count], self.known[:count])
+    def __getitem__(self, episodes: slice) -> Trials:
+        return Trials(**{name: value[episodes] for name, value in vars(self).items()})
+
+    def and_then(self, more: Trials) -> Trials:
+        """Those of both, of as many steps."""
+        return Trials(**{name: torch.cat([value, vars(more)[name]]) for name, value in vars(self).items()})
 
     def past(self) -> torch.Tensor:
-        """The PAST actions before each step [N, T, PAST, nu], the newest last; zeros before the first."""
-        none = torch.zeros_like(self.actions[:, :1]).repeat(1, PAST, 1)
-        return torch.cat([none, self.actions], 1).unfold(1, PAST, 1)[:, :-1].movedim(-1, 2)
+        """The PAST actions before each step [N, T, PAST, nu], the newest last."""
+        return (
+            torch.cat([self.idle[:, None].repeat(1, PAST, 1), self.actions], 1)
+            .unfold(1, PAST, 1)[:, :-1]
+            .movedim(-1, 2)
+        )
+
+    def drives(self) -> torch.Tensor:
+        """The drives of each step and the PAST before it [N, T, PAST + 1, 1 + PLAYS, nu], the newest last."""
+        found = [self.idle[:, None].repeat(1, 1 + len(PLAYS), 1)] * PAST
+        for step in range(self.actions.shape[1]):
+            found.append(driven(self.actions[:, step], found[-1]))
+        return torch.stack(found, 1).unfold(1, PAST + 1, 1).movedim(-1, 2)
+
+
+def driven(actions: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    """The actions [B, nu] and, for each of PLAYS, what follows them only when they leave its play: [B, 1 + PLAYS, nu], of those a
+    step before."""
+    half = torch.tensor((0.0, *PLAYS))[:, None] / 2
+    return before.clamp(actions[:, None] - half, actions[:, None] + half)
 
 
 def collect(world: World, policy: Policy, episodes: int, seed: int) -> Trials:
@@ -42,7 +67,12 @@ def collect(world: World, policy: Policy, episodes: int, seed: int) -> Trials:
     steps = world.spec.max_episode_steps or 200
     found = rollout(world, world.start(episodes, rng), policy, rng, channels, steps)
     qpos, qvel, done = (found.observations[name].transpose(0, 1) for name in ("qpos", "qvel", "done"))
-    return Trials(qpos, qvel, found.actions.transpose(0, 1).float(), ~done[:, :-1])
+    return Trials(qpos, qvel, found.actions.transpose(0, 1).float(), ~done[:, :-1], idle(world.spec, episodes))
+
+
+def idle(spec: Spec, count: int) -> torch.Tensor:
+    """The idle action, `count` times: [count, nu]."""
+    return torch.from_numpy(neutral_action(spec)).float().expand(count, -1)
 
 
 def inner(world: World) -> MujocoWorld:
