@@ -26,6 +26,7 @@ from .say import Json, Seed, result, say
 BUNDLED = Path(__file__).parent.parent / "sim" / "models"
 ARMS = ("nominal", "randomised", "identified", "model", "oracle")
 FREE = ("arms", "real_episodes", "look", "looks", "look_hash")  # more of them may be asked for later
+ROUNDS = 2  # in which a model's episodes are gathered, each by the policy that practised in the last one's model
 PICTURE = (64, 64)  # pixels of the real one's pictures, where its goal is read off them
 DIAL = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -49,6 +50,7 @@ class Experiment:
     look: str = ""
     looks: str = ""
     look_hash: str = ""
+    rounds: int = ROUNDS
 
 
 def transfer(

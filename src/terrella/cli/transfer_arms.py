@@ -35,7 +35,6 @@ HIDDEN, LEARNING_RATE = 64, 3e-3
 GENTLY = 2e-3  # of a policy that has practised already
 ENTROPY = 1e-2  # a policy that is sure of what it learned in the simulator must try other things again
 FITTED = 2000  # steps of a residual's regression
-ROUNDS = 2  # in which a model's episodes are gathered, each by the policy that practised in the last one's model
 SLIPS = 0.3  # of the actions in the episodes that are learned from are random
 IDENTIFIED_FROM, GATHER = 10, 50  # real episodes: of identification, and so many are gathered at a time
 STARTS, GATHERED = (
@@ -169,7 +168,8 @@ class _Seed:
         first policy's say nothing of where a better one goes."""
         if count in self._models:
             return self._models[count]
-        shares = [count // ROUNDS + (number < count % ROUNDS) for number in range(min(ROUNDS, count))]
+        rounds = min(self.asked.rounds, count)
+        shares = [count // rounds + (number < count % rounds) for number in range(rounds)]
         policy = self.folder / "first"
         trials = self._gathered(policy, shares[0])
         for number, share in enumerate(shares):
