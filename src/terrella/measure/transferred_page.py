@@ -20,7 +20,8 @@ METHOD = (
     "All arms but random and idle begin with the nominal policy and practise as many steps more; nominal goes on in the simulator.",
     "identified N: the simulator with the parameters, within the ranges of the randomised arm, under which it repeats N real "
     "episodes best; then practice in narrow ranges around them.",
-    "model N: the simulator and a learned residual, fitted to N real episodes, as one world model; then practice in it.",
+    "model N: the simulator and a learned residual, fitted to N real episodes, as one world model; then practice in it. Half of the "
+    "episodes are the nominal policy's, half that of the policy which practised in the model of the first half.",
     "With a camera: an encoder reads the goal off one picture when an episode begins. It learned from pictures of the simulator "
     "with their goals (nominal); of many looks of it (randomised); of those, and of the real one without goals, which an adversary "
     "must not tell apart (adversarial, by gradient reversal); or of the real one with goals (oracle). visual: the nominal policy "
@@ -42,7 +43,9 @@ def transferred_page(title: str, found: Transferred, facts: Mapping[str, object]
     rows = [(arm, [(figure, colours[arm])]) for arm, figure in found.arms.items()]
     svg = listed(rows, "share of successes in the real one", [(SUCCEEDS, QUIET)])
     settings = "".join(
-        f"<li>{escape(name.replace('_', ' '))}: {escape(str(value))}</li>" for name, value in facts.items()
+        f"<li>{escape(name.replace('_', ' '))}: {escape(str(value))}</li>"
+        for name, value in facts.items()
+        if value not in ("", [], ())
     )
     parts = [
         f"<section><h2>{escape(lines[0])}</h2><ul>{words}</ul></section>",
@@ -69,7 +72,7 @@ def _few(found: Transferred) -> str:
         if said:
             kinds.setdefault(said[1], []).append((int(said[2]), figure))
     lines = [_line(name, sorted(points), COLOURS[at]) for at, (name, points) in enumerate(kinds.items())]
-    if not lines:
+    if not any(len(line.x) > 1 for line in lines):
         return ""
     counts = sorted({int(x) for line in lines for x in line.x})
     guides = []
@@ -77,7 +80,7 @@ def _few(found: Transferred) -> str:
         low, high = found.arms[NOMINAL].value, found.arms[ORACLE].value
         guides = [low, low + RECOVERS * (high - low), high]
     ticks = [(float(count), str(count)) for count in counts]
-    svg = line_chart(lines, ticks, "real episodes", "successes", len(counts) > 1, (0.0, 1.0), guides)
+    svg = line_chart(lines, ticks, "real episodes", "successes", True, (0.0, 1.0), guides)
     note = f"<p>Dotted: nominal, {RECOVERS:.0%} of the gap, oracle.</p>" if guides else ""
     return f"<div class=charts><figure>{svg}{keys_of({line.label: line.colour for line in lines})}</figure></div>{note}"
 
