@@ -20,8 +20,8 @@ METHOD = (
     "All arms but random and idle begin with the nominal policy and practise as many steps more; nominal goes on in the simulator.",
     "identified N: the simulator with the parameters, within the ranges of the randomised arm, under which it repeats N real "
     "episodes best; then practice in narrow ranges around them.",
-    "model N: the simulator and a learned residual, fitted to N real episodes, as one world model; then practice in it. Half of the "
-    "episodes are the nominal policy's, half that of the policy which practised in the model of the first half.",
+    "model N: the simulator and a learned residual, fitted to N real episodes, as one world model; then practice in it. Half of "
+    "the episodes are the nominal policy's, half that of the policy which practised in the model of the first half.",
     "With a camera: an encoder reads the goal off one picture when an episode begins. It learned from pictures of the simulator "
     "with their goals (nominal); of many looks of it (randomised); of those, and of the real one without goals, which an adversary "
     "must not tell apart (adversarial, by gradient reversal); or of the real one with goals (oracle). visual: the nominal policy "
