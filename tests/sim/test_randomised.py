@@ -175,6 +175,19 @@ def test_at_a_scale_of_nothing_every_parameter_leaves_the_world_as_it_is():
 
 
 @needs_mujoco
+def test_models_are_made_once_though_worlds_are_looked_at_one_by_one(monkeypatch):
+    from terrella.sim.mujoco_parameters import Models
+
+    made, change = [], Models.changed
+    monkeypatch.setattr(Models, "changed", lambda self, *rest: made.append(1) or change(self, *rest))
+    world, rng = Randomised(load("mujoco:ant", cameras=()), {"mass": Distribution("uniform", (0.9, 1.1))}), make_rng(0)
+    state = world.start(100, rng)
+    for _ in range(2):
+        state = world.imagine(state, world.spec.sample_action(100, rng), rng)
+        world.render(state, ("contacts",))
+    assert len(made) <= 101  # the file's own, at the start, and one of each world
+
+
 def test_masses_multiply_in_any_order():
     from terrella.sim.mujoco_parameters import Models
 

@@ -202,6 +202,7 @@ class Models:
     def __init__(self, file: Model, changes: Sequence[Parameter]):
         self.file, self.changes = file, tuple(changes)
         self._made: OrderedDict[bytes, Model] = OrderedDict()
+        self._most = 0  # rows of the largest batch: what looks at its worlds one by one leaves their models here
         self._data = mujoco.MjData(file)
 
     def of(self, values: np.ndarray) -> list[Model]:
@@ -217,7 +218,8 @@ class Models:
             else:
                 self._made.move_to_end(key)
             found.append(model)
-        while len(self._made) > 2 * len(values) + 64:
+        self._most = max(self._most, len(values))
+        while len(self._made) > 2 * self._most + 64:
             self._made.popitem(last=False)
         return found
 
