@@ -94,6 +94,46 @@ def test_what_is_no_pair_is_refused_in_a_sentence(tmp_path, capsys, words, why):
     assert code == 2 and why in err and err.count("\n") == 1
 
 
+HOLD = '<custom><text name="terrella.task" data="hold"/><numeric name="terrella.within" data="0.1"/></custom>'
+
+
+def own_arm(folder, name, *changes: tuple[str, str]):
+    """A file of somebody's own arm that tells its task."""
+    from terrella.cli.transfer import BUNDLED
+
+    text = (BUNDLED / "arm.xml").read_text().replace("<worldbody>", f"{HOLD}<worldbody>")
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after)
+    (folder / f"{name}.xml").write_text(text)
+    return f"mujoco:{folder / name}.xml"
+
+
+def test_files_of_ones_own_that_tell_their_task_are_carried_over(tmp_path, capsys, few):
+    mine, other = own_arm(tmp_path, "mine"), own_arm(tmp_path, "other", ('gear="8"', 'gear="7"'))
+    (tmp_path / "gap.toml").write_text("delay = 1")
+    words = ["transfer", "--sim", mine, "--real", other, "--gap", tmp_path / "gap.toml", "--arms", "nominal", "model"]
+    words += ["--real-episodes", 1, "--practice", 1, "--episodes", 2, "--seeds", 1, "--out", tmp_path / "t", "--json"]
+    code, out, _ = ran(capsys, *words)
+    assert code == 0 and {"nominal", "model 1"} < set(json.loads(out)["arms"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ((('motor name="shoulder" joint="shoulder" gear="8"', 'position name="shoulder" joint="shoulder"'),), "in rad"),
+        ((("motor name", "velocity name"), ('gear="8" ', ""), ('gear="4" ', "")), "rad/s"),
+        ((('name="shoulder" joint="shoulder" gear="8"', 'name="elbow" joint="elbow" gear="4" '),
+          ('name="elbow" joint="elbow" gear="4" ctrl', 'name="shoulder" joint="shoulder" gear="8" ctrl')), "their axes are"),
+        ((("<option", '<option gravity="0 9.81 0"'),), "their axes differ"),
+    ],
+)  # fmt: skip
+def test_pairs_that_disagree_about_units_or_axes_are_refused(tmp_path, capsys, changes, why):
+    mine, other = own_arm(tmp_path, "mine"), own_arm(tmp_path, "other", *changes)
+    code, _, err = ran(capsys, "transfer", "--sim", mine, "--real", other, "--arms", "nominal", "--out", tmp_path / "t")
+    assert code == 2 and why in err and err.count("\n") == 1
+
+
 def test_an_unknown_parameter_of_the_gap_is_named(tmp_path, capsys):
     (tmp_path / "gap.toml").write_text("fricton = 2.0")
     code, _, err = ran(capsys, "transfer", "--gap", tmp_path / "gap.toml", "--out", tmp_path / "t")
@@ -153,6 +193,12 @@ def test_a_recording_stands_for_reality(tmp_path, capsys, few):
     code, _, err = ran(capsys, *words, "--sim", "mujoco:ant")
     assert code == 2 and "actions" in err and err.count("\n") == 1
     about = tmp_path / "set" / "meta" / "terrella.json"
+    plain, facts = about.read_text(), json.loads(about.read_text())
+    facts["world"]["action_names"].reverse()
+    about.write_text(json.dumps(facts))
+    code, _, err = ran(capsys, *words)
+    assert code == 2 and "their axes are elbow, shoulder" in err
+    about.write_text(plain)
     about.write_text(about.read_text().replace('"action_mode": "torque"', '"action_mode": "position"'))
     code, _, err = ran(capsys, *words)
     assert code == 2 and "other semantics" in err

@@ -19,7 +19,7 @@ if find_spec("mujoco") is None:
 
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import robot_of
-from terrella.sim.mujoco_tasks import Reach, Stepping, VelocityTracking
+from terrella.sim.mujoco_tasks import Hold, Reach, Stepping, VelocityTracking
 from terrella.sim.mujoco_world import MujocoWorld
 
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
@@ -147,6 +147,29 @@ def test_broken_files_are_told_in_a_sentence(text, tmp_path):
     with pytest.raises(TerrellaError, match=BROKEN[text]) as found:
         load(f"mujoco:{tmp_path / 'x.xml'}")
     assert "\n" not in str(found.value)
+
+
+def test_a_file_tells_its_task(arm):
+    told = '<custom><text name="terrella.task" data="{}"/><numeric name="terrella.{}" data="{}"/></custom></mujoco>'
+    for kind, key, numbers, why in (
+        ("hald", "ring", "1 2", "did you mean 'hold'"),
+        ("hold", "rng", "1 2", "did you mean 'ring'"),
+        ("hold", "ring", "1", "is 2 numbers; got 1"),
+        ("hold", "dwell", "5", "'hand'; the file has tip"),
+    ):
+        arm.write_text(ARM.replace("</mujoco>", told.format(kind, key, numbers)))
+        with pytest.raises(TerrellaError, match=why):
+            load(f"mujoco:{arm}", cameras=())
+    file = ARM.replace('framepos name="tip"', 'framepos name="hand"').replace(
+        "</mujoco>", told.format("hold", "dwell", "5")
+    )
+    arm.write_text(file)
+    with pytest.raises(TerrellaError, match="moves freely"):
+        load(f"mujoco:{arm}", cameras=())
+    arm.write_text(file.replace("<freejoint/>", ""))
+    world = load(f"mujoco:{arm}", cameras=())
+    assert world.task == Hold(dwell=5) and {"reward", "success"} < set(world.spec.channels)
+    check_world(world)
 
 
 def test_names_that_there_are_not(arm):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,9 +14,11 @@ from ..act.planning import Revealed
 from ..core.errors import ActionError, PlanningError
 from ..core.spec import Spec, kind_of
 from ..core.world import World
+from ..data.channels import facts_of
 from .named import Environment
 
 STEPS = 200  # of an episode, where the environment sets no limit
+_SIZE = re.compile(r"^[\d.e+-]+ ")  # 8 of "8 N m"
 _NEVER = (
     "snapshot",
     "reward",
@@ -50,6 +53,8 @@ def check_alike(world: Spec, real: Spec) -> None:
         raise ActionError(
             f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
         )
+    if why := misunderstood(facts_of(world), facts_of(real)):
+        raise ActionError(f"the actions of {world.name} and {real.name} mean different things: {why}.")
     if not math.isclose(world.dt_s, real.dt_s, rel_tol=0.02):
         held = round(world.dt_s / real.dt_s)
         hint = (
@@ -70,6 +75,25 @@ def check_alike(world: Spec, real: Spec) -> None:
                 f"{world.name} sees '{channel}' of shape {world.channels[channel].shape}, and {real.name} shows "
                 f"{real.channels[channel].shape}; --size HEIGHT WIDTH sets that of pictures."
             )
+
+
+def misunderstood(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+    """How the actions of two worlds differ in what they mean, by their facts (data/channels.py): mode, frame, order of the axes,
+    units. "" where nothing that both tell does. Sizes of units are left alone: a weaker motor is a gap."""
+    mode, frame, names, units = (
+        tuple(facts.get(f"action_{what}") or "" for facts in (mine, theirs))
+        for what in ("mode", "frame", "names", "units")
+    )
+    if all(mode) and mode[0] != mode[1] and "axes" not in mode:  # which says nothing of what the numbers are
+        return f"{mode[0]} and {mode[1]}"
+    if all(frame) and frame[0] != frame[1]:
+        return f"in the frame of the {frame[0]} and of the {frame[1]}"
+    if all(names) and list(names[0]) != list(names[1]) and sorted(names[0]) == sorted(names[1]):
+        return f"their axes are {', '.join(names[0])}, and {', '.join(names[1])}"
+    bare = [[_SIZE.sub("", unit) for unit in one] for one in units]
+    if all(units) and any(a and b and a != b for a, b in zip(*bare)):
+        return f"they are in {', '.join(units[0])}, and in {', '.join(units[1])}"
+    return ""
 
 
 def compared(world: Spec, real: Spec) -> tuple[str, ...]:

@@ -79,7 +79,7 @@ def transfer(
     Leaves a page of plots and all figures in a folder. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
-        sim: The simulator to learn in (mujoco:NAME or mujoco:FILE.xml with a reward and a task's success).
+        sim: The simulator to learn in (mujoco:NAME, or a mujoco:FILE.xml that tells a task: docs/robots.md).
         real: What stands for reality: another such world, or the folder of a recording with actions, qpos and qvel, of which
             open-loop errors and the agreement of actions are told. Default: the bundled one, or --sim itself with --gap.
         gap: A TOML or JSON file of what else differs in reality at a gap of 1: parameters, delay, backlash, noise.CHANNEL.
@@ -193,11 +193,18 @@ def check_pair(asked: Experiment) -> None:
     """TerrellaError where the two cannot be a pair, or where nobody could say what success is."""
     sim, real = library.load(asked.sim, cameras=(), threads=1), opened_real(asked.real, asked.gap, asked.dial)
     check_alike(sim.spec, real.spec)
+    inside: list[Any] = [getattr(world, "world", world) for world in (sim, real)]
+    pulls = [world.file.opt.gravity for world in inside]
+    if pulls[0] @ pulls[1] < 0.5 * (pulls[0] @ pulls[0] * (pulls[1] @ pulls[1])) ** 0.5:
+        along = " and ".join(str(pull.tolist()) for pull in pulls)
+        raise TerrellaError(
+            f"{asked.sim} and {asked.real} have gravity along {along}: their axes differ; turn one of them."
+        )
     for spec in (sim.spec, real.spec):
         if "reward" not in spec.channels or asked.success not in spec.channels:
             raise TerrellaError(
                 f"{spec.name} has no channel '{asked.success}' beside 'reward', so nobody can say what success is; it has "
-                f"{', '.join(spec.channels)}."
+                f"{', '.join(spec.channels)}. A file tells its task itself, hold for example: docs/robots.md says how."
             )
     for channel in ("observation", "qpos", "qvel"):
         if sim.spec.channels[channel].shape != real.spec.channels[channel].shape:

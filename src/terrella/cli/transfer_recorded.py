@@ -14,14 +14,14 @@ from ..core.errors import DatasetError
 from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data import Dataset
-from ..data.channels import check_game
+from ..data.channels import check_game, facts_of
 from ..data.storage.durable import write_json
 from ..measure.statistics import Figure, mean_interval
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld
 from ..sim.randomised import Randomised, read
 from ..sim.trials import PAST, Trials, idle, inner, placed
-from .beside import sound
+from .beside import misunderstood, sound
 from .evaluate import table_lines
 from .say import result
 from .transfer_arms import fitted
@@ -78,11 +78,9 @@ def _mark(world: MujocoWorld, learned: Trials) -> str:
 def check_recording(dataset: Dataset, spec: Spec) -> None:
     """DatasetError where its actions mean something else than a world's, or where joints are missing."""
     check_game(dataset, spec)
-    mode = dataset.world.get("action_mode")
-    if mode and mode != spec.action_mode:
-        raise DatasetError(
-            f"the actions of {dataset.root} are {mode}, and {spec.name} takes {spec.action_mode}: other semantics."
-        )
+    theirs = {"action_names": dataset.action_names, **dataset.world}
+    if why := misunderstood(theirs, facts_of(spec)):
+        raise DatasetError(f"the actions of {dataset.root} and of {spec.name} have other semantics: {why}.")
     if not math.isclose(dataset.fps * spec.dt_s, 1, rel_tol=0.02):
         raise DatasetError(
             f"{dataset.root} has {dataset.fps:g} rows a second, and {spec.name} {1 / spec.dt_s:.4g} steps: they differ."

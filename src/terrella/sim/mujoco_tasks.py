@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import TerrellaError
+from ..similar import did_you_mean
 
 Tensors = Mapping[str, torch.Tensor]
 _START, _GOAL = 1, 2  # streams of chance
@@ -259,6 +260,10 @@ class Hold:
     def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
         _check_hand(body, self.hand)
         joints = len(body.home)
+        if joints != body.qvel.stop - body.qvel.start:
+            raise TerrellaError(
+                "holding a point is for hinges and slides; the file has a joint that moves freely or a ball."
+            )
         return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
 
     def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -293,6 +298,38 @@ class Hold:
     def _apart(self, body: Body, state: Tensors) -> torch.Tensor:
         """From the goal to the hand [B, 2], m."""
         return state["sensors"][:, body.sensors[self.hand]][:, [0, 2]] - state["goal"]
+
+
+TASKS: Mapping[str, Callable[..., Task]] = {"hold": Hold, "reach": Reach, "velocity": VelocityTracking}
+_TOLD = "terrella."  # begins the names of what a file tells
+
+
+def task_of(spec: Any, name: str) -> Task:
+    """The task that an MJCF file tells of itself, none where it tells none, as in
+
+        <custom><text name="terrella.task" data="hold"/><numeric name="terrella.ring" data="0.1 0.3"/></custom>
+
+    TerrellaError, a sentence, for what there is not."""
+    kind = next((one.data for one in spec.texts if one.name == f"{_TOLD}task"), None)
+    if kind is None:
+        return Free()
+    if kind not in TASKS:
+        raise TerrellaError(
+            f"{name} tells the task '{kind}'{did_you_mean(kind, TASKS) or '.'} There are {', '.join(TASKS)}."
+        )
+    usual: Any = TASKS[kind]()
+    known: dict[str, Any] = {one.name: getattr(usual, one.name) for one in fields(usual)}
+    known = {name: value for name, value in known.items() if isinstance(value, int | float | tuple)}
+    told = {one.name.removeprefix(_TOLD): list(one.data) for one in spec.numerics if one.name.startswith(_TOLD)}
+    for key, given in told.items():
+        if key not in known:
+            likest = did_you_mean(key, known) or "."
+            raise TerrellaError(f"the task '{kind}' of {name} has no '{key}'{likest} It has {', '.join(known)}.")
+        count = len(known[key]) if isinstance(known[key], tuple) else 1
+        if len(given) != count:
+            raise TerrellaError(f"'{key}' of the task '{kind}' of {name} is {count} numbers; got {len(given)}.")
+    made = {key: tuple(given) if len(given) > 1 else type(known[key])(given[0]) for key, given in told.items()}
+    return TASKS[kind](**made)
 
 
 def _check_hand(body: Body, hand: str) -> None:

@@ -30,7 +30,7 @@ from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_pictures import Pictures, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
-from .mujoco_tasks import MARKER, Body, Free, Task, numbers
+from .mujoco_tasks import MARKER, Body, Task, numbers, task_of
 from .mujoco_warp import WarpStepper
 
 FILES = (".xml", ".mjcf", ".urdf")
@@ -43,7 +43,7 @@ _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 class MujocoWorld:
     """`MujocoWorld("go1")`, a robot that is ready to use (sim/mujoco_robots.py), or `MujocoWorld("FILE.xml")`, an MJCF or URDF.
 
-    task:       what is wanted (sim/mujoco_tasks.py); default: the robot's own, of a file nothing.
+    task:       what is wanted (sim/mujoco_tasks.py); default: the robot's own, or what a file tells.
     control_s:  seconds of a control step, of which physics takes as many of its own as fit.
     size:       (height, width) of pictures.
     cameras:    names of cameras of the model, the first is `rgb`, others `rgb.NAME`; default: the first that there is; () for none.
@@ -96,7 +96,7 @@ class MujocoWorld:
             0,
         )
         self._home = _home(self.file, robot)
-        self.task: Task = task or (robot.task if robot else Free())
+        self.task: Task = task or (robot.task if robot else task_of(spec, label))
         self.body = _body(self.file, self._home, self._steps)
         self._cameras = _cameras(self._seen, cameras)
         self._kinds = ("rgb", *(kind for kind, asked in (("depth", depth), ("segmentation", segmentation)) if asked))
