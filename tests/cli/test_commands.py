@@ -365,3 +365,16 @@ def test_the_doctor_exits_with_1_where_a_recording_is_broken(capsys, tmp_path):
     capsys.readouterr()
     assert main(["data", "doctor", str(folder)]) == 1
     assert "mend" in capsys.readouterr().out
+
+
+def test_warnings_are_sentences_without_our_source(monkeypatch, capsys):
+    import warnings
+
+    from terrella import cli
+
+    monkeypatch.setattr(
+        cli, "_run", lambda given: print(warnings.formatwarning("so it is.", UserWarning, "x.py", 3)) or 0
+    )
+    before = warnings.formatwarning
+    assert main([]) == 0 and capsys.readouterr().out.strip() == "terrella: so it is."
+    assert warnings.formatwarning is before

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -94,11 +95,22 @@ def _ended_as_a_whole() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@contextmanager
+def _warned_plainly() -> Iterator[None]:
+    """Lets warnings be their sentence, without a line of our source."""
+    before, plain = warnings.formatwarning, lambda message, *_, **__: f"terrella: {message}\n"
+    warnings.formatwarning = plain
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command. The exit code is 0, the command's own, 2 with one sentence on stderr, or 130 after Ctrl-C or SIGTERM."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _ended_as_a_whole():
+        with _ended_as_a_whole(), _warned_plainly():
             return _run(given)
     except KeyboardInterrupt as stop:
         print(f"terrella: {str(stop) or 'stopped.'}", file=sys.stderr)
