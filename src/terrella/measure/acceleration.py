@@ -35,7 +35,7 @@ class Meter:
     """Joules since it was made: of RAPL where the machine tells, else processor seconds at an assumed power."""
 
     def __init__(self) -> None:
-        self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _readable(file))
+        self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _of_a_processor(file))
         self._first, self._busy = self._counted(), time.process_time()
 
     @property
@@ -44,11 +44,15 @@ class Meter:
 
     def joules(self) -> float:
         if self.files:
-            return (self._counted() - self._first) / 1e6
+            return sum((now - then) % most for now, then, most in zip(self._counted(), self._first, self._ends())) / 1e6
         return WATTS_OF_A_CORE * (time.process_time() - self._busy)
 
-    def _counted(self) -> int:
-        return sum(int(file.read_text()) for file in self.files)
+    def _counted(self) -> list[int]:
+        return [int(file.read_text()) for file in self.files]
+
+    def _ends(self) -> list[int]:
+        """Where each counter begins again."""
+        return [int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files]
 
 
 @torch.inference_mode()
@@ -99,8 +103,10 @@ def horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int
     return last_step_above(torch.stack(gains, 1), torch.zeros(episodes), rng)
 
 
-def _readable(file: Path) -> bool:
+def _of_a_processor(file: Path) -> bool:
+    """Whether a counter can be read and is of one whole processor: that of a machine (psys) counts the same joules again."""
     try:
-        return bool(file.read_text())
+        told = {name: (file.parent / name).read_text() for name in (file.name, "max_energy_range_uj", "name")}
+        return all(told.values()) and told["name"].startswith("package")
     except OSError:
         return False
