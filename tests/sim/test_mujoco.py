@@ -103,6 +103,14 @@ def test_a_large_batch_is_its_entries_and_threads_do_not_matter(arm):
         states = together
 
 
+def test_one_thread_at_a_time_steps(arm, monkeypatch):
+    world, rng, alone = load(f"mujoco:{arm}", cameras=()), make_rng(0), []
+    step = world._stepper.step
+    monkeypatch.setattr(world._stepper, "step", lambda *rest: alone.append(world._lock.locked()) or step(*rest))
+    world.imagine(world.start(1, rng), torch.zeros(1, 1), rng)
+    assert alone == [True, True]
+
+
 def test_worlds_of_one_batch_differ_by_their_parameters(arm):
     world = load(f"mujoco:{arm}").varying(("gravity", "mass.ball", "gain"))
     state = world.start(3, make_rng(0))

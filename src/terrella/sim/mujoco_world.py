@@ -170,7 +170,8 @@ class MujocoWorld:
         nominal = torch.tensor([self.parameters[name].nominal for name in self.varied], dtype=torch.float64)
         values = nominal.repeat(batch, 1)
         none = torch.zeros(batch, self.file.nv, dtype=torch.float64)
-        _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # what is sensed before the first step
+        with self._lock:
+            _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # what is sensed before the first step
         held = {"physics": physics, "warmstart": none, "ctrl": ctrl, "sensors": sensors, **kept}
         held |= {"parameters": values} if self.varied else {}
         return State({**held, "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool)})
