@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from errno import ENOSPC
 from functools import partial
 from typing import Any
 
@@ -74,6 +75,15 @@ def test_what_fails_in_a_worker_is_said(tmp_path):
         gathered(tmp_path / "set", LocalWorkers(1), partial(dying, tmp_path / "deaths", 99))
     with pytest.raises(TerrellaError, match="0 workers"):
         LocalWorkers(0)
+
+
+def test_a_full_disk_is_said_as_what_it_is(tmp_path, monkeypatch):
+    def full(**_):
+        raise OSError(ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryDirectory", full)
+    with pytest.raises(OSError, match="No space left"):
+        gathered(tmp_path / "set", LocalWorkers(1))
 
 
 def test_ray_records_the_same_when_a_worker_is_killed(tmp_path, never):

@@ -181,6 +181,7 @@ class LocalWorkers:
         self._idle: list[Connection] = []
         self._deaths: Counter[int] = Counter()
         self._processes: list[Any] = []
+        self._scratch: tempfile.TemporaryDirectory | None = None
 
     def begin(self, job: Job) -> None:
         self._scratch = tempfile.TemporaryDirectory(prefix="terrella-", ignore_cleanup_errors=True)
@@ -214,7 +215,8 @@ class LocalWorkers:
             process.join(max(0.0, until - time.monotonic()))
             process.kill()
             process.join()
-        self._scratch.cleanup()
+        if self._scratch is not None:
+            self._scratch.cleanup()
         self._processes.clear()
         self._idle.clear()
         self._busy.clear()
