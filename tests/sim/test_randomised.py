@@ -110,6 +110,8 @@ def test_what_cannot_be_is_said(text, tmp_path):
 def test_files_are_read(file):
     found = read(file)
     assert found["mass.torso"] == Distribution("loguniform", (0.5, 2.0)) and found["noise.qpos"].kind == "constant"
+    file.write_text("mass.torso = 1.2")
+    assert read(file) == {"mass.torso": Distribution("constant", (1.2,))}
 
 
 class Slider:

@@ -85,11 +85,13 @@ def read(file: str | Path) -> dict[str, Distribution]:
 
 
 def _flat(told: Mapping, before: str = "") -> list[tuple[str, Any]]:
-    """[mass] trunk = ... is "mass.trunk" = ..."""
+    """[mass] trunk = ... and mass.trunk = ... are "mass.trunk" = ..."""
     found = []
     for name, value in told.items():
         inner = (
-            isinstance(value, dict) and not set(value) & set(KINDS) and all(isinstance(v, dict) for v in value.values())
+            isinstance(value, dict)
+            and not set(value) & set(KINDS)
+            and all(isinstance(one, dict | int | float) for one in value.values())
         )
         found += _flat(value, f"{before}{name}.") if inner and value else [(before + name, value)]
     return found
