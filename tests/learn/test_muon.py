@@ -17,6 +17,15 @@ def test_orthogonal_keeps_the_directions_and_levels_the_sizes(shape, scale):
     torch.testing.assert_close(left @ torch.diag(sizes) @ right, orthogonal(matrix), atol=1e-3, rtol=1e-3)
 
 
+def test_directions_that_hardly_count_do_not_run_away():
+    left, _, right = torch.linalg.svd(
+        torch.randn(24, 200, generator=torch.Generator().manual_seed(0)), full_matrices=False
+    )
+    step = orthogonal(left @ torch.diag(10.0 ** -torch.linspace(0, 7, 24)) @ right)
+    sizes = torch.linalg.svdvals(step)
+    assert sizes.max() < 1.3 and (sizes[:8] > 0.6).all()
+
+
 def test_no_gradient_moves_nothing():
     assert torch.equal(orthogonal(torch.zeros(3, 4)), torch.zeros(3, 4))
 

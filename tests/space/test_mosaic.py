@@ -12,6 +12,8 @@ from terrella.space.matching import (
     explains,
     explains_slowly,
     fetched,
+    half_a_pixel,
+    half_a_pixel_slowly,
     scrolled,
     voted,
     voted_slowly,
@@ -37,6 +39,7 @@ def test_kernels_are_as_their_slow_twins():
     for fast, slow in zip(explained(frames, truth, MOVES), explained_slowly(frames, truth, MOVES)):
         assert torch.allclose(fast, slow, atol=5e-4), "what is cut off is worth e ** -8"
     assert torch.allclose(explains(frames[:, 0], truth, MOVES), explains_slowly(frames[:, 0], truth, MOVES))
+    assert torch.equal(half_a_pixel(frames[0]), half_a_pixel_slowly(frames[0]))
     mosaic = blank(1, (16, 24))
     for move in MOVES[:4]:
         for frame in (frames[:, 0], truth, truth):

@@ -63,9 +63,14 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
     first, third, fifth = QUINTIC
     x = matrix / (matrix.norm() + 1e-7)
     x = x.T if len(x) > x.shape[1] else x
+    square = x @ x.T
+    whole = None  # all rounds are polynomials of `square`, a small matrix, by which x is multiplied once
     for _ in range(ROUNDS):
-        square = x @ x.T
-        x = first * x + (third * square + fifth * square @ square) @ x
+        step = torch.addmm(third * square, square, square, alpha=fifth)
+        step.diagonal().add_(first)
+        square = step @ square @ step
+        whole = step if whole is None else step @ whole
+    x = whole @ x
     return x if x.shape == matrix.shape else x.T
 
 

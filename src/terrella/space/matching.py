@@ -8,6 +8,7 @@ import torch.nn.functional as F
 
 from .kernels_numba.matching import explained as explained_kernel
 from .kernels_numba.matching import explains as explains_kernel
+from .kernels_numba.matching import half_a_pixel as half_a_pixel_kernel
 from .kernels_numba.matching import voted as voted_kernel
 from .views import arrays, each_view
 
@@ -34,6 +35,15 @@ def fetched(frames: torch.Tensor, source: torch.Tensor, moves: torch.Tensor) -> 
 def half_a_pixel(frame: torch.Tensor) -> torch.Tensor:
     """The least and the largest colours that each pixel of uint8 [B, 3, H, W] takes when the picture is displaced by up to half a
     pixel: uint8 [B, 2, 3, H, W]. Pictures scroll by parts of pixels, and sources are displaced by whole ones."""
+    if frame.device.type != "cpu":
+        return half_a_pixel_slowly(frame)
+    bounds = torch.empty(len(frame), 2, *frame.shape[1:], dtype=torch.uint8)
+    each_view(half_a_pixel_kernel, arrays(frame, bounds))
+    return bounds
+
+
+def half_a_pixel_slowly(frame: torch.Tensor) -> torch.Tensor:
+    """The same as `half_a_pixel`, in plain tensor algebra; the way on a GPU."""
     both = []
     for least in (torch.minimum, torch.maximum):
         bound = frame.to(torch.int16) * 16
@@ -67,7 +77,7 @@ def explained_slowly(
     sources = torch.arange(len(moves) + frames.shape[1] - 1, device=truth.device)
     each = sources[:, None, None, None].expand(-1, len(truth), *size)
     error = [(fetched(frames, one, moves).int() - truth.int()).abs() for one in each]
-    bounds = half_a_pixel(frames[:, 0]).transpose(0, 1)[:, :, None]
+    bounds = half_a_pixel_slowly(frames[:, 0]).transpose(0, 1)[:, :, None]
     for number in range(1, len(moves)):
         least, most = (fetched(bound, each[number], moves).int() for bound in bounds)
         error[number] = torch.maximum(least - truth.int(), truth.int() - most).clamp_min(0)

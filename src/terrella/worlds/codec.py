@@ -23,6 +23,9 @@ PIXEL = 16  # features of each pixel, of the squares and of its own neighbours e
 HIDDEN = 32  # of each pixel, of which its choice is made
 CHANCE = 0.25  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
 AROUND = 8  # pixels of a side of the squares, near which colours are counted
+TAKEN_BACK = (
+    0.7  # the power of the stress that drawing takes back: with 1 small things that one moves fade, with 0 they spread
+)
 UNKNOWN = -1e4  # the logit of what is not there
 
 
@@ -180,37 +183,44 @@ class Codec(nn.Module):
         moved = torch.where(beyond, UNKNOWN, moved)
         return torch.cat([moved, others, memory, painted], 1), features
 
-    def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
-        """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
-        near = torch.cat([seen.sources[:, 0], seen.scrolled], 1).float() / 127.5 - 1
-        known = torch.cat([features, near], 1).permute(0, 2, 3, 1)
-        around = self._around(seen.scrolled)
-        shares = torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
+    def colours(
+        self, seen: Seen, features: torch.Tensor, shares: torch.Tensor, where: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours].
+        shares: of the `common_colours`."""
+        near = torch.cat([seen.sources[:, 0], seen.scrolled], 1)
         often = (shares + 1e-3).log() @ self.common
         if where is None:
+            known = torch.cat([features, near.float() / 127.5 - 1], 1).permute(0, 2, 3, 1)
             often = often.repeat_interleave(AROUND, 1).repeat_interleave(AROUND, 2)
             return (self.colour(known) + often).flatten(0, 2)
         batch, v, u = where.nonzero(as_tuple=True)
-        return self.colour(known[batch, v, u]) + often[batch, v // AROUND, u // AROUND]
+        known = features.permute(0, 2, 3, 1)[batch, v, u], near.permute(0, 2, 3, 1)[batch, v, u].float() / 127.5 - 1
+        return self.colour(torch.cat(known, 1)) + often[batch, v // AROUND, u // AROUND]
 
-    def _around(self, frame: torch.Tensor) -> torch.Tensor:
-        """The share of pixels in and around squares of uint8 [B, 3, H, W] to which each colour of the palette is the nearest: [B,
-        H / AROUND, W / AROUND, colours]."""
-        every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
+    def common_colours(self, seen: Seen) -> torch.Tensor:
+        """The share of pixels to which each colour of the palette is the nearest, in the whole picture and in and around each
+        square: [B, H / AROUND, W / AROUND, colours, 2]."""
+        every = seen.scrolled[..., ::2, ::2].permute(0, 2, 3, 1)
         nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
         each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])
-        return F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1)
+        around = F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1)
+        return torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
 
-    def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
+    def drawn(
+        self, seen: Seen, choices: torch.Tensor, features: torch.Tensor, shares: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from.
+        shares: of the `common_colours`, where they are known already."""
+        shares = self.common_colours(seen) if shares is None else shares
         share = choices.softmax(1)
         if share.device.type == "cpu":  # few pixels may be painted, in most frames
             paints = share[:, -1] >= FEW
             painted = torch.zeros(*paints.shape, 3, dtype=torch.uint8)
-            painted[paints] = self.palette[self.colours(seen, features, paints).argmax(1)]
+            painted[paints] = self.palette[self.colours(seen, features, shares, paints).argmax(1)]
         else:
-            painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
-        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
+            painted = self.palette[self.colours(seen, features, shares).argmax(1)].view(*share[:, -1].shape, 3)
+        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress**TAKEN_BACK)
 
     def _beyond(self, device: torch.device) -> torch.Tensor:
         """bool [moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame."""

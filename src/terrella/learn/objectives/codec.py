@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ...core.errors import DatasetError
 from ...space.matching import CLEAR, explained, preferred, scrolled
 from ...space.mosaic import remembered
-from ...worlds.codec import Codec, Scroll
+from ...worlds.codec import Codec, Scroll, Seen
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
 from ..moves import mosaics
@@ -70,7 +70,8 @@ def clip(
     """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
     rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
     past, slots = spans.past, spans.slots
-    differs = np.abs(rgb[:, past + slots :].astype(np.int16) - rgb[:, past + slots - 1 : -1]).max(-1) > 2 * CHANGED
+    some = rgb[:, past + slots - 1 :, ::2, ::2]
+    differs = (np.maximum(some[:, 1:], some[:, :-1]) - np.minimum(some[:, 1:], some[:, :-1])).max(-1) > 2 * CHANGED
     weight = 0.3 + (differs.mean((2, 3)) > 0.005).mean(1)
     picks = now.rng.choice(len(rgb), batch, replace=len(rgb) < batch, p=weight / weight.sum())
     whole = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
@@ -110,19 +111,19 @@ class CodecObjective:
         slots = self.generator.config.slots
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
-        follows = torch.arange(len(recorded), device=now.device)[:, None, None, None] % 2 == 0  # half is never dreamt
-        follows = follows | (now.step * self.strides < RECORDED)
+        half = len(recorded) // 2 * (now.step * self.strides >= RECORDED)  # the other half is never dreamt
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
             mosaic = remembered(mosaic, shown[:, 0], moves[scrolled(shown[:, 1], shown[:, 0], moves)])
-            loss, drawn = self._loss(shown, mosaic, context, truth, before, now)
+            dreamt = half if step + 1 < recorded.shape[1] else 0
+            loss, drawn = self._loss(shown, mosaic, context, truth, before, dreamt, now)
             yield loss
-            drawn = torch.where(follows, truth, drawn)
-            shown = torch.cat([drawn[:, None], shown[:, :-1]], 1)
+            shown = torch.cat([torch.cat([drawn, truth[dreamt:]])[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, mosaic, context, truth, before, now: Now) -> tuple[Loss, torch.Tensor]:
-        """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and what is drawn now."""
+    def _loss(self, shown, mosaic, context, truth, before, dreamt: int, now: Now) -> tuple[Loss, torch.Tensor]:
+        """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and the first `dreamt` of
+        them as they are drawn now."""
         codec = self.generator
         move = scrolled(shown[:, 0], truth, codec.moves)
         seen = codec.seen(shown, mosaic, move)
@@ -138,12 +139,14 @@ class CodecObjective:
         some = changes | (stays > OFF)
         some[:, ::7, ::7] = True
         nearest = torch.cdist(truth.permute(0, 2, 3, 1)[some].float(), codec.palette.float()).argmin(1)
-        colour = F.cross_entropy(codec.colours(seen, features, some), nearest, reduction="none")
+        common = codec.common_colours(seen)
+        colour = F.cross_entropy(codec.colours(seen, features, common, some), nearest, reduction="none")
         painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
         each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
         weight = torch.where(changes, codec.stress, 1.0)
         weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
         pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
         with torch.no_grad():
-            drawn = codec.drawn(seen, choices, features)
+            few = Seen(*(part[:dreamt] for part in seen))
+            drawn = codec.drawn(few, choices[:dreamt], features[:dreamt], common[:dreamt])
         return Loss("generator", pixels + 0.1 * colour.mean(), {"pixels": pixels, "colour": colour.mean()}), drawn

@@ -22,6 +22,29 @@ def around(plane, rows, mean):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def half_a_pixel(frame, bounds):
+    """The kernel of matching.half_a_pixel_slowly: frame uint8 [3, H, W]; fills bounds uint8 [2, 3, H, W]."""
+    _, height, width = frame.shape
+    above, row = np.empty((height, width), np.int32), np.empty(width, np.int32)
+    for which in range(2):
+        for c in range(3):
+            for v in range(height):
+                one, here, other = frame[c, max(v - 1, 0)], frame[c, v], frame[c, min(v + 1, height - 1)]
+                for u in range(width):
+                    own, a, b = np.int32(here[u]) * 16, np.int32(one[u]) * 16, np.int32(other[u]) * 16
+                    near = min(a, b) if which == 0 else max(a, b)
+                    half = (own + near) // 2
+                    above[v, u] = min(own, half) if which == 0 else max(own, half)
+            for v in range(height):
+                row[:] = above[v]
+                for u in range(width):
+                    a, b = row[max(u - 1, 0)], row[min(u + 1, width - 1)]
+                    near = min(a, b) if which == 0 else max(a, b)
+                    half = (row[u] + near) // 2
+                    bounds[which, c, v, u] = (min(row[u], half) if which == 0 else max(row[u], half)) // 16
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def differences(low, high, truth, x, y, most, mean):
     """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those x, y away, from `low` to
     `high` uint8 [3, H, W]."""
