@@ -64,12 +64,12 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
     x = matrix / (matrix.norm() + 1e-7)
     x = x.T if len(x) > x.shape[1] else x
     square = x @ x.T
-    whole = None  # all rounds are polynomials of `square`, a small matrix, by which x is multiplied once
+    whole = torch.eye(len(x), dtype=x.dtype, device=x.device)  # all rounds, polynomials of the small `square`
     for _ in range(ROUNDS):
         step = torch.addmm(third * square, square, square, alpha=fifth)
         step.diagonal().add_(first)
         square = step @ square @ step
-        whole = step if whole is None else step @ whole
+        whole = step @ whole
     x = whole @ x
     return x if x.shape == matrix.shape else x.T
 
