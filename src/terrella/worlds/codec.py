@@ -23,9 +23,6 @@ PIXEL = 16  # features of each pixel, of the squares and of its own neighbours e
 HIDDEN = 32  # of each pixel, of which its choice is made
 CHANCE = 0.25  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
 AROUND = 8  # pixels of a side of the squares, near which colours are counted
-TAKEN_BACK = (
-    0.7  # the power of the stress that drawing takes back: with 1 small things that one moves fade, with 0 they spread
-)
 UNKNOWN = -1e4  # the logit of what is not there
 
 
@@ -86,7 +83,7 @@ class Scroll(nn.Module):
 @final
 class Codec(nn.Module):
     """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]; `stress` [], how many times as
-    much a pixel counted that changed as one that stayed when it was learned: what is drawn takes that back."""
+    likely as it says a pixel stays: what it says was learned with pixels that change counting for more."""
 
     kind = "codec"
     moves: torch.Tensor
@@ -220,7 +217,7 @@ class Codec(nn.Module):
             painted[paints] = self.palette[self.colours(seen, features, shares, paints).argmax(1)]
         else:
             painted = self.palette[self.colours(seen, features, shares).argmax(1)].view(*share[:, -1].shape, 3)
-        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress**TAKEN_BACK)
+        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
     def _beyond(self, device: torch.device) -> torch.Tensor:
         """bool [moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame."""

@@ -89,8 +89,9 @@ def clip(
 class CodecObjective:
     """The likelihood of each pixel under the mixture of its sources and of the palette, in clips of these `spans`."""
 
-    def __init__(self, codec: Codec, learning_rate: float, spans: Spans):
+    def __init__(self, codec: Codec, learning_rate: float, spans: Spans, stress: float):
         self.spans, self.strides = spans, spans.dream  # losses of a batch, each of which is descended
+        self.stress = stress  # how many times as much pixels count that change
         self.generator = channels_last(codec)
         self.smooth = Average(self.generator, 0.998)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
@@ -143,7 +144,7 @@ class CodecObjective:
         colour = F.cross_entropy(codec.colours(seen, features, common, some), nearest, reduction="none")
         painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
         each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
-        weight = torch.where(changes, codec.stress, 1.0)
+        weight = torch.where(changes, self.stress, 1.0)
         weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
         pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
         with torch.no_grad():

@@ -121,7 +121,7 @@ def forget(out: Path) -> None:
 
 def _horizon(recording: Recording, frames: int) -> int:
     """Steps of a dream."""
-    return min(64, max(8, frames // 40), int(_ahead(recording).max()) - max(SHOWN))
+    return min(64, max(8, frames // 40), int(ahead(recording).max()) - max(SHOWN))
 
 
 def _steps(frames: int) -> int:
@@ -159,7 +159,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: i
         arm = NONE
     alone, horizon = arm == LONE, rollout.horizon
     shown = 1 if alone else int(rng.choice(SHOWN))
-    begins = rng.choice(np.flatnonzero(_ahead(recording) >= shown + horizon), rollout.batch)
+    begins = rng.choice(np.flatnonzero(ahead(recording) >= shown + horizon), rollout.batch)
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
     noted: list[tuple[torch.Tensor, torch.Tensor]] = []
 
@@ -204,7 +204,7 @@ def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int
     return world.with_memory(world.memory.at(left))
 
 
-def _ahead(recording: Recording) -> np.ndarray:
+def ahead(recording: Recording) -> np.ndarray:
     """Of each row, how many follow one another from it on that may be seen, by valid actions in one episode: [N]."""
     fine = recording.usable & np.asarray(recording.cache.action_valid)
     if recording.cache.done is not None:

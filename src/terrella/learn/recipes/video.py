@@ -32,6 +32,7 @@ from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
 from ..objectives.outcome import Happenings, Pieces, learn_outcome
 from ..objectives.scroll import learn_scroll
+from ..objectives.stress import USUAL, balanced
 from ..objectives.uncertainty import expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..run_folder import resume_file
@@ -206,10 +207,12 @@ class _Learned:
         levels = int(np.log2(min(plain.size) // COARSE)) + 1  # that so small a picture has room for
         codec = Codec(replace(settings, channels=(self.config.channels or settings.channels)[:levels]))
         codec.moves[1:], codec.palette[:] = found.moves, found.palette
-        codec.stress.fill_(found.stress)
+        codec.stress.fill_(found.stress**USUAL)
         ranges = self.recording.cache.episodes
         lengths = np.array([np.diff(ranges[number])[0] for number in self.recording.seen] or [0])
-        return CodecObjective(codec, self.config.learning_rate or 2e-3, Spans.fitting(lengths, self.video.slots))
+        return CodecObjective(
+            codec, self.config.learning_rate or 2e-3, Spans.fitting(lengths, self.video.slots), found.stress
+        )
 
     def _looks(self) -> Looks:
         recording, rng = self.recording, np.random.default_rng(self.config.seed)
@@ -285,12 +288,21 @@ class _Learned:
     def _finish(self, trainer: Trainer) -> None:
         """The last strip, and the estimator and uncertainty of the finished world."""
         config = self.config
+        if isinstance(self.flow, CodecObjective):
+            self._balance(self.flow, trainer)
         self.draw_strip(trainer)
         world = self.world(trainer)
         settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
         sensing, facts = learn_senses(self.run, world, self.recording, config.keep_out, settings)
         save_world(sensing.replaced(card=facts), self.run.out / "world")
         trainer.once("senses", lambda: facts)
+
+    def _balance(self, flow: CodecObjective, trainer: Trainer) -> None:
+        """How likely pixels are to stay is told by how dreams of recorded episodes come out."""
+        world = self.world(trainer)
+        assert isinstance(world.generator, Codec)
+        self.facts["taken_back"] = balanced(world, world.generator, self.recording, flow.stress, self.config.seed)
+        flow.smooth.module.stress.copy_(world.generator.stress)
 
     def world(self, trainer: Trainer) -> LearnedWorld:
         """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""

@@ -1,0 +1,48 @@
+"""Stress: how much of the weight that pixels had in training that change is taken back when frames are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ...core import make_rng
+from ...worlds.codec import Codec
+from ...worlds.learned import LearnedWorld
+from ..recording import Recording
+from .uncertainty import ahead
+
+# Powers of the stress. With a small one what moves is drawn where it is unlikely, with a large one small things fade.
+POWERS, USUAL = (0.5, 0.7, 1.0, 1.4, 2.0), 0.7
+SHOWN, STEPS, CLIPS = 8, 32, 12  # frames that a dream is shown, steps that it goes on, at most; dreams
+ALIKE = 0.05  # of the logarithm of errors: of powers so nearly alike the smallest wins, for what moves lives longer
+
+
+@torch.inference_mode()
+def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int) -> float:
+    """Which of POWERS brings dreams of recorded episodes nearest to them, by the mean logarithm of the pooled squared error after
+    1, 2, 4, ... steps, the smallest of those that are nearly alike. Sets the stress of `codec`, by which the world draws, to
+    that power of `stress`."""
+    reach, rng = ahead(recording), np.random.default_rng([seed, 11])
+    steps = min(STEPS, int(reach.max()) - SHOWN)
+    if steps < 1 or stress <= 1:
+        return USUAL
+    begins = rng.choice(np.flatnonzero(reach >= SHOWN + steps), CLIPS)
+    chance = make_rng(seed)
+    state = world.observe(recording.evidence(world.config, begins), None, chance)
+    for row in range(1, SHOWN):
+        state = world.imagine(state, recording.played(world.spec, begins + row - 1), chance)
+        state = world.observe(recording.evidence(world.config, begins + row), state, chance)
+    found = []
+    for power in POWERS:
+        codec.stress.fill_(stress**power)
+        dreamt, chance, errors = state, make_rng(seed), []
+        for step in range(steps):
+            rows = begins + SHOWN + step
+            dreamt = world.imagine(dreamt, recording.played(world.spec, rows - 1), chance)
+            drawn = world.render(dreamt, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
+            errors.append((drawn - recording.rgb(rows).float()).square().mean())
+        some = [2**doubled - 1 for doubled in range(6) if 2**doubled <= steps]
+        found.append(float(torch.stack(errors)[some].clamp_min(1e-3).log().mean()))
+    best = next(power for power, error in zip(POWERS, found) if error <= min(found) + ALIKE)
+    codec.stress.fill_(stress**best)
+    return best
