@@ -9,9 +9,10 @@ import torch
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
 from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, palette
-from terrella.learn.objectives.codec import Spans, clip
+from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans, clip
 from terrella.learn.trainer import Now
 from terrella.space.mosaic import recalled
+from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.controls import Controls
 
 SIZE = (32, 40)
@@ -94,3 +95,28 @@ def test_of_few_clips_some_are_taken_twice():
     made = clip(found, Controls.buttons(2), torch.zeros(1, 2, dtype=torch.int64), Spans(0, 4, 3), 5, now)
     assert made.frames.shape == (5, 7, 3, 8, 8) and made.actions.shape[:2] == (5, 7)
     assert set(made.frames[:, 0, 0, 0, 0].tolist()) <= {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("batch", "step", "dreamt"), [(5, RECORDED, [2, 2, 0]), (1, RECORDED, [0, 0, 0]), (5, 0, [0, 0, 0])]
+)
+def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, batch, step, dreamt):
+    codec = Codec(CodecConfig(SIZE, 4, 36 + 4 * 2, 1, 4, (8, 8)))
+    objective, seen = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0), []
+    truth = torch.randint(0, 256, (batch, 7, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
+
+    def loss(shown, mosaic, context, target, before, count, now):
+        seen.append(count)
+        assert torch.equal(target, truth[:, 3 + len(seen)])
+        drawn = torch.full_like(target[:count], len(seen))
+        if len(seen) > 1:
+            assert (shown[: dreamt[0], 0] == len(seen) - 1).all() and torch.equal(
+                shown[dreamt[0] :, 0], before[dreamt[0] :]
+            )
+        return None, drawn
+
+    monkeypatch.setattr(objective, "_loss", loss)
+    mosaic = mosaics(truth[:, :3], codec.moves, torch.ones(batch, 3, dtype=torch.bool))
+    now = Now(step, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
+    list(objective.losses(Clip(truth, torch.zeros(batch, 7, 2), mosaic), now))
+    assert seen == dreamt

@@ -13,63 +13,75 @@ from terrella.learn.objectives import stress
 from terrella.learn.objectives.stress import POWERS, USUAL, balanced
 
 SIZE = (4, 4)
+ROWS = 100  # of an episode
 
 
-def codec() -> Any:
-    return SimpleNamespace(stress=torch.tensor(3.0))
-
-
-class Drawn:
-    """A world whose frames are off by how far its codec's stress is from `right`."""
+class World:
+    """Its frames show the row that its state has come to, off by how far its codec's stress is from `right`."""
 
     config = spec = None
 
-    def __init__(self, codec, right: float):
+    def __init__(self, codec, right: float | None):
         self.codec, self.right = codec, right
 
-    def observe(self, seen, prior, rng):
-        return 0
+    def observe(self, rows, prior, rng):
+        assert prior is None or (prior == rows).all()
+        return rows
 
     def imagine(self, state, action, rng):
+        assert (action == state).all(), "the action that led from this row to the next"
         return state + 1
 
     def render(self, state, channels):
-        off = 10 * (self.codec.stress.log() - np.log(self.right)).abs() + 1
-        return {"rgb": off.expand(stress.CLIPS, *SIZE, 3)}
+        off = 0.0 if self.right is None else 3 * float((self.codec.stress.log() - np.log(self.right)).abs())
+        seen = torch.from_numpy(state % ROWS).float() + off
+        return {"rgb": seen[:, None, None, None].expand(-1, *SIZE, 3)}
 
 
-def drawn(made: Any, right: float) -> Any:
-    return Drawn(made, right)
+def made(right: float | None) -> Any:
+    codec = SimpleNamespace(stress=torch.tensor(3.0))
+    return World(codec, right), codec
 
 
-def recording(rows: int) -> Any:
-    still = torch.zeros(stress.CLIPS, 3, *SIZE, dtype=torch.uint8)
+def recording(episodes: int, rows: int = ROWS) -> Any:
+    """Pictures of row t of an episode are of the brightness t."""
+    count = episodes * rows
     return SimpleNamespace(
-        usable=np.ones(rows, bool),
-        start=np.zeros(rows, np.int64),
-        cache=SimpleNamespace(action_valid=np.ones(rows, bool), done=None),
-        evidence=lambda config, rows: {},
-        played=lambda spec, rows: None,
-        rgb=lambda rows: still,
+        usable=np.ones(count, bool),
+        start=np.repeat(np.arange(episodes) * rows, rows),
+        cache=SimpleNamespace(action_valid=np.ones(count, bool), done=None),
+        evidence=lambda config, rows: rows,
+        played=lambda spec, rows: rows,
+        rgb=lambda rows: torch.from_numpy(rows % ROWS).float()[:, None, None, None].expand(-1, 3, *SIZE),
     )
 
 
 @pytest.mark.parametrize("power", POWERS)
 def test_the_power_whose_dreams_come_nearest_is_found(power):
-    made = codec()
-    assert balanced(drawn(made, 9.0**power), made, recording(200), 9.0, 0) == power
-    assert made.stress == pytest.approx(9.0**power)
+    world, codec = made(9.0**power)
+    assert balanced(world, codec, recording(3), 9.0, 0) == power
+    assert codec.stress == pytest.approx(9.0**power)
 
 
 def test_of_powers_that_are_alike_the_smallest_is_taken():
-    made = codec()
-    world = drawn(made, 9.0)
-    world.render = lambda state, channels: {"rgb": torch.ones(stress.CLIPS, *SIZE, 3)}
-    assert balanced(world, made, recording(200), 9.0, 0) == POWERS[0]
+    world, codec = made(None)
+    assert balanced(world, codec, recording(3), 9.0, 0) == POWERS[0]
 
 
-@pytest.mark.parametrize(("rows", "weight"), [(6, 9.0), (200, 1.0)])
-def test_where_nothing_can_be_told_it_stays_as_it_is(rows, weight):
-    made = codec()
-    assert balanced(drawn(made, 1.0), made, recording(rows), weight, 0) == USUAL
-    assert made.stress == 3
+@pytest.mark.parametrize(("rows", "weight"), [(6, 9.0), (ROWS, 1.2)])
+def test_where_nothing_can_be_told_it_is_the_usual_one(rows, weight):
+    world, codec = made(1.0)
+    assert balanced(world, codec, recording(3, rows), weight, 0) == USUAL
+    assert codec.stress == pytest.approx(weight**USUAL)
+
+
+def test_one_long_episode_among_short_ones_does_not_decide(monkeypatch):
+    found = recording(20, 20)
+    found.start = np.concatenate([np.repeat(np.arange(19) * 20, 20), np.full(41, 380)])
+    found.usable, found.cache.action_valid = np.ones(421, bool), np.ones(421, bool)
+    asked: list[np.ndarray] = []
+    found.evidence = lambda config, rows: asked.append(rows) or rows
+    monkeypatch.setattr(stress, "SHOWN", 4)
+    world, codec = made(9.0)
+    balanced(world, codec, found, 9.0, 0)
+    assert len(np.unique(asked[0])) == stress.CLIPS and (asked[0] < 380).sum() > stress.CLIPS // 2

@@ -21,6 +21,7 @@ from terrella.core.spec import Camera
 from terrella.data import ClipCache, Dataset, Layout, Recorder, record
 from terrella.learn.batches import Batch, varied
 from terrella.learn.feeds import frames_feed
+from terrella.learn.recipes import video
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, choose_keyframes, usable_rows
 from terrella.learn.trainer import Now, Trainer
@@ -76,6 +77,20 @@ def test_a_run_without_geometry_reads_clips_and_goes_on_exactly(recording, tmp_p
     config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=3, steps=36)
     stages = {"outcome": 1, "flow": 1}
     goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
+
+
+def test_a_world_without_geometry_draws_with_the_stress_that_its_dreams_told(recording, tmp_path, monkeypatch):
+    def told(world, codec, recording, stress, seed):
+        codec.stress.fill_(5.0)
+        return 1.4
+
+    monkeypatch.setattr(video, "balanced", told)
+    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=0, steps=2)
+    first = train_video(recording, tmp_path, config, quiet)
+    assert first["taken_back"] == 1.4 and load_world(tmp_path / "world").generator.stress == 5
+    assert '"taken_back": 1.4' in (tmp_path / "world" / "world.json").read_text()
+    again = train_video(recording, tmp_path, config, quiet)
+    assert again["taken_back"] == 1.4 and load_world(tmp_path / "world").generator.stress == 5
 
 
 def test_a_step_that_a_second_ctrl_c_cuts_is_done_again(recording, trained, tmp_path, monkeypatch):

@@ -63,14 +63,13 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
     first, third, fifth = QUINTIC
     x = matrix / (matrix.norm() + 1e-7)
     x = x.T if len(x) > x.shape[1] else x
-    square = x @ x.T
-    whole = torch.eye(len(x), dtype=x.dtype, device=x.device)  # all rounds, polynomials of the small `square`
+    square, steps = x @ x.T, []  # each round multiplies x by a polynomial of the small `square`
     for _ in range(ROUNDS):
         step = torch.addmm(third * square, square, square, alpha=fifth)
         step.diagonal().add_(first)
         square = step @ square @ step
-        whole = step @ whole
-    x = whole @ x
+        steps.append(step)
+    x = torch.linalg.multi_dot([*reversed(steps), x])
     return x if x.shape == matrix.shape else x.T
 
 

@@ -82,8 +82,8 @@ class Scroll(nn.Module):
 
 @final
 class Codec(nn.Module):
-    """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]; `stress` [], how many times as
-    likely as it says a pixel stays: what it says was learned with pixels that change counting for more."""
+    """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]; `stress` []: a pixel is drawn
+    as if it were so many times as likely to stay as the choices say, which were learned with what changes counting for more."""
 
     kind = "codec"
     moves: torch.Tensor

@@ -70,10 +70,11 @@ def clip(
     """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
     rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
     past, slots = spans.past, spans.slots
-    some = rgb[:, past + slots - 1 :, ::2, ::2]
+    some = rgb[:, past + slots - 1 :]
     differs = (np.maximum(some[:, 1:], some[:, :-1]) - np.minimum(some[:, 1:], some[:, :-1])).max(-1) > 2 * CHANGED
     weight = 0.3 + (differs.mean((2, 3)) > 0.005).mean(1)
     picks = now.rng.choice(len(rgb), batch, replace=len(rgb) < batch, p=weight / weight.sum())
+    picks = now.rng.permutation(picks)  # those that change more are picked first, and the first half will be dreamt
     whole = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
     actions = controls.encode(torch.from_numpy(action[picks][:, past:]).flatten(0, 1)).unflatten(0, (batch, -1))
     begins = torch.from_numpy(now.rng.random(batch) < STILL)[:, None]
@@ -147,7 +148,10 @@ class CodecObjective:
         weight = torch.where(changes, self.stress, 1.0)
         weight = weight * torch.where(~changes & (stays > OFF), STALE, 1.0)
         pixels = -(each.logsumexp(1) * weight).sum() / weight.sum()
-        with torch.no_grad():
-            few = Seen(*(part[:dreamt] for part in seen))
-            drawn = codec.drawn(few, choices[:dreamt], features[:dreamt], common[:dreamt])
+        if not dreamt:
+            drawn = truth[:0]
+        else:
+            with torch.no_grad():
+                few = Seen(*(part[:dreamt] for part in seen))
+                drawn = codec.drawn(few, choices[:dreamt], features[:dreamt], common[:dreamt])
         return Loss("generator", pixels + 0.1 * colour.mean(), {"pixels": pixels, "colour": colour.mean()}), drawn

@@ -12,8 +12,10 @@ from ..recording import Recording
 from .uncertainty import ahead
 
 # Powers of the stress. With a small one what moves is drawn where it is unlikely, with a large one small things fade.
-POWERS, USUAL = (0.5, 0.7, 1.0, 1.4, 2.0), 0.7
-SHOWN, STEPS, CLIPS = 8, 32, 12  # frames that a dream is shown, steps that it goes on, at most; dreams
+POWERS, USUAL = (0.5, 0.7, 1.0, 1.4), 0.7
+HARDLY = 1.5  # a stress of less has no effect worth choosing
+SHOWN, STEPS, CLIPS = 8, (32, 16, 8, 4), 12  # frames that a dream is shown, steps that it goes on, dreams
+FRAMES = CLIPS * (SHOWN + STEPS[0] * len(POWERS))  # that are drawn, at most
 ALIKE = 0.05  # of the logarithm of errors: of powers so nearly alike the smallest wins, for what moves lives longer
 
 
@@ -22,11 +24,13 @@ def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: fl
     """Which of POWERS brings dreams of recorded episodes nearest to them, by the mean logarithm of the pooled squared error after
     1, 2, 4, ... steps, the smallest of those that are nearly alike. Sets the stress of `codec`, by which the world draws, to
     that power of `stress`."""
+    codec.stress.fill_(stress**USUAL)
     reach, rng = ahead(recording), np.random.default_rng([seed, 11])
-    steps = min(STEPS, int(reach.max()) - SHOWN)
-    if steps < 1 or stress <= 1:
+    some = (reach > SHOWN).sum() / 2  # of the rows from which a dream may begin there should be many
+    steps = next((steps for steps in STEPS if (reach >= SHOWN + steps).sum() >= max(some, CLIPS)), 0)
+    if not steps or stress < HARDLY:
         return USUAL
-    begins = rng.choice(np.flatnonzero(reach >= SHOWN + steps), CLIPS)
+    begins = rng.choice(np.flatnonzero(reach >= SHOWN + steps), CLIPS, replace=False)
     chance = make_rng(seed)
     state = world.observe(recording.evidence(world.config, begins), None, chance)
     for row in range(1, SHOWN):

@@ -32,7 +32,7 @@ from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
 from ..objectives.outcome import Happenings, Pieces, learn_outcome
 from ..objectives.scroll import learn_scroll
-from ..objectives.stress import USUAL, balanced
+from ..objectives.stress import FRAMES, USUAL, balanced
 from ..objectives.uncertainty import expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..run_folder import resume_file
@@ -272,7 +272,8 @@ class _Learned:
 
     def _divide(self, trainer: Trainer) -> None:
         """Gives the generator what is left of the hours when the other stages have had theirs: before it is trained those that
-        can be, and for the uncertainty, which comes after, as long as a trial says. A run that has had its hours keeps to them."""
+        can be, and for the stress and the uncertainty, which come after, as long as a trial says. A run that has had its hours
+        keeps to them."""
         config, budget, took_s = self.config, self.run.budget, trainer.facts["seconds"]
         if config.hours <= trainer.facts.get("asked", 0.0):
             trainer.limit_s = took_s
@@ -283,26 +284,29 @@ class _Learned:
         if config.uncertainty_frames:
             most_s = budget.most_s("dreams") + budget.most_s("uncertainty")
             after_s = min(most_s, 1.2 * expected_s(self.world(trainer), self.recording, config.uncertainty_frames))
+        if isinstance(self.flow, CodecObjective):
+            after_s += expected_s(self.world(trainer), self.recording, FRAMES)
         trainer.limit_s = max(1e-6, took_s + budget.left_s - after_s)
 
     def _finish(self, trainer: Trainer) -> None:
         """The last strip, and the estimator and uncertainty of the finished world."""
         config = self.config
-        if isinstance(self.flow, CodecObjective):
-            self._balance(self.flow, trainer)
+        balance = self._balanced(self.flow, trainer) if isinstance(self.flow, CodecObjective) else {}
         self.draw_strip(trainer)
         world = self.world(trainer)
         settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
         sensing, facts = learn_senses(self.run, world, self.recording, config.keep_out, settings)
+        facts |= balance
         save_world(sensing.replaced(card=facts), self.run.out / "world")
         trainer.once("senses", lambda: facts)
 
-    def _balance(self, flow: CodecObjective, trainer: Trainer) -> None:
+    def _balanced(self, flow: CodecObjective, trainer: Trainer) -> dict:
         """How likely pixels are to stay is told by how dreams of recorded episodes come out."""
         world = self.world(trainer)
         assert isinstance(world.generator, Codec)
-        self.facts["taken_back"] = balanced(world, world.generator, self.recording, flow.stress, self.config.seed)
+        power = balanced(world, world.generator, self.recording, flow.stress, self.config.seed)
         flow.smooth.module.stress.copy_(world.generator.stress)
+        return {"taken_back": power}
 
     def world(self, trainer: Trainer) -> LearnedWorld:
         """The world as it now is, on the CPU; of copies, since a finished world's weights learn no more."""
