@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test test-all test-portable test-lerobot test-splats judge check format bench clean
+.PHONY: help play test test-all test-portable test-lerobot test-splats judge judge-cube check format bench clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
@@ -16,6 +16,7 @@ help:
 	@echo "make test-lerobot  run the tests against the real lerobot package, in an environment of its own"
 	@echo "make test-splats  try our files of Gaussians in Spark, three.js and PlayCanvas, and theirs in ours (npm; into ~/.cache/terrella)"
 	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (it trains for some six minutes of one core first)"
+	@echo "make judge-cube   the same for OGBench's cube-single: our recordings of its scripted arm, its own five tasks"
 	@echo "make check   format, lint, types and the directions of imports"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
@@ -52,6 +53,9 @@ test-splats: $(VENV)/.ready-dev
 
 judge:
 	@python=$$(sh benchmarks/judge_setup.sh .venv-judge) && OMP_NUM_THREADS=1 $$python -W ignore benchmarks/judge.py $(ARGS)
+
+judge-cube:
+	@python=$$(sh benchmarks/judge_setup.sh .venv-judge) && OMP_NUM_THREADS=1 $$python -W ignore benchmarks/cube.py $(ARGS)
 
 check: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

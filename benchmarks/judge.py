@@ -16,8 +16,6 @@ import argparse
 import contextlib
 import io
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -30,49 +28,14 @@ from judge_tasks import TASKS
 from stable_worldmodel import PlanConfig
 from stable_worldmodel.policy import BasePolicy, RandomPolicy, WorldModelPolicy
 from stable_worldmodel.solver import CEMSolver
+from trained import trained, words
 
-import terrella
 from terrella.act.goal_network import GoalActor
 from terrella.act.planning import Cost, CostModel, Planner, Reaching, SearchConfig, distance_to
 from terrella.core import World
 from terrella.measure.statistics import wilson
 
 OFFSET, BUDGET, BLOCK, HORIZON = 25, 50, 5, 5
-
-
-def command(*words: str) -> float:
-    """A command of terrella's, as a user types it; the processor seconds that it took."""
-    print("$ terrella", *words, flush=True)
-    began = np.array(_times())
-    subprocess.run([str(Path(sys.executable).with_name("terrella")), *words], check=True)
-    return float((np.array(_times()) - began).sum())
-
-
-def _times() -> tuple[float, float]:
-    import resource
-
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime, used.ru_stime
-
-
-def prepared(
-    task: Task, folder: Path, episodes: int, seed: int, steps: list[str], reach: list[str]
-) -> tuple[World, GoalActor, dict[str, float]]:
-    """The world and the policy of a seed, made where they are missing, and the processor seconds of training."""
-    recording, run, goals, notes = (folder / f"{name}-{seed}" for name in ("recording", "world", "goals", "cost.json"))
-    spent = json.loads(notes.read_text()) if notes.exists() else {}
-    if not (recording / "meta" / "info.json").exists():
-        with Recorded(task, recording) as writer:
-            task.collect(writer, episodes, 1000 * seed)
-    if not (run / "world" / "world.json").exists():
-        words = ("train", "latent", str(recording), "--out", str(run), "--seed", str(seed), *steps)
-        spent["world"] = command(*words)
-    if not (goals / "policy" / "policy.json").exists():
-        words = ("--in", str(run), "--from", str(recording), "--out", str(goals), "--seed", str(seed), *reach)
-        spent["goals"] = command("train", "goals", *words)
-    notes.write_text(json.dumps(spent))
-    world = terrella.load(run)
-    return world, GoalActor.load(goals, world.spec), spent
 
 
 def arms(task: Task, world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], BasePolicy]]:
@@ -156,14 +119,17 @@ def main() -> None:
     task = TASKS[asked.task]
     torch.set_num_threads(1)
     asked.out.mkdir(parents=True, exist_ok=True)
-    train, reach = (
-        [f"--{word}" if number % 2 == 0 else word for number, word in enumerate(words)]
-        for words in (asked.train, asked.reach)
-    )
-    trained = [prepared(task, asked.out, asked.episodes, seed, train, reach) for seed in range(asked.seeds)]
+    ready = []
+    for seed in range(asked.seeds):
+
+        def record(out: Path, seed: int = seed) -> None:
+            with Recorded(task, out) as writer:
+                task.collect(writer, asked.episodes, 1000 * seed, task.numbers is None)
+
+        ready.append(trained(asked.out, seed, record, words(asked.train), words(asked.reach)))
     with Held(task) as held:
         task.collect(held, asked.held, 777_000)
-    for seed, (_, _, spent) in enumerate(trained):
+    for seed, (_, _, spent) in enumerate(ready):
         took = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent.items())
         print(f"Training of seed {seed} took {took} processor minutes.", flush=True)
     found: dict[str, dict[str, list]] = {}
@@ -174,12 +140,12 @@ def main() -> None:
         for name in asked.arms:
             rows = [
                 judged(held, arms(task, world, actor, seed)[name](), asked.starts, 42 + seed, unsolved)
-                for seed, (world, actor, _) in enumerate(trained)
+                for seed, (world, actor, _) in enumerate(ready)
             ]
             found.setdefault(kind, {})[name] = rows
             print(line(name, rows), flush=True)
             (asked.out / "judge.json").write_text(
-                json.dumps({"spent_s": [spent for _, _, spent in trained], **found}, indent=1)
+                json.dumps({"spent_s": [spent for _, _, spent in ready], **found}, indent=1)
             )
 
 
