@@ -1,7 +1,7 @@
 """OGBench's cube-single: a robot arm carries a cube to where it lies in the goal, from starts where it lies elsewhere.
 
     make judge-cube                                          # in the environment of `make judge`
-    make judge-cube ARGS="--episodes 500 --reach steps 2000" # fewer recordings, a shorter training
+    make judge-cube ARGS="--episodes 200 --reach steps 3000" # fewer recordings, a shorter training
 
 It records OGBench's own scripted oracle with noise on its actions, numbers alone: no pictures, no rewards, and no goals, which are
 what episodes came to. It learns a world of them and a goal-conditioned policy, and plays OGBench's own five tasks and random ones.
@@ -140,6 +140,8 @@ def played(policy_of: Callable[[np.ndarray], Act], count: int, seed: int, own: b
                 break
         done += solved.tolist()
         steps += taken[solved].tolist()
+    for env in envs:
+        env.close()
     by_task = {str(1 + at): float(np.mean(done[at::5])) for at in range(5)} if own else {}
     return {
         "reached": int(np.sum(done)),
@@ -186,7 +188,7 @@ def line(name: str, kind: str, found: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("judged/cube"))
-    parser.add_argument("--episodes", type=int, default=1000, help="of 200 steps, that are recorded to learn from")
+    parser.add_argument("--episodes", type=int, default=500, help="of 200 steps, that are recorded to learn from")
     parser.add_argument("--noise", type=float, default=0.1, help="of the recorded actions, at most")
     parser.add_argument("--starts", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0, help="of recording and training")
@@ -201,7 +203,7 @@ def main() -> None:
     parser.add_argument(
         "--reach",
         nargs="*",
-        default=["steps", "8000", "hidden", "512", "farthest", "100"],
+        default=["steps", "10000", "farthest", "100"],
         help="words for `terrella train goals`, without --",
     )
     asked = parser.parse_args()

@@ -1,5 +1,6 @@
 """What a plan of the published protocol costs (300 candidates, 30 rounds, 5 moves of 5 actions), in a latent world and in a
 predictor of LeWorldModel's size with random weights, in one run: processor seconds on one thread, which other work hardly changes.
+And what iCEM's plans cost at which TwoRoom's starts are all solved (`make judge`): alone, and with a policy's plans as proposals.
 
     python benchmarks/plan_time.py
 """
@@ -15,7 +16,9 @@ import torch
 from latent import preset
 from torch import nn
 
-from terrella.act.planning import CostModel
+from terrella.act.goal_network import GoalActor, GoalConfig, GoalNetwork
+from terrella.act.planning import CostModel, Planner, SearchConfig, distance_to
+from terrella.core import make_rng
 from terrella.worlds.latent import LatentWorld
 from terrella.worlds.latent_network import LatentNetwork
 
@@ -56,6 +59,16 @@ def spent(work: Callable[[], object], tries: int) -> float:
     return best
 
 
+def decided(world: LatentWorld, samples: int, rounds: int, proposed: bool) -> Callable[[], object]:
+    """A decision of iCEM that plans anew, as `judge.py` has it."""
+    goal = {"rgb": torch.randint(0, 256, (64, 64, 3), dtype=torch.uint8)}
+    seen = {"rgb": torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8)}
+    config = SearchConfig("icem", samples=samples, iterations=rounds, horizon=MOVES, block=BLOCK)
+    actor = GoalActor(GoalNetwork(GoalConfig.of(world.spec)), world.spec, varied=True) if proposed else None
+    planner = Planner(world, distance_to(world, goal, "last"), config, proposal=actor, replan=MOVES)
+    return lambda: planner.act(seen, planner.begin(1, make_rng(0)), make_rng(0))
+
+
 @torch.inference_mode()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -77,6 +90,10 @@ def main() -> None:
     )
     for name, seconds in found.items():
         print(f"| {name} | {seconds:.2f} | {seconds / next(iter(found.values())):.1f} x |")
+    print("\n| iCEM, 5 moves of 5 | processor milliseconds a plan |\n| --- | --- |")
+    for samples, rounds, proposed in ((64, 5, False), (16, 2, False), (16, 2, True)):
+        ms = 1000 * spent(decided(made(True, BLOCK), samples, rounds, proposed), tries)
+        print(f"| {samples} x {rounds}{', with proposals of a policy' if proposed else ''} | {ms:.0f} |")
     print(f"\nThe large predictor has {weights / 1e6:.1f}M weights, and its encoder is not counted.")
 
 
