@@ -98,19 +98,29 @@ def expected_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
     """Seconds that `learn_uncertainty` will take of such a world, by a few steps of dreaming and of learning."""
     if _horizon(recording, frames) < 8:
         return 0.0
-    trial = Rollout(frames, 4)
-    dream(world, recording, trial, 0)  # the first compiles
+    dreamt_s, seen = _dreamt_s(world, recording)
     began = time.monotonic()
-    seen = dream(world, recording, trial, 0)
-    dreamt = time.monotonic()
     with torch.random.fork_rng(devices=[]):
         objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
     for step in range(3):
         now = Now(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
         for loss in objective.losses(objective.picked(now), now):
             loss.value.backward()
-    learned = time.monotonic()
-    return (dreamt - began) * frames / (trial.horizon * trial.batch) + (learned - dreamt) * _steps(frames) / 3
+    return dreamt_s * frames + (time.monotonic() - began) * _steps(frames) / 3
+
+
+def dreaming_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
+    """Seconds in which such a world dreams so many frames, by a few of them."""
+    return 0.0 if _horizon(recording, frames) < 8 else _dreamt_s(world, recording)[0] * frames
+
+
+def _dreamt_s(world: LearnedWorld, recording: Recording) -> tuple[float, Dreamt]:
+    """Seconds of a dreamt frame, and some of them."""
+    trial = Rollout(0, 4)
+    dream(world, recording, trial, 0)  # the first compiles
+    began = time.monotonic()
+    seen = dream(world, recording, trial, 0)
+    return (time.monotonic() - began) / (trial.horizon * trial.batch), seen
 
 
 def forget(out: Path) -> None:

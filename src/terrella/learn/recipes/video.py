@@ -33,7 +33,7 @@ from ..objectives.objects import learn_objects
 from ..objectives.outcome import Happenings, Pieces, learn_outcome
 from ..objectives.scroll import learn_scroll
 from ..objectives.stress import FRAMES, USUAL, balanced
-from ..objectives.uncertainty import expected_s, forget
+from ..objectives.uncertainty import dreaming_s, expected_s, forget
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, choose_keyframes, open_views, there
 from ..run_folder import resume_file
 from ..strips import draw_strip
@@ -285,7 +285,7 @@ class _Learned:
             most_s = budget.most_s("dreams") + budget.most_s("uncertainty")
             after_s = min(most_s, 1.2 * expected_s(self.world(trainer), self.recording, config.uncertainty_frames))
         if isinstance(self.flow, CodecObjective):
-            after_s += expected_s(self.world(trainer), self.recording, FRAMES)
+            after_s += dreaming_s(self.world(trainer), self.recording, FRAMES)
         trainer.limit_s = max(1e-6, took_s + budget.left_s - after_s)
 
     def _finish(self, trainer: Trainer) -> None:
