@@ -1,16 +1,20 @@
 """A policy of a walking MuJoCo robot, in Drake: the same masses, joints, servos and touching geoms; other solver, other contacts.
 
     pip install drake
-    python benchmarks/walk_in_drake.py runs/go1 --episodes 8 --steps 500
+    python benchmarks/walk_in_drake.py runs/go1 runs/rough idle random --episodes 60 --steps 500
 
 The compiled model is rebuilt body by body, and steps by `--step-s` (at 5 ms Drake's servos lag behind what smaller steps agree
 on); starts, commands, observations and the end of an episode are those of our task.
-Prints each episode, then how many did not fall, and of those whose mean velocity was within 20% of the command.
+For each policy, in both engines from the same starts: how many did not fall, whose mean velocity was within 20% of the
+command, and both.
 """
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -42,8 +46,14 @@ from pydrake.systems.framework import DiagramBuilder
 
 import terrella
 from terrella.core import make_rng
+from terrella.core.policy import Policy
+from terrella.core.state import State
+from terrella.measure.judged import share
+from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import FREE, mujoco
+from terrella.sim.mujoco_world import MujocoWorld
 
+SETTLING = 50  # control steps whose velocity does not count: a second
 GEOM = mujoco.mjtGeom
 SHAPES = {
     GEOM.mjGEOM_SPHERE: lambda size: Sphere(size[0]),
@@ -155,45 +165,86 @@ def _rough(friction: float) -> ProximityProperties:
     return found
 
 
+@dataclass(frozen=True)
+class Walk:
+    """What became of an episode: whether it did not fall, and whether its mean velocity after the first second, as far as it
+    came, was within 20% of the command."""
+
+    stood: bool
+    followed: bool
+
+
 @torch.no_grad()
-def episode(walker: Walker, world, policy, state, steps: int) -> tuple[bool, bool]:
-    """Whether it did not fall, and whether its velocity after a second was within 20% of the command."""
-    rng, task, body, seen = make_rng(0), world.task, world.body, []
-    memory, physics = policy.begin(1, rng), state["physics"].clone()
-    walker.begin(physics[0, body.qpos].numpy(), physics[0, body.qvel].numpy())
-    for step in range(steps):
-        action, memory = policy.act({"observation": task.see(body, state, "observation")}, memory, rng)
-        now_s = (step + 1) * world.spec.dt_s
-        qpos, qvel = walker.move(action.double().numpy()[0], now_s)
-        physics = physics.clone()
-        physics[0, 0] = now_s
-        physics[0, body.qpos], physics[0, body.qvel] = torch.from_numpy(qpos), torch.from_numpy(qvel)
-        after = state.replace(physics=physics, ctrl=action.double())
-        _, fallen, _ = task.judge(body, dict(state.items()), dict(after.items()))
-        state = after
-        seen.append(task.see(body, state, "velocity")[0, :2])
-        if bool(fallen):
-            return False, False
-    found, wanted = torch.stack(seen[50:]).mean(0), state["command"][0, :2]
-    return True, bool((found - wanted).norm() < 0.2 * wanted.norm())
+def in_drake(walker: Walker, world: MujocoWorld, policy: Policy, starts: State, steps: int) -> Iterator[Walk]:
+    task, body = world.task, world.body
+    for at in range(len(starts["physics"])):
+        state, rng, seen, fell = starts.at(torch.tensor([at])), make_rng(at), [], False
+        memory, physics = policy.begin(1, rng), state["physics"]
+        walker.begin(physics[0, body.qpos].numpy(), physics[0, body.qvel].numpy())
+        for step in range(steps):
+            action, memory = policy.act({"observation": task.see(body, state, "observation")}, memory, rng)
+            now_s = (step + 1) * world.spec.dt_s
+            qpos, qvel = walker.move(action.double().numpy()[0], now_s)
+            physics = physics.clone()
+            physics[0, 0] = now_s
+            physics[0, body.qpos], physics[0, body.qvel] = torch.from_numpy(qpos), torch.from_numpy(qvel)
+            after = state.replace(physics=physics, ctrl=action.double())
+            fell = bool(task.judge(body, dict(state.items()), dict(after.items()))[1])
+            state = after
+            if fell:
+                break
+            seen.append(task.see(body, state, "velocity")[0, :2])
+        yield walk(fell, seen, state["command"][0, :2])
+
+
+@torch.no_grad()
+def in_mujoco(world: MujocoWorld, policy: Policy, starts: State, steps: int) -> Iterator[Walk]:
+    state, rng, seen, alive = starts, make_rng(0), [], []
+    memory = policy.begin(len(starts["physics"]), rng)
+    for _ in range(steps):
+        action, memory = policy.act(world.render(state, ("observation",)), memory, rng)
+        state = world.imagine(state, action, rng)
+        seen.append(world.render(state, ("velocity",))["velocity"][:, :2])
+        alive.append(~state["done"])
+    for at in range(len(starts["physics"])):
+        lived = sum(int(one[at]) for one in alive)
+        yield walk(lived < steps, [one[at] for one in seen[:lived]], state["command"][at, :2])
+
+
+def walk(fell: bool, seen: list[torch.Tensor], wanted: torch.Tensor) -> Walk:
+    """seen: velocities [2] of each step before a fall."""
+    if len(seen) <= SETTLING:
+        return Walk(not fell, False)
+    missed = torch.stack(seen[SETTLING:]).mean(0) - wanted
+    return Walk(not fell, bool(missed.norm() < 0.2 * wanted.norm()))
+
+
+def told(walks: list[Walk]) -> str:
+    counts = {
+        "no fall": sum(one.stood for one in walks),
+        "within 20%": sum(one.followed for one in walks),
+        "both": sum(one.stood and one.followed for one in walks),
+    }
+    shares = (f"{what} {count}, {share(clopper_pearson(count, len(walks)))}" for what, count in counts.items())
+    return f"{'; '.join(shares)} of {len(walks)}"
 
 
 def main(
-    run: tyro.conf.Positional[str],
+    policies: tyro.conf.Positional[list[str]],
+    /,
     robot: str = "go1",
     episodes: int = 100,
     steps: int = 1000,
     step_s: float = 0.001,
     seed: int = 12345,
 ) -> None:
-    world = terrella.load(f"mujoco:{robot}", cameras=())
-    policy, walker = terrella.load_policy(run, world.spec), Walker(world.file, step_s)
-    starts, found = world.start(episodes, make_rng(seed)), []
-    for at in range(episodes):
-        found.append(episode(walker, world, policy, starts.at(torch.tensor([at])), steps))
-        print(at, "stood" if found[-1][0] else "fell", "followed" if found[-1][1] else "", flush=True)
-    for what, count in (("did not fall", sum(one for one, _ in found)), ("followed", sum(one for _, one in found))):
-        print(f"{what}: {count} of {episodes}")
+    torch.set_num_threads(1)
+    world = MujocoWorld(robot, cameras=())
+    walker, starts = Walker(world.file, step_s), world.start(episodes, make_rng(seed))
+    for name in policies:
+        policy = terrella.load_policy(name, world.spec)
+        print(f"{name} in MuJoCo: {told(list(in_mujoco(world, policy, starts, steps)))}", flush=True)
+        print(f"{name} in Drake: {told(list(in_drake(walker, world, policy, starts, steps)))}", flush=True)
 
 
 if __name__ == "__main__":
