@@ -3,8 +3,9 @@
     python benchmarks/robots.py --robot ant      # go1 where the files of mjlab are installed (docs/robots.md)
 
 `world`: imagine and what a learner is shown (observation, reward, done), fresh random actions at each step. `bare`: the same
-states and controls through mujoco.rollout alone. `randomised`: worlds with masses, friction and gains of their own. `async`:
-Gymnasium's AsyncVectorEnv of Ant-v5 (its own frame skip), against our ant at the same control step.
+states and controls through mujoco.rollout alone, `mjbatch` through that (where it is installed; it pins its own MuJoCo).
+`randomised`: worlds with masses, friction and gains of their own. `async`: Gymnasium's AsyncVectorEnv of Ant-v5 (its own
+frame skip), against our ant at the same control step.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 
 import gymnasium
 import numpy as np
@@ -46,6 +48,8 @@ def main(
             "world": stepped(plain, batch, steps),
             "randomised": stepped(rough, batch, steps),
         }
+        if find_spec("mjbatch"):
+            ways["mjbatch"] = by_mjbatch(plain, batch, steps, threads)
         seconds = in_turns(ways, turns)
         rates = {name: batch * steps * per / statistics.median(times) for name, times in seconds.items()}
         told = {f"{name} physics steps/s": round(rate) for name, rate in rates.items()}
@@ -53,6 +57,8 @@ def main(
             "share of bare": ratio(seconds, "bare", "world"),
             "share of bare, randomised": ratio(seconds, "bare", "randomised"),
         }
+        if "mjbatch" in ways:
+            told["share of bare, mjbatch"] = ratio(seconds, "bare", "mjbatch")
         found[f"{threads} threads"] = told
     small = MujocoWorld(robot, size=(64, 64))
     state = small.start(frames, make_rng(0))
@@ -85,6 +91,27 @@ def bare(world: MujocoWorld, batch: int, steps: int, threads: int) -> Callable[[
         for _ in range(steps):
             actions = world.spec.sample_action(batch, rng).double().numpy()
             now = pool.rollout(model, datas, now, np.repeat(actions[:, None], per, 1))[0][:, -1]
+
+    return run
+
+
+def by_mjbatch(world: MujocoWorld, batch: int, steps: int, threads: int) -> Callable[[], object]:
+    """From the same states; sensors and states are read after each control step, as mujoco.rollout gives them."""
+    from mjbatch import Batch  # pyright: ignore[reportMissingImports]
+
+    model, rng = world.file, make_rng(1)
+    start, per = world.start(batch, make_rng(0))["physics"].numpy(), round(world.spec.dt_s / model.opt.timestep)
+    worlds = Batch(model, num_sims=batch, num_threads=threads)
+    fields = {name: worlds.bind(name) for name in ("state", "qpos", "qvel", "qacc_warmstart", "ctrl", "sensordata")}
+
+    def run() -> None:
+        fields["qpos"][:] = start[:, 1 : 1 + model.nq]
+        fields["qvel"][:] = start[:, 1 + model.nq : 1 + model.nq + model.nv]
+        fields["qacc_warmstart"][:] = 0.0
+        for _ in range(steps):
+            fields["ctrl"][:] = world.spec.sample_action(batch, rng).numpy()
+            worlds.step(nstep=per)
+            fields["state"].copy(), fields["sensordata"].copy()
 
     return run
 
