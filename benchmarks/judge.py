@@ -16,7 +16,6 @@ import argparse
 import contextlib
 import io
 import json
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from judge_harness import Acting, Held, Practising, Recorded, Task, evaluated
+from judge_harness import Acting, Held, Recorded, Task, evaluated
 from judge_tasks import TASKS
 from stable_worldmodel import PlanConfig
 from stable_worldmodel.policy import BasePolicy, RandomPolicy, WorldModelPolicy
@@ -33,38 +32,10 @@ from trained import trained, words
 
 from terrella.act.goal_network import GoalActor
 from terrella.act.planning import Cost, CostModel, Planner, Reaching, SearchConfig, distance_to
-from terrella.core import World, make_rng
-from terrella.data import Dataset
+from terrella.core import World
 from terrella.measure.statistics import wilson
 
 OFFSET, BUDGET, BLOCK, HORIZON = 25, 50, 5, 5
-
-
-def again(
-    task: Task,
-    asked: argparse.Namespace,
-    seed: int,
-    number: int,
-    world: World,
-    actor: GoalActor,
-    spent: dict[str, float],
-) -> tuple[World, GoalActor, dict[str, float]]:
-    """Another round: episodes that the policy plays towards goals of its own are recorded as well, and a policy learns of all."""
-    before = asked.out / (f"round-{number - 1}" if number > 1 else "") / f"recording-{seed}"
-    folder = asked.out / f"round-{number}"
-
-    def record(out: Path) -> None:
-        shutil.copytree(before, out)
-        recording, rng = Dataset(before), np.random.default_rng(seed)
-        drawn = rng.permutation(len(recording.episodes))[:300]
-        rows = np.concatenate([recording.episode(int(one), ("observation",))["observation"] for one in drawn])
-        state = world.observe({"observation": torch.from_numpy(rows.astype(np.float32))}, None, make_rng(0))
-        with Recorded(task, out) as writer:
-            policy = Practising(task, world, actor, world.render(state, ("latent",))["latent"], seed)
-            task.collect(writer, asked.episodes // 2, 1000 * seed + 100_000 * number, False, policy)
-
-    found = trained(folder, seed, record, words(asked.train), words(asked.reach))
-    return found[0], found[1], {name: spent.get(name, 0.0) + seconds for name, seconds in found[2].items()}
 
 
 def arms(task: Task, world: World, actor: GoalActor, seed: int) -> dict[str, Callable[[], BasePolicy]]:
@@ -136,12 +107,6 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=50)
     parser.add_argument("--seeds", type=int, default=1, help="each with its own recording, training, starts and draws")
     parser.add_argument(
-        "--rounds",
-        type=int,
-        default=0,
-        help="more, in which the policy's own episodes are learned of, half as many (numbers alone)",
-    )
-    parser.add_argument(
         "--arms", nargs="*", default=["random", "reaching", "icem", "icem anew", "icem+reaching", "cem 300x30"]
     )
     parser.add_argument(
@@ -161,10 +126,7 @@ def main() -> None:
             with Recorded(task, out) as writer:
                 task.collect(writer, asked.episodes, 1000 * seed, task.numbers is None)
 
-        now = trained(asked.out, seed, record, words(asked.train), words(asked.reach))
-        for number in range(1, asked.rounds + 1):
-            now = again(task, asked, seed, number, *now)
-        ready.append(now)
+        ready.append(trained(asked.out, seed, record, words(asked.train), words(asked.reach)))
     with Held(task) as held:
         task.collect(held, asked.held, 777_000)
     for seed, (_, _, spent) in enumerate(ready):

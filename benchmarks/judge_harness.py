@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from terrella.act.goal_network import GoalActor
-from terrella.core import World
 from terrella.core.spec import DONE, Spec
 from terrella.data import Layout, Recorder
 
@@ -70,12 +68,10 @@ class Task:
             self.environment, num_envs=count, image_shape=SIZE, max_episode_steps=LONGEST, add_pixels=pictures
         )
 
-    def collect(
-        self, writer: Any, episodes: int, seed: int, pictures: bool = True, policy: BasePolicy | None = None
-    ) -> None:
-        """Episodes of the recorder, or of another policy."""
+    def collect(self, writer: Any, episodes: int, seed: int, pictures: bool = True) -> None:
+        """Episodes of the recorder."""
         world = self.opened(AT_ONCE, pictures)
-        world.set_policy(policy or self.recorder(seed))
+        world.set_policy(self.recorder(seed))
         world.collect(writer=writer, episodes=episodes, seed=seed)
         world.close()
 
@@ -184,44 +180,6 @@ class Acting(BasePolicy):
         action, self._memory = self._policy.act(seen, self._memory, self._rng)
         self.ms.append(1e3 * (time.perf_counter() - began) / len(action))
         return action.detach().cpu().numpy().astype(np.float32)
-
-
-class Practising(BasePolicy):
-    """A goal-conditioned policy towards goals of its own, so that recordings tell what comes of its mistakes (Ghosh et al. 2019):
-    now this, now that recorded latent [R, D] that it thinks 5 to 40 steps away, sooner or later than usual, with lasting noise."""
-
-    def __init__(
-        self, task: Task, world: World, actor: GoalActor, latents: torch.Tensor, seed: int, noise: float = 0.1
-    ):
-        super().__init__()
-        self._task, self._world, self._network, self._latents = task, world, actor.network, latents
-        self._seed, self._noise, self._goal = seed, noise, None
-
-    @torch.no_grad()
-    def get_action(self, infos: dict, **kwargs: Any) -> np.ndarray:
-        count = len(infos["state"])
-        if self._goal is None:
-            self._rng = torch.Generator().manual_seed(self._seed)
-            self._goal, self._left = torch.zeros(count, self._latents.shape[1]), torch.zeros(count)
-            self._pace, self._spread, self._slip = torch.ones(count), torch.zeros(count, 1), 0.0
-        state = self._world.observe(self._task.shown(infos), None, self._rng)
-        latent = self._world.render(state, ("latent",))["latent"]
-        for entry in torch.nonzero(self._left <= 0)[:, 0].tolist():
-            self._choose(entry, latent[entry])
-        self._left -= 1
-        steps = self._network.steps(latent, self._goal) * self._pace
-        action = torch.tanh(self._network(latent, self._goal, steps).likeliest())
-        self._slip = 0.5 * self._slip + 0.75**0.5 * torch.randn(action.shape, generator=self._rng)
-        return (action + self._spread * self._slip).clamp(-1, 1).numpy().astype(np.float32)
-
-    def _choose(self, entry: int, latent: torch.Tensor) -> None:
-        goals = self._latents[torch.randint(len(self._latents), (256,), generator=self._rng)]
-        steps = self._network.steps(latent.expand_as(goals), goals)
-        off = torch.maximum(5 - steps, steps - 40).clamp_min(0)
-        chosen = int(off.argmin())  # the first of those that are neither near nor far, else the one that is least so
-        low, high, noise = torch.rand(3, generator=self._rng).tolist()
-        self._goal[entry], self._left[entry] = goals[chosen], float(steps[chosen]) * (0.7 + 1.3 * low)
-        self._pace[entry], self._spread[entry] = 0.7 * 2**high, self._noise * 2 * noise**2
 
 
 CALLABLES = [

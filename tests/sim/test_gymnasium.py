@@ -318,6 +318,16 @@ def test_what_it_says_of_itself():
     assert GymnasiumWorld("Pendulum-v1", rgb=False, dt_s=0.1).spec.dt_s == 0.1
 
 
+@pytest.mark.parametrize("extra", ["box2d", "mujoco"])
+def test_packages_that_an_environment_needs_are_named_as_ours(monkeypatch, extra):
+    def missing(*words, **options):
+        raise gymnasium.error.DependencyNotInstalled(f'X is not installed, run `pip install "gymnasium[{extra}]"`')
+
+    monkeypatch.setattr(gymnasium, "make", missing)
+    with pytest.raises(TerrellaError, match=rf"pip install 'terrella\[{extra}\]'"):
+        GymnasiumWorld("CarRacing-v3")
+
+
 def test_bad_requests_are_answered_in_one_sentence():
     for name in ("NoSuchWorld-v0", "no such name", "CartPole-v99"):
         with pytest.raises(TerrellaError, match="Gymnasium cannot make"):

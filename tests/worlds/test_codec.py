@@ -144,12 +144,12 @@ def test_colours_that_are_in_the_picture_and_near_are_the_likelier_ones():
         torch.nn.init.zeros_(weight)
     frame = made.palette[3][:, None, None].expand(3, *SIZE).clone()
     frame[:, :, :12] = made.palette[1][:, None, None]
-    seen = shown(made)._replace(scrolled=frame[None])
-    nothing, shares = torch.zeros(1, HIDDEN, *SIZE), made.common_colours(seen)
-    best = made.colours(seen, nothing, shares).argmax(1).unflatten(0, SIZE)
+    seen = shown(made)._replace(scrolled=frame[None], common=made.common_colours(frame[None]))
+    nothing = torch.zeros(1, HIDDEN, *SIZE)
+    best = made.colours(seen, nothing).argmax(1).unflatten(0, SIZE)
     assert (best[:, :8] == 1).all() and (best[:, 16:] == 3).all()
     made.common.data.zero_()
-    assert made.colours(seen, nothing, shares).std(1).max() == 0
+    assert made.colours(seen, nothing).std(1).max() == 0
 
 
 def test_pixels_in_doubt_go_one_way_together():

@@ -76,7 +76,8 @@ def learn(
 
 
 def _go(plan: Plan, name: str, controls: Controls, environment: Environment) -> None:
-    """All stages that are not over."""
+    """All stages that are not over. The environment is opened before anything is promised."""
+    plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
     took = ", ".join(f"{words} {_minutes(plan.spent[stage])}" for stage, words in _DID.items() if plan.spent[stage])
     if took:
         say(f"Goes on in {plan.folder}: {took} so far.")
@@ -105,7 +106,7 @@ _DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for
 
 
 def _record(plan: Plan, name: str, controls: Controls, environment: Environment, report: Report) -> dict[str, object]:
-    opened = plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
+    opened = plan.facts["opened"]
     world = controls.of(_open(opened, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
     if opened != name:
         held = opened.rpartition("@")[2]

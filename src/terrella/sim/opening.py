@@ -19,6 +19,8 @@ from . import islet  # noqa: F401  it registers Islet-v0
 
 _DISPLAY = re.compile(r"display|video device|gl context|\b(glfw|opengl|egl|osmesa|x11|glx|xlib)\b")
 
+_EXTRA = re.compile(r"gymnasium\[(box2d|mujoco)\]")  # what Gymnasium asks for, and we under the same name
+
 
 def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> tuple[gymnasium.Env, str]:
     """(environment, name) of an id, "module:Id", or of a function. One from an id is made
@@ -45,6 +47,10 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
             )
             raise TerrellaError(f"Gymnasium cannot make '{env}': {said}{hint}") from error
         except (gymnasium.error.Error, TypeError) as error:
+            if extra := _EXTRA.search(str(error)):
+                raise TerrellaError(
+                    f"'{env}' needs packages that are not installed: pip install 'terrella[{extra[1]}]'."
+                ) from error
             raise TerrellaError(f"Gymnasium cannot make '{env}': {error}") from error
 
 

@@ -45,13 +45,15 @@ class CodecConfig:
 class Seen(NamedTuple):
     """What a frame is made from: `sources` uint8 [B, slots + 1, 3, H, W], the last frames, the newest first, and what the mosaic
     knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by `move` [B]; `went`
-    [B, moves + 1, H, W], how well each of the moves, at what it leads to this pixel, explained the last step."""
+    [B, moves + 1, H, W], how well each of the moves, at what it leads to this pixel, explained the last step; `common` [B, h, w,
+    colours, 2], the share of pixels of each colour of the palette, in all of `scrolled` and in and around each square."""
 
     sources: torch.Tensor
     scrolled: torch.Tensor
     known: torch.Tensor
     went: torch.Tensor
     move: torch.Tensor
+    common: torch.Tensor
 
 
 class Scroll(nn.Module):
@@ -150,7 +152,7 @@ class Codec(nn.Module):
         sources = torch.cat([frames, torch.where(known, memory[:, :3], scrolled)[:, None]], 1)
         went, _ = explained(frames[:, 1:2], frames[:, 0], self.moves)
         last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
-        return Seen(sources, scrolled, known, self._carried(preferred(went, last)), move)
+        return Seen(sources, scrolled, known, self._carried(preferred(went, last)), move, self.common_colours(scrolled))
 
     def choices(self, seen: Seen, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted"; and the pixels' features [B, HIDDEN,
@@ -180,13 +182,10 @@ class Codec(nn.Module):
         moved = torch.where(beyond, UNKNOWN, moved)
         return torch.cat([moved, others, memory, painted], 1), features
 
-    def colours(
-        self, seen: Seen, features: torch.Tensor, shares: torch.Tensor, where: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours].
-        shares: of the `common_colours`."""
+    def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
+        """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1)
-        often = (shares + 1e-3).log() @ self.common
+        often = (seen.common + 1e-3).log() @ self.common
         if where is None:
             known = torch.cat([features, near.float() / 127.5 - 1], 1).permute(0, 2, 3, 1)
             often = often.repeat_interleave(AROUND, 1).repeat_interleave(AROUND, 2)
@@ -195,28 +194,24 @@ class Codec(nn.Module):
         known = features.permute(0, 2, 3, 1)[batch, v, u], near.permute(0, 2, 3, 1)[batch, v, u].float() / 127.5 - 1
         return self.colour(torch.cat(known, 1)) + often[batch, v // AROUND, u // AROUND]
 
-    def common_colours(self, seen: Seen) -> torch.Tensor:
-        """The share of pixels to which each colour of the palette is the nearest, in the whole picture and in and around each
-        square: [B, H / AROUND, W / AROUND, colours, 2]."""
-        every = seen.scrolled[..., ::2, ::2].permute(0, 2, 3, 1)
+    def common_colours(self, frame: torch.Tensor) -> torch.Tensor:
+        """The share of pixels of uint8 [B, 3, H, W] to which each colour of the palette is the nearest, in the whole picture and in
+        and around each square: [B, H / AROUND, W / AROUND, colours, 2]."""
+        every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
         nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
         each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])
         around = F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1)
         return torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
 
-    def drawn(
-        self, seen: Seen, choices: torch.Tensor, features: torch.Tensor, shares: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from.
-        shares: of the `common_colours`, where they are known already."""
-        shares = self.common_colours(seen) if shares is None else shares
+    def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
         share = choices.softmax(1)
         if share.device.type == "cpu":  # few pixels may be painted, in most frames
             paints = share[:, -1] >= FEW
             painted = torch.zeros(*paints.shape, 3, dtype=torch.uint8)
-            painted[paints] = self.palette[self.colours(seen, features, shares, paints).argmax(1)]
+            painted[paints] = self.palette[self.colours(seen, features, paints).argmax(1)]
         else:
-            painted = self.palette[self.colours(seen, features, shares).argmax(1)].view(*share[:, -1].shape, 3)
+            painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
         return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
     def _beyond(self, device: torch.device) -> torch.Tensor:

@@ -141,8 +141,7 @@ class CodecObjective:
         some = changes | (stays > OFF)
         some[:, ::7, ::7] = True
         nearest = torch.cdist(truth.permute(0, 2, 3, 1)[some].float(), codec.palette.float()).argmin(1)
-        common = codec.common_colours(seen)
-        colour = F.cross_entropy(codec.colours(seen, features, common, some), nearest, reduction="none")
+        colour = F.cross_entropy(codec.colours(seen, features, some), nearest, reduction="none")
         painted = torch.full_like(stays, -8.0).masked_scatter(some, -colour)
         each = torch.cat([share.clamp_min(1e-6).log(), painted[:, None]], 1) + choices.log_softmax(1)
         weight = torch.where(changes, self.stress, 1.0)
@@ -153,5 +152,5 @@ class CodecObjective:
         else:
             with torch.no_grad():
                 few = Seen(*(part[:dreamt] for part in seen))
-                drawn = codec.drawn(few, choices[:dreamt], features[:dreamt], common[:dreamt])
+                drawn = codec.drawn(few, choices[:dreamt], features[:dreamt])
         return Loss("generator", pixels + 0.1 * colour.mean(), {"pixels": pixels, "colour": colour.mean()}), drawn

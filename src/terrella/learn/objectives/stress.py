@@ -26,8 +26,8 @@ def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: fl
     that power of `stress`."""
     codec.stress.fill_(stress**USUAL)
     reach, rng = ahead(recording), np.random.default_rng([seed, 11])
-    some = (reach > SHOWN).sum() / 2  # of the rows from which a dream may begin there should be many
-    steps = next((steps for steps in STEPS if (reach >= SHOWN + steps).sum() >= max(some, CLIPS)), 0)
+    many = max((reach > SHOWN).sum() / 2, CLIPS)  # of the rows from which a dream may begin
+    steps = next((steps for steps in STEPS if (reach >= SHOWN + steps).sum() >= many), 0)
     if not steps or stress < HARDLY:
         return USUAL
     begins = rng.choice(np.flatnonzero(reach >= SHOWN + steps), CLIPS, replace=False)
@@ -45,8 +45,8 @@ def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: fl
             dreamt = world.imagine(dreamt, recording.played(world.spec, rows - 1), chance)
             drawn = world.render(dreamt, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
             errors.append((drawn - recording.rgb(rows).float()).square().mean())
-        some = [2**doubled - 1 for doubled in range(6) if 2**doubled <= steps]
-        found.append(float(torch.stack(errors)[some].clamp_min(1e-3).log().mean()))
+        told = [2**doubled - 1 for doubled in range(6) if 2**doubled <= steps]
+        found.append(float(torch.stack(errors)[told].clamp_min(1e-3).log().mean()))
     best = next(power for power, error in zip(POWERS, found) if error <= min(found) + ALIKE)
     codec.stress.fill_(stress**best)
     return best
