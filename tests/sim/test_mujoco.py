@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -287,6 +289,28 @@ def test_many_pictures_drawn_at_once_are_those_drawn_one_by_one():
     assert (seen[[0, 1, 63, 64, 69]].float() - alone.float()).abs().mean() < 0.5
     assert seen.float().std(0).mean() > 1  # they differ
     world.close()
+
+
+DRAWN_ASIDE = """
+import threading
+from terrella.core import make_rng
+from terrella.library import load
+world, drawn = load("mujoco:ant", size=(24, 32)), threading.Event()
+def draw():
+    try:
+        world.render(world.start(1, make_rng(0)), ("rgb",))
+    finally:
+        drawn.set()
+    threading.Event().wait()
+threading.Thread(target=draw, daemon=True).start()
+drawn.wait()
+"""
+
+
+def test_a_process_that_drew_in_another_thread_ends_in_silence():
+    drawn_or_skipped(load("mujoco:ant", size=(24, 32))).close()
+    ended = subprocess.run([sys.executable, "-c", DRAWN_ASIDE], capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_a_small_picture_of_a_fine_mesh_looks_as_before(tmp_path):

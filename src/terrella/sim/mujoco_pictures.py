@@ -12,6 +12,7 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -131,4 +132,5 @@ def _blind() -> bool:
 def _closed(pictures: weakref.ref[Pictures]) -> None:
     held = pictures()
     if held is not None:
-        held.close()
+        with suppress(Exception):  # a thread that drew may still hold it: then the end of the process frees it
+            held.close()
