@@ -79,7 +79,7 @@ def test_score_says_first_whether_the_world_is_better_than_a_copy(recording, tmp
     assert main(arguments(recording, tmp_path / "out")) == 0
     shown = capsys.readouterr().out
     assert shown.startswith(
-        "still is not clearly better than copying the last frame at any step up to 4; it stays sharp."
+        "still is not clearly better than copying the last frame at any step up to 4; it stays sharp, moves too little."
     )
     assert "scorecard.html" in shown and "copy last" in shown
     assert "not applicable: pose needs pose" in shown and not (tmp_path / "out" / "parts").exists()

@@ -71,10 +71,18 @@ def test_every_figure_of_likeness_stands_beside_what_knows_nothing(card):
     assert all("copy last" in r.baselines for r in card.rows if r.probe == "pixels" and r.what in ("SSIM", "sharpness"))
 
 
+def test_a_world_that_stands_still_is_said_to_move_too_little(card, clips):
+    moving = [row(card, "dynamic degree", "perfect", horizon).figure.value for horizon in (1, 8, 32)]
+    assert moving == pytest.approx([1, 1, 1], abs=0.02)
+    static = card_of({"still": Panorama("static")}, {"recorded": clips})
+    assert row(static, "dynamic degree", "still", 32).figure.value == 0
+    assert "moves too little" in verdict(static)[0]
+
+
 def test_the_verdict_comes_first(card, clips):
     assert next(iter(as_dict(card))) == "verdict"
     better = "better than copying the last frame at every step up to 32"
-    assert verdict(card)[0] == f"panorama is {better}; it obeys, stays sharp."
+    assert verdict(card)[0] == f"panorama is {better}; it obeys, stays sharp, moves as much as the recording."
     alike = "not clearly better than copying the last frame at any step up to 32"
     still = verdict(card_of({"still": Panorama("static")}, {"recorded": clips}))
     assert still[0].startswith(f"panorama static is {alike}; it does not clearly obey")

@@ -52,9 +52,9 @@ class Plan:
 
     @property
     def share_s(self) -> dict[str, float]:
-        """Seconds of each stage: an eighth is recorded, a ninth scored (between one and ten minutes, at most a fifth); training has
-        what these leave."""
-        scoring = min(max(60.0, self.seconds / 9), 600.0, self.seconds / 5)
+        """Seconds of each stage: an eighth is recorded, a fifteenth scored (between one and ten minutes, at most a fifth);
+        training has what these leave."""
+        scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 5)
         recording = self.spent[RECORDING] if RECORDING in self.facts else self.seconds / 8
         training = self.seconds - recording - scoring - STARTING_S
         return {RECORDING: recording, TRAINING: max(training, 1.0), SCORING: scoring}

@@ -1,4 +1,4 @@
-"""Pixels, of every camera: PSNR, SSIM, sharpness, and the Frechet distance of looks."""
+"""Pixels, of every camera: PSNR, SSIM, sharpness, dynamic degree, and the Frechet distance of looks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_e
 from .frechet import frechet_interval
 from .likeness import Series, report
 from .roll import Results, Tick, Watch, rows_at
-from .scorecard import COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
+from .scorecard import COPY_LAST, DYNAMIC, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
 from .statistics import mean_interval, ratio_band, ratio_interval
 from .work import Unit
 
@@ -24,8 +24,9 @@ LEAD = (
     "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
     "are 95% intervals. A mean of PSNR flatters copying where many frames do not change at all, for an identical frame counts "
     "as 60 dB: pooled PSNR is that of all clips' errors together, of all frames, of those that changed, and of the pixels that "
-    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. The Frechet "
-    "distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
+    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. Dynamic degree is "
+    "how many pixels are no longer those of the last frame shown, predicted over recorded: below 1 things stop or fade, which "
+    "PSNR forgives. The Frechet distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
 )
 _LEAST_SSIM = 11  # pixels: the size of its window
 
@@ -60,12 +61,12 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
 
 
 def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip], row: int, step: int) -> Results:
-    mine, truth = seen[name], rows_at(clips, name, row)
+    mine, truth, last = seen[name], rows_at(clips, name, row), rows_at(clips, name, clips[0].context - 1)
     kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
     if horizons:
-        changed = changes(rows_at(clips, name, clips[0].context - 1), truth)
-        kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changed)
+        kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
     if step in horizons:
+        kept[f"{name}/moved"] = changes(last, mine).sum((-2, -1)).double()
         if min(mine.shape[1:3]) >= _LEAST_SSIM:
             kept[f"{name}/ssim"] = ssim(mine, truth)
         if min(mine.shape[1:3]) >= MIN_SIDE:
@@ -156,6 +157,11 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
         baselines = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
         rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
+        if f"{name}/moved" in dreamt:
+            moved, changed = dreamt[f"{name}/moved"][:, number], truth[f"{name}/changed"][:, step - 1]
+            baselines = {COPY_LAST: ratio_interval(torch.zeros_like(changed), changed, exam.rng())}
+            figure = ratio_interval(moved, changed, exam.rng())
+            rows.append(Row(probe, name, DYNAMIC, "\u00d7", place, arm, motion, step, figure, 0, baselines))
         if f"{name}/features" in dreamt:
             looks = truth[f"{name}/features"][:, number]
             others = {COPY_LAST: truth[f"{name}/last"][:, 0], "blurred by 1 pixel": truth[f"{name}/blurred"][:, number]}
