@@ -68,6 +68,22 @@ def test_of_powers_that_are_alike_the_smallest_is_taken():
     assert balanced(world, codec, recording(3), 9.0, 0) == POWERS[0]
 
 
+class Lively(World):
+    """With the smallest stress its frames are `db` further off than with all others."""
+
+    def render(self, state, channels):
+        smallest = self.codec.stress < 9.0 ** (POWERS[0] + 0.1)
+        seen = torch.from_numpy(state % ROWS).float() + 10 * 10 ** ((self.right or 0) * smallest / 20)
+        return {"rgb": seen[:, None, None, None].expand(-1, *SIZE, 3)}
+
+
+@pytest.mark.parametrize(("db", "power"), [(0.3, POWERS[0]), (0.8, POWERS[1])])
+def test_half_a_decibel_is_not_worth_a_world_that_stands_still(db, power):
+    codec: Any = SimpleNamespace(stress=torch.tensor(3.0))
+    world: Any = Lively(codec, db)
+    assert balanced(world, codec, recording(3), 9.0, 0) == power
+
+
 @pytest.mark.parametrize(("rows", "weight"), [(6, 9.0), (ROWS, 1.2)])
 def test_where_nothing_can_be_told_it_is_the_usual_one(rows, weight):
     world, codec = made(1.0)

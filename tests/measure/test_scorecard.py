@@ -72,10 +72,10 @@ def test_every_figure_of_likeness_stands_beside_what_knows_nothing(card):
 
 
 def test_a_world_that_stands_still_is_said_to_move_too_little(card, clips):
-    moving = [row(card, "dynamic degree", "perfect", horizon).figure.value for horizon in (1, 8, 32)]
+    moving = [row(card, "change per step", "perfect", horizon).figure.value for horizon in (1, 8, 32)]
     assert moving == pytest.approx([1, 1, 1], abs=0.02)
     static = card_of({"still": Panorama("static")}, {"recorded": clips})
-    assert row(static, "dynamic degree", "still", 32).figure.value == 0
+    assert row(static, "change per step", "still", 32).figure.value == 0
     assert "moves too little" in verdict(static)[0]
 
 

@@ -76,13 +76,12 @@ def learn(
 
 
 def _go(plan: Plan, name: str, controls: Controls, environment: Environment) -> None:
-    """All stages that are not over. The environment is opened before anything is promised."""
-    plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
+    """All stages that are not over."""
     took = ", ".join(f"{words} {_minutes(plan.spent[stage])}" for stage, words in _DID.items() if plan.spent[stage])
     if took:
         say(f"Goes on in {plan.folder}: {took} so far.")
-    parts = [f"{words} {_minutes(plan.left_s(stage))}" for stage, words in _DOES.items() if stage not in plan.facts]
-    say(f"Of {_minutes(plan.seconds)} it {', '.join(parts)}; all of it lies in {plan.folder}.")
+    if RECORDING in plan.facts:
+        _promise(plan)
     for stage, work in ((RECORDING, _record), (TRAINING, _train), (SCORING, _score)):
         if stage in plan.facts:
             continue
@@ -101,13 +100,19 @@ def _go(plan: Plan, name: str, controls: Controls, environment: Environment) -> 
             say(f"{_DID[stage].capitalize()} {_minutes(plan.spent[stage])}: {_summary(facts)}")
 
 
+def _promise(plan: Plan) -> None:
+    parts = [f"{words} {_minutes(plan.left_s(stage))}" for stage, words in _DOES.items() if stage not in plan.facts]
+    say(f"Of {_minutes(plan.seconds)} it {', '.join(parts)}; all of it lies in {plan.folder}.")
+
+
 _DOES = {RECORDING: "records for up to", TRAINING: "trains for", SCORING: "scores for"}
 _DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for"}
 
 
 def _record(plan: Plan, name: str, controls: Controls, environment: Environment, report: Report) -> dict[str, object]:
-    opened = plan.facts["opened"]
+    opened = plan.facts.setdefault("opened", name if plan.recorded else _slowed(name, environment))
     world = controls.of(_open(opened, environment, SMALL if plan.seconds < 60 * SOON_MIN else MOST))
+    _promise(plan)  # nothing is promised of what does not open
     if opened != name:
         held = opened.rpartition("@")[2]
         say(

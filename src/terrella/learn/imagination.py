@@ -206,7 +206,7 @@ def check_practised(spec: Spec) -> None:
     if "reward" not in spec.channels:
         raise ChannelError(
             f"{spec.name} has no channel 'reward', and practice is for a reward; record one and train the world on it, "
-            "or give a simulated robot a task that has rewards (docs/robots.md: an MJCF file can tell one itself)."
+            "or give a simulated robot a task that has rewards (docs/robots.md: an MJCF file can name its task)."
         )
     if not spec.forkable:
         raise ObservationError(

@@ -22,6 +22,7 @@ from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report, words_of
 from .work import Unit
 
 CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: of figures, of drift, those that may run into an end
+KEPT = 2  # the form in which results are kept; those of another form are measured again
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class Exam:
             for place, some in places.items()
         }
         arms = {arm: repr(world.spec) for arm, world in {**self.arms, **self.closing}.items()}
-        return json.dumps([identity, self.seed, asdict(self.config), arms, drawn])
+        return json.dumps([KEPT, identity, self.seed, asdict(self.config), arms, drawn])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Pixels, of every camera: PSNR, SSIM, sharpness, dynamic degree, and the Frechet distance of looks."""
+"""Pixels, of every camera: PSNR, SSIM, sharpness, change per step, and the Frechet distance of looks."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_e
 from .frechet import frechet_interval
 from .likeness import Series, report
 from .roll import Results, Tick, Watch, rows_at
-from .scorecard import COPY_LAST, DYNAMIC, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
-from .statistics import mean_interval, ratio_band, ratio_interval
+from .scorecard import CHANGE, COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
+from .statistics import Figure, mean_interval, ratio_band, ratio_interval
 from .work import Unit
 
 LEAD = (
     "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
     "are 95% intervals. A mean of PSNR flatters copying where many frames do not change at all, for an identical frame counts "
     "as 60 dB: pooled PSNR is that of all clips' errors together, of all frames, of those that changed, and of the pixels that "
-    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. Dynamic degree is "
-    "how many pixels are no longer those of the last frame shown, predicted over recorded: below 1 things stop or fade, which "
-    "PSNR forgives. The Frechet distance asks only whether the pictures could be the game's; 0 is alike, and blur does not help."
+    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. Change per step is "
+    "how many pixels change from step to step, in the eight steps before, predicted over recorded: below 1 things stop or are "
+    "gone, which PSNR forgives. The Frechet distance asks only whether the pictures could be the game's; 0 is alike, and blur "
+    "does not help."
 )
 _LEAST_SSIM = 11  # pixels: the size of its window
+_RECENT = 8  # steps over which what changes is counted
 
 
 def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
@@ -57,22 +59,32 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
     if of == ENDINGS:
         return []
     horizons = exam.config.horizons if of == CLIPS else ()
-    return [Watch((name,), partial(_see, exam, name, horizons, first)) for name in exam.shared(world, "rgb")]
+    before: dict[str, torch.Tensor] = {}
+    return [Watch((name,), partial(_see, exam, name, horizons, first, before)) for name in exam.shared(world, "rgb")]
 
 
-def _see(exam: Exam, name: str, horizons, first: int, seen, clips: Sequence[Clip], row: int, step: int) -> Results:
-    mine, truth, last = seen[name], rows_at(clips, name, row), rows_at(clips, name, clips[0].context - 1)
+def _see(
+    exam: Exam, name: str, horizons, first: int, before: dict, seen, clips: Sequence[Clip], row: int, step: int
+) -> Results:
+    """`before`: the frame that was seen at the step before, by its name."""
+    mine, truth = seen[name], rows_at(clips, name, row)
     kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
     if horizons:
+        last = rows_at(clips, name, clips[0].context - 1)
         kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
+        kept[f"{name}/change"] = _count(changes(last if step == 1 else before[name], mine))
+        before[name] = mine
     if step in horizons:
-        kept[f"{name}/moved"] = changes(last, mine).sum((-2, -1)).double()
         if min(mine.shape[1:3]) >= _LEAST_SSIM:
             kept[f"{name}/ssim"] = ssim(mine, truth)
         if min(mine.shape[1:3]) >= MIN_SIDE:
             kept[f"{name}/features"] = frame_features(mine)
         kept[f"{name}/frames"] = mine[: max(0, exam.config.strips - first)]
     return kept
+
+
+def _count(changed: torch.Tensor) -> torch.Tensor:
+    return changed.sum((-2, -1)).double()
 
 
 def _units(exam: Exam) -> list[Unit]:
@@ -93,7 +105,7 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
     kept: dict[str, list[torch.Tensor]] = {}
     context = clips[0].context
     for name in names:
-        last = rows_at(clips, name, context - 1)
+        last = before = rows_at(clips, name, context - 1)
         looks = min(last.shape[1:3]) >= MIN_SIDE
         alone = {f"{name}/first": gradient_energy(last)} | ({f"{name}/last": frame_features(last)} if looks else {})
         for step in range(1, steps + 1):
@@ -101,7 +113,8 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
             here = {f"{name}/copied": psnr(last, frames), f"{name}/energy": gradient_energy(frames)}
             if horizons:
                 changed = changes(last, frames)
-                here[f"{name}/changed"] = changed.sum((-2, -1)).double()
+                here[f"{name}/changed"], here[f"{name}/change"] = _count(changed), _count(changes(before, frames))
+                before = frames
                 here[f"{name}/copied_pooled"] = pooled(squared_error(last, frames), changed)
             if step in horizons:
                 if min(last.shape[1:3]) >= _LEAST_SSIM:
@@ -157,11 +170,13 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
         baselines = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
         rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
-        if f"{name}/moved" in dreamt:
-            moved, changed = dreamt[f"{name}/moved"][:, number], truth[f"{name}/changed"][:, step - 1]
-            baselines = {COPY_LAST: ratio_interval(torch.zeros_like(changed), changed, exam.rng())}
-            figure = ratio_interval(moved, changed, exam.rng())
-            rows.append(Row(probe, name, DYNAMIC, "\u00d7", place, arm, motion, step, figure, 0, baselines))
+        mine_change, change = (
+            some[f"{name}/change"][:, max(0, step - _RECENT) : step].sum(1) for some in (dreamt, truth)
+        )
+        if change.any():
+            figure = ratio_interval(mine_change, change, exam.rng())
+            baselines = {COPY_LAST: Figure(0.0, 0.0, 0.0, len(change))}
+            rows.append(Row(probe, name, CHANGE, "\u00d7", place, arm, motion, step, figure, 0, baselines))
         if f"{name}/features" in dreamt:
             looks = truth[f"{name}/features"][:, number]
             others = {COPY_LAST: truth[f"{name}/last"][:, 0], "blurred by 1 pixel": truth[f"{name}/blurred"][:, number]}

@@ -13,7 +13,7 @@ PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alon
 OTHERS, IDLE = "other actions", "no action"  # actions of another clip; the action at rest, held
 COPY_LAST = "copy last"
 POOLED = "pooled PSNR"  # that of all errors of all clips together
-DYNAMIC = "dynamic degree"  # how many pixels are no longer those of the last frame shown, over the recording (VBench)
+CHANGE = "change per step"  # how many pixels change from step to step, predicted over recorded
 GAIN = ": gain over copy-last"  # of a measure: the curve by which it is compared at every step
 
 

@@ -10,12 +10,12 @@ from itertools import groupby
 from typing import Any
 
 from .endurance import COLOUR_WITHIN, SHARP_WITHIN
-from .scorecard import COPY_LAST, DYNAMIC, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, words_of
+from .scorecard import CHANGE, COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, words_of
 from .statistics import Figure
 
 BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
 REMEMBERED_DB = 25.0  # back where it was, the picture is the first one to this or better
-ALIKE = 0.7, 1.3  # sharpness, and the dynamic degree, over the recorded one
+ALIKE = 0.7, 1.3  # sharpness, and the change per step, over the recorded one
 BLUR_STEPS = 32
 
 
@@ -110,7 +110,7 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     """Does it obey, remember, stay sharp, keep moving, stand still? What was not asked is not said."""
     mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
     sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
-    moving = [row for row in mine if (row.what, row.motion) == (DYNAMIC, PREDICTED)]
+    change = [row for row in mine if (row.what, row.motion) == (CHANGE, PREDICTED) and math.isfinite(row.figure.low)]
     reach = max((row.horizon for row in sharp if row.horizon <= BLUR_STEPS), default=0)
     control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
@@ -122,7 +122,7 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
         ),
         (closed, lambda row: _sure(row, REMEMBERED_DB, math.inf, "remembers", "does not surely remember", "forgets")),
         (_first([row for row in sharp if row.horizon == reach]), _sharpness),
-        (_first([row for row in moving if row.horizon == reach]), _moves),
+        (_first([row for row in change if row.horizon == reach]), _moves),
         (stillness, _stands),
     )
     for rows, say in asked:

@@ -16,13 +16,13 @@ POWERS, USUAL = (0.5, 0.7, 1.0, 1.4), 0.7
 HARDLY = 1.5  # a stress of less has no effect worth choosing
 SHOWN, STEPS, CLIPS = 8, (32, 16, 8, 4), 12  # frames that a dream is shown, steps that it goes on, dreams
 FRAMES = CLIPS * (SHOWN + STEPS[0] * len(POWERS))  # that are drawn, at most
-ALIKE = 0.115  # of the logarithm of errors, half a decibel: for less than that no world shall stand still
+ALIKE = 0.115  # of the logarithm of errors, half a decibel: errors closer than that count as equal
 
 
 @torch.inference_mode()
 def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int) -> float:
     """Which of POWERS brings dreams of recorded episodes nearest to them, by the mean logarithm of the pooled squared error after
-    1, 2, 4, ... steps, the smallest of those that are nearly alike: what moves lives longer by it. Sets the stress of `codec`,
+    1, 2, 4, ... steps, the smallest of those that are nearly alike: with it, what moves fades later. Sets the stress of `codec`,
     by which the world draws, to that power of `stress`."""
     codec.stress.fill_(stress**USUAL)
     reach, rng = ahead(recording), np.random.default_rng([seed, 11])
