@@ -17,13 +17,15 @@ HARDLY = 1.5  # a stress of less has no effect worth choosing
 SHOWN, STEPS, CLIPS = 8, (32, 16, 8, 4), 12  # frames that a dream is shown, steps that it goes on, dreams
 FRAMES = CLIPS * (SHOWN + STEPS[0] * len(POWERS))  # that are drawn, at most
 ALIKE = 0.115  # of the logarithm of errors, half a decibel: errors closer than that count as equal
+CHANGED = 8  # difference of 255 from the step before, above which a pixel has changed
 
 
 @torch.inference_mode()
 def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int) -> float:
     """Which of POWERS brings dreams of recorded episodes nearest to them, by the mean logarithm of the pooled squared error after
-    1, 2, 4, ... steps, the smallest of those that are nearly alike: with it, what moves fades later. Sets the stress of `codec`,
-    by which the world draws, to that power of `stress`."""
+    1, 2, 4, ... steps; of those that are nearly alike, the one of which as much changes from step to step as in the recording
+    (what stops or fades costs hardly any error). Sets the stress of `codec`, by which the world draws, to that power of
+    `stress`."""
     codec.stress.fill_(stress**USUAL)
     reach, rng = ahead(recording), np.random.default_rng([seed, 11])
     many = max((reach > SHOWN).sum() / 2, CLIPS)  # of the rows from which a dream may begin
@@ -36,17 +38,25 @@ def balanced(world: LearnedWorld, codec: Codec, recording: Recording, stress: fl
     for row in range(1, SHOWN):
         state = world.imagine(state, recording.played(world.spec, begins + row - 1), chance)
         state = world.observe(recording.evidence(world.config, begins + row), state, chance)
-    found = []
+    found, unlike = [], []
     for power in POWERS:
         codec.stress.fill_(stress**power)
-        dreamt, chance, errors = state, make_rng(seed), []
+        dreamt, chance, errors, counts = state, make_rng(seed), [], torch.ones(2)
+        before = last = recording.rgb(begins + SHOWN - 1).float()
         for step in range(steps):
             rows = begins + SHOWN + step
             dreamt = world.imagine(dreamt, recording.played(world.spec, rows - 1), chance)
             drawn = world.render(dreamt, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
-            errors.append((drawn - recording.rgb(rows).float()).square().mean())
+            truth = recording.rgb(rows).float()
+            errors.append((drawn - truth).square().mean())
+            counts += torch.stack(
+                [((drawn - before).abs() > CHANGED).any(1).sum(), ((truth - last).abs() > CHANGED).any(1).sum()]
+            )
+            before, last = drawn, truth
         told = [2**doubled - 1 for doubled in range(6) if 2**doubled <= steps]
         found.append(float(torch.stack(errors)[told].clamp_min(1e-3).log().mean()))
-    best = next(power for power, error in zip(POWERS, found) if error <= min(found) + ALIKE)
+        unlike.append(abs(float((counts[0] / counts[1]).log())))
+    alike = [at for at, error in enumerate(found) if error <= min(found) + ALIKE]
+    best = POWERS[min(alike, key=lambda at: unlike[at])]
     codec.stress.fill_(stress**best)
     return best
