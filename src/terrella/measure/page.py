@@ -44,7 +44,8 @@ def _verdict(card: Scorecard) -> str:
     steps = sorted({row.horizon for row in rows})
     for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
         mine = {row.horizon: row for row in rows if (row.channel, row.what, row.unit, row.place) == kind}
-        about = f"{escape(f'{kind[0]} {kind[1]}, {kind[2]}')}<small>{escape(words_of(kind[3]))}</small>"
+        unit = f", {kind[2]}" if kind[2] else ""
+        about = f"{escape(f'{kind[0]} {kind[1]}{unit}')}<small>{escape(words_of(kind[3]))}</small>"
         lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
     inside = (
         table_of(["gain over copying the last frame", *(steps_words(step) for step in steps)], lines) if lines else ""

@@ -110,7 +110,12 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     """Does it obey, remember, stay sharp, keep moving, stand still? What was not asked is not said."""
     mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
     sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
-    change = [row for row in mine if (row.what, row.motion) == (CHANGE, PREDICTED) and math.isfinite(row.figure.low)]
+    main = {row.channel for row in sharp[:1]}
+    change = [
+        row
+        for row in mine
+        if (row.what, row.motion) == (CHANGE, PREDICTED) and row.channel in main and math.isfinite(row.figure.low)
+    ]
     reach = max((row.horizon for row in sharp if row.horizon <= BLUR_STEPS), default=0)
     control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
