@@ -1,0 +1,103 @@
+"""There and back: off by one action and back by another, in a game and in a world that learned it. What does the world still know?
+
+    python recipes/there_and_back.py islet gym:Islet-v0 --there left --back right --steps 100
+
+Starts count from which the way is free: the game shows its first picture again, but for what moved meanwhile, and nothing half
+way. PSNR in dB, pooled, of the pixels that the game shows again (the place), and of all; --strip draws some of the starts.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+import terrella
+from terrella.core import make_rng
+
+CONTEXT = 8  # pictures that the world is shown, nobody doing anything
+ALIKE = 8  # of 255, up to which a pixel is shown again
+
+
+def psnr(one: torch.Tensor, other: torch.Tensor, where: torch.Tensor) -> float:
+    """dB of uint8 [N, H, W, 3] against each other, pooled over the pixels `where` bool [N, H, W]."""
+    off = (one[where].float() - other[where].float()).square().mean()
+    return float(10 * torch.log10(255**2 / off.clamp_min(1e-6)))
+
+
+def went(game, seed: int, actions: list[int]) -> torch.Tensor:
+    """What the game shows from the seed's start on, uint8 [T + 1, H, W, 3]."""
+    rng = make_rng(seed)
+    state = game.start(1, rng)
+    frames = [game.render(state, ("rgb",))["rgb"][0]]
+    for action in actions:
+        state = game.imagine(state, torch.tensor([action]), rng)
+        frames.append(game.render(state, ("rgb",))["rgb"][0])
+    return torch.stack(frames)
+
+
+def dreamt(world, truth: torch.Tensor, actions: list[int], rng: torch.Generator) -> torch.Tensor:
+    """The same of a world that is shown the first CONTEXT pictures of truth [N, T + 1, H, W, 3]: [N, T + 1 - CONTEXT, H, W, 3]."""
+    state = world.observe({"rgb": truth[:, 0]}, None, rng)
+    frames = []
+    for step, action in enumerate(actions, start=1):
+        state = world.imagine(state, torch.full((len(truth),), action), rng)
+        if step < CONTEXT:
+            state = world.observe({"rgb": truth[:, step]}, state, rng)
+        else:
+            frames.append(world.render(state, ("rgb",))["rgb"])
+    return torch.stack(frames, 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("world")
+    parser.add_argument("game")
+    parser.add_argument("--there", required=True, help="name of an action")
+    parser.add_argument("--back", required=True)
+    parser.add_argument("--rest", default="noop")
+    parser.add_argument("--steps", type=int, default=100, help="there and back together")
+    parser.add_argument("--starts", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=1000, help="of the first start that is tried")
+    parser.add_argument("--strip", type=Path)
+    args = parser.parse_args()
+    world, game, half = terrella.load(args.world), terrella.load(args.game), args.steps // 2
+    for name in (args.rest, args.there, args.back):
+        if name not in game.spec.action_names:
+            parser.error(
+                f"{args.game} has no action {name!r}; it has {', '.join(game.spec.action_names) or 'none with names'}."
+            )
+    rest, there, back = (game.spec.action_names.index(name) for name in (args.rest, args.there, args.back))
+    actions = [rest] * (CONTEXT - 1) + [there] * half + [back] * half
+    found, tried = [], 0
+    while len(found) < args.starts and tried < 40 * args.starts:
+        truth = went(game, args.seed + tried, actions)
+        same = [
+            (frame.int() - truth[CONTEXT - 1].int()).abs().amax(-1) <= ALIKE for frame in (truth[-1], truth[-1 - half])
+        ]
+        found += [truth] if same[0].float().mean() > 0.9 and same[1].float().mean() < 0.5 else []
+        tried += 1
+    if not found:
+        raise SystemExit(f"None of {tried} starts had a free way {args.there} and {args.back}.")
+    truth = torch.stack(found)
+    dream = dreamt(world, truth, actions, make_rng(args.seed))
+    first, last = truth[:, CONTEXT - 1], truth[:, -1]
+    place = (last.int() - first.int()).abs().amax(-1) <= ALIKE
+    every, end = torch.ones_like(place), dream[:, -1]
+    each = torch.tensor([psnr(*one) for one in zip(end[:, None], last[:, None], place[:, None])])
+    print(f"{args.there} and {args.back}, {2 * half} steps: {len(truth)} of {tried} starts have a free way")
+    far = psnr(dream[:, half - 1], truth[:, -1 - half], every)
+    print(
+        f"back, the place: {psnr(end, last, place):.1f} dB; each {' '.join(f'{value:.0f}' for value in each.sort().values)}"
+    )
+    print(f"  at 30 dB or more {int((each >= 30).sum())} of {len(each)}; half way, against the game {far:.1f} dB")
+    print(
+        f"back, all: {psnr(end, last, every):.1f} dB; the game's last picture against its first {psnr(last, first, every):.1f} dB"
+    )
+    if args.strip:
+        looked = [first[:8], truth[:8, -1 - half], dream[:8, half - 1], last[:8], end[:8]]
+        Image.fromarray(torch.cat([torch.cat(list(row), 1) for row in looked]).numpy()).save(args.strip)
+
+
+if __name__ == "__main__":
+    main()
