@@ -14,15 +14,15 @@ from PIL import Image
 
 import terrella
 from terrella.core import make_rng
+from terrella.measure.fidelity import changes, squared_error
 
 CONTEXT = 8  # pictures that the world is shown, nobody doing anything
-ALIKE = 8  # of 255, up to which a pixel is shown again
 
 
-def psnr(one: torch.Tensor, other: torch.Tensor, where: torch.Tensor) -> float:
-    """dB of uint8 [N, H, W, 3] against each other, pooled over the pixels `where` bool [N, H, W]."""
-    off = (one[where].float() - other[where].float()).square().mean()
-    return float(10 * torch.log10(255**2 / off.clamp_min(1e-6)))
+def psnr(one: torch.Tensor, other: torch.Tensor, where: torch.Tensor | None = None) -> float:
+    """dB of uint8 [..., H, W, 3] against each other, pooled over the pixels `where` bool [..., H, W]; None: over all."""
+    error = squared_error(one, other)
+    return float(10 * torch.log10(255**2 / (error if where is None else error[where]).mean().clamp_min(1e-6)))
 
 
 def went(game, seed: int, actions: list[int]) -> torch.Tensor:
@@ -61,7 +61,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000, help="of the first start that is tried")
     parser.add_argument("--strip", type=Path)
     args = parser.parse_args()
-    world, game, half = terrella.load(args.world), terrella.load(args.game), args.steps // 2
+    if args.steps < 2 or args.starts < 1:
+        parser.error("--steps takes 2 or more, --starts 1 or more.")
+    world, half = terrella.load(args.world), args.steps // 2
+    game = terrella.load(args.game, size=world.spec.channels["rgb"].shape[:2])
+    if world.spec.action_names != game.spec.action_names:
+        parser.error(
+            f"{args.world} and {args.game} have other actions: a world is compared with the game that it learned."
+        )
     for name in (args.rest, args.there, args.back):
         if name not in game.spec.action_names:
             parser.error(
@@ -72,28 +79,23 @@ def main() -> None:
     found, tried = [], 0
     while len(found) < args.starts and tried < 40 * args.starts:
         truth = went(game, args.seed + tried, actions)
-        same = [
-            (frame.int() - truth[CONTEXT - 1].int()).abs().amax(-1) <= ALIKE for frame in (truth[-1], truth[-1 - half])
-        ]
-        found += [truth] if same[0].float().mean() > 0.9 and same[1].float().mean() < 0.5 else []
+        back_off, far_off = (changes(truth[CONTEXT - 1], truth[row]).double().mean() for row in (-1, -1 - half))
+        found += [truth] if back_off < 0.1 and far_off > 0.5 else []
         tried += 1
     if not found:
         raise SystemExit(f"None of {tried} starts had a free way {args.there} and {args.back}.")
     truth = torch.stack(found)
     dream = dreamt(world, truth, actions, make_rng(args.seed))
     first, last = truth[:, CONTEXT - 1], truth[:, -1]
-    place = (last.int() - first.int()).abs().amax(-1) <= ALIKE
-    every, end = torch.ones_like(place), dream[:, -1]
-    each = torch.tensor([psnr(*one) for one in zip(end[:, None], last[:, None], place[:, None])])
+    place, end = ~changes(first, last), dream[:, -1]
+    each = torch.tensor([psnr(*one) for one in zip(end, last, place)])
     print(f"{args.there} and {args.back}, {2 * half} steps: {len(truth)} of {tried} starts have a free way")
-    far = psnr(dream[:, half - 1], truth[:, -1 - half], every)
+    far = psnr(dream[:, half - 1], truth[:, -1 - half])
     print(
         f"back, the place: {psnr(end, last, place):.1f} dB; each {' '.join(f'{value:.0f}' for value in each.sort().values)}"
     )
     print(f"  at 30 dB or more {int((each >= 30).sum())} of {len(each)}; half way, against the game {far:.1f} dB")
-    print(
-        f"back, all: {psnr(end, last, every):.1f} dB; the game's last picture against its first {psnr(last, first, every):.1f} dB"
-    )
+    print(f"back, all: {psnr(end, last):.1f} dB; the game's last picture against its first {psnr(last, first):.1f} dB")
     if args.strip:
         looked = [first[:8], truth[:8, -1 - half], dream[:8, half - 1], last[:8], end[:8]]
         Image.fromarray(torch.cat([torch.cat(list(row), 1) for row in looked]).numpy()).save(args.strip)
