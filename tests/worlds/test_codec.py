@@ -52,10 +52,23 @@ def test_where_the_picture_scrolls_the_mosaic_is_shown_with_the_picture_in_its_m
     seen, (height, width) = made.render(state, ("rgb", "mosaic")), SIZE
     assert seen["mosaic"].shape == (2, *made.spec.channels["mosaic"].shape)
     known = seen["mosaic"][..., 3] > 0
-    top, left = height, 3 * width // 2
+    top, left = (known.shape[1] - height) // 2, (known.shape[2] - width) // 2
     assert known[:, top : top + height, left : left + width].all() and not known.all()
     assert not seen["mosaic"][~known].any()
     assert "mosaic" not in Layout.of(made.spec).channels, "recordings do without it"
+
+
+def test_a_mosaic_goes_on_as_the_dream_scrolls_though_its_pictures_are_too_plain_to_tell():
+    made, rng = world(codec(wild=False)), make_rng(0)
+    plain = {"rgb": torch.full((2, *SIZE, 3), 90, dtype=torch.uint8)}
+    made.generator.scrolling.votes.bias[1] = 99.0  # two pixels to the right
+    state = made.observe(plain, None, rng)
+    for _ in range(3):
+        state = made.imagine(state, torch.zeros(2, 2, dtype=torch.int8), rng)
+    seen = made.render(state, ("mosaic",))["mosaic"][..., 3] > 0
+    assert seen.any(1).sum(1).tolist() == [SIZE[1] + 3 * 2] * 2
+    state = made.observe(plain, state, rng)  # of evidence nobody knows but by looking how it went on
+    assert (made.render(state, ("mosaic",))["mosaic"][..., 3] > 0).any(1).sum(1).tolist() == [SIZE[1] + 2 * 2] * 2
 
 
 def test_where_nothing_scrolls_there_is_no_mosaic_to_show():

@@ -130,16 +130,16 @@ class Codec(nn.Module):
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """The next frame [B, 4, H, W] in the generator's code, by the chance that is in `noisy`; the time says nothing to it."""
-        frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
-        context, mosaic = conditioning.context, conditioning.mosaic
-        assert mosaic is not None
-        seen = self.seen(frames, mosaic, self.scroll(frames, context))
-        choices, features = self.choices(seen, context)
+        mosaic, scroll = conditioning.mosaic, conditioning.scroll
+        assert mosaic is not None and scroll is not None
+        seen = self.seen(_frames(conditioning), mosaic, scroll)
+        choices, features = self.choices(seen, conditioning.context)
         drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
-    def scroll(self, frames: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-        """By which of the moves most of the picture goes on: int64 [B]. frames: uint8 [B, slots, 3, H, W], the newest first."""
+    def scroll(self, conditioning: Conditioning) -> torch.Tensor:
+        """By which of the moves most of the picture goes on: int64 [B]."""
+        frames, context = _frames(conditioning), conditioning.context
         went = [explains(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
         logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
         return least_off(logits, self.moves)
@@ -228,6 +228,11 @@ class Codec(nn.Module):
         y = (torch.arange(height, device=went.device) - self.moves[:, 1:]).clamp(0, height - 1)
         place = (y[:, :, None] * width + x[:, None]).flatten(1)
         return went.flatten(2).gather(2, place.expand(len(went), -1, -1)).unflatten(2, (height, width))
+
+
+def _frames(conditioning: Conditioning) -> torch.Tensor:
+    """The last frames, uint8 [B, slots, 3, H, W], the newest first."""
+    return (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
 
 
 def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
 The last frames take the place of keyframes, unwarped, and the actions are part of the context, since no motion model turns
-them into a view. It answers and stays in tune with its recordings; it does not remember what left the picture.
+them into a view. Where pictures scroll, a mosaic remembers what left the picture.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class FrameHistory:
     def __init__(self, config: HistoryConfig, starts: Starts):
         self.config, self.starts = config, starts
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=starts.frames.device).view(-1, 2)
-        self.drawn_names = ("frames", "mosaic") if config.moves else ("frames",)
+        self.drawn_names = ("frames", "mosaic", "scroll") if config.moves else ("frames",)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
@@ -110,13 +110,20 @@ class FrameHistory:
 
     def blank(self, evidence: Evidence) -> State:
         """A state in which nothing was seen yet."""
-        mosaic = {"mosaic": blank(evidence.batch, self.config.size, self.device)} if self.config.moves else {}
-        return State({"frames": evidence.seen["frames"], **mosaic})
+        flat = {}
+        if self.config.moves:
+            flat = {"mosaic": blank(evidence.batch, self.config.size, self.device)}
+            flat["scroll"] = torch.zeros(evidence.batch, dtype=torch.int64, device=self.device)
+        return State({"frames": evidence.seen["frames"], **flat})
 
     def pictured(self, state: State, evidence: Evidence) -> State:
-        """`state` with the frames of the evidence, the actions that led to them, and the mosaic as of the frame before."""
+        """`state` with the frames of the evidence, the actions that led to them, the mosaic as of the frame before, and how the
+        newest scrolled."""
         names = ("frames", "actions", "mosaic")
-        return state.replace(**{name: evidence.seen[name] for name in names if name in evidence.seen})
+        found = {name: evidence.seen[name] for name in names if name in evidence.seen}
+        if self.config.moves:
+            found["scroll"] = scrolled(found["frames"][:, 1], found["frames"][:, 0], self.moves)
+        return state.replace(**found)
 
     def frame(self, state: State) -> torch.Tensor:
         """The newest frame, uint8 [B, 3, H, W]."""
@@ -140,14 +147,15 @@ class FrameHistory:
     def drawn(
         self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
     ) -> State:
-        """`state` with the frame `clean` [B, 4, H, W] as its newest, and the one before in its mosaic."""
-        mosaic = {} if conditioning.mosaic is None else {"mosaic": conditioning.mosaic}
-        return state.replace(frames=torch.cat([pixels(clean)[:, None], state["frames"][:, :-1]], 1), **mosaic)
+        """`state` with the frame `clean` [B, 4, H, W] as its newest, how it was made to scroll, and the last in its mosaic."""
+        mosaic, scroll = conditioning.mosaic, conditioning.scroll
+        flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
+        return state.replace(frames=torch.cat([pixels(clean)[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:
-        """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it."""
-        frames = state["frames"]
-        return remembered(state["mosaic"], frames[:, 0], self.moves[scrolled(frames[:, 1], frames[:, 0], self.moves)])
+        """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it.
+        It goes on as the frame was made to: new ground, of which little is known, is too plain to tell how it scrolled."""
+        return remembered(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]])
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
         return {

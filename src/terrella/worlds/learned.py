@@ -249,7 +249,8 @@ class LearnedWorld:
 
     def conditioning(self, asked: State, before: State) -> Conditioning:
         """What the generator gets to draw the frame of `asked`, `before` being the last."""
-        return self.scene.conditioning(asked, before)
+        found = self.scene.conditioning(asked, before)
+        return found if found.mosaic is None else replace(found, scroll=self.generator.scroll(found))
 
     def drawn(self, asked: State, before: State, conditioning: Conditioning, clean: torch.Tensor) -> State:
         """`asked` with the frame `clean` [B, 4 or 5, H, W] that was drawn of it, remembered if new."""

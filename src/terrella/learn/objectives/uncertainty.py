@@ -10,7 +10,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -96,9 +96,10 @@ def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frame
 
 def expected_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
     """Seconds that `learn_uncertainty` will take of such a world, by a few steps of dreaming and of learning."""
-    if _horizon(recording, frames) < 8:
+    horizon = _horizon(recording, frames)
+    if horizon < 8:
         return 0.0
-    dreamt_s, seen = _dreamt_s(world, recording)
+    dreamt_s, seen = _dreamt_s(world, recording, horizon)
     began = time.monotonic()
     with torch.random.fork_rng(devices=[]):
         objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
@@ -111,13 +112,14 @@ def expected_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
 
 def dreaming_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
     """Seconds in which such a world dreams so many frames, by a few of them."""
-    return 0.0 if _horizon(recording, frames) < 8 else _dreamt_s(world, recording)[0] * frames
+    horizon = _horizon(recording, frames)
+    return 0.0 if horizon < 8 else _dreamt_s(world, recording, horizon)[0] * frames
 
 
-def _dreamt_s(world: LearnedWorld, recording: Recording) -> tuple[float, Dreamt]:
+def _dreamt_s(world: LearnedWorld, recording: Recording, horizon: int) -> tuple[float, Dreamt]:
     """Seconds of a dreamt frame, and some of them."""
-    trial = Rollout(0, 4)
-    dream(world, recording, trial, 0)  # the first compiles
+    trial = Rollout(0, min(24, horizon))  # no shorter: the frames that a dream is shown first take time, too
+    dream(world, recording, replace(trial, horizon=4), 0)  # the first compiles
     began = time.monotonic()
     seen = dream(world, recording, trial, 0)
     return (time.monotonic() - began) / (trial.horizon * trial.batch), seen
