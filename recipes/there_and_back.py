@@ -2,8 +2,9 @@
 
     python recipes/there_and_back.py islet gym:Islet-v0 --there left --back right --steps 100
 
-Starts count from which the way is free: the game shows its first picture again, but for what moved meanwhile, and nothing half
-way. PSNR in dB, pooled, of the pixels that the game shows again (the place), and of all; --strip draws some of the starts.
+Starts count from which the way is free: on the way back the game shows the pictures of the way there, but for what moved
+meanwhile; so nothing stops one on the way. With --shown the world is shown the way there, and dreams the way back alone. PSNR in
+dB, pooled, of the pixels that the game shows again (the place), and of all; --strip draws some of the starts.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from terrella.core import make_rng
 from terrella.measure.fidelity import changes, squared_error
 
 CONTEXT = 8  # pictures that the world is shown, nobody doing anything
+MOVED = 0.12  # the share of pixels that may be others on the way back
 
 
 def psnr(one: torch.Tensor, other: torch.Tensor, where: torch.Tensor | None = None) -> float:
@@ -36,15 +38,15 @@ def went(game, seed: int, actions: list[int]) -> torch.Tensor:
     return torch.stack(frames)
 
 
-def dreamt(world, truth: torch.Tensor, actions: list[int], rng: torch.Generator) -> torch.Tensor:
-    """The same of a world that is shown the first CONTEXT pictures of truth [N, T + 1, H, W, 3]: [N, T + 1 - CONTEXT, H, W, 3]."""
+def dreamt(world, truth: torch.Tensor, actions: list[int], shown: int, rng: torch.Generator) -> torch.Tensor:
+    """The same of a world that is shown the first `shown` pictures of truth [N, T + 1, H, W, 3]: [N, T + 1 - CONTEXT, H, W, 3]."""
     state = world.observe({"rgb": truth[:, 0]}, None, rng)
     frames = []
     for step, action in enumerate(actions, start=1):
         state = world.imagine(state, torch.full((len(truth),), action), rng)
-        if step < CONTEXT:
+        if step < shown:
             state = world.observe({"rgb": truth[:, step]}, state, rng)
-        else:
+        if step >= CONTEXT:
             frames.append(world.render(state, ("rgb",))["rgb"])
     return torch.stack(frames, 1)
 
@@ -59,6 +61,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="there and back together")
     parser.add_argument("--starts", type=int, default=16)
     parser.add_argument("--seed", type=int, default=1000, help="of the first start that is tried")
+    parser.add_argument("--shown", action="store_true", help="show it the way there; it dreams the way back alone")
     parser.add_argument("--strip", type=Path)
     args = parser.parse_args()
     if args.steps < 2 or args.starts < 1:
@@ -79,13 +82,14 @@ def main() -> None:
     found, tried = [], 0
     while len(found) < args.starts and tried < 40 * args.starts:
         truth = went(game, args.seed + tried, actions)
-        back_off, far_off = (changes(truth[CONTEXT - 1], truth[row]).double().mean() for row in (-1, -1 - half))
-        found += [truth] if back_off < 0.1 and far_off > 0.5 else []
+        way = truth[CONTEXT - 1 :]
+        others = changes(way[:half], way.flip(0)[:half]).double().mean((1, 2))
+        found += [truth] if others.max() < MOVED and changes(way[0], way[half]).double().mean() > 0.5 else []
         tried += 1
     if not found:
         raise SystemExit(f"None of {tried} starts had a free way {args.there} and {args.back}.")
     truth = torch.stack(found)
-    dream = dreamt(world, truth, actions, make_rng(args.seed))
+    dream = dreamt(world, truth, actions, CONTEXT + half * args.shown, make_rng(args.seed))
     first, last = truth[:, CONTEXT - 1], truth[:, -1]
     place, end = ~changes(first, last), dream[:, -1]
     each = torch.tensor([psnr(*one) for one in zip(end, last, place)])

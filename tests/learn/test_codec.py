@@ -8,7 +8,7 @@ import torch
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, palette
+from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, overlay, palette
 from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans, clip
 from terrella.learn.trainer import Now
 from terrella.space.mosaic import recalled
@@ -16,6 +16,7 @@ from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.controls import Controls
 
 SIZE = (32, 40)
+NONE = torch.zeros(SIZE, dtype=torch.bool)  # nothing lies over what scrolls
 
 
 def scrolling(x: int, y: int, count: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
@@ -44,16 +45,39 @@ def test_a_palette_holds_the_colours_of_a_picture():
     assert all((found.int() - colour.int()).abs().amax(1).min() <= 4 for colour in colours)
 
 
+def test_what_stays_while_the_picture_scrolls_is_found():
+    before, after = (torch.cat(part) for part in zip(scrolling(3, 0, 40), scrolling(-3, 0, 40)))
+    for picture in (before, after):
+        picture[..., 18:22, 18:22] = torch.tensor([200, 30, 90], dtype=torch.uint8)[:, None, None]  # the walker
+        picture[..., 3:6, 10:30] = 60
+    found = overlay(before, after, torch.tensor([[0, 0], [3, 0], [-3, 0]]))
+    wanted = NONE.clone()
+    wanted[:8], wanted[18:22, 18:22] = True, True
+    assert (found != wanted).sum() <= 4 and found[3:6, 10:30].all(), "plain pixels of the status line, too"
+    assert not overlay(before, before, torch.tensor([[0, 0], [3, 0]])).any(), (
+        "where nothing scrolls, nothing lies over it"
+    )
+
+
 def test_a_run_keeps_its_moves_and_palette_and_only_its_own(tmp_path):
-    found = Looks(torch.tensor([[0, -2], [3, 0]]), torch.tensor([[0, 9, 255]], dtype=torch.uint8), 2.5)
+    found = Looks(torch.tensor([[0, -2], [3, 0]]), torch.tensor([[0, 9, 255]], dtype=torch.uint8), 2.5, NONE.clone())
+    found.over[:3, 5] = True
     assert Looks.read(tmp_path, {}) is None
     found.write(tmp_path, {"size": (64, 64)})
     kept = Looks.read(tmp_path, {"size": (64, 64)})
     assert kept is not None and kept.stress == 2.5 and kept.palette.dtype == torch.uint8
     assert torch.equal(kept.moves, found.moves) and torch.equal(kept.palette, found.palette)
+    assert torch.equal(kept.over, found.over)
     assert Looks.read(tmp_path, {"size": (32, 32)}) is None, "that of another recipe"
     text = (tmp_path / LOOKS).read_text()
-    for damage in (text[:40], text.replace("255", "256"), text.replace("-2", "-99"), text.replace("2.5", "0.0"), "[]"):
+    for damage in (
+        text[:40],
+        text.replace("255", "256"),
+        text.replace("-2", "-99"),
+        text.replace("2.5", "0.0"),
+        text.replace("#", "?"),
+        "[]",
+    ):
         (tmp_path / LOOKS).write_text(damage)
         assert Looks.read(tmp_path, {"size": (64, 64)}) is None
 
@@ -61,7 +85,7 @@ def test_a_run_keeps_its_moves_and_palette_and_only_its_own(tmp_path):
 def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
     before, after = scrolling(3, 0, 2)
     moves, real = torch.tensor([[0, 0], [3, 0]]), torch.tensor([[True, True], [False, False]])
-    made = mosaics(torch.stack([before, after], 1), moves, real)
+    made = mosaics(torch.stack([before, after], 1), moves, NONE, real)
     known = recalled(made, SIZE, torch.tensor([[0, 0], [0, 0]]))
     assert torch.equal(known[0, :3, 8:], after[0, :, 8:]) and not known[1].any()
     gone = recalled(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
@@ -92,7 +116,8 @@ def test_of_few_clips_some_are_taken_twice():
     rgb[:, :, 0, 0, 0] = np.arange(3)[:, None]
     now = Now(0, 0.0, torch.device("cpu"), np.random.default_rng(0), torch.Generator())
     found = {"rgb": rgb, "action": np.zeros((3, 7, 2), np.float32)}
-    made = clip(found, Controls.buttons(2), torch.zeros(1, 2, dtype=torch.int64), Spans(0, 4, 3), 5, now)
+    still, none = torch.zeros(1, 2, dtype=torch.int64), torch.zeros(8, 8, dtype=torch.bool)
+    made = clip(found, Controls.buttons(2), still, none, Spans(0, 4, 3), 5, now)
     assert made.frames.shape == (5, 7, 3, 8, 8) and made.actions.shape[:2] == (5, 7)
     assert set(made.frames[:, 0, 0, 0, 0].tolist()) <= {0, 1, 2}
 
@@ -102,10 +127,10 @@ def test_of_few_clips_some_are_taken_twice():
 )
 def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, batch, step, dreamt):
     codec = Codec(CodecConfig(SIZE, 4, 36 + 4 * 2, 1, 4, (8, 8)))
-    objective, seen = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0), []
+    objective, seen = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, NONE), []
     truth = torch.randint(0, 256, (batch, 7, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
 
-    def loss(shown, mosaic, context, target, before, count, now):
+    def loss(shown, mosaic, move, context, target, before, count, now):
         seen.append(count)
         assert torch.equal(target, truth[:, 3 + len(seen)])
         drawn = torch.full_like(target[:count], len(seen))
@@ -116,7 +141,7 @@ def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, b
         return None, drawn
 
     monkeypatch.setattr(objective, "_loss", loss)
-    mosaic = mosaics(truth[:, :3], codec.moves, torch.ones(batch, 3, dtype=torch.bool))
+    mosaic = mosaics(truth[:, :3], codec.moves, NONE, torch.ones(batch, 3, dtype=torch.bool))
     now = Now(step, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
     list(objective.losses(Clip(truth, torch.zeros(batch, 7, 2), mosaic), now))
     assert seen == dreamt

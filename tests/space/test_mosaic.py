@@ -20,6 +20,7 @@ from terrella.space.matching import (
 )
 from terrella.space.mosaic import MOST, blank, recalled, remembered, remembered_slowly
 
+NONE = torch.zeros(16, 24, dtype=torch.bool)  # nothing lies over the mosaic
 MOVES = torch.tensor([[0, 0], [3, 0], [-3, 0], [0, 2], [0, -2], [1, 1]])
 
 
@@ -40,11 +41,11 @@ def test_kernels_are_as_their_slow_twins():
         assert torch.allclose(fast, slow, atol=5e-4), "what is cut off is worth e ** -8"
     assert torch.allclose(explains(frames[:, 0], truth, MOVES), explains_slowly(frames[:, 0], truth, MOVES))
     assert torch.equal(half_a_pixel(frames[0]), half_a_pixel_slowly(frames[0]))
-    mosaic = blank(1, (16, 24))
+    mosaic, some = blank(1, (16, 24)), torch.rand(16, 24, generator=make_rng(3)) < 0.2
     for move in MOVES[:4]:
         for frame in (frames[:, 0], truth, truth):
-            slow = remembered_slowly(mosaic, frame, move[None])
-            mosaic = remembered(mosaic, frame, move[None])
+            slow = remembered_slowly(mosaic, frame, move[None], some)
+            mosaic = remembered(mosaic, frame, move[None], some)
             assert torch.equal(mosaic, slow)
 
 
@@ -70,12 +71,12 @@ def test_a_scroll_is_found_and_a_still_picture_stands():
 
 def test_what_left_the_picture_is_recalled_where_it_comes_back():
     whole, mosaic, x = map_(), blank(1, (16, 24)), 20
-    mosaic = remembered(mosaic, view(whole, x, 20), MOVES[:1])
+    mosaic = remembered(mosaic, view(whole, x, 20), MOVES[:1], NONE)
     for way, steps in ((2, 8), (1, 7)):  # the camera goes 24 pixels to the right, and 21 back
         for _ in range(steps):
             before, x = x, x - int(MOVES[way, 0])
             found = scrolled(view(whole, before, 20), view(whole, x, 20), MOVES)
-            mosaic = remembered(mosaic, view(whole, x, 20), MOVES[found])
+            mosaic = remembered(mosaic, view(whole, x, 20), MOVES[found], NONE)
     known = recalled(mosaic, (16, 24), MOVES[1:2])  # one step more, and it is where it was
     assert torch.equal(known[:, :3], view(whole, 20, 20)) and (known[:, 3] > 0).all()
     assert (recalled(mosaic, (16, 24), torch.tensor([[0, 16]]))[:, 3] == 0).all(), "above it nothing was seen"
@@ -88,9 +89,23 @@ def test_what_passes_leaves_no_trace():
         frame = view(whole, 20, 20).clone()
         if 6 <= step < 16:
             frame[..., 5:9, step : step + 4] = 255
-        mosaic = remembered(mosaic, frame, still)
+        mosaic = remembered(mosaic, frame, still, NONE)
     known = recalled(mosaic, (16, 24), still)
     assert torch.equal(known[:, :3], view(whole, 20, 20)) and known[:, 3].max() == MOST
+
+
+def test_what_lies_over_a_mosaic_is_no_part_of_it():
+    whole, mosaic, over = map_(), blank(1, (16, 24)), NONE.clone()
+    over[:3], over[8:11, 10:13] = True, True  # a status line, and the walker in the middle
+    for step in range(8):
+        frame = view(whole, 20 + 3 * step, 20).clone()
+        frame[..., over] = 255
+        mosaic = remembered(mosaic, frame, MOVES[2][None] * min(step, 1), over)
+    known = recalled(mosaic, (16, 24), MOVES[:1])
+    assert torch.equal(known[0, :3, 3:], view(whole, 41, 20)[0, :, 3:]), (
+        "the ground under the walker is what was seen before"
+    )
+    assert not known[0, :, :3].any()
 
 
 def test_what_most_sources_are_like_is_drawn():

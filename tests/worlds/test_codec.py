@@ -21,6 +21,7 @@ from terrella.worlds.learned import About, LearnedWorld
 
 SIZE, SLOTS = (16, 24), 3
 MOVES = torch.tensor([[0, 0], [2, 0], [0, -3]])
+NONE = torch.zeros(SIZE, dtype=torch.bool)  # nothing lies over what scrolls
 
 
 def codec(seed: int = 0, wild: bool = True) -> Codec:
@@ -88,9 +89,9 @@ def test_an_untrained_one_stands_still_to_the_last_bit():
 def shown(made: Codec, batch: int = 1, seed: int = 0) -> Seen:
     """Frames, and a mosaic that holds the newest of them but for its upper half."""
     frames = pictures(batch, seed)
-    mosaic = remembered(blank(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64))
+    mosaic = remembered(blank(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64), NONE)
     mosaic[:, :, : mosaic.shape[2] // 2] = 0
-    return made.seen(frames, mosaic, torch.arange(batch) % len(MOVES))
+    return made.seen(frames, mosaic, NONE.expand(batch, -1, -1), torch.arange(batch) % len(MOVES))
 
 
 def like(one: torch.Tensor, other: torch.Tensor) -> bool:
@@ -122,12 +123,27 @@ def test_what_the_mosaic_does_not_know_is_not_fetched_from_it():
 
 def test_what_lies_outside_of_the_picture_is_as_the_mosaic_knows_it():
     made, frames = codec(wild=False), pictures(1)
-    mosaic = torch.full((1, 4, 3 * SIZE[0], 4 * SIZE[1]), 200, dtype=torch.uint8)
-    seen = made.seen(frames, mosaic, torch.tensor([1]))  # all goes two pixels to the right
+    mosaic = torch.full_like(blank(1, SIZE), 200)
+    seen = made.seen(frames, mosaic, NONE[None], torch.tensor([1]))  # all goes two pixels to the right
     choices, features = made.choices(seen, torch.zeros(1, 36 + 2 * SLOTS))
     share = choices.softmax(1)[0]
     assert not share[1, :, :2].any() and (share[1, :, 2:] > 0.5).all()
     assert like(made.drawn(seen, choices, features)[0, :, :, :2], torch.full((3, SIZE[0], 2), 200, dtype=torch.uint8))
+
+
+def test_what_lies_over_what_scrolls_neither_goes_along_nor_hides_it():
+    made, frames, over = codec(wild=False), pictures(1), NONE.clone()
+    over[:4], over[8:12, 10:14] = True, True
+    mosaic = torch.full_like(blank(1, SIZE), 200)
+    seen = made.seen(frames, mosaic, over[None], torch.tensor([1]))  # all goes two pixels to the right
+    assert torch.equal(seen.known[0, 0], ~over), "the mosaic is not asked for what it is no part of"
+    made.choice.bias.data[made.sources] = 9.0  # everything else is painted
+    choices, features = made.choices(seen, torch.zeros(1, 36 + 2 * SLOTS))
+    share = choices.softmax(1)[0]
+    assert torch.equal(seen.scrolled[0, :, over], frames[0, 0, :, over]), "it stays"
+    assert not share[[1, -1], 8:12, 14:16].any() and (share[-1, 8:12, 16:] > 0.5).all()
+    ground = made.drawn(seen, choices, features)[0, :, 8:12, 14:16]
+    assert like(ground, torch.full_like(ground, 200)), "what it hid is as the mosaic knows it"
 
 
 def test_what_went_on_is_carried_to_where_it_would_go_next():
@@ -190,6 +206,7 @@ def test_the_stress_on_what_changes_is_taken_back():
 
 def test_a_saved_one_draws_the_same(tmp_path):
     one, seen = world(codec()), shown(codec(), 2, seed=3)
+    one.scene.over[2:5, 3] = True
     one.generator.stress.fill_(3.0)
     save_world(one, tmp_path / "world")
     again = load_world(tmp_path / "world")
@@ -198,7 +215,7 @@ def test_a_saved_one_draws_the_same(tmp_path):
         assert torch.equal(mine, other)
     made = again.generator
     assert torch.equal(made.moves, MOVES) and made.stress == 3 and made.palette.dtype == torch.uint8
-    assert again.scene.config == one.scene.config
+    assert again.scene.config == one.scene.config and torch.equal(again.scene.over, one.scene.over)
 
 
 @pytest.mark.parametrize("device", ["meta"])

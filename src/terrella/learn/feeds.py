@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import torch
-
 from ..core.errors import DatasetError
 from ..data import Clips
 from ..space.keyframes import Keyframes
@@ -64,13 +62,13 @@ def frames_feed(
     return Streamed(clips, lambda found, now: history_batch(found, controls, config, now, dream))
 
 
-def codec_feed(
-    recording: Recording, config: VideoConfig, moves: torch.Tensor, spans: codec.Spans, size: int, seed: int
-) -> Feed:
-    """Clips for a codec of these `moves`, `size` at a time: of thrice as many those in which more happens are the likelier."""
-    clips = clips_of(recording, spans.length, 3 * size, config, seed, drop_last=False)
+def codec_feed(recording: Recording, config: VideoConfig, flow: codec.CodecObjective, size: int, seed: int) -> Feed:
+    """Clips for a codec, `size` at a time: of thrice as many those in which more happens are the likelier."""
+    clips = clips_of(recording, flow.spans.length, 3 * size, config, seed, drop_last=False)
     controls = recording.controls or Controls.buttons(config.actions)
-    return Streamed(clips, lambda found, now: codec.clip(found, controls, moves, spans, size, now))
+    return Streamed(
+        clips, lambda found, now: codec.clip(found, controls, flow.generator.moves, flow.over, flow.spans, size, now)
+    )
 
 
 def clips_of(

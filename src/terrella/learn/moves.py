@@ -12,24 +12,27 @@ import torch
 import torch.nn.functional as F
 
 from ..data.storage.durable import write_json
-from ..space.matching import scrolled
+from ..space.matching import fetched, half_a_pixel, scrolled
 from ..space.mosaic import blank, remembered
 
 REACH, NEAR = 24, 5  # pixels that a block may move in a step; up to NEAR, all moves are tried at the full size
 BLOCK = 8  # pixels
 DIFFERENT = 4.0  # mean difference (of 255) of blocks above which a block has changed
 AWAY = 0.05  # by which each pixel of a move must improve the match
+SAME = 8  # difference of 255 up to which a pixel is the same
+FEWEST = 32  # pairs that scroll, which tell what lies over the rest
 LOOKS = "looks.json"  # of a run
 
 
 @dataclass(frozen=True)
 class Looks:
     """What a run finds once in its recording: moves int64 [n, 2], palette uint8 [n, 3], stress, how many times as much pixels
-    count that change."""
+    count that change; over bool [H, W], what stays while the picture scrolls (see overlay)."""
 
     moves: torch.Tensor
     palette: torch.Tensor
     stress: float
+    over: torch.Tensor
 
     @staticmethod
     def read(run: Path, recipe: Mapping) -> Looks | None:
@@ -39,14 +42,17 @@ class Looks:
             moves = torch.tensor(found["moves"], dtype=torch.int64).view(-1, 2)
             colours = torch.tensor(found["palette"], dtype=torch.int64).view(-1, 3)
             stress, same = float(found["stress"]), found["recipe"] == json.loads(json.dumps(recipe))
+            over = torch.tensor([[{".": False, "#": True}[pixel] for pixel in row] for row in found["over"]])
         except (OSError, ValueError, LookupError, TypeError, RuntimeError):
             return None
         sound = same and (moves.abs() <= REACH).all() and ((colours >= 0) & (colours < 256)).all() and len(colours)
-        return Looks(moves, colours.to(torch.uint8), stress) if sound and 0 < stress < float("inf") else None
+        sound = sound and 0 < stress < float("inf") and over.ndim == 2
+        return Looks(moves, colours.to(torch.uint8), stress, over) if sound else None
 
     def write(self, run: Path, recipe: Mapping) -> None:
         run.mkdir(parents=True, exist_ok=True)
         found = {"moves": self.moves.tolist(), "palette": self.palette.tolist(), "stress": self.stress}
+        found["over"] = ["".join(".#"[pixel] for pixel in row) for row in self.over.int().tolist()]
         write_json(run / LOOKS, {"recipe": dict(recipe), **found})
 
 
@@ -101,12 +107,31 @@ def palette(frames: torch.Tensor, colours: int, rng: np.random.Generator) -> tor
     return centres.round().clamp(0, 255).to(torch.uint8)
 
 
-def mosaics(frames: torch.Tensor, moves: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
-    """Mosaics [B, 4, H', W'] of frames uint8 [B, T, 3, H, W], the oldest first, those that are `real` bool [B, T] alone."""
+def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
+    """The pixels bool [H, W] that stay while the picture scrolls from `before` to `after` (uint8 [N, 3, H, W]): a status line, the
+    walker in the middle. They stay where they would not have gone along more often than the reverse, with those around them."""
+    scroll = scrolled(before, after, moves)
+    scrolls = scroll > 0
+    if scrolls.sum() < FEWEST:
+        return torch.zeros(before.shape[-2:], dtype=torch.bool)
+    before, after, scroll = before[scrolls], after[scrolls], scroll[scrolls]
+    least, most = half_a_pixel(before).unbind(1)
+    along = scroll[:, None, None].expand(-1, *before.shape[-2:])
+    least, most = (fetched(bound[:, None], along, moves).int() for bound in (least, most))
+    goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
+    stays = (before.int() - after.int()).abs().amax(1) <= SAME
+    lies, scrolls = (part.float().mean(0) for part in (stays & ~goes, goes & ~stays))
+    near = lambda share: share + F.avg_pool2d(share[None], 5, 1, 2, count_include_pad=False)[0]  # noqa: E731
+    return near(lies) > 2 * near(scrolls) + 0.02
+
+
+def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
+    """Mosaics [B, 4, H', W'] of frames uint8 [B, T, 3, H, W], the oldest first, those that are `real` bool [B, T] alone, without
+    the pixels `over` [H, W]."""
     mosaic = blank(len(frames), (frames.shape[-2], frames.shape[-1]), frames.device)
     for step in range(frames.shape[1]):
         before, now = frames[:, max(step - 1, 0)], frames[:, step]
-        joined = remembered(mosaic, now, moves[scrolled(before, now, moves)])
+        joined = remembered(mosaic, now, moves[scrolled(before, now, moves)], over)
         mosaic = torch.where(real[:, step, None, None, None], joined, mosaic)
     return mosaic
 

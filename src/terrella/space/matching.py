@@ -90,8 +90,9 @@ def explained_slowly(
 
 def preferred(share: torch.Tensor, along: torch.Tensor) -> torch.Tensor:
     """What `explained` found [B, sources, H, W], where the first that explains a pixel leaves little to others: the move `along`
-    [B], by which the picture scrolls, what stays, then all the rest. Else what is of one colour would come from anywhere."""
-    index = along[:, None, None, None].expand(-1, 1, *share.shape[2:])
+    [B, H, W], by which the picture scrolls there, what stays, then all the rest. Else what is of one colour would come from
+    anywhere."""
+    index = along[:, None]
     scrolled, stays = share.gather(1, index), share[:, :1]
     left = share * (1 - CLEAR * scrolled) * (1 - CLEAR * stays)
     left = torch.cat([stays * (1 - CLEAR * scrolled), left[:, 1:]], 1)

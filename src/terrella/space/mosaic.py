@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from .kernels_numba.matching import remembered as remembered_kernel
 from .views import arrays, each_view
 
-PICTURES = (3, 4)  # of the height and of the width of a picture
+PICTURES = (4, 5)  # of the height and of the width of a picture
 SAME, MOST = 8, 20  # difference of 255 up to which colours are one; votes that a colour may have
 
 
@@ -21,17 +21,19 @@ def blank(batch: int, size: tuple[int, int], device: torch.device | str = "cpu")
     return torch.zeros(batch, 4, PICTURES[0] * size[0], PICTURES[1] * size[1], dtype=torch.uint8, device=device)
 
 
-def remembered(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor) -> torch.Tensor:
+def remembered(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
     """Mosaics uint8 [B, 4, H', W'] after the next pictures uint8 [B, 3, H, W], to which those before went on by `move` int64
-    [B, 2] = x, y in pixels. What leaves the mosaic is forgotten."""
+    [B, 2] = x, y in pixels. Pixels `over` bool [H, W] are no part of what scrolls. What leaves the mosaic is forgotten."""
     if frame.device.type != "cpu":
-        return remembered_slowly(mosaic, frame, move)
+        return remembered_slowly(mosaic, frame, move, over)
     after = torch.empty(mosaic.shape, dtype=torch.uint8)
-    each_view(remembered_kernel, arrays(mosaic, frame, move, after), SAME, MOST)
+    each_view(remembered_kernel, arrays(mosaic, frame, move, after), *arrays(over), SAME, MOST)
     return after
 
 
-def remembered_slowly(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor) -> torch.Tensor:
+def remembered_slowly(
+    mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor, over: torch.Tensor
+) -> torch.Tensor:
     """The same as `remembered`, in plain tensor algebra; the way on a GPU."""
     size = frame.shape[-2:]
     after = _window(mosaic, move, mosaic.shape[-2:])
@@ -42,7 +44,8 @@ def remembered_slowly(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Ten
     colour = torch.where(agree | doubt, seen[:, :3], frame)
     votes = torch.where(agree, (votes + 1).clamp_max(MOST), torch.where(doubt, votes - 1, 1))
     top, left = _corner(mosaic, size)
-    after[..., top : top + size[0], left : left + size[1]] = torch.cat([colour, votes.to(torch.uint8)], 1)
+    joined = torch.where(over, seen, torch.cat([colour, votes.to(torch.uint8)], 1))
+    after[..., top : top + size[0], left : left + size[1]] = joined
     return after
 
 

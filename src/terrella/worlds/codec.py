@@ -44,15 +44,17 @@ class CodecConfig:
 
 class Seen(NamedTuple):
     """What a frame is made from: `sources` uint8 [B, slots + 1, 3, H, W], the last frames, the newest first, and what the mosaic
-    knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by `move` [B]; `went`
-    [B, moves + 1, H, W], how well each of the moves, at what it leads to this pixel, explained the last step; `common` [B, h, w,
-    colours, 2], the share of pixels of each colour of the palette, in all of `scrolled` and in and around each square."""
+    knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by the moves `along`
+    int64 [B, H, W], by which the picture scrolls but for what lies `over` it (bool [B, H, W]); `went` [B, moves + 1, H, W], how
+    well each of the moves, at what it leads to this pixel, explained the last step; `common` [B, h, w, colours, 2], the share of
+    pixels of each colour of the palette, in all of `scrolled` and in and around each square."""
 
     sources: torch.Tensor
     scrolled: torch.Tensor
     known: torch.Tensor
+    along: torch.Tensor
+    over: torch.Tensor
     went: torch.Tensor
-    move: torch.Tensor
     common: torch.Tensor
 
 
@@ -130,9 +132,9 @@ class Codec(nn.Module):
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """The next frame [B, 4, H, W] in the generator's code, by the chance that is in `noisy`; the time says nothing to it."""
-        mosaic, scroll = conditioning.mosaic, conditioning.scroll
-        assert mosaic is not None and scroll is not None
-        seen = self.seen(_frames(conditioning), mosaic, scroll)
+        mosaic, over, scroll = conditioning.mosaic, conditioning.over, conditioning.scroll
+        assert mosaic is not None and over is not None and scroll is not None
+        seen = self.seen(_frames(conditioning), mosaic, over, scroll)
         choices, features = self.choices(seen, conditioning.context)
         drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
@@ -144,20 +146,23 @@ class Codec(nn.Module):
         logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
         return least_off(logits, self.moves)
 
-    def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, move: torch.Tensor) -> Seen:
-        """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]."""
+    def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> Seen:
+        """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over: bool
+        [B, H, W], the pixels that are no part of it."""
         memory = recalled(mosaic, self.config.size, self.moves[move])
-        known = memory[:, 3:] > 0
-        scrolled = fetched(frames, move[:, None, None].expand(-1, *self.config.size), self.moves)
+        known = (memory[:, 3:] > 0) & ~over[:, None]
+        last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
+        along, last = (torch.where(over, 0, one[:, None, None]) for one in (move, last))
+        scrolled = fetched(frames, along, self.moves)
         sources = torch.cat([frames, torch.where(known, memory[:, :3], scrolled)[:, None]], 1)
         went, _ = explained(frames[:, 1:2], frames[:, 0], self.moves)
-        last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
-        return Seen(sources, scrolled, known, self._carried(preferred(went, last)), move, self.common_colours(scrolled))
+        went = self._carried(preferred(went, last))
+        return Seen(sources, scrolled, known, along, over, went, self.common_colours(scrolled))
 
     def choices(self, seen: Seen, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted"; and the pixels' features [B, HIDDEN,
         H, W]."""
-        batch, (height, width), last = len(seen.move), self.config.size, torch.channels_last
+        batch, (height, width), last = len(seen.known), self.config.size, torch.channels_last
         shown = torch.cat([seen.sources.flatten(1, 2), seen.scrolled], 1).float() / 127.5 - 1
         shown = torch.cat([shown, seen.known.float()], 1)
         down, across = (torch.linspace(-1, 1, length, device=shown.device) for length in (height, width))
@@ -172,14 +177,15 @@ class Codec(nn.Module):
         choices, scrolls, goes = self.choice(features).split((self.sources + 1, 1, 1), 1)
         moved, others, memory, painted = choices.split((len(self.moves), self.config.slots - 1, 1, 1), 1)
         moved = moved + goes * seen.went
-        along = seen.move[:, None, None, None].expand_as(scrolls)
+        along = seen.along[:, None]
         moved = moved.scatter(1, along, torch.logaddexp(moved.gather(1, along), scrolls))
-        beyond = (
-            self._beyond(moved.device) & seen.known
-        )  # what lies outside of the last frame is as the mosaic knows it
+        beyond = self._beyond(seen.over) & seen.known  # what the last frame does not show is as the mosaic knows it
         memory = torch.where(seen.known, memory, UNKNOWN)
         memory = torch.logaddexp(memory, torch.where(beyond, moved, UNKNOWN).logsumexp(1, keepdim=True))
         moved = torch.where(beyond, UNKNOWN, moved)
+        comes = beyond.gather(1, along)  # nor is it painted anew
+        memory = torch.logaddexp(memory, torch.where(comes, painted, UNKNOWN))
+        painted = torch.where(comes, UNKNOWN, painted)
         return torch.cat([moved, others, memory, painted], 1), features
 
     def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
@@ -214,15 +220,17 @@ class Codec(nn.Module):
             painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
         return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
-    def _beyond(self, device: torch.device) -> torch.Tensor:
-        """bool [moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame."""
+    def _beyond(self, over: torch.Tensor) -> torch.Tensor:
+        """bool [B, moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame, or from what lies `over`
+        it (bool [B, H, W])."""
         height, width = self.config.size
-        x = torch.arange(width, device=device) - self.moves[:, :1]
-        y = torch.arange(height, device=device) - self.moves[:, 1:]
-        return ((y < 0) | (y >= height))[:, :, None] | ((x < 0) | (x >= width))[:, None]
+        x = torch.arange(width, device=over.device) - self.moves[:, :1]
+        y = torch.arange(height, device=over.device) - self.moves[:, 1:]
+        outside = ((y < 0) | (y >= height))[:, :, None] | ((x < 0) | (x >= width))[:, None]
+        return outside | self._carried(over[:, None].expand(-1, len(self.moves), -1, -1))
 
     def _carried(self, went: torch.Tensor) -> torch.Tensor:
-        """How well each of the moves explained the last step [B, moves + 1, H, W], at the pixel to which it would lead next."""
+        """What each of the moves has at a pixel, [B, moves + 1, H, W], at the pixel to which it would lead next."""
         height, width = self.config.size
         x = (torch.arange(width, device=went.device) - self.moves[:, :1]).clamp(0, width - 1)
         y = (torch.arange(height, device=went.device) - self.moves[:, 1:]).clamp(0, height - 1)

@@ -276,7 +276,7 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
         begun = replace(
             begun, actions=starts["actions"], vitals=starts["vitals"], known=starts.get("known", begun.known)
         )
-    return FrameHistory(config, begun)
+    return FrameHistory(config, begun, remembered.get("over"))
 
 
 # By part and kind: its settings, and how it is made of them, its weights and what is remembered.
@@ -304,10 +304,12 @@ def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, 
         parts = {"memory": scene.recorded, "starts": scene.starts}
         return {f"{name}.{key}": value for name, keys in parts.items() for key, value in _pack(keys, quality).items()}
     starts: Any = scene.starts
+    assert isinstance(scene, FrameHistory)
     packed = {
         f"starts.{key}": value for key, value in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()
     }
-    return {**packed, **{f"starts.{name}": getattr(starts, name) for name in ("actions", "vitals", "known")}}
+    packed |= {f"starts.{name}": getattr(starts, name) for name in ("actions", "vitals", "known")}
+    return {**packed, "over": scene.over}
 
 
 def _below(tensors: Tensors, name: str) -> dict[str, torch.Tensor]:

@@ -23,23 +23,24 @@ LASTING = 5.0  # by how much (a logit) the last frame is the likelier source whe
 class Conditioning:
     """What a frame is drawn from: what the scene knows of the view; `last` [B, 4, H, W], the last frame's colour in [0, 1]
     carried into the view and its trust (where things move [B, 4 + PLANES, H, W], see moving.carry_frames); `context` [B, n],
-    the last frame's thumbnail and, in some worlds, the last actions; of a flat world its `mosaic` (space/mosaic.py) and `scroll`
-    [B], by which of its moves most of the picture goes on."""
+    the last frame's thumbnail and, in some worlds, the last actions; of a flat world its `mosaic` (space/mosaic.py), what
+    lies `over` it (bool [B, H, W]), and `scroll` [B], by which of its moves most of the picture goes on."""
 
     glimpse: Glimpse
     last: torch.Tensor
     context: torch.Tensor
     mosaic: torch.Tensor | None = None
+    over: torch.Tensor | None = None
     scroll: torch.Tensor | None = None
 
     def to(self, device) -> Conditioning:
-        flat = (None if part is None else part.to(device) for part in (self.mosaic, self.scroll))
+        flat = (None if part is None else part.to(device) for part in (self.mosaic, self.over, self.scroll))
         return Conditioning(self.glimpse.to(device), self.last.to(device), self.context.to(device), *flat)
 
     def at(self, rows: slice) -> Conditioning:
         """The entries `rows` of the batch."""
         glimpse = Glimpse(*(part[rows] for part in vars(self.glimpse).values()))
-        flat = (None if part is None else part[rows] for part in (self.mosaic, self.scroll))
+        flat = (None if part is None else part[rows] for part in (self.mosaic, self.over, self.scroll))
         return Conditioning(glimpse, self.last[rows], self.context[rows], *flat)
 
 

@@ -47,19 +47,22 @@ class Starts:
 
 @final
 class FrameHistory:
-    """`starts`: where episodes begin."""
+    """`starts`: where episodes begin; `over` bool [H, W]: the pixels that stay while the picture scrolls, such as a status line or
+    the walker in the middle, which are no part of the mosaic. Default: none."""
 
     kind, posed, camera = "history", False, None
 
-    def __init__(self, config: HistoryConfig, starts: Starts):
+    def __init__(self, config: HistoryConfig, starts: Starts, over: torch.Tensor | None = None):
         self.config, self.starts = config, starts
+        self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=starts.frames.device).view(-1, 2)
         self.drawn_names = ("frames", "mosaic", "scroll") if config.moves else ("frames",)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
     def to(self, device) -> FrameHistory:
-        return FrameHistory(self.config, Starts(*(part.to(device) for part in vars(self.starts).values())))
+        starts = Starts(*(part.to(device) for part in vars(self.starts).values()))
+        return FrameHistory(self.config, starts, self.over.to(device))
 
     def with_memory(self, *given) -> FrameHistory:
         """It has no use for keyframes."""
@@ -142,7 +145,9 @@ class FrameHistory:
         frames, actions = state["frames"], state["actions"].flip(1)
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
-        return Conditioning(past(frames), last, context, self._joined(state) if self.config.moves else None)
+        if not self.config.moves:
+            return Conditioning(past(frames), last, context)
+        return Conditioning(past(frames), last, context, self._joined(state), self.over.expand(len(frames), -1, -1))
 
     def drawn(
         self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
@@ -155,12 +160,18 @@ class FrameHistory:
     def _joined(self, state: State) -> torch.Tensor:
         """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it.
         It goes on as the frame was made to: new ground, of which little is known, is too plain to tell how it scrolled."""
-        return remembered(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]])
+        return remembered(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]], self.over)
+
+    def _whole(self, state: State) -> torch.Tensor:
+        """The mosaic, and what lies over it where it knows nothing."""
+        frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
+        joined, none = self._joined(state), torch.zeros_like(self.over)
+        return torch.where(joined[:, 3:] > 0, joined, remembered(state["mosaic"], frame, move, none))
 
     def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
         return {
             "rgb": lambda: state["frames"][:, 0].permute(0, 2, 3, 1).contiguous(),
-            "mosaic": lambda: _shown(self._joined(state)),
+            "mosaic": lambda: _shown(self._whole(state)),
         }
 
 

@@ -65,8 +65,9 @@ class Spans:
 
 
 def clip(
-    found: Mapping[str, np.ndarray], controls: Controls, moves: torch.Tensor, spans: Spans, batch: int, now: Now
-) -> Clip:
+    found: Mapping[str, np.ndarray], controls: Controls, moves: torch.Tensor, over: torch.Tensor, spans: Spans, batch: int,
+    now: Now,
+) -> Clip:  # fmt: skip
     """`batch` of the clips `found` (rgb uint8 [N, T, H, W, 3], action [N, T, ...]), those that change more the likelier."""
     rgb, action = np.asarray(found["rgb"]), np.asarray(found["action"], np.float32)
     past, slots = spans.past, spans.slots
@@ -83,14 +84,15 @@ def clip(
     before = torch.where(begins[..., None], 0.0, actions[:, : slots - 1])
     since = torch.from_numpy(now.rng.integers(0, past + slots, batch))[:, None]  # play has a longer or a shorter past
     real = (torch.arange(past + slots - 1) >= since) & ~begins
-    mosaic = mosaics(whole[:, : past + slots - 1], moves, real)
+    mosaic = mosaics(whole[:, : past + slots - 1], moves, over, real)
     return Clip(torch.cat([first, frames[:, slots:]], 1), torch.cat([before, actions[:, slots - 1 :]], 1), mosaic)
 
 
 class CodecObjective:
     """The likelihood of each pixel under the mixture of its sources and of the palette, in clips of these `spans`."""
 
-    def __init__(self, codec: Codec, learning_rate: float, spans: Spans, stress: float):
+    def __init__(self, codec: Codec, learning_rate: float, spans: Spans, stress: float, over: torch.Tensor):
+        self.over = over  # bool [H, W], what stays while the picture scrolls
         self.spans, self.strides = spans, spans.dream  # losses of a batch, each of which is descended
         self.stress = stress  # how many times as much pixels count that change
         self.generator = channels_last(codec)
@@ -110,30 +112,34 @@ class CodecObjective:
         self.smooth.module.scrolling.load_state_dict(self.scroll.requires_grad_(False).state_dict())
 
     def losses(self, batch: Clip, now: Now) -> Iterator[Loss]:
-        slots = self.generator.config.slots
+        slots, over = self.generator.config.slots, self.over.to(now.device)
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
+        scroll = scrolled(shown[:, 1], shown[:, 0], moves)
         half = len(recorded) // 2 * (now.step * self.strides >= RECORDED)  # the other half is never dreamt
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
-            mosaic = remembered(mosaic, shown[:, 0], moves[scrolled(shown[:, 1], shown[:, 0], moves)])
+            mosaic = remembered(mosaic, shown[:, 0], moves[scroll], over)
+            scroll = scrolled(shown[:, 0], truth, moves)
             dreamt = half if step + 1 < recorded.shape[1] else 0
-            loss, drawn = self._loss(shown, mosaic, context, truth, before, dreamt, now)
+            loss, drawn = self._loss(shown, mosaic, scroll, context, truth, before, dreamt, now)
             yield loss
             shown = torch.cat([torch.cat([drawn, truth[dreamt:]])[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, mosaic, context, truth, before, dreamt: int, now: Now) -> tuple[Loss, torch.Tensor]:
-        """Of the frames `truth` after those `shown`, `before` being the recorded frames before them; and the first `dreamt` of
-        them as they are drawn now."""
+    def _loss(self, shown, mosaic, move, context, truth, before, dreamt: int, now: Now) -> tuple[Loss, torch.Tensor]:
+        """Of the frames `truth` after those `shown`, to which most goes on by `move`, `before` being the recorded frames before
+        them; and the first `dreamt` of them as they are drawn now."""
         codec = self.generator
-        move = scrolled(shown[:, 0], truth, codec.moves)
-        seen = codec.seen(shown, mosaic, move)
+        seen = codec.seen(shown, mosaic, self.over.to(now.device).expand(len(shown), -1, -1), move)
         shows = torch.from_numpy(now.rng.random(len(shown)) >= BLIND).to(now.device)[:, None, None, None]
         seen = seen._replace(went=seen.went * shows)
         choices, features = codec.choices(seen, context)
         share, stays = explained(shown, truth, codec.moves)
-        share, memory = preferred(share, move), explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known
+        share, memory = (
+            preferred(share, seen.along),
+            explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known,
+        )
         # What the last frame explains need not be recalled.
         within = share[:, : codec.config.moves + 1].amax(1, keepdim=True)
         share = torch.cat([share, memory * (1 - CLEAR * within)], 1)

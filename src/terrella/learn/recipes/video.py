@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ...core.errors import DatasetError, TrainingError
 from ...data import Dataset
@@ -24,7 +25,7 @@ from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
 from ...worlds.outcome import Constant, ConstantConfig, Outcome
 from ...worlds.places import KeyframeScene
 from ..feeds import codec_feed, frames_feed
-from ..moves import Looks, frequent_moves, mosaics, palette
+from ..moves import Looks, frequent_moves, mosaics, overlay, palette
 from ..objectives.codec import CodecObjective, Spans
 from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
@@ -200,7 +201,7 @@ class _Learned:
         if self.video.slots < 2:
             raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
         plain, found = self.video.generator, Looks.read(self.run.out, self.run.recipe)
-        if found is None:
+        if found is None or found.over.shape != plain.size:
             found = self._looks()
             found.write(self.run.out, self.run.recipe)
         settings = CodecConfig(plain.size, plain.slots, plain.context, len(found.moves), len(found.palette))
@@ -210,9 +211,8 @@ class _Learned:
         codec.stress.fill_(found.stress**USUAL)
         ranges = self.recording.cache.episodes
         lengths = np.array([np.diff(ranges[number])[0] for number in self.recording.seen] or [0])
-        return CodecObjective(
-            codec, self.config.learning_rate or 2e-3, Spans.fitting(lengths, self.video.slots), found.stress
-        )
+        spans = Spans.fitting(lengths, self.video.slots)
+        return CodecObjective(codec, self.config.learning_rate or 2e-3, spans, found.stress, found.over)
 
     def _looks(self) -> Looks:
         recording, rng = self.recording, np.random.default_rng(self.config.seed)
@@ -223,13 +223,13 @@ class _Learned:
         most = max(32, MATCHED // before[0, 0].numel())  # pairs: each is matched at 625 displacements
         some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
-        return Looks(moves, colours, float(np.clip(STRESSED / change.mean(), 1, STRESS)))
+        over = overlay(before, after, F.pad(moves, (0, 0, 1, 0)))
+        return Looks(moves, colours, float(np.clip(STRESSED / change.mean(), 1, STRESS)), over)
 
     def _feed(self, batch: int) -> Feed:
         parts = self.video, batch, self.config.seed
         if isinstance(self.flow, CodecObjective):
-            moves, spans = self.flow.generator.moves, self.flow.spans
-            return codec_feed(self.recording, self.video, moves, spans, *parts[1:])
+            return codec_feed(self.recording, self.video, self.flow, *parts[1:])
         dream = self.flow.dream if self.config.flow_steps == 1 else None  # a teacher sees recorded frames alone
         return frames_feed(self.recording, self.memory, *parts, dream)
 
@@ -321,10 +321,12 @@ class _Learned:
         usual = float(np.median(self.happened.reward))
         if self.memory is None:
             outcome = self._outcome(ConstantConfig(usual))
-            moves = self.flow.generator.moves.cpu() if isinstance(self.flow, CodecObjective) else torch.zeros(0, 2)
+            moves, over = torch.zeros(0, 2), None
+            if isinstance(self.flow, CodecObjective):
+                moves, over = self.flow.generator.moves.cpu(), self.flow.over
             kept = replace(self.video.frames, moves=tuple((int(x), int(y)) for x, y in moves))
-            self.starts = self.starts or self._starts(moves)
-            scene = FrameHistory(kept, self.starts)
+            self.starts = self.starts or self._starts(moves, over)
+            scene = FrameHistory(kept, self.starts, over)
             return LearnedWorld(what, scene=scene, generator=generator, outcome=outcome)
         ends = self.happened.done & np.array(cache.action_valid)
         outcome = self._outcome(ConstantConfig(usual, _ending_pays(self.happened.reward - usual, ends)))
@@ -362,7 +364,7 @@ class _Learned:
         first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
         return first[:: max(1, len(first) // STARTS)][:STARTS]
 
-    def _starts(self, moves: torch.Tensor) -> Starts:
+    def _starts(self, moves: torch.Tensor, over: torch.Tensor | None) -> Starts:
         """Where episodes begin in a world without geometry: some 32 moments of the recording, evenly."""
         slots, recording = self.video.slots, self.recording
         since = np.arange(recording.cache.length) - recording.start
@@ -376,17 +378,16 @@ class _Learned:
             recording.actions_before(rows, np.arange(1, slots + 1)),
             torch.from_numpy(self.happened.vitals[rows]),
         )
-        return replace(
-            begun, actions=acts, vitals=vitals, known=self._known(rows, moves) if len(moves) else begun.known
-        )
+        known = begun.known if over is None else self._known(rows, moves, over)
+        return replace(begun, actions=acts, vitals=vitals, known=known)
 
-    def _known(self, rows: np.ndarray, moves: torch.Tensor) -> torch.Tensor:
+    def _known(self, rows: np.ndarray, moves: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
         """What mosaics of their episodes know of the pictures before `rows`: uint8 [n, 4, H, W]."""
         recording, past = self.recording, rows[:, None] - np.arange(REMEMBERED, 0, -1)
         real = torch.from_numpy(past >= recording.start[rows][:, None])
         pictures = recording.rgb(np.maximum(past, 0).ravel()).unflatten(0, past.shape)
         nowhere = torch.zeros(len(rows), 2, dtype=torch.int64)
-        return recalled(mosaics(pictures, moves, real), self.video.size, nowhere)
+        return recalled(mosaics(pictures, moves, over, real), self.video.size, nowhere)
 
     def draw_strip(self, trainer: Trainer) -> None:
         """Truth above dream, with the memory and without; and the world as it now is, so that it can be played while it

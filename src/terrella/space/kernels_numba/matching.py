@@ -176,8 +176,9 @@ def voted(frames, share, painted, drawn, moves, limits):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def remembered(mosaic, frame, move, after, same, most):
-    """The kernel of mosaic.remembered_slowly: mosaic and after uint8 [4, H', W'], frame uint8 [3, H, W], move [2]; fills after."""
+def remembered(mosaic, frame, move, after, over, same, most):
+    """The kernel of mosaic.remembered_slowly: mosaic and after uint8 [4, H', W'], frame uint8 [3, H, W], move [2], over
+    bool [H, W]; fills after."""
     _, tall, wide = mosaic.shape
     _, height, width = frame.shape
     x, y = move[0], move[1]
@@ -194,6 +195,8 @@ def remembered(mosaic, frame, move, after, same, most):
     top, left = (tall - height) // 2, (wide - width) // 2
     for v in range(height):
         for u in range(width):
+            if over[v, u]:
+                continue
             votes, off = after[3, top + v, left + u], 0
             for c in range(3):
                 off = max(off, abs(np.int32(after[c, top + v, left + u]) - np.int32(frame[c, v, u])))
