@@ -109,7 +109,8 @@ def palette(frames: torch.Tensor, colours: int, rng: np.random.Generator) -> tor
 
 def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The pixels bool [H, W] that stay while the picture scrolls from `before` to `after` (uint8 [N, 3, H, W]): a status line, the
-    walker in the middle. They stay where they would not have gone along more often than the reverse, with those around them."""
+    walker in the middle. They stay where they would not have gone along more often than the reverse, with those around them; holes
+    are filled."""
     scroll = scrolled(before, after, moves)
     scrolls = scroll > 0
     if scrolls.sum() < FEWEST:
@@ -121,8 +122,8 @@ def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> t
     goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
     stays = (before.int() - after.int()).abs().amax(1) <= SAME
     lies, scrolls = (part.float().mean(0) for part in (stays & ~goes, goes & ~stays))
-    near = lambda share: share + F.avg_pool2d(share[None], 5, 1, 2, count_include_pad=False)[0]  # noqa: E731
-    return near(lies) > 2 * near(scrolls) + 0.02
+    found = lies + _around(lies) > 2 * (scrolls + _around(scrolls)) + 0.02
+    return found | (_around(found.float()) > 0.5)
 
 
 def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
@@ -134,6 +135,11 @@ def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real:
         joined = remembered(mosaic, now, moves[scrolled(before, now, moves)], over)
         mosaic = torch.where(real[:, step, None, None, None], joined, mosaic)
     return mosaic
+
+
+def _around(plane: torch.Tensor) -> torch.Tensor:
+    """Means of the 5 x 5 pixels around each of a plane [H, W], as far as they lie in it."""
+    return F.avg_pool2d(plane[None], 5, 1, 2, count_include_pad=False)[0]
 
 
 def _shifted(pictures: torch.Tensor, x: int, y: int) -> torch.Tensor:
