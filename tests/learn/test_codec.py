@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
+from terrella.learn import feeds
 from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, overlay, palette
 from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans, clip
 from terrella.learn.trainer import Now
@@ -17,6 +20,7 @@ from terrella.worlds.controls import Controls
 
 SIZE = (32, 40)
 NONE = torch.zeros(SIZE, dtype=torch.bool)  # nothing lies over what scrolls
+LINE = (torch.arange(SIZE[0]) < 8)[:, None].expand(SIZE)  # a status line does
 
 
 def scrolling(x: int, y: int, count: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
@@ -90,6 +94,9 @@ def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
     assert torch.equal(known[0, :3, 8:], after[0, :, 8:]) and not known[1].any()
     gone = recalled(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
     assert torch.equal(gone[0, :3, 8:], before[0, :, 8:])
+    without = mosaics(torch.stack([before, after], 1), moves, LINE, real)[0]
+    known = recalled(without[None], SIZE, torch.zeros(1, 2, dtype=torch.int64))[0, 3] > 0
+    assert torch.equal(known, ~LINE), "what lies over it never enters it"
 
 
 @pytest.mark.parametrize(
@@ -122,17 +129,30 @@ def test_of_few_clips_some_are_taken_twice():
     assert set(made.frames[:, 0, 0, 0, 0].tolist()) <= {0, 1, 2}
 
 
+def test_clips_are_made_on_the_cpu_wherever_the_codec_learns(monkeypatch):
+    objective = CodecObjective(Codec(CodecConfig(SIZE, 4, 36 + 4 * 2, 1, 4, (8, 8))), 1e-3, Spans(0, 4, 3), 2.0, NONE)
+    found = {"rgb": np.zeros((3, 7, *SIZE, 3), np.uint8), "action": np.zeros((3, 7, 2), np.float32)}
+    monkeypatch.setattr(feeds, "clips_of", lambda *given, **options: SimpleNamespace(forever=lambda: iter([found])))
+    recording = SimpleNamespace(controls=Controls.buttons(2))
+    feed = feeds.codec_feed(recording, None, objective, 2, 0)  # type: ignore[arg-type]
+    objective.generator.to("meta")  # stands for a GPU
+    made = feed.batch(Now(0, 0.0, torch.device("meta"), np.random.default_rng(0), make_rng(0)))
+    assert made.mosaic.device.type == made.frames.device.type == "cpu"
+
+
 @pytest.mark.parametrize(
     ("batch", "step", "dreamt"), [(5, RECORDED, [2, 2, 0]), (1, RECORDED, [0, 0, 0]), (5, 0, [0, 0, 0])]
 )
 def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, batch, step, dreamt):
     codec = Codec(CodecConfig(SIZE, 4, 36 + 4 * 2, 1, 4, (8, 8)))
-    objective, seen = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, NONE), []
+    objective, seen = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, LINE), []
     truth = torch.randint(0, 256, (batch, 7, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
 
     def loss(shown, mosaic, move, context, target, before, count, now):
         seen.append(count)
         assert torch.equal(target, truth[:, 3 + len(seen)])
+        known = recalled(mosaic, SIZE, torch.zeros(batch, 2, dtype=torch.int64))[:, 3] > 0
+        assert torch.equal(known, ~LINE.expand(batch, -1, -1)) and not move.any()
         drawn = torch.full_like(target[:count], len(seen))
         if len(seen) > 1:
             assert (shown[: dreamt[0], 0] == len(seen) - 1).all() and torch.equal(
@@ -141,7 +161,7 @@ def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, b
         return None, drawn
 
     monkeypatch.setattr(objective, "_loss", loss)
-    mosaic = mosaics(truth[:, :3], codec.moves, NONE, torch.ones(batch, 3, dtype=torch.bool))
+    mosaic = mosaics(truth[:, :3], codec.moves, LINE, torch.ones(batch, 3, dtype=torch.bool))
     now = Now(step, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
     list(objective.losses(Clip(truth, torch.zeros(batch, 7, 2), mosaic), now))
     assert seen == dreamt

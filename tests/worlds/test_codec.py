@@ -10,7 +10,7 @@ import torch
 from terrella.core import check_world, make_rng
 from terrella.data import Layout
 from terrella.space.matching import SAME, fetched
-from terrella.space.mosaic import blank, remembered
+from terrella.space.mosaic import blank, recalled, remembered
 from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen, shared_chance
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
@@ -70,6 +70,36 @@ def test_a_mosaic_goes_on_as_the_dream_scrolls_though_its_pictures_are_too_plain
     assert seen.any(1).sum(1).tolist() == [SIZE[1] + 3 * 2] * 2
     state = made.observe(plain, state, rng)  # of evidence nobody knows but by looking how it went on
     assert (made.render(state, ("mosaic",))["mosaic"][..., 3] > 0).any(1).sum(1).tolist() == [SIZE[1] + 2 * 2] * 2
+
+
+def test_what_lies_over_what_scrolls_is_no_part_of_the_mosaic_but_of_the_map():
+    made, rng = world(codec()), make_rng(0)
+    made.scene.over[:4] = True
+    before = made.start(2, rng)
+    state = made.imagine(before, torch.zeros(2, 2, dtype=torch.int8), rng)
+    given = made.conditioning(state, before)
+    assert given.over is not None and given.mosaic is not None
+    assert torch.equal(given.over, made.scene.over.expand(2, -1, -1))
+    known = recalled(given.mosaic, SIZE, torch.zeros(2, 2, dtype=torch.int64))[:, 3] > 0
+    assert not known[:, :4].any() and known[:, 4:].all()
+    seen = made.render(state, ("rgb", "mosaic"))
+    top, left = ((whole - part) // 2 for whole, part in zip(seen["mosaic"].shape[1:3], SIZE))
+    middle = seen["mosaic"][:, top : top + SIZE[0], left : left + SIZE[1]]
+    assert torch.equal(middle[:, :4, :, :3], seen["rgb"][:, :4]) and (middle[..., 3] > 0).all()
+    ground = state.replace(mosaic=torch.ones_like(state["mosaic"]))  # of colour 1, seen once
+    beneath = made.render(ground, ("mosaic",))["mosaic"][:, top : top + 4, left : left + SIZE[1], :3]
+    assert (beneath == 1).all(), "where the ground beneath is known, the map shows it"
+
+
+def test_what_lies_over_what_scrolls_is_seen_to_stay_where_both_would_explain_it():
+    made, over = codec(), NONE.clone()
+    over[:4] = True
+    frames = pictures(1)
+    frames[:, 0] = fetched(frames[:, 1:], torch.ones(1, *SIZE, dtype=torch.int64), MOVES)  # two pixels to the right
+    frames[..., :8, :] = 90  # of one colour, which every move explains
+    for shown, stays in ((NONE, False), (over, True)):
+        went = made.seen(frames, blank(1, SIZE), shown[None], torch.ones(1, dtype=torch.int64)).went[0, :2, :2, 4:-4]
+        assert ((went[0] > 0.5) == stays).all() and ((went[1] > 0.5) != stays).all()
 
 
 def test_where_nothing_scrolls_there_is_no_mosaic_to_show():

@@ -21,7 +21,7 @@ from .storage.tables import read_json, read_whole
 
 def read_info(root: Path, files: LocalFiles | Files) -> dict:
     """meta/info.json; DatasetError where there is none, or it is of another version."""
-    make_one = f"record one with `terrella record doom --out {root}`"
+    make_one = f"record one with `terrella record world ENVIRONMENT --out {root}`"
     if not files.exists(INFO):
         if isinstance(files, LocalFiles) and not root.is_dir():
             raise DatasetError(f"there is no dataset at {root}; {make_one}.")

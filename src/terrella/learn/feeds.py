@@ -66,9 +66,8 @@ def codec_feed(recording: Recording, config: VideoConfig, flow: codec.CodecObjec
     """Clips for a codec, `size` at a time: of thrice as many those in which more happens are the likelier."""
     clips = clips_of(recording, flow.spans.length, 3 * size, config, seed, drop_last=False)
     controls = recording.controls or Controls.buttons(config.actions)
-    return Streamed(
-        clips, lambda found, now: codec.clip(found, controls, flow.generator.moves, flow.over, flow.spans, size, now)
-    )
+    parts = controls, flow.generator.moves.cpu(), flow.over, flow.spans, size  # clips are made where they are read
+    return Streamed(clips, lambda found, now: codec.clip(found, *parts, now))
 
 
 def clips_of(

@@ -115,15 +115,21 @@ def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> t
     scrolls = scroll > 0
     if scrolls.sum() < FEWEST:
         return torch.zeros(before.shape[-2:], dtype=torch.bool)
-    before, after, scroll = before[scrolls], after[scrolls], scroll[scrolls]
-    least, most = half_a_pixel(before).unbind(1)
-    along = scroll[:, None, None].expand(-1, *before.shape[-2:])
-    least, most = (fetched(bound[:, None], along, moves).int() for bound in (least, most))
-    goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
-    stays = (before.int() - after.int()).abs().amax(1) <= SAME
-    lies, scrolls = (part.float().mean(0) for part in (stays & ~goes, goes & ~stays))
-    found = lies + _around(lies) > 2 * (scrolls + _around(scrolls)) + 0.02
+    lies = goes_along = torch.zeros(before.shape[-2:])
+    for part in scrolls.nonzero().flatten().split(256):
+        stays, goes = _ways(before[part], after[part], moves, scroll[part])
+        lies, goes_along = lies + (stays & ~goes).sum(0), goes_along + (goes & ~stays).sum(0)
+    lies, goes_along = lies / scrolls.sum(), goes_along / scrolls.sum()
+    found = lies + _around(lies) > 2 * (goes_along + _around(goes_along)) + 0.02
     return found | (_around(found.float()) > 0.5)
+
+
+def _ways(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor, scroll: torch.Tensor):
+    """Which pixels of `after` stayed, and which went along with the `scroll` [N]: bool [N, H, W] each."""
+    along = scroll[:, None, None].expand(-1, *before.shape[-2:])
+    least, most = (fetched(bound[:, None], along, moves).int() for bound in half_a_pixel(before).unbind(1))
+    goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
+    return (before.int() - after.int()).abs().amax(1) <= SAME, goes
 
 
 def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real: torch.Tensor) -> torch.Tensor:

@@ -82,7 +82,7 @@ class Scrolling:
             near = (wanted - wanted.amax(1, keepdim=True)) / ALIKE
             known = (wanted.amax(1) > 0.2).float()
             losses.append(-((logits.log_softmax(1) + near).logsumexp(1) * known).sum() / known.sum().clamp_min(1))
-            guess = least_off(logits.detach(), self.moves)
+            guess = least_off(logits.detach(), self.moves.to(now.device))
             right.append((wanted.gather(1, guess[:, None]) > wanted.amax(1, keepdim=True) - ALIKE).float().mean())
             went.insert(0, torch.where(dreamt, F.one_hot(guess, wanted.shape[1]).float(), wanted))
         loss = torch.stack(losses).mean()
