@@ -163,6 +163,24 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     assert "seed 0, not 5" in capsys.readouterr().err
 
 
+def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monkeypatch):
+    enough = []
+
+    def slow(world, out, frames, seed, report, *rest, **more):
+        for rows in (1, 40, 590, 600):
+            report(rows, frames)
+            enough.append(more["enough"]())
+        return explore(world, out, 20, seed, report, *rest, **more)
+
+    monkeypatch.setattr("terrella.cli.learn.explore", slow)
+    monkeypatch.setattr("terrella.progress.LINE_EVERY_S", -1.0)
+    monkeypatch.setattr(Plan, "share_s", property(lambda plan: {RECORDING: 0.0, TRAINING: 1.0, SCORING: 1.0}))
+    main(command(tmp_path / "slow"))
+    assert enough == [False, False, False, True]
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("recording")]
+    assert ["a slow game: until it has 600 frames" in line for line in said[1:4]] == [True, True, False]
+
+
 def test_too_few_frames_are_said_and_kept(tmp_path, capsys, monkeypatch):
     few = lambda world, out, frames, *rest, **more: explore(world, out, 20, *rest, **more)  # noqa: E731
     monkeypatch.setattr("terrella.cli.learn.explore", few)

@@ -125,14 +125,19 @@ def _record(plan: Plan, name: str, controls: Controls, environment: Environment,
     plan.save()
     rows = 0
 
-    def told(done: float, total: float, *words: Any) -> None:
+    def few_s() -> float:
+        """Seconds for which it goes on beyond its time, at this pace, for there are few frames."""
+        spent = plan.spent[RECORDING]
+        return min(plan.seconds / 2 - spent, (FEW_FRAMES / max(rows, 1) - 1) * spent)
+
+    def told(done: float, total: float, words: str = "", left_s: float | None = None) -> None:
         nonlocal rows
         rows = done
-        report(done, total, *words)
+        late = plan.left_s(RECORDING) <= 0 < few_s()
+        report(done, total, *((f"a slow game: until it has {FEW_FRAMES} frames", few_s()) if late else (words, left_s)))
 
     def enough() -> bool:
-        few = rows < FEW_FRAMES and plan.spent[RECORDING] < plan.seconds / 2
-        return plan.left_s(RECORDING) <= 0 and not few
+        return plan.left_s(RECORDING) <= 0 and few_s() <= 0
 
     more: dict[str, Any] = {"max_episode_steps": plan.facts["longest"], "enough": enough}
     explore(world, out, frames, plan.asked["seed"], told, stored_as(world.spec), **more)

@@ -1,0 +1,96 @@
+"""A device that is pretended: tensors that refuse to meet those of the CPU, as a GPU's do; and the losses of flat
+worlds on it.
+
+Run as a program, for the pretence changes torch for the whole process. `test_devices.py` does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+from terrella.core import make_rng
+from terrella.learn.moves import mosaics
+from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans
+from terrella.learn.objectives.scroll import LENGTH, Piece, Scrolling
+from terrella.learn.trainer import Now
+from terrella.worlds.codec import Codec, CodecConfig
+
+_setup_privateuseone_for_python_backend("other")
+OTHER, CPU = torch.device("other:0"), torch.device("cpu")
+INDEXED = ("aten::index", "aten::index_put", "aten::index_put_")  # which take indices of the CPU on a GPU, too
+
+
+class Other(torch.Tensor):
+    """A tensor that says it lies on the other device; `here` holds its numbers."""
+
+    here: torch.Tensor
+
+    @staticmethod
+    def __new__(cls, here):
+        layout = {"strides": here.stride(), "storage_offset": here.storage_offset()}
+        made = torch.Tensor._make_wrapper_subclass(cls, here.shape, dtype=here.dtype, device=OTHER, **layout)
+        made.here = here
+        return made
+
+    def __init__(self, here):
+        pass
+
+    @classmethod
+    def __torch_dispatch__(cls, op, types, args=(), kwargs=None):
+        return _run(op, args, kwargs or {})
+
+
+class Pretended(TorchDispatchMode):
+    def __torch_dispatch__(self, op, types, args=(), kwargs=None):
+        return _run(op, args, kwargs or {})
+
+
+def _run(op, args, kwargs):
+    given = [part for part in tree_leaves((args, kwargs)) if isinstance(part, torch.Tensor)]
+    other, name = [part for part in given if isinstance(part, Other)], op._schema.name
+    wanted = kwargs.get("device")
+    plain_args, plain = tree_map_only(Other, lambda part: part.here, (args, {**kwargs}))
+    if wanted is not None:
+        plain["device"] = CPU
+    found = op(*plain_args, **plain)
+    if name == "aten::copy_":
+        return args[0]
+    if name not in ("aten::_to_copy", *INDEXED) and other and any(p.ndim and not isinstance(p, Other) for p in given):
+        raise RuntimeError(f"{name}: tensors of two devices, {[tuple(part.shape) for part in given]}")
+    if not (wanted.type == OTHER.type if wanted is not None else other):
+        return found
+    same = {id(part.here): part for part in other} if op._schema.is_mutable else {}
+    return tree_map_only(torch.Tensor, lambda part: same.get(id(part)) or Other(part), found)
+
+
+def main() -> None:
+    size, moves = (32, 40), torch.tensor([[0, 0], [1, 0], [0, -2]])
+    over = (torch.arange(size[0]) < 5)[:, None].expand(size)
+    now = Now(RECORDED, 0.0, OTHER, np.random.default_rng(0), make_rng(0))
+    codec = Codec(CodecConfig(size, 4, 36 + 4 * 2, 2, 4, (8, 8)))
+    codec.moves[:] = moves
+    truth = torch.randint(0, 256, (4, 7, 3, *size), dtype=torch.uint8, generator=make_rng(0))
+    clip = Clip(truth, torch.zeros(4, 7, 2), mosaics(truth[:, :3], moves, over, torch.ones(4, 3, dtype=torch.bool)))
+    piece = Piece(torch.cat([truth, truth[:, :1]], 1), torch.zeros(4, LENGTH, 36 + 4 * 2), torch.rand(4, 3 + LENGTH, 3))
+    objective = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, over)
+    scrolling = object.__new__(Scrolling)  # without a recording
+    scrolling.scroll, scrolling.moves, scrolling.slots = objective.scroll, moves, 4
+    with Pretended():
+        for module in objective.modules.values():
+            module.to(OTHER)
+        try:
+            codec.moves + moves
+        except RuntimeError:
+            print("mixing is refused")
+        for losses in (objective.losses(clip, now), scrolling.losses(piece, now)):
+            for loss in losses:
+                assert loss.value.device == OTHER
+                print(f"{loss.learner} has a loss")
+
+
+if __name__ == "__main__":
+    main()
