@@ -124,7 +124,9 @@ def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> t
     return found | (_around(found.float()) > 0.5)
 
 
-def _ways(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor, scroll: torch.Tensor):
+def _ways(
+    before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor, scroll: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Which pixels of `after` stayed, and which went along with the `scroll` [N]: bool [N, H, W] each."""
     along = scroll[:, None, None].expand(-1, *before.shape[-2:])
     least, most = (fetched(bound[:, None], along, moves).int() for bound in half_a_pixel(before).unbind(1))
