@@ -18,7 +18,7 @@ import torch
 from terrella.core import make_rng
 from terrella.space.fitting import decibels
 from terrella.space.layout import build, understood
-from terrella.space.occupancy import Body, Occupancy
+from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.solids import Solids
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
 
@@ -26,7 +26,7 @@ TEXT = (
     "a long room with two pillars and a red door, two windows and stairs, and a library with a sofa, a table, four chairs, "
     "two bookshelves, a rug and a plant"
 )
-BODY = Body(eye_m=1.65, step_m=0.35)
+BODY = Walker(eye_m=1.65, step_m=0.35)
 
 
 def in_a_wall(place: torch.Tensor, boxes: torch.Tensor, radius: float) -> torch.Tensor:

@@ -13,13 +13,13 @@ import torch
 from terrella.learn.recipes.splat_views import SplatFit, read_views
 from terrella.sim.mujoco_model import mujoco
 from terrella.space.camera import planar_pose, rotation
-from terrella.space.fitting import Views
+from terrella.space.fitting import PosedViews
 
 LENS, SIZE = (0.5, 0.5, 0.5, 0.5), (256, 256)
 LOOKS = ("checker", "gradient", "flat")
 
 
-def doom_room() -> Views:
+def doom_room() -> PosedViews:
     """68 pictures of the big room of my_way_home, of which 60 are fitted: the example of docs/space.md."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["record", "doom", "--frames", "3000", "--seed", "3", "--out", f"{folder}/maze"]
@@ -30,7 +30,7 @@ def doom_room() -> Views:
         return read_views(f"{folder}/maze", Path(folder), SplatFit(frames=68, episodes=1, box=(15.5, -9, 24, -2)))[0]
 
 
-def mujoco_room(count: int = 112, seed: int = 0) -> Views:
+def mujoco_room(count: int = 112, seed: int = 0) -> PosedViews:
     """Pictures of a room of 6 x 5 m with a dozen things in it, drawn by MuJoCo from places at eye height."""
     model = mujoco.MjModel.from_xml_string(_room_xml(seed))
     data, renderer = mujoco.MjData(model), mujoco.Renderer(model, *SIZE)
@@ -50,7 +50,7 @@ def mujoco_room(count: int = 112, seed: int = 0) -> Views:
         renderer.disable_depth_rendering()
     renderer.close()
     pictures = torch.from_numpy(np.stack(rgb)).permute(0, 3, 1, 2).contiguous()
-    return Views(pictures, torch.from_numpy(np.stack(depth)).float(), pose, LENS)
+    return PosedViews(pictures, torch.from_numpy(np.stack(depth)).float(), pose, LENS)
 
 
 def _room_xml(seed: int) -> str:

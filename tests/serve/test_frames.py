@@ -1,4 +1,4 @@
-"""Frames drawn on the server: what the rasteriser draws, and a page that walks by them where there is no WebGL2."""
+"""FrameRenderer drawn on the server: what the rasteriser draws, and a page that walks by them where there is no WebGL2."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 
 from terrella.cli.space import shown_place
 from terrella.core.errors import ServeError
-from terrella.serve.frames import Frames
+from terrella.serve.frames import FrameRenderer
 from terrella.serve.place import build_place
 from terrella.space.camera import planar_pose
 from terrella.space.raster import rasterise
@@ -39,7 +39,7 @@ def picture(content: bytes) -> torch.Tensor:
 
 def test_a_frame_is_what_the_rasteriser_draws_after_the_edits():
     place, edits = world(1500), []
-    frames = Frames(place.gaussians, place.objects, lambda: edits)
+    frames = FrameRenderer(place.gaussians, place.objects, lambda: edits)
     pose = planar_pose(*(torch.tensor([float(VIEW[name])]) for name in ("x", "y", "z", "heading")))
     truth = rasterise(place.gaussians, pose, (0.5 / 0.8, 0.5 / 0.6, 0.5, 0.5), (120, 160)).rgb[0].clamp(0, 1)
     assert (picture(frames.draw(view())).permute(2, 0, 1) - truth).abs().mean() < 0.03
@@ -50,7 +50,7 @@ def test_a_frame_is_what_the_rasteriser_draws_after_the_edits():
 def test_what_lies_ahead_is_in_the_middle():
     ahead = torch.tensor([[math.cos(0.7) * math.cos(0.4), math.sin(0.7) * math.cos(0.4), math.sin(0.4)]])
     one = world(300).gaussians.at(torch.arange(1))
-    frames = Frames(replace(one, means=torch.tensor([[1.5, 2.0, 1.4]]) + 2 * ahead), torch.zeros(1), list)
+    frames = FrameRenderer(replace(one, means=torch.tensor([[1.5, 2.0, 1.4]]) + 2 * ahead), torch.zeros(1), list)
     light = picture(frames.draw(view(pitch=0.4))).sum(2)
     row, column = divmod(int(light.argmax()), 160)
     assert light.max() > 0.3 and abs(row - 59.5) < 5 and abs(column - 79.5) < 5
@@ -61,7 +61,7 @@ def test_what_lies_ahead_is_in_the_middle():
 )
 def test_other_views_are_refused(wrong):
     with pytest.raises(ServeError, match="reload"):
-        Frames(world(300).gaussians, world(300).objects, list).draw(view(**wrong))
+        FrameRenderer(world(300).gaussians, world(300).objects, list).draw(view(**wrong))
 
 
 def test_without_webgl_the_server_draws_and_one_walks(serving, browser):  # noqa: F811

@@ -18,7 +18,7 @@ from terrella.serve.door import make_server, open_port
 from terrella.serve.place import PAGE, PlacePage, build_place, bundled
 from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
-from terrella.space.occupancy import Body, Occupancy
+from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import rasterise
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import checked_edits, merging, read_edits, save_splat, write_edits
@@ -194,7 +194,7 @@ def test_known_walls_of_merged_places_are_met_as_in_python(tmp_path, opened):
 
 
 def test_bodies_move_as_they_do_in_python(tmp_path, opened):
-    page, place, body = opened(exported(tmp_path, 6000)), world(6000), Body()
+    page, place, body = opened(exported(tmp_path, 6000)), world(6000), Walker()
     rng = torch.Generator().manual_seed(1)
     points = torch.tensor([-0.5, -0.5, 1.2]) + torch.tensor([5.0, 5.0, 1.5]) * torch.rand(300, 3, generator=rng)
     wish = 0.6 * torch.rand(300, 3, generator=rng) - 0.3
@@ -209,7 +209,7 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     boxes = torch.tensor(
         [[-1, -1, -0.2, 5, 5, 0], [4, -1, 0, 4.2, 5, 3], [1, 1, 0, 2, 2, 0.3], [0, 3, 0, 4, 3.2, 2]]
     ).float()
-    body, walled = Body(), walled_by(world(600), boxes)
+    body, walled = Walker(), walled_by(world(600), boxes)
     save_splat(walled, tmp_path / "w")
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
     page, rng = opened((tmp_path / "place.html").as_uri()), torch.Generator().manual_seed(2)

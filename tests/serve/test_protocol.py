@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
 from terrella.serve.history import Image
-from terrella.serve.protocol import Controls, Show
+from terrella.serve.protocol import HeldControls, Show
 
 from .wire import Frame, decode_frame, encode
 
@@ -86,9 +86,9 @@ def test_every_message_is_understood():
     said = {
         '{"type": "controls", "id": 7, "t": 12.5, "held": ["KeyW", "ArrowLeft"]}': (
             "controls",
-            Controls(7, ("KeyW", "ArrowLeft"), (), 12.5),
+            HeldControls(7, ("KeyW", "ArrowLeft"), (), 12.5),
         ),
-        '{"type": "controls", "id": 8, "held": [], "axes": [0.5, -1]}': ("controls", Controls(8, (), (0.5, -1.0))),
+        '{"type": "controls", "id": 8, "held": [], "axes": [0.5, -1]}': ("controls", HeldControls(8, (), (0.5, -1.0))),
         '{"type": "drive", "on": false}': ("drive", False),
         '{"type": "show", "map": true, "invented": false, "cameras": ["rgb.wrist"]}': (
             "show",

@@ -6,7 +6,7 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from terrella.serve.protocol import REPLAY, Controls, Show
+from terrella.serve.protocol import REPLAY, HeldControls, Show
 from terrella.serve.session import MAX_UNACKED, Session
 from terrella.serve.timeline import Timeline
 
@@ -97,9 +97,9 @@ def test_the_latest_keys_win_and_are_named_in_the_frame():
         socket = FakeSocket(session)
         session.attach(socket)
         await until(lambda: socket.frames)
-        session.hear("controls", Controls(1, ("ArrowLeft",), t=5.0))
-        session.hear("controls", Controls(3, ("KeyW",), t=7.0))
-        session.hear("controls", Controls(2, ("ArrowLeft",), t=6.0))  # late, and older
+        session.hear("controls", HeldControls(1, ("ArrowLeft",), t=5.0))
+        session.hear("controls", HeldControls(3, ("KeyW",), t=7.0))
+        session.hear("controls", HeldControls(2, ("ArrowLeft",), t=6.0))  # late, and older
         await until(lambda: socket.last.action_id == 3)
         obeyed = next(frame for frame in socket.frames if frame.action_id == 3)
         assert obeyed.client_ms == 7.0
@@ -180,7 +180,7 @@ def test_a_dropped_socket_pauses_the_story_and_another_goes_on():
     async def scenario(session):
         first = FakeSocket(session)
         session.attach(first)
-        session.hear("controls", Controls(50, ("KeyW",)))
+        session.hear("controls", HeldControls(50, ("KeyW",)))
         await until(lambda: first.frames and first.last.step >= 5)
         session.detach(first)
         await asyncio.sleep(0.05)
@@ -193,7 +193,7 @@ def test_a_dropped_socket_pauses_the_story_and_another_goes_on():
         assert second.frames[0].step == step and second.frames[0].seq > first.last.seq
         score = second.last.episode_return
         session.hear(
-            "controls", Controls(1, ("ArrowLeft",))
+            "controls", HeldControls(1, ("ArrowLeft",))
         )  # a reloaded page counts anew, and no key of the old page is held
         await until(lambda: second.last.action_id == 1)
         assert second.last.episode_return == score

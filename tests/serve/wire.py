@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
 from terrella.serve.history import Image, Moment
-from terrella.serve.protocol import Controls
+from terrella.serve.protocol import HeldControls
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def encode(frame: Frame) -> bytes:
     moment = Moment(
         frame.step, frame.images, frame.flags, frame.episode_return, uncertainty=frame.uncertainty, vitals=frame.vitals
     )
-    controls = Controls(frame.action_id, t=frame.client_ms)
+    controls = HeldControls(frame.action_id, t=frame.client_ms)
     past = frame.oldest, frame.newest
     return protocol.encode_frame(moment, frame.seq, *past, controls, frame.generation_ms, frame.server_s)
 

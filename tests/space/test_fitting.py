@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from terrella.space.camera import planar_pose
-from terrella.space.fitting import Fit, FitConfig, Views, decibels, nearest_views, psnr
-from terrella.space.occupancy import Body, Occupancy
+from terrella.space.fitting import Fit, FitConfig, PosedViews, decibels, nearest_views, psnr
+from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import Gaussians, rasterise
 from terrella.space.raster.gaussians import plain_sh
 
@@ -25,13 +25,13 @@ def room(side=4.0, high=2.5, count=1500) -> Gaussians:
     return Gaussians(means, quats, torch.full((count, 3), 0.12), torch.full((count,), 0.95), plain_sh(colours))
 
 
-def views(count=20) -> Views:
+def views(count=20) -> PosedViews:
     turn = torch.arange(count) * 2.4
     x, y = 2 + 0.8 * torch.cos(turn * 1.7), 2 + 0.8 * torch.sin(turn * 0.9)
     pose = planar_pose(x, y, torch.full((count,), 1.2), turn)
     seen = rasterise(room(), pose, LENS, SIZE)
     rgb = (seen.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-    return Views(rgb, seen.depth / seen.alpha.clamp_min(0.5), pose, LENS)
+    return PosedViews(rgb, seen.depth / seen.alpha.clamp_min(0.5), pose, LENS)
 
 
 def test_a_fit_learns_and_goes_on_exactly():
@@ -59,7 +59,7 @@ def test_a_fit_learns_and_goes_on_exactly():
 
 
 def test_walls_stop_and_floors_carry():
-    place, body = Occupancy.of(room(count=6000)), Body()
+    place, body = Occupancy.of(room(count=6000)), Walker()
     here = torch.tensor([[2.0, 2.0, 1.6]]).repeat(16, 1)
     assert not place.blocked(here, body).any()
     assert torch.allclose(place.floor(here, body), torch.zeros(16), atol=0.1)

@@ -14,10 +14,10 @@ from terrella.core.errors import DatasetError
 from terrella.space.camera import planar_pose
 from terrella.space.files import read_scene
 from terrella.space.files.glb import encode_gaussians
-from terrella.space.files.gltf_scene import Scene, read_gltf
+from terrella.space.files.gltf_scene import GltfScene, read_gltf
 from terrella.space.layout.mesh_solids import solids_of
 from terrella.space.layout.meshes import of_triangles
-from terrella.space.occupancy import Body
+from terrella.space.occupancy import Walker
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
 
@@ -26,7 +26,7 @@ from .test_raster import cloud
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]]).astype(np.uint32)
-BODY = Body(eye_m=1.65, step_m=0.35)
+BODY = Walker(eye_m=1.65, step_m=0.35)
 # a room of 6 x 4 x 3 metres of five walls that are boxes and a ceiling, a pillar, in our frame: low and high corners
 WALLS = {
     "floor": (-0.2, -0.2, -0.2, 6.2, 4.2, 0), "ceiling": (-0.2, -0.2, 3, 6.2, 4.2, 3.2), "west": (-0.2, -0.2, 0, 0, 4.2, 3),
@@ -65,11 +65,11 @@ def glb(about: dict | None = None, nodes: list | None = None, **more: object) ->
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Scene:
+def scene(tmp_path_factory) -> GltfScene:
     path = tmp_path_factory.mktemp("glb") / "room.glb"
     path.write_bytes(glb())
     found = read_gltf(path)
-    assert isinstance(found, Scene)
+    assert isinstance(found, GltfScene)
     return found
 
 

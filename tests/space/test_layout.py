@@ -11,7 +11,7 @@ import torch
 
 from terrella.core.errors import ContractError
 from terrella.space.kernels_numba.light import first_box
-from terrella.space.layout import build, looks, read_plan, understood, words
+from terrella.space.layout import build, looks, read_layout, understood, words
 from terrella.space.layout.blocks import blocks_of
 from terrella.space.raster import rasterise
 
@@ -57,7 +57,7 @@ def test_any_words_make_a_place_that_can_be_built(seed):
     ]
     heard = understood("room " + " ".join(rng.choice(some) for _ in range(30)), seed)
     blocks = blocks_of(heard.plan)
-    assert json.loads(json.dumps(heard.layout)) == heard.layout and read_plan(heard.layout) == heard.plan
+    assert json.loads(json.dumps(heard.layout)) == heard.layout and read_layout(heard.layout) == heard.plan
     assert (blocks.solids[:, 3:] > blocks.solids[:, :3]).all()
 
 
@@ -98,7 +98,7 @@ def test_the_same_seed_the_same_bytes():
 )  # fmt: skip
 def test_a_layout_that_cannot_be_is_refused(change, says):
     with pytest.raises(ContractError, match=says):
-        blocks_of(read_plan({"rooms": [ROOM], **change}))
+        blocks_of(read_layout({"rooms": [ROOM], **change}))
 
 
 def test_doors_join_rooms_or_are_shut(tmp_path):
@@ -108,7 +108,7 @@ def test_doors_join_rooms_or_are_shut(tmp_path):
             {"rooms": [ROOM, NEXT], "doors": [{"room": "hall", "wall": "east"}, {"room": "hall", "wall": "west"}]}
         )
     )
-    solids = blocks_of(read_plan(path)).solids.astype(np.float64)
+    solids = blocks_of(read_layout(path)).solids.astype(np.float64)
     through = lambda y, ahead: first_box(3.0, y, 1.5, ahead, 0.0, 0.0, solids, 1e9)[1]  # noqa: E731
     assert abs(through(2.0, 1.0) - 6.2) < 1e-5 and through(2.0, -1.0) < 3 and abs(through(1.0, 1.0) - 3.0) < 1e-5
 

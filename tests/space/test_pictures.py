@@ -12,7 +12,7 @@ from PIL import Image
 from terrella.cli import main
 from terrella.core.errors import DatasetError
 from terrella.space.camera import FAR_M, rotation
-from terrella.space.fitting import Views
+from terrella.space.fitting import PosedViews
 from terrella.space.pictures import is_pictures, posed_pictures
 from terrella.space.pictures.posed import to_views
 from terrella.space.pictures.reading import blurred, read_picture, sharpness
@@ -62,12 +62,12 @@ def test_depth_is_found_where_pictures_show_something():
     seen = rasterise(bright_room(), pose, LENS, SIZE)
     truth = seen.depth / seen.alpha.clamp_min(0.5)
     blank = torch.full((20, 1, 1), FAR_M)
-    given = Views((seen.rgb.clamp(0, 1) * 255).byte(), blank, pose, LENS)
+    given = PosedViews((seen.rgb.clamp(0, 1) * 255).byte(), blank, pose, LENS)
     found = with_depth(given).depth
     known = found < FAR_M
     assert known.float().mean() > 0.3
     assert ((found / truth - 1).abs()[known] < 0.2).float().mean() > 0.8
-    mixed = Views(given.rgb, blank, pose[torch.randperm(20, generator=torch.Generator().manual_seed(0))], LENS)
+    mixed = PosedViews(given.rgb, blank, pose[torch.randperm(20, generator=torch.Generator().manual_seed(0))], LENS)
     wrong = with_depth(mixed).depth
     assert (wrong < FAR_M).float().mean() < 0.3 * known.float().mean()  # poses that do not fit the pictures
 

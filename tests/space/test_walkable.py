@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from terrella.space.occupancy import Body, Occupancy
+from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.solids import Solids
 from terrella.space.walkable import CELL_M, walkable
 
@@ -14,7 +14,7 @@ WALL, WITH_DOOR = (
     [[4.0, 0, 0, 4.1, 4, 3]],
     [[4.0, 0, 0, 4.1, 1.5, 3], [4.0, 2.5, 0, 4.1, 4, 3], [4.0, 1.5, 2.1, 4.1, 2.5, 3]],
 )
-START, BODY = torch.tensor([[1.0, 2.0, 1.6]]), Body()
+START, BODY = torch.tensor([[1.0, 2.0, 1.6]]), Walker()
 
 
 def reached(boxes, most=1000):

@@ -11,7 +11,7 @@ import torch
 from terrella.cli import main
 from terrella.core import check_world, make_rng
 from terrella.space.camera import planar_pose
-from terrella.space.occupancy import Body
+from terrella.space.occupancy import Walker
 from terrella.space.solids import Solids
 from terrella.worlds.folder import open_world
 
@@ -79,7 +79,7 @@ def test_one_goes_through_the_door_and_nowhere_else(folder):
 
 
 def test_nobody_enters_a_wall(folder):
-    world, body, rng = open_world(folder), Body(eye_m=1.65, step_m=0.35), torch.Generator().manual_seed(0)
+    world, body, rng = open_world(folder), Walker(eye_m=1.65, step_m=0.35), torch.Generator().manual_seed(0)
     state = world.start(64, make_rng(0))
     for step in range(60):
         if step % 6 == 0:
@@ -90,7 +90,7 @@ def test_nobody_enters_a_wall(folder):
 
 
 def test_solids_are_met_exactly():
-    body, wall = Body(0.25, 1.6, 0.35, 0.15), Solids(torch.tensor([[1.0, -5, 0, 1.1, 5, 3], [-9, -9, -0.1, 9, 9, 0]]))
+    body, wall = Walker(0.25, 1.6, 0.35, 0.15), Solids(torch.tensor([[1.0, -5, 0, 1.1, 5, 3], [-9, -9, -0.1, 9, 9, 0]]))
     at = torch.tensor([[0.74, 0, 1.6], [0.76, 0, 1.6], [1.05, 0, 1.6], [1.36, 0, 1.6]])
     assert wall.blocked(at, body).tolist() == [False, True, True, False]
     assert torch.allclose(wall.depth(at, body)[1:3], torch.tensor([0.01, 0.3]), atol=1e-5)

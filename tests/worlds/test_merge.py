@@ -11,10 +11,10 @@ import torch
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
-from terrella.serve.frames import NAMES, Frames
+from terrella.serve.frames import NAMES, FrameRenderer
 from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
-from terrella.space.occupancy import Body
+from terrella.space.occupancy import Walker
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
 from terrella.worlds.splat import SplatConfig, SplatWorld
@@ -74,7 +74,7 @@ def test_it_is_there_what_it_was_at_home(two):
 def test_bodies_meet_what_was_merged(two, turn):
     _, other, path = two
     assert edit(path / "a", "--merge", str(path / "b"), "--turn", str(turn), "--move", "20", "0", "0") == 0
-    world, body = opened(path / "a"), Body()
+    world, body = opened(path / "a"), Walker()
     assert len(world.solids) == (0 if turn == 37 else 4)  # then the Gaussians stop bodies
     if turn == 37:
         return
@@ -109,7 +109,7 @@ def test_it_is_undone_redone_and_edited_as_anything_else(two):
     view = dict.fromkeys(NAMES, "0") | {"x": "14", "wide": "1", "tall": "1", "width": "32", "height": "32"}
     source, mine = source_of(path / "a"), other_of(path / "a")
     with_it, without = (
-        Frames(source.gaussians, source.objects, edits, mine) for edits in (lambda: read_edits(path / "a"), list)
+        FrameRenderer(source.gaussians, source.objects, edits, mine) for edits in (lambda: read_edits(path / "a"), list)
     )
     assert with_it.draw(view) != without.draw(view)
     assert edit(path / "a", "--undo") == 0 and len(opened(path / "a").gaussians) == 60

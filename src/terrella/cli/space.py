@@ -15,7 +15,7 @@ from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
 from ..space.edits import DEEDS, Edit, edited
 from ..space.files import read_scene, replace_whole, write_scene
-from ..space.files.gltf_scene import GLTF_ENDINGS, Scene, read_gltf
+from ..space.files.gltf_scene import GLTF_ENDINGS, GltfScene, read_gltf
 from ..space.files.spz import Version
 from ..space.occupancy import extent
 from ..space.solids import Solids
@@ -38,7 +38,7 @@ from .space_build import COUNT, of_scene
 from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_other
 
 if TYPE_CHECKING:
-    from ..serve.place import Place
+    from ..serve.place import PlaceScene
 
 COARSE_M = 0.3  # cells that are wider let nobody through doors
 Axes = Literal["rdf", "rub", "flu"]
@@ -107,7 +107,7 @@ def import_(
         raise TerrellaError("--scale is above 0, and --size from 8 to 4096 pixels a side.")
     if file.suffix.lower() in GLTF_ENDINGS and axes is None:
         scene = read_gltf(file, scale)
-        if isinstance(scene, Scene):
+        if isinstance(scene, GltfScene):
             return of_scene(scene, file, out, COUNT, size, json)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -211,27 +211,29 @@ def _mergeable(folder: Path, other: str) -> Edit | None:
         return None
 
 
-def compared_with(name: str) -> Place:
+def compared_with(name: str) -> PlaceScene:
     """What a page compares a place with: a world of Gaussians as its edits have it, or a file in the axes usual for its kind."""
     file = Path(name)
     return shown_place(world_of(read_scene(file), file.name, {}, SplatConfig()) if file.is_file() else open_splat(name))
 
 
-def place_of(world: str) -> Place:
+def place_of(world: str) -> PlaceScene:
     """What a page shows of a world of Gaussians: as it was before its edits."""
     open_splat(world)  # refuses what is none
     other = other_of(folder_of(world))
     return shown_place(source_of(folder_of(world)), lambda edit: shown_place(other(edit), walked=False))
 
 
-def shown_place(source: SplatWorld, other: Callable[[Edit], Place] | None = None, walked: bool = True) -> Place:
+def shown_place(
+    source: SplatWorld, other: Callable[[Edit], PlaceScene] | None = None, walked: bool = True
+) -> PlaceScene:
     """A world of Gaussians as a page takes it; `other` opens what an edit merges. Where nobody walks no floors and walls are read
     off the Gaussians."""
-    from ..serve.place import Place
+    from ..serve.place import PlaceScene
 
     config, seen = source.config, source.provenance == OBSERVED
     collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
-    return Place(
+    return PlaceScene(
         source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
         config.keep, config.dt_s, source.object_names, other,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from .say import Json, result
 
 if TYPE_CHECKING:
-    from ..space.files.gltf_scene import Scene
+    from ..space.files.gltf_scene import GltfScene
     from ..space.raster import Gaussians
 
 LAYOUT_FILE, COUNT = "layout.json", 120_000
@@ -43,7 +43,7 @@ def build(
     from ..core.errors import TerrellaError
     from ..space.files.gltf_scene import GLTF_ENDINGS, read_gltf
     from ..space.layout import build as built
-    from ..space.layout import read_plan, understood
+    from ..space.layout import read_layout, understood
 
     if (layout is None) == (text is None):
         raise TerrellaError('give a layout.json or a .glb, or --text "a long room with two pillars and a red door".')
@@ -57,7 +57,7 @@ def build(
         heard = understood(text, seed or 0)
         plan, unknown, left_out, said = heard.plan, heard.unknown, heard.left_out, heard.layout
     else:
-        plan = read_plan(layout or "")
+        plan = read_layout(layout or "")
         plan = plan if seed is None else replace(plan, seed=seed)
         said = asdict(plan)
     place = built(plan, gaussians)
@@ -84,12 +84,12 @@ def _save(place: Any, name: str, text: str | None, size: tuple[int, int], out: P
     import torch
 
     from ..space.files import replace_whole
-    from ..space.occupancy import Body
+    from ..space.occupancy import Walker
     from ..worlds.additions import INVENTED, OBSERVED
     from ..worlds.splat import SplatConfig, SplatWorld
     from ..worlds.splat_folder import save_splat
 
-    body = Body(eye_m=1.65, step_m=0.35)
+    body = Walker(eye_m=1.65, step_m=0.35)
     starts = place.starts.clone()
     starts[:, 2] += body.eye_m
     known = OBSERVED if text is None else INVENTED  # what a layout states is given; of words much is guessed
@@ -103,19 +103,19 @@ def _save(place: Any, name: str, text: str | None, size: tuple[int, int], out: P
 
 
 def of_scene(
-    scene: Scene | Gaussians, file: Path, out: Path, gaussians: int, size: tuple[int, int], json: bool
+    scene: GltfScene | Gaussians, file: Path, out: Path, gaussians: int, size: tuple[int, int], json: bool
 ) -> None:
     """Make a place to walk in of the triangles of a file."""
     from ..core.errors import DatasetError
-    from ..space.files.gltf_scene import Scene
+    from ..space.files.gltf_scene import GltfScene
     from ..space.layout.meshes import of_triangles
-    from ..space.occupancy import Body
+    from ..space.occupancy import Walker
     from ..worlds.splat import SplatConfig
     from ..worlds.splat_folder import save_splat, world_of
 
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GltfScene):
         raise DatasetError(f"{file} holds Gaussians; `terrella space import` makes a world of them.")
-    config = SplatConfig((0.5, 0.5 * size[1] / size[0], 0.5, 0.5), size, body=Body(eye_m=1.65, step_m=0.35))
+    config = SplatConfig((0.5, 0.5 * size[1] / size[0], 0.5, 0.5), size, body=Walker(eye_m=1.65, step_m=0.35))
     found, objects, solids = of_triangles(scene, gaussians)
     names = list(scene.names)
     world = world_of(found, file.stem, {"file": file.name, "objects": names}, config, objects, solids)

@@ -131,7 +131,7 @@ def make_server(
     url = page_address(host, listener.getsockname()[1], token)
     app.state.on_ready = lambda: on_ready and on_ready(url)
     settings = uvicorn.Config(
-        app, http=Door, ws="websockets-sansio" if websockets else "none", ws_max_size=2**16, ws_max_queue=64,
+        app, http=GuardedConnection, ws="websockets-sansio" if websockets else "none", ws_max_size=2**16, ws_max_queue=64,
         ws_per_message_deflate=False, log_level="error", access_log=False, timeout_graceful_shutdown=2,
         server_header=False, proxy_headers=False,
     )  # fmt: skip
@@ -184,14 +184,14 @@ def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:
     loop.set_exception_handler(handle)
 
 
-class Door(H11Protocol):
+class GuardedConnection(H11Protocol):
     """uvicorn's connection with a deadline for each request. A request that is whole is answered without one; a
     WebSocket takes the connection over, and is let in or refused by its own handshake."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
         found = vars(self.server_state).setdefault("waiting", OrderedDict())  # oldest first
-        self._waiting: OrderedDict[Door, asyncio.TimerHandle] = found
+        self._waiting: OrderedDict[GuardedConnection, asyncio.TimerHandle] = found
         if len(self._waiting) >= MOST_WAITING:
             next(iter(self._waiting)).drop()
         self._await_request()

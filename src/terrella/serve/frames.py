@@ -19,7 +19,7 @@ SMALLEST, LARGEST, NARROWEST, WIDEST = 8, 1280, 1e-3, 20.0
 FARTHEST_M = 1e6
 
 
-class Frames:
+class FrameRenderer:
     """Pictures of Gaussians, objects int32 [N], after the `edits` of the moment, of which `other` opens what they merge; one
     is drawn at a time."""
 

@@ -27,12 +27,12 @@ from starlette.routing import Route
 from ..core.errors import ServeError, TerrellaError
 from ..space.edits import Edit, merges
 from ..space.files.compressed import packed_quats
-from ..space.occupancy import Body, Occupancy, samples
+from ..space.occupancy import Occupancy, Walker, samples
 from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
 from .door import WEB, application, posted, serve_page
-from .frames import Frames
+from .frames import FrameRenderer
 
 PAGE = WEB / "place"
 MOST_STARTS = 64
@@ -46,7 +46,7 @@ _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.
 
 
 @dataclass(frozen=True)
-class Place:
+class PlaceScene:
     """What the page shows: Gaussians before all edits, of which `seen` bool [N] were observed, and objects int32 [N] says to which
     object each belongs (0: none) of those that `names` lists; starts [S, 7] poses; what is solid and who walks; pace and keep as a
     SplatConfig has them, and dt_s of a step; `other` opens the place that an edit merges."""
@@ -57,19 +57,19 @@ class Place:
     objects: torch.Tensor
     starts: torch.Tensor
     collider: Occupancy | Solids
-    body: Body
+    body: Walker
     pace: Sequence[float]
     keep: Sequence[float]
     dt_s: float
     names: Sequence[str] = ()
-    other: Callable[[Edit], Place] | None = None
+    other: Callable[[Edit], PlaceScene] | None = None
 
 
 class PlacePage:
     """The page of a place, to compare with `beside` if that is given, and to merge with it if `merge` says how an edit does. It
     loads nothing from anywhere: `policy` is its Content-Security-Policy."""
 
-    def __init__(self, place: Place, beside: Place | None = None, merge: Edit | None = None):
+    def __init__(self, place: PlaceScene, beside: PlaceScene | None = None, merge: Edit | None = None):
         self._place, self._beside, self._compared = place, None, ""
         self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # what merges bring to it
         if beside is not None:
@@ -120,14 +120,14 @@ def _key(edit: Edit) -> tuple[str, str]:
     return edit["place"], edit["sha256"]
 
 
-def _whole(place: Place) -> tuple[dict[str, Any], str]:
+def _whole(place: PlaceScene) -> tuple[dict[str, Any], str]:
     """What scene.js unpacks of a place that comes in one: what is said of it, and its columns in gzip and base64."""
     packed = gzip.compress(_packed(place, torch.ones(len(place.gaussians), dtype=torch.bool)), 6, mtime=0)
     told = {"count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names)}
     return told, base64.b64encode(packed).decode()
 
 
-def packed_place(place: Place, first: int) -> tuple[dict[str, Any], bytes, bytes]:
+def packed_place(place: PlaceScene, first: int) -> tuple[dict[str, Any], bytes, bytes]:
     """What scene.js and solid.js unpack: `count`, `first` and `solid`; what is solid and the columns of so many Gaussians,
     which are spread over all, in gzip; and the columns of the rest, empty where there is none."""
     count, (solid, cubes) = len(place.gaussians), _packed_solid(place.collider)
@@ -165,7 +165,7 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _packed(place: Place, chosen: torch.Tensor) -> bytes:
+def _packed(place: PlaceScene, chosen: torch.Tensor) -> bytes:
     """The columns of some Gaussians that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
     scene = place.gaussians.at(chosen)
     if place.objects.numel() and int(place.objects.max()) > 65535:
@@ -195,7 +195,7 @@ def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]
     return about, np.packbits(solid.ravel()).tobytes() + within[solid].tobytes()
 
 
-def _boxes(place: Place) -> list[list[float]]:
+def _boxes(place: PlaceScene) -> list[list[float]]:
     return place.collider.boxes.tolist() if isinstance(place.collider, Solids) else []
 
 
@@ -206,12 +206,12 @@ def _by_bytes(numbers: np.ndarray, kind: str) -> bytes:
 
 
 def build_place(
-    place: Place,
+    place: PlaceScene,
     edits: Callable[[], Sequence[Edit]],
     save: Callable[[str], None],
     host: str = "127.0.0.1",
     token: str | None = None,
-    beside: Place | None = None,
+    beside: PlaceScene | None = None,
     merge: Edit | None = None,
 ) -> Starlette:
     """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
@@ -220,7 +220,7 @@ def build_place(
     page, alone, frames = (
         PlacePage(place, beside, merge),
         threading.Lock(),
-        Frames(place.gaussians, place.objects, edits, place.other),
+        FrameRenderer(place.gaussians, place.objects, edits, place.other),
     )
 
     def kept(content: bytes) -> None:
@@ -261,14 +261,14 @@ def build_place(
 
 
 def serve_place(
-    place: Place,
+    place: PlaceScene,
     edits: Callable[[], Sequence[Edit]],
     save: Callable[[str], None],
     port: int = 8767,
     host: str = "127.0.0.1",
     token: str | None = None,
     on_ready: Callable[[str], None] | None = None,
-    beside: Place | None = None,
+    beside: PlaceScene | None = None,
     merge: Edit | None = None,
 ) -> None:
     """Serves the page of a place until interrupted; `edits`, `save`, `beside` and `merge` as `build_place` has them.

@@ -37,7 +37,7 @@ _IMAGE = struct.Struct("<BBHI")  # world, camera, 0, bytes
 
 
 @dataclass(frozen=True)
-class Controls:
+class HeldControls:
     """What is held from now on: keys in the order they were pressed, and the value of each axis in the world's units.
 
     `id` grows with each message, `t` is the page's clock.
@@ -72,7 +72,7 @@ class Show:
 
 
 def encode_frame(
-    moment: Moment, seq: int, oldest: int, newest: int, controls: Controls, made_ms: float, server_s: float
+    moment: Moment, seq: int, oldest: int, newest: int, controls: HeldControls, made_ms: float, server_s: float
 ) -> bytes:
     """One moment as the page gets it. seq counts messages (the page acknowledges it); oldest..newest is what can be rewound
     to; `controls`, of which id and time are echoed, are the latest that this step obeyed; vitals are in the order of hello."""
@@ -111,13 +111,13 @@ def parse_message(data: str | bytes) -> tuple[str, Any]:
     return str(kind), read(body)
 
 
-def _controls(body: dict) -> Controls:
+def _controls(body: dict) -> HeldControls:
     axes = body.get("axes", [])
     if not isinstance(axes, list) or len(axes) > MAX_AXES:
         raise ProtocolError(f"'axes' must be a list of at most {MAX_AXES} numbers.")
     held = _names(body, "held", MAX_HELD, "key codes")
     numbers = tuple(_finite(value, "axes") for value in axes)
-    return Controls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
+    return HeldControls(_integer(body, "id", 0, U32), held, numbers, _finite(body.get("t", 0.0), "t"))
 
 
 def _goal(body: dict) -> Goal:

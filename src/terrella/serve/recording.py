@@ -27,7 +27,7 @@ class Sink(Protocol):
 SinkFactory = Callable[[], Sink]
 
 
-class Recording:
+class SessionRecording:
     """Off until `begin`. Play goes on where a recording cannot: `fault` then says why it stopped."""
 
     def __init__(self, factory: SinkFactory | None):

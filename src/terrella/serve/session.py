@@ -21,7 +21,7 @@ from .actions import MAX_AXES, axes_of, keys_of
 from .chart import EVERY_S
 from .history import Moment
 from .keys import KeyBook
-from .protocol import Controls, Show
+from .protocol import HeldControls, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
@@ -44,7 +44,7 @@ class Session:
         self.heard_at = time.monotonic()
         self._make_timeline, self._worker, self._book = make_timeline, worker, book
         self._socket: WebSocket | None = None
-        self._controls = Controls(0)
+        self._controls = HeldControls(0)
         self._commands: deque[tuple[str, Any]] = deque()
         self._wake = asyncio.Event()
         self._sent = self._acked = 0
@@ -71,7 +71,7 @@ class Session:
         """Plays on through `socket`; gives the socket that was attached until now."""
         before, self._socket = self._socket, socket
         self.detached_at, self._acked, self._sent_last = None, self._sent, {}
-        self._controls = Controls(0)  # a new page counts its messages anew
+        self._controls = HeldControls(0)  # a new page counts its messages anew
         self._show = Show(map=False, invented=False)
         self.heard_at = time.monotonic()
         self._unseen = self.timeline.shown if self.timeline else None
@@ -180,7 +180,7 @@ class Session:
             return self._fail(error)
         await self._send(moment, timeline, made_ms, controls)
 
-    def _step(self, timeline: Timeline) -> tuple[Controls, Moment, float]:
+    def _step(self, timeline: Timeline) -> tuple[HeldControls, Moment, float]:
         """In the worker: the controls are read as late as can be."""
         begun, controls = time.perf_counter(), self._controls
         moment = timeline.step(controls.held, controls.axes)
@@ -268,7 +268,7 @@ class Session:
             await self._event(kind, **body)
             self._sent_last[kind] = body
 
-    async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: Controls) -> None:
+    async def _send(self, moment: Moment, timeline: Timeline, made_ms: float, controls: HeldControls) -> None:
         self._unseen = None
         images = moment.images
         if self._show.invented or not made_ms:

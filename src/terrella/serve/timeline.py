@@ -21,7 +21,7 @@ from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
 from .protocol import DONE, FRESH, Goal
-from .recording import Recording, SinkFactory
+from .recording import SessionRecording, SinkFactory
 
 JPEG_QUALITY = 90
 
@@ -89,7 +89,7 @@ class Timeline:
         self.notice = ""  # something that a person should know, in one sentence
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
         self.driver = Driver(agents_of(policy), worlds[0])
-        self.recording = Recording(sink_factory)
+        self.recording = SessionRecording(sink_factory)
         frames = int(min(max(history_s / self.spec.dt_s, 64), 4096))
         self.history = History(frames, state_mb * 2**20)
         self.shown: Moment  # that the timeline stands at: the newest, unless it was rewound

@@ -15,9 +15,9 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from .door import application, make_server, open_port
-from .place import Place, PlacePage, packed_place
+from .place import PlacePage, PlaceScene, packed_place
 
-Show = Callable[[Callable[[], Place], Mapping[str, Any]], None]
+Show = Callable[[Callable[[], PlaceScene], Mapping[str, Any]], None]
 STARTS_S = 20.0
 
 
@@ -26,9 +26,9 @@ class Newest:
 
     def __init__(self):
         self._lock, self._packed, self._page = threading.Lock(), (0, b"", b""), (0, b"")
-        self._newest: tuple[int, Callable[[], Place] | None, Mapping[str, Any]] = 0, None, {}
+        self._newest: tuple[int, Callable[[], PlaceScene] | None, Mapping[str, Any]] = 0, None, {}
 
-    def show(self, make: Callable[[], Place], facts: Mapping[str, Any]) -> None:
+    def show(self, make: Callable[[], PlaceScene], facts: Mapping[str, Any]) -> None:
         """`make` gives the place as it is now; facts: `step`, `steps` and `db` (PSNR), for the page's head."""
         self._newest = self._newest[0] + 1, make, facts
 
@@ -74,7 +74,7 @@ def watched(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator[S
 
     with contextlib.closing(open_port(host, port)) as listener, contextlib.ExitStack() as stack:
 
-        def show(make: Callable[[], Place], facts: Mapping[str, Any]) -> None:
+        def show(make: Callable[[], PlaceScene], facts: Mapping[str, Any]) -> None:
             newest.show(make, facts)
             if not started.is_set():
                 started.set()

@@ -23,7 +23,7 @@ _RATES = {"means": 1.5e-4, "quats": 1e-3, "scales": 1e-2, "opacities": 3e-2, "sh
 
 
 @dataclass(frozen=True)
-class Views:
+class PosedViews:
     """Posed pictures with depth: rgb uint8 [T, 3, H, W]; depth float32 [T, h, w] metres, 0 or FAR_M where nothing is known; pose
     [T, 7]; the camera's intrinsics."""
 
@@ -39,7 +39,7 @@ class Views:
     def size(self) -> tuple[int, int]:
         return self.rgb.shape[-2], self.rgb.shape[-1]
 
-    def at(self, rows: torch.Tensor) -> Views:
+    def at(self, rows: torch.Tensor) -> PosedViews:
         return replace(self, rgb=self.rgb[rows], depth=self.depth[rows], pose=self.pose[rows])
 
     def depths(self, rows: torch.Tensor) -> torch.Tensor:
@@ -72,7 +72,7 @@ class FitConfig:
 class Fit:
     """A fit under way: `step()` until `done` is config.steps; `state()` and `restore` make it go on exactly where it was."""
 
-    def __init__(self, views: Views, config: FitConfig):
+    def __init__(self, views: PosedViews, config: FitConfig):
         self.views, self.config, self.done = views, config, 0
         self.mean_depth_m = float(views.depths(torch.arange(0, len(views), max(len(views) // 20, 1))).mean())
         if not self.mean_depth_m > 0:
@@ -183,7 +183,7 @@ def _scene(leaves: dict[str, torch.Tensor]) -> Gaussians:
     )
 
 
-def from_depth(views: Views, count: int, seed: int = 0) -> Gaussians:
+def from_depth(views: PosedViews, count: int, seed: int = 0) -> Gaussians:
     """About `count` Gaussians on the surfaces that depth shows, one for each little cube, those of near surfaces smaller."""
     rng = torch.Generator().manual_seed(seed)
     found = []
@@ -228,7 +228,7 @@ def _of_pixels(
     )
 
 
-def psnr(gaussians: Gaussians, views: Views) -> torch.Tensor:
+def psnr(gaussians: Gaussians, views: PosedViews) -> torch.Tensor:
     """How well pictures come out, in dB: [T]."""
     found = []
     with torch.no_grad():
@@ -243,7 +243,7 @@ def decibels(off: torch.Tensor) -> torch.Tensor:
     return 10 * (255**2 / off.square().mean().clamp_min(1e-6)).log10()
 
 
-def nearest_views(kept: Views, asked: Views) -> torch.Tensor:
+def nearest_views(kept: PosedViews, asked: PosedViews) -> torch.Tensor:
     """The kept picture whose camera stands and looks most like that of each asked one: rows [T]; a metre counts as 0.5 rad."""
     apart = torch.cdist(asked.pose[:, :3], kept.pose[:, :3])
     ahead, other = rotation(asked.pose)[..., 0], rotation(kept.pose)[..., 0]

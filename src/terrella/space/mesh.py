@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from ..core.errors import ContractError
-from .occupancy import Body, Occupancy
+from .occupancy import Occupancy, Walker
 from .raster import Drawing, Gaussians, rasterise
 from .solids import Solids
 
@@ -117,7 +117,7 @@ def collider_mesh(collider: Solids | Occupancy) -> Mesh:
     return Mesh(vertices, faces, torch.full((len(vertices), 3), 180, dtype=torch.uint8))
 
 
-def viewpoints(gaussians: Gaussians, collider: Solids | Occupancy, starts: torch.Tensor, body: Body) -> torch.Tensor:
+def viewpoints(gaussians: Gaussians, collider: Solids | Occupancy, starts: torch.Tensor, body: Walker) -> torch.Tensor:
     """Poses [E, 7] from which a place is looked over: where one begins, and free places from which it is as closed all around, far
     from one another."""
     rng = torch.Generator().manual_seed(0)

@@ -13,7 +13,7 @@ import torch
 from mujoco import rollout
 
 from .camera import rotation
-from .occupancy import Body
+from .occupancy import Walker
 
 STEP_S = 1 / 240
 DENSITY = 100.0  # kg/m^3: hollow wood
@@ -28,7 +28,7 @@ class RigidBodies:
     """Bodies 1 to K of boxes float32 [S, 6] (low and high corners): `owner` [S] says whose each is, 0 of what stays where it is.
     `body` walks among them; a step takes `dt_s`."""
 
-    def __init__(self, boxes: torch.Tensor, owner: torch.Tensor, body: Body, dt_s: float):
+    def __init__(self, boxes: torch.Tensor, owner: torch.Tensor, body: Walker, dt_s: float):
         self.body, self.dt_s, self.steps = body, dt_s, max(round(dt_s / STEP_S), 1)
         self.count = int(owner.max())
         self._own, self._boxes = owner, boxes

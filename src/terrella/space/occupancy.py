@@ -23,7 +23,7 @@ _DEEPEST_M = 8.0  # floors lower than this below the feet are not looked for
 
 
 @dataclass(frozen=True)
-class Body:
+class Walker:
     """radius and height of the eye above the feet; up to which height it steps onto things; headroom above the eye; all metres."""
 
     radius_m: float = 0.25
@@ -68,7 +68,7 @@ class Occupancy:
         shape = tuple(size.tolist())
         return Occupancy(low, cell_m, (count >= _FEWEST).view(shape), top.view(shape))
 
-    def blocked(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+    def blocked(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
         """Whether a body at `place` [B, 3] stands in something: bool [B]. What is as low as a step does not count."""
         angle = torch.arange(8) * (math.pi / 4)
         ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * body.radius_m, torch.zeros(1, 2)])
@@ -80,12 +80,12 @@ class Occupancy:
         cells, inside = self._cells(place[:, None] + offset.flatten(0, 1).to(place))
         return (self.solid[cells] & inside).any(1)
 
-    def floor(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+    def floor(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
         """How high the floor under a body is [B]; its feet where there is none."""
         level = self.surface(place, body)
         return torch.where(level.isnan(), place[:, 2] - body.eye_m, level)
 
-    def surface(self, place: torch.Tensor, body: Body) -> torch.Tensor:
+    def surface(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
         """How high the highest surface up to a step above a body's feet is [B], the mean of what lies around; nan where there is
         none."""
         feet = place[:, 2] - body.eye_m
@@ -102,7 +102,7 @@ class Occupancy:
         middle = level.nanmedian(1, keepdim=True).values
         return torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
 
-    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Body) -> torch.Tensor:
+    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
         """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever
         stands in something already may leave it."""
         stuck = self.blocked(place, body)

@@ -18,7 +18,7 @@ _FIRST_M, _FIRST_RAD, _ROUNDS = 0.5, 0.12, 6  # of the search, whose steps are h
 
 
 @dataclass(frozen=True)
-class Found:
+class RecognisedPose:
     """Where a picture was taken: pose [7], how alike memory's view from there is (normalised correlation of the known
     pixels, at most 1) and its edges are (that of their differences), and the share of it that is known."""
 
@@ -39,7 +39,7 @@ def thumbnails(rgb: torch.Tensor) -> torch.Tensor:
 
 def recognise(
     picture: torch.Tensor, memory: Keyframes, small: torch.Tensor, camera: Intrinsics, sources: int
-) -> Found | None:
+) -> RecognisedPose | None:
     """The best pose for a level picture, uint8 [3, H, W], among `memory` with its `thumbnails`; None in an empty memory.
 
     Keyframes are compared with the picture as it would be with the camera turned a little; the best are searched around, each
@@ -56,7 +56,7 @@ def recognise(
     size = (picture.shape[-2], picture.shape[-1])
     last = _View(memory, winner.pose, camera, sources, _scaled(picture, size)).searched(_ROUNDS - 3)
     likeness, known = last.judged(last.pose)
-    return Found(last.pose, likeness, last.edges(last.pose), known)
+    return RecognisedPose(last.pose, likeness, last.edges(last.pose), known)
 
 
 def _candidates(

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from .camera import FAR_M, project, rotation, unproject
-from .fitting import Views
+from .fitting import PosedViews
 
 DEPTHS, NEIGHBOURS, WINDOW = 64, 4, 5
 LONGEST = 128  # pixels of the pictures that are compared
@@ -20,7 +20,7 @@ AGREE, SURE = 0.05, 0.5  # share by which two pictures' depths may differ; agree
 _SMOOTH = 1e-4  # variance of a window (of 1) below which it has nothing to compare
 
 
-def with_depth(views: Views, points: torch.Tensor | None = None) -> Views:
+def with_depth(views: PosedViews, points: torch.Tensor | None = None) -> PosedViews:
     """The same views with depth [T, h, w], FAR_M where it is not known; `points` [N, 3]: what is known to be there."""
     shape = [max(round(side * min(LONGEST / max(views.size), 1)), 8) for side in views.size]
     grey = F.interpolate(views.rgb.float().mean(1, keepdim=True) / 255, shape, mode="area")
@@ -32,7 +32,7 @@ def with_depth(views: Views, points: torch.Tensor | None = None) -> Views:
     return replace(views, depth=_agreed(found, views, others))
 
 
-def _range(views: Views, points: torch.Tensor | None) -> tuple[float, float]:
+def _range(views: PosedViews, points: torch.Tensor | None) -> tuple[float, float]:
     """The nearest and the farthest depth to try: of the points, or else of how far the cameras are spread."""
     pose = views.pose
     if points is not None and len(points) >= 16:
@@ -56,7 +56,9 @@ def _neighbours(pose: torch.Tensor, depth: float) -> torch.Tensor:
     return badness.argsort(1)[:, : min(NEIGHBOURS, len(pose) - 1)]
 
 
-def _swept(known: torch.Tensor, views: Views, row: int, others: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:
+def _swept(
+    known: torch.Tensor, views: PosedViews, row: int, others: torch.Tensor, levels: torch.Tensor
+) -> torch.Tensor:
     """Depth of one picture [h, w], 0 where no two neighbours agree well enough; known [T, 2, h, w]: see `_normal`."""
     shape, count = known.shape[-2:], len(levels)
     here, contrast = known[row].split(1)
@@ -78,7 +80,7 @@ def _swept(known: torch.Tensor, views: Views, row: int, others: torch.Tensor, le
     return torch.where((top > SURE) & (contrast[0] > _SMOOTH) & (which == middle), found, 0.0)
 
 
-def _projected(world: torch.Tensor, views: Views, other: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _projected(world: torch.Tensor, views: PosedViews, other: int) -> tuple[torch.Tensor, torch.Tensor]:
     at, depth = project(world, views.pose[other], views.camera)
     return 2 * at - 1, depth
 
@@ -97,7 +99,7 @@ def _normal(grey: torch.Tensor) -> torch.Tensor:
     return torch.cat([(grey - mean) / (variance + _SMOOTH).sqrt(), variance], 1)
 
 
-def _agreed(found: torch.Tensor, views: Views, others: torch.Tensor) -> torch.Tensor:
+def _agreed(found: torch.Tensor, views: PosedViews, others: torch.Tensor) -> torch.Tensor:
     """Depths that another picture's depths confirm, FAR_M for the rest."""
     kept = []
     for row, depth in enumerate(found):

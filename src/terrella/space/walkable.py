@@ -6,7 +6,7 @@ from typing import Protocol
 
 import torch
 
-from .occupancy import Body
+from .occupancy import Walker
 
 CELL_M = 0.4  # between two places; walls stand further apart from whoever is beside them
 _WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -16,11 +16,11 @@ _PARTS = 4  # of the way from one place to the next, each looked at
 class Collider(Protocol):
     """What Solids and Occupancy have in common."""
 
-    def blocked(self, place: torch.Tensor, body: Body) -> torch.Tensor: ...
-    def surface(self, place: torch.Tensor, body: Body) -> torch.Tensor: ...
+    def blocked(self, place: torch.Tensor, body: Walker) -> torch.Tensor: ...
+    def surface(self, place: torch.Tensor, body: Walker) -> torch.Tensor: ...
 
 
-def walkable(collider: Collider, starts: torch.Tensor, body: Body, most: int) -> torch.Tensor:
+def walkable(collider: Collider, starts: torch.Tensor, body: Walker, most: int) -> torch.Tensor:
     """Places [N, 3] of the eye, metres, at most `most`, the nearest to `starts` [S, 3] first: each CELL_M from a neighbour, from
     which one can walk straight there. Where floors lie above each other, the one that is come to first."""
     origin = starts[0, :2]
@@ -42,7 +42,7 @@ def walkable(collider: Collider, starts: torch.Tensor, body: Body, most: int) ->
 
 
 def _stood(
-    collider: Collider, place: torch.Tensor, cells: torch.Tensor, body: Body
+    collider: Collider, place: torch.Tensor, cells: torch.Tensor, body: Walker
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Of places [n, 3] those where one stands on something and in nothing: their cells, and how high the eye is there."""
     level = collider.surface(place, body)
@@ -54,7 +54,7 @@ def _stood(
 
 
 def _reached(
-    collider: Collider, origin: torch.Tensor, cells: torch.Tensor, height: torch.Tensor, way: torch.Tensor, body: Body
+    collider: Collider, origin: torch.Tensor, cells: torch.Tensor, height: torch.Tensor, way: torch.Tensor, body: Walker
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Which cells [n, 2] are come to by a step `way` [n, 2] from eyes as high as `height` [n]."""
     for part in range(1, _PARTS + 1):

@@ -19,7 +19,7 @@ from ..core.state import State
 from ..core.world import Observation
 from ..space.camera import Intrinsics, rotation, yaw
 from ..space.fitting import resized
-from ..space.occupancy import Body, Occupancy
+from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Drawing, Gaussians, rasterise
 from ..space.raster.move import multiplied
 from ..space.solids import Solids
@@ -51,7 +51,7 @@ class SplatConfig:
     buttons: tuple[str, ...] = BUTTONS
     pace: tuple[float, float, float, float] = (0.03, 0.025, 0.018, 0.025)
     keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)
-    body: Body = Body()
+    body: Walker = Walker()
     additions: int = 32768
 
 

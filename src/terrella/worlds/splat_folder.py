@@ -21,7 +21,7 @@ from ..core.errors import CheckpointError, ContractError
 from ..space.camera import planar_pose
 from ..space.edits import Edit, Edited, edited, merges, placed_boxes
 from ..space.files import replace_whole
-from ..space.occupancy import Body
+from ..space.occupancy import Walker
 from ..space.raster import Gaussians
 from .additions import INVENTED, OBSERVED
 from .splat import SplatConfig, SplatWorld
@@ -81,7 +81,7 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         )
     try:
         tensors, said = load_file(path / SCENE_FILE), dict(about["config"])
-        body = Body(**said.pop("body"))
+        body = Walker(**said.pop("body"))
         given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in said.items()}
         config = SplatConfig(body=body, **given)
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")

@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 
 from ...core.errors import ContractError, TrainingError
 from ...space.files import replace_whole
-from ...space.fitting import Fit, Views, decibels, nearest_views, psnr
-from ...space.occupancy import Body, Occupancy
+from ...space.fitting import Fit, PosedViews, decibels, nearest_views, psnr
+from ...space.occupancy import Occupancy, Walker
 from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
 from ...worlds.splat import SplatConfig, SplatWorld
@@ -95,7 +95,7 @@ def fit_splat(
     return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
-def _figures(fit: Fit, kept: Views, asked: Views) -> dict[str, Any]:
+def _figures(fit: Fit, kept: PosedViews, asked: PosedViews) -> dict[str, Any]:
     near = nearest_views(kept, asked)
     copied = torch.stack([decibels(kept.rgb[one].float() - truth.float()) for one, truth in zip(near, asked.rgb)])
     found = psnr(fit.gaussians, asked)
@@ -113,14 +113,14 @@ def _figures(fit: Fit, kept: Views, asked: Views) -> dict[str, Any]:
 
 
 def _world(
-    gaussians: Gaussians, kept: Views, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
+    gaussians: Gaussians, kept: PosedViews, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
 ) -> SplatWorld:
     """The world of a fit, in which one is as tall as the recording's camera was over its floor."""
     gaussians = gaussians.at(gaussians.opacities > 0.01)
     eye = kept.pose[:, :3]
-    below = Occupancy.of(gaussians).floor(eye, Body(eye_m=0.5, step_m=0.0))
+    below = Occupancy.of(gaussians).floor(eye, Walker(eye_m=0.5, step_m=0.0))
     tall = float((eye[:, 2] - below).median())
-    body = Body(eye_m=tall, step_m=min(0.45, 0.4 * tall)) if 0.3 < tall < 3 else Body()
+    body = Walker(eye_m=tall, step_m=min(0.45, 0.4 * tall)) if 0.3 < tall < 3 else Walker()
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     starts = kept.pose[:: max(len(kept) // 64, 1)]
     made = SplatConfig(kept.camera, kept.size, body=body)

@@ -16,7 +16,7 @@ from ...core.errors import DatasetError
 from ...data import Dataset
 from ...space.camera import FAR_M
 from ...space.files import replace_whole
-from ...space.fitting import FitConfig, Views
+from ...space.fitting import FitConfig, PosedViews
 from ...space.pictures import is_pictures, posed_pictures
 from ...space.pictures.posed import FEWEST, to_views
 from ...space.stereo import with_depth
@@ -50,7 +50,7 @@ class SplatFit:
     fit: FitConfig = field(default_factory=FitConfig)
 
 
-def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[Views, Mapping[str, Any], list[str]]:
+def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedViews, Mapping[str, Any], list[str]]:
     """Views with depth, what a recording says of its world, and the pictures that were left out; DatasetError where they are no
     views of one place. Depth that had to be found, and poses, are kept in `out`."""
     path, spec, left_out = Path(data), {}, []
@@ -80,7 +80,7 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[Views, Ma
     return views, spec, left_out
 
 
-def _with_depth(views: Views, points: torch.Tensor | None, path: Path, told: str) -> Views:
+def _with_depth(views: PosedViews, points: torch.Tensor | None, path: Path, told: str) -> PosedViews:
     """The views with depth by stereo, which is read again where it was found before."""
     try:
         with safe_open(str(path), "pt") as file:
@@ -93,7 +93,7 @@ def _with_depth(views: Views, points: torch.Tensor | None, path: Path, told: str
     return found
 
 
-def _recorded(data: str | Path, config: SplatFit) -> tuple[Views, Mapping[str, Any]]:
+def _recorded(data: str | Path, config: SplatFit) -> tuple[PosedViews, Mapping[str, Any]]:
     """Pictures of a recording, and what it says of its world; DatasetError where it has no poses or lens."""
     dataset = Dataset(data)
     missing = [name for name in ("rgb", "pose") if not dataset.has(name)]
@@ -124,7 +124,7 @@ def _recorded(data: str | Path, config: SplatFit) -> tuple[Views, Mapping[str, A
     rgb, pose = whole["rgb"], whole["pose"]
     depth = whole["depth"].float() if "depth" in whole else torch.full((len(rgb), 1, 1), FAR_M)
     depth = torch.where(depth.isfinite() & (depth < 65), depth, FAR_M)
-    return Views(rgb.permute(0, 3, 1, 2).contiguous(), depth, pose.float(), lens.intrinsics), dataset.world
+    return PosedViews(rgb.permute(0, 3, 1, 2).contiguous(), depth, pose.float(), lens.intrinsics), dataset.world
 
 
 def _within(pose: np.ndarray, box: tuple[float, float, float, float] | None) -> np.ndarray:

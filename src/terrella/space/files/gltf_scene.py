@@ -50,7 +50,7 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Scene:
+class GltfScene:
     """corners float32 [F, 3, 9] of triangles: x y z (world frame, metres), tint red green blue opacity (linear), u v; materials and
     things, int32 [F]: which of `materials`, and which of `names` (1, 2, ...) each is of."""
 
@@ -62,7 +62,7 @@ class Scene:
     lights: tuple[Light, ...]
 
 
-def read_gltf(path: str | Path, scale: float = 1.0) -> Scene | Gaussians:
+def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
     """The triangles and lights of a .glb or .gltf, or its Gaussians (KHR_gaussian_splatting; in glTF's own frame). DatasetError
     says what is wrong with it. Faces are counted before they are read. scale: metres of a unit of the file."""
     path = Path(path)
@@ -130,7 +130,7 @@ def _parts(file: Gltf, node: dict[str, Any]) -> list[dict[str, Any]]:
     return file.named("meshes", node["mesh"])["primitives"] if "mesh" in node else []
 
 
-def _scene(file: Gltf, nodes: list, parts: list) -> Scene:
+def _scene(file: Gltf, nodes: list, parts: list) -> GltfScene:
     many = sum(file.count(part.get("indices", part["attributes"]["POSITION"])) // 3 for *_, part in parts)
     if many > MOST_FACES:
         raise ValueError(f"it has {many:,} triangles, {MOST_FACES:,} is the most: decimate it")
@@ -158,7 +158,9 @@ def _scene(file: Gltf, nodes: list, parts: list) -> Scene:
     pictures: dict[int, np.ndarray] = {}
     looks = tuple(_material(file, abouts[k] if k >= 0 else {}, pictures) for k in used.tolist())
     lights = _lights(file, nodes)
-    return Scene(np.concatenate(corners), which.astype(np.int32), np.concatenate(things), looks, tuple(names), lights)
+    return GltfScene(
+        np.concatenate(corners), which.astype(np.int32), np.concatenate(things), looks, tuple(names), lights
+    )
 
 
 def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..raster.gaussians import plain_sh
 from ..views import over_views
 from .blocks import Blocks, blocks_of
 from .looks import FINE, painted
-from .plan import Plan
+from .room_layout import RoomLayout
 
 TEXEL_M = 0.14
 RAYS = 64
@@ -64,7 +64,7 @@ class _Grid:
         return found
 
 
-def build(plan: Plan, count: int = 120_000) -> Built:
+def build(plan: RoomLayout, count: int = 120_000) -> Built:
     """The place of a plan, of about `count` Gaussians. ContractError for what does not fit. The same plan, the same numbers."""
     blocks = blocks_of(plan)
     boxes, bodies = blocks.boxes, blocks.bodies
@@ -135,7 +135,7 @@ def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray, bodies: np.ndarray) -
     return _Grid(grid.points[bare], grid.sides[bare], grid.blocks[bare], grid.widths[bare], grid.starts, grid.counts)
 
 
-def _light(plan: Plan, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
+def _light(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
     """How much light falls on each texel: [T, 3]."""
     rows = np.flatnonzero(bare)
     normals = texels.normals[rows]
@@ -198,7 +198,7 @@ def _direct(plan, blocks, boxes, points, normals, areas, glow) -> np.ndarray:
     return light + _sun(plan, blocks, boxes, points, normals)
 
 
-def _sun(plan: Plan, blocks: Blocks, boxes: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _sun(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Sunlight through windows and open roofs [T, 3]."""
     if plan.sun is None:
         return np.zeros((len(points), 3))
@@ -298,7 +298,7 @@ def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:
     return Gaussians(to(means), quats, to(scales), torch.full((count,), OPACITY), plain_sh(to(colours)))
 
 
-def _starts(plan: Plan, blocks: Blocks) -> torch.Tensor:
+def _starts(plan: RoomLayout, blocks: Blocks) -> torch.Tensor:
     """Where one begins: as the plan says, or in each room at the free place that looks furthest, along its longer side."""
     if plan.start is not None:
         x, y, degrees = plan.start

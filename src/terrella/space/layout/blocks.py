@@ -11,7 +11,7 @@ import numpy as np
 from ...core.errors import ContractError
 from .furniture import kind_of
 from .looks import Look, look_of
-from .plan import REACH_M, WALL_M, WALLS, Door, Plan, Room, Stairs, Thing, Window, room_at
+from .room_layout import REACH_M, WALL_M, WALLS, Door, Room, RoomLayout, Stairs, Thing, Window, room_at
 
 RISER_M = 0.18  # steps of stairs are at most so high
 FRAME_M = 0.05
@@ -73,7 +73,7 @@ class Blocks:
         return found
 
 
-def blocks_of(plan: Plan) -> Blocks:
+def blocks_of(plan: RoomLayout) -> Blocks:
     """Everything in a plan; ContractError for what does not fit."""
     blocks = Blocks()
     holes: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
@@ -153,7 +153,7 @@ def _without(rect: tuple[float, ...], hole: tuple[float, ...]) -> list[tuple[flo
     return [part for part in parts if part[1] - part[0] > 1e-9 and part[3] - part[2] > 1e-9]
 
 
-def _door(blocks: Blocks, plan: Plan, door: Door, holes: dict) -> None:
+def _door(blocks: Blocks, plan: RoomLayout, door: Door, holes: dict) -> None:
     room = next(one for one in plan.rooms if one.name == door.room)
     wall, look, thing = _Wall(room, door.wall), look_of(door.look, "wood"), blocks.named("door")
     middle = wall.origin + (wall.length / 2 if door.at is None else door.at)
@@ -185,7 +185,9 @@ def _door(blocks: Blocks, plan: Plan, door: Door, holes: dict) -> None:
     blocks.add(*wall.box(*leaf), look, thing)
 
 
-def _beyond(plan: Plan, room: Room, door: Door, wall: _Wall, span: tuple[float, float]) -> tuple[Room | None, float]:
+def _beyond(
+    plan: RoomLayout, room: Room, door: Door, wall: _Wall, span: tuple[float, float]
+) -> tuple[Room | None, float]:
     """The room that a door leads to, and how far it is; none where nothing is behind the wall."""
     for other in plan.rooms:
         near = other.low[wall.axis] if wall.out > 0 else other.high[wall.axis]
@@ -204,7 +206,7 @@ def _beyond(plan: Plan, room: Room, door: Door, wall: _Wall, span: tuple[float, 
     return None, 0.0
 
 
-def _window(blocks: Blocks, plan: Plan, window: Window, holes: dict) -> None:
+def _window(blocks: Blocks, plan: RoomLayout, window: Window, holes: dict) -> None:
     room = next(one for one in plan.rooms if one.name == window.room)
     wall, look, thing = _Wall(room, window.wall), look_of(window.look), blocks.named("window")
     middle = wall.origin + (wall.length / 2 if window.at is None else window.at)
@@ -224,7 +226,7 @@ def _window(blocks: Blocks, plan: Plan, window: Window, holes: dict) -> None:
     blocks.add(*wall.box((a0 - 0.06, a1 + 0.06), (-0.12, 0), (z0 - 0.04, z0)), look, thing)
 
 
-def _stairs(blocks: Blocks, plan: Plan, stairs: Stairs) -> None:
+def _stairs(blocks: Blocks, plan: RoomLayout, stairs: Stairs) -> None:
     high = tuple(a + b for a, b in zip(stairs.at, stairs.size))
     _inside(plan, stairs.at, high, stairs.label)
     thing, (axis, upper) = blocks.named(stairs.label), WALLS[stairs.up]
@@ -242,7 +244,7 @@ def _stairs(blocks: Blocks, plan: Plan, stairs: Stairs) -> None:
         blocks.add(low, top, look_of(stairs.look), thing)
 
 
-def _thing(blocks: Blocks, plan: Plan, thing: Thing) -> None:
+def _thing(blocks: Blocks, plan: RoomLayout, thing: Thing) -> None:
     kind, number = kind_of(thing.label), blocks.named(thing.label)
     room = room_at(plan, (thing.at[0], thing.at[1], thing.at[2] + 1e-3))
     width, depth, height = thing.size or kind.size
@@ -271,7 +273,7 @@ def _thing(blocks: Blocks, plan: Plan, thing: Thing) -> None:
         )
 
 
-def _inside(plan: Plan, low: Sequence[float], high: Sequence[float], label: str) -> None:
+def _inside(plan: RoomLayout, low: Sequence[float], high: Sequence[float], label: str) -> None:
     room = room_at(plan, [(a + b) / 2 for a, b in zip(low, high)])
     if room is None:
         raise ContractError(f"the {label} at {[round(v, 2) for v in low]} lies in no room.")

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..camera import rotation
-from ..files.gltf_scene import Scene
+from ..files.gltf_scene import GltfScene
 from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
 from ..raster.move import multiplied
@@ -22,7 +22,7 @@ _INNER = (
 _SEEN = 0.02  # opacity
 
 
-def of_triangles(scene: Scene, count: int = 120_000) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
+def of_triangles(scene: GltfScene, count: int = 120_000) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
     """Gaussians, about `count` and at least one a triangle; int32 [N], which thing of the scene each belongs to; and boxes
     float32 [S, 6] that stop bodies, None where they would be too many: then what the Gaussians fill stops them."""
     corners, face = pieces(scene.corners, count, 2 * FINEST_M)
@@ -43,7 +43,7 @@ def of_triangles(scene: Scene, count: int = 120_000) -> tuple[Gaussians, torch.T
 
 
 def _surface(
-    scene: Scene, corners: np.ndarray, face: np.ndarray
+    scene: GltfScene, corners: np.ndarray, face: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of each piece its colour and its opacity, its glow (all linear) and whether its colour holds its light."""
     tint, glow = corners[..., 3:7].mean(1), np.zeros((len(face), 3), np.float32)

@@ -21,7 +21,7 @@ _STAIRS_M, _LANDING_M = (
 Rect = tuple[float, float, float, float]
 
 
-class Asked(Protocol):
+class FurnitureRequest(Protocol):
     label: str
     count: int
     look: str
@@ -29,7 +29,9 @@ class Asked(Protocol):
     side: str
 
 
-def furnished(layout: dict[str, Any], number: int, asked: Sequence[Asked], following: bool, seed: int) -> list[str]:
+def furnished(
+    layout: dict[str, Any], number: int, asked: Sequence[FurnitureRequest], following: bool, seed: int
+) -> list[str]:
     """Puts what is asked for into room `number` of a layout, and a door to the next room; what found no place."""
     room = layout["rooms"][number]
     return _Room(layout, room, random.Random(1000 * seed + number)).fill(asked, number > 0, following)
@@ -44,7 +46,7 @@ class _Room:
         self.clear: list[Rect] = []  # where nothing may
         self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
 
-    def fill(self, asked: Sequence[Asked], entered: bool, following: bool) -> list[str]:
+    def fill(self, asked: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
         """Openings first, then what is largest."""
         middle = (self.y0 + self.y1) / 2
         if entered:
@@ -63,9 +65,9 @@ class _Room:
                 lost.append(f"{one.count - done} {one.label}")
         return lost
 
-    def _openings(self, asked: Sequence[Asked], entered: bool, following: bool) -> list[str]:
+    def _openings(self, asked: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
         """Doors and windows, spread evenly over each wall; those for which it is too short."""
-        on: dict[str, list[Asked]] = {side: [] for side in _SIDES}
+        on: dict[str, list[FurnitureRequest]] = {side: [] for side in _SIDES}
         joined = [side for side, there in (("east", following), ("west", entered)) if there]
         free = [side for side in ("east", "north", "south", "west") if side not in joined]
         first = following
@@ -108,7 +110,7 @@ class _Room:
         middle = self._length(side) / 2 if at is None else at
         self.clear.append(self._before(side, middle - 0.6, middle + 0.6, CLEAR_M + 0.1))
 
-    def _window(self, side: str, at: float, one: Asked, several: int) -> None:
+    def _window(self, side: str, at: float, one: FurnitureRequest, several: int) -> None:
         width = round(min(1.5 * one.scale[0], self._length(side) / several - 0.3), 2)
         height = round(min(1.3 * one.scale[2], self.height - 1.1), 2)
         look = {"look": one.look} if one.look else {}
@@ -124,7 +126,7 @@ class _Room:
         b = (self.y1 - deep, self.y1) if side == "north" else (self.y0, self.y0 + deep)
         return (self.x0 + low, b[0], self.x0 + high, b[1])
 
-    def _place(self, one: Asked) -> int:
+    def _place(self, one: FurnitureRequest) -> int:
         """How many of them found a place."""
         if one.label == "stairs":
             return sum(self._stairs(one) for _ in range(one.count))
@@ -147,7 +149,7 @@ class _Room:
             done += 1
         return done
 
-    def _put(self, one: Asked, kind, size, spot: tuple[float, float, str]) -> None:
+    def _put(self, one: FurnitureRequest, kind, size, spot: tuple[float, float, str]) -> None:
         x, y, facing = spot
         z = 1.25 if kind.stands == "hung" else 0.0
         look = {"look": one.look} if one.look else {}
@@ -190,7 +192,7 @@ class _Room:
                 places.append((x, self.y0 + (self.y1 - self.y0) * share, "south"))
         return places
 
-    def _spots(self, one: Asked, stands: str, size) -> Iterator[tuple[float, float, str]]:
+    def _spots(self, one: FurnitureRequest, stands: str, size) -> Iterator[tuple[float, float, str]]:
         """Where such a thing may stand, the best first."""
         if one.label == "chair":
             for _, seats in self.tables:
@@ -246,7 +248,7 @@ class _Room:
             (x1 + off, y, "west"),
         ]
 
-    def _stairs(self, one: Asked) -> bool:
+    def _stairs(self, one: FurnitureRequest) -> bool:
         """Stairs along a wall that rise to the east, up to a platform."""
         (long, wide, high), landing = _STAIRS_M, _LANDING_M
         sides = [one.side] if one.side in ("north", "south") else ["north", "south"]

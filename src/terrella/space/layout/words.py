@@ -16,7 +16,7 @@ from ...core.errors import ContractError
 from . import looks
 from .furniture import KINDS, SAME
 from .placing import furnished
-from .plan import Plan, read_plan
+from .room_layout import RoomLayout, read_layout
 
 ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in metres, and looks
     "room": {"size": (6.0, 4.8, 2.8)},
@@ -79,7 +79,7 @@ class _RoomAsked:
 class Understood:
     """The plan of a text, what layout.json says of it, words that were not understood, and things for which there was no place."""
 
-    plan: Plan
+    plan: RoomLayout
     layout: dict[str, Any]
     unknown: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -117,7 +117,7 @@ def understood(text: str, seed: int = 0) -> Understood:
     for at, asked in enumerate(rooms):
         following = at + 1 < len(rooms)
         left_out += furnished(layout, at, asked.things, following, seed)
-    return Understood(read_plan(layout), layout, tuple(unknown), tuple(left_out))
+    return Understood(read_layout(layout), layout, tuple(unknown), tuple(left_out))
 
 
 def _parsed(text: str) -> tuple[list[_RoomAsked], list[str]]:

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from ...core.errors import DatasetError
 from ..camera import FAR_M, rotation
-from ..fitting import Views
+from ..fitting import PosedViews
 from ..raster.move import multiplied, quaternion
 from .reading import blurred, read_picture, sharpness
 
@@ -86,7 +86,7 @@ def levelled(shots: Shots) -> Shots:
     return Shots(shots.files, shots.lenses, pose, (points - middle) * scale, False)
 
 
-def to_views(shots: Shots, longest: int) -> tuple[Views, list[str]]:
+def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:
     """The pictures as one pinhole camera would have taken them, `longest` pixels at most a side, without depth; and the names
     of those that were left out because they are blurred."""
     if len(shots.files) < FEWEST:
@@ -115,7 +115,7 @@ def to_views(shots: Shots, longest: int) -> tuple[Views, list[str]]:
     wide, tall = right - left, bottom - top
     camera = float(1 / wide), float(1 / tall), float(-left / wide), float(-top / tall)
     depth = torch.full((len(rows), 1, 1), FAR_M)
-    views = Views(torch.stack([pictures[k] for k in rows]), depth, shots.pose[rows], camera)
+    views = PosedViews(torch.stack([pictures[k] for k in rows]), depth, shots.pose[rows], camera)
     return views, [shots.files[k].name for k, bad in enumerate(out) if bad]
 
 

@@ -95,7 +95,7 @@ class Thing:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RoomLayout:
     """A whole place; start: x, y and the heading in degrees (0 east, 90 north) where one begins."""
 
     rooms: tuple[Room, ...]
@@ -117,7 +117,7 @@ class Plan:
 _PARTS = {"rooms": Room, "doors": Door, "windows": Window, "stairs": Stairs, "things": Thing}
 
 
-def read_plan(source: str | Path | Mapping[str, Any]) -> Plan:
+def read_layout(source: str | Path | Mapping[str, Any]) -> RoomLayout:
     """The plan in a file of JSON, or in what such a file says. ContractError names what is wrong with it."""
     if isinstance(source, Mapping):
         said: Any = source
@@ -138,7 +138,7 @@ def read_plan(source: str | Path | Mapping[str, Any]) -> Plan:
             given[name] = tuple(_read(_PARTS[name], one, f"{name}[{at}]") for at, one in enumerate(value))
         else:
             given[name] = value
-    return _read(Plan, given, "the layout")
+    return _read(RoomLayout, given, "the layout")
 
 
 def _read(kind: type, said: Any, where: str) -> Any:
@@ -182,7 +182,7 @@ def _value(value: Any, kind: str, where: str) -> Any:
     raise ContractError(f"{where} takes a {'whole number' if whole else 'finite number'}; got {value!r:.60}.")
 
 
-def check(plan: Plan) -> None:
+def check(plan: RoomLayout) -> None:
     """Refuses, in a sentence of ContractError, what cannot be built."""
     if not plan.rooms:
         raise ContractError("a layout has at least one room.")
@@ -216,7 +216,7 @@ def check(plan: Plan) -> None:
         raise ContractError(f"the start {list(plan.start)} lies in no room.")
 
 
-def room_at(plan: Plan, place: Sequence[float]) -> Room | None:
+def room_at(plan: RoomLayout, place: Sequence[float]) -> Room | None:
     """The room in which a place [3] is."""
     for room in plan.rooms:
         if all(room.low[k] - 1e-6 <= place[k] <= room.high[k] + 1e-6 for k in range(3)):
@@ -229,7 +229,7 @@ def _sizes(size: Sequence[float], whose: str, least: float) -> None:
         raise ContractError(f"{whose} has the size {list(size)}; sides are from {least} to {MOST_M:.0f} m.")
 
 
-def _check_openings(plan: Plan) -> None:
+def _check_openings(plan: RoomLayout) -> None:
     rooms = {room.name: room for room in plan.rooms}
     spans: dict[tuple[str, str], list[tuple[float, float, float, float, str]]] = {}
     for one in (*plan.doors, *plan.windows):
