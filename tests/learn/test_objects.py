@@ -14,7 +14,7 @@ from terrella.learn.objectives.objects import learn_objects
 from terrella.learn.trainer import Run
 from terrella.space.billboards import PICTURE, painted
 from terrella.space.camera import planar_pose
-from terrella.worlds.objects import LOOK, NUMBER, PLACE, Objects, ObjectsConfig
+from terrella.worlds.objects import LOOK, NUMBER, PLACE, Billboards, BillboardsConfig
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 EPISODES, LENGTH, STEP_M = 30, 16, 0.1
@@ -63,7 +63,7 @@ def pose(count: int) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     torch.manual_seed(0)
-    objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+    objects, recording = Billboards(BillboardsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     starts = pose(2)
     starts[1, 1] = 1.0  # whichever episode began nearest
     run = Run(tmp_path_factory.mktemp("objects"), {}, quiet)
@@ -102,7 +102,7 @@ def test_who_is_shot_at_falls_and_who_is_not_walks_on(learned):
 
 
 def test_a_recording_that_shows_no_thing_whole_teaches_nothing(tmp_path):
-    objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+    objects, recording = Billboards(BillboardsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
     recording.cache.arrays["observation.instances"] = np.zeros_like(recording.cache.arrays["observation.instances"])
     with pytest.raises(DatasetError, match="no thing whole and near: record more"):
         learn_objects(Run(tmp_path, {}, quiet), objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5)  # pyright: ignore
@@ -111,7 +111,10 @@ def test_a_recording_that_shows_no_thing_whole_teaches_nothing(tmp_path):
 def test_a_stopped_run_goes_on_exactly(tmp_path):
     def train(out):
         torch.manual_seed(0)
-        objects, recording = Objects(ObjectsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)), toy()
+        objects, recording = (
+            Billboards(BillboardsConfig(actions=2, history=3, looks=6, moves=4, rows=2, starts=2)),
+            toy(),
+        )
         learn_objects(Run(out, {}, quiet), objects, recording, recording.rgb.__getitem__, pose(1), CAMERA, 5)  # pyright: ignore
         torch.rand(3)
 

@@ -19,10 +19,10 @@ from terrella.learn.recording import Recording, controls_of
 from terrella.learn.trainer import Now, Run
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world
-from terrella.worlds.generator import Generator
-from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.frame_history import FrameHistory, StartClips
+from terrella.worlds.generator import UNet
 from terrella.worlds.learned import About, LearnedWorld
-from terrella.worlds.outcome import Outcome
+from terrella.worlds.outcome import FrameOutcome
 
 from ..data.layouts import layout_of
 
@@ -68,14 +68,14 @@ def learned(recording, tmp_path_factory):
     seen = Recording(cache, start, usable, controls_of(cache))
     happened = Happenings.of(cache, seen.action(slice(None)).numpy(), usable)
     torch.manual_seed(0)
-    outcome = Outcome(happened.config())
+    outcome = FrameOutcome(happened.config())
     run = Run(tmp_path_factory.mktemp("run"), {}, quiet)
     learn_outcome(run, Pieces(outcome, seen.rgb, happened, batch=6, learning_rate=5e-3), 300)
     return cache, seen, happened, outcome
 
 
 @torch.inference_mode()
-def examine_outcome(outcome: Outcome, rgb, happened: Happenings, first: int, stop: int) -> dict[str, np.ndarray]:
+def examine_outcome(outcome: FrameOutcome, rgb, happened: Happenings, first: int, stop: int) -> dict[str, np.ndarray]:
     """Follows the recorded frames of rows first..stop: predicted reward, done (probability) and vitals' change, one row
     for each recorded step."""
     found: dict[str, list] = {"reward": [], "done": [], "change": []}
@@ -133,8 +133,8 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
 def test_a_dream_pays_costs_lives_and_ends(learned):
     _, seen, _, outcome = learned
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8, 8), slots=4, geometry=False)
-    starts = replace(Starts.of(torch.zeros(1, 4, 3, *SIZE, dtype=torch.uint8), 3), vitals=torch.full((1, 1), 3.0))
-    parts = {"scene": FrameHistory(config.frames, starts), "generator": Generator(config.generator), "outcome": outcome}
+    starts = replace(StartClips.of(torch.zeros(1, 4, 3, *SIZE, dtype=torch.uint8), 3), vitals=torch.full((1, 1), 3.0))
+    parts = {"scene": FrameHistory(config.frames, starts), "generator": UNet(config.generator), "outcome": outcome}
     world, rng = LearnedWorld(About("row", seen.controls, 1 / 15), **parts), make_rng(0)
     before, after = (torch.from_numpy(np.stack([picture(place) for place in pair])) for pair in ((1, 4), (0, 5)))
     state = world.observe({"rgb": before, "lives": torch.tensor([1.0, 3.0])}, None, rng)

@@ -26,7 +26,7 @@ from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.trainer import Now
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
-from terrella.worlds.uncertainty import Asked
+from terrella.worlds.uncertainty import UncertaintyProbe
 
 from ..data.layouts import layout_of
 
@@ -146,7 +146,9 @@ def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, reque
     world = tame(request.getfixturevalue(kind))
     pair = paired(world, request.getfixturevalue(data), None, quiet)
     dreams, noted = Rollouts(world, pair.recording, 4, 2, now(seed)), []
-    playing = dreams.world.replaced(uncertainty=Asked(lambda shown, clean, situation: noted.append((shown, clean))))
+    playing = dreams.world.replaced(
+        uncertainty=UncertaintyProbe(lambda shown, clean, situation: noted.append((shown, clean)))
+    )
     state = dreams.state
     for step in range(4):
         action = pair.recording.action(dreams.row)

@@ -10,11 +10,11 @@ from terrella.space.keyframes import Keyframes, doubled
 from terrella.worlds.body import Motion, MotionBody
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
-from terrella.worlds.generator import Generator
+from terrella.worlds.generator import UNet
+from terrella.worlds.keyframe_scene import KeyframeScene
 from terrella.worlds.learned import About, LearnedWorld
-from terrella.worlds.objects import LOOK, NUMBER, PLACE, Objects, ObjectsConfig
-from terrella.worlds.outcome import Constant, ConstantConfig, Outcome, OutcomeConfig
-from terrella.worlds.places import KeyframeScene
+from terrella.worlds.objects import LOOK, NUMBER, PLACE, Billboards, BillboardsConfig
+from terrella.worlds.outcome import ConstantConfig, ConstantOutcome, FrameOutcome, OutcomeConfig
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (16, 32)
 
@@ -33,20 +33,22 @@ def place(controls: Controls, moving: bool = False, objects: bool = False, seed:
     torch.manual_seed(seed)
     rng = make_rng(seed)
     config = VideoConfig(CAMERA, controls.numbers, SIZE, (8, 8), history=2, body_m=0.3, memory_mb=1.0, moving=moving)
-    motion, generator = Motion(config.motion), Generator(config.generator)
+    motion, generator = Motion(config.motion), UNet(config.generator)
     for weight in (generator.output.weight, *motion.glide.parameters()):
         torch.nn.init.normal_(weight, std=0.05)
     scene = KeyframeScene(config.keyframes, keyframes(8, rng), keyframes(3, rng))
-    parts: dict = {"outcome": Constant(ConstantConfig(-0.1, 1.0))}
+    parts: dict = {"outcome": ConstantOutcome(ConstantConfig(-0.1, 1.0))}
     if objects:
-        parts["objects"] = one_thing(Objects(ObjectsConfig(controls.numbers, 2, looks=4, moves=3, rows=4, starts=3)))
+        parts["objects"] = one_thing(
+            Billboards(BillboardsConfig(controls.numbers, 2, looks=4, moves=3, rows=4, starts=3))
+        )
         kinds = OutcomeConfig(controls.numbers, (0.0, 1.0), ("health",), ((-1.0, 0.0),), (9.0,), begins=(9.0,))
-        parts["outcome"] = Outcome(kinds)
+        parts["outcome"] = FrameOutcome(kinds)
     about = About("made", controls, 0.1, card={"what": "made for tests"})
     return LearnedWorld(about, scene=scene, generator=generator, body=MotionBody(motion), **parts)
 
 
-def one_thing(objects: Objects) -> Objects:
+def one_thing(objects: Billboards) -> Billboards:
     """With one billboard two metres ahead in every start."""
     objects.pictures[:] = 255
     objects.boxes[:] = torch.tensor([0.4, 0.4, 0.0, 1.0])

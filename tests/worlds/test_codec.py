@@ -11,12 +11,12 @@ from terrella.core import check_world, make_rng
 from terrella.data import Layout
 from terrella.space.matching import SAME, fetched
 from terrella.space.mosaic import blank, recalled, remembered
-from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, Seen, shared_chance
+from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, CodecInputs, shared_chance
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import context_thumbnail
-from terrella.worlds.history import FrameHistory, Starts
 from terrella.worlds.learned import About, LearnedWorld
 
 SIZE, SLOTS = (16, 24), 3
@@ -39,7 +39,9 @@ def pictures(batch: int, seed: int = 0) -> torch.Tensor:
 
 
 def world(generator: Codec) -> LearnedWorld:
-    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2, tuple(map(tuple, MOVES.tolist()))), Starts.of(pictures(4), 2))
+    scene = FrameHistory(
+        HistoryConfig(SIZE, SLOTS, 2, tuple(map(tuple, MOVES.tolist()))), StartClips.of(pictures(4), 2)
+    )
     return LearnedWorld(About("made", Controls.buttons(2), 0.1), scene=scene, generator=generator)
 
 
@@ -104,7 +106,7 @@ def test_what_lies_over_what_scrolls_is_seen_to_stay_where_both_would_explain_it
 
 def test_where_nothing_scrolls_there_is_no_mosaic_to_show():
     still = replace(world(codec()).scene.config, moves=((0, 0),) * len(MOVES))
-    scene = FrameHistory(still, Starts.of(pictures(4), 2))
+    scene = FrameHistory(still, StartClips.of(pictures(4), 2))
     assert "mosaic" not in scene.channels().shows
 
 
@@ -116,7 +118,7 @@ def test_an_untrained_one_stands_still_to_the_last_bit():
     assert torch.equal(still.render(state, ("rgb",))["rgb"], still.render(first, ("rgb",))["rgb"])
 
 
-def shown(made: Codec, batch: int = 1, seed: int = 0) -> Seen:
+def shown(made: Codec, batch: int = 1, seed: int = 0) -> CodecInputs:
     """Frames, and a mosaic that holds the newest of them but for its upper half."""
     frames = pictures(batch, seed)
     mosaic = remembered(blank(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64), NONE)

@@ -14,7 +14,7 @@ from terrella.core.errors import CheckpointError
 from terrella.worlds.controls import Controls
 from terrella.worlds.convert import convert_world
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.uncertainty import Uncertainty, UncertaintyConfig
+from terrella.worlds.uncertainty import UncertaintyConfig, UncertaintyNetwork
 
 from .made import place
 
@@ -56,7 +56,7 @@ def old_folder(path, new) -> None:
 
 @pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
 def test_an_old_world_is_converted_without_loss(tmp_path, capsys, more):
-    made = place(Controls.buttons(3), **more).replaced(uncertainty=Uncertainty(UncertaintyConfig()))
+    made = place(Controls.buttons(3), **more).replaced(uncertainty=UncertaintyNetwork(UncertaintyConfig()))
     save_world(made, tmp_path / "made")
     world = load_world(tmp_path / "made")
     old_folder(tmp_path / "old", tmp_path / "made")

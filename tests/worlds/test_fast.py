@@ -14,13 +14,13 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.space.keyframes import Glimpse
 from terrella.worlds import fast
+from terrella.worlds.carried_frames import PLANES
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.fast import EAGER, ONNX, compiled, example, quickened, through_onnx
-from terrella.worlds.generator import Conditioning, Generator, generate
-from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.frame_history import FrameHistory, StartClips
+from terrella.worlds.generator import Conditioning, UNet, generate
 from terrella.worlds.learned import About, LearnedWorld
-from terrella.worlds.moving import PLANES
 
 from .made import place
 
@@ -40,10 +40,10 @@ def small_world() -> LearnedWorld:
     """A frames-only world, its network untrained but not silent."""
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), geometry=False)
     torch.manual_seed(0)
-    generator = Generator(config.generator)
+    generator = UNet(config.generator)
     torch.nn.init.normal_(generator.output.weight, std=0.1)
     frames = torch.randint(0, 256, (4, 3, 3, 32, 48), dtype=torch.uint8, generator=make_rng(0))
-    scene = FrameHistory(config.frames, Starts.of(frames, 2))
+    scene = FrameHistory(config.frames, StartClips.of(frames, 2))
     return LearnedWorld(About("small", Controls.buttons(2), 0.1, ("a", "b")), scene=scene, generator=generator)
 
 
@@ -80,7 +80,7 @@ def test_every_kind_of_generator_is_drawn_alike(kind):
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 2, (32, 48), (8, 12), **kind)
     torch.manual_seed(0)
-    generator, rng = Generator(config.generator).eval(), make_rng(0)
+    generator, rng = UNet(config.generator).eval(), make_rng(0)
     torch.nn.init.normal_(generator.output.weight, std=0.1)
 
     def given(batch: int) -> tuple:

@@ -18,9 +18,9 @@ from terrella.learn.recording import controls_of
 from terrella.worlds import learned
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_world, save_keys, save_world
-from terrella.worlds.generator import Generator
+from terrella.worlds.generator import UNet
 from terrella.worlds.learned import LearnedWorld
-from terrella.worlds.uncertainty import Asked, Uncertainty, UncertaintyConfig
+from terrella.worlds.uncertainty import UncertaintyConfig, UncertaintyNetwork, UncertaintyProbe
 
 from .made import place
 
@@ -134,10 +134,10 @@ def test_gradients_are_the_callers():
 def test_parts_are_exchanged_and_the_old_world_stays():
     world = place(KINDS["buttons"])
     asked = []
-    noted = world.replaced(uncertainty=Asked(lambda *given: asked.append(given)), card={"more": 1})
+    noted = world.replaced(uncertainty=UncertaintyProbe(lambda *given: asked.append(given)), card={"more": 1})
     state = walk(noted, look=True, steps=2)
     assert len(asked) == 2 and "uncertainty" not in noted.spec.channels and noted.spec.card["more"] == 1
-    judged = world.replaced(uncertainty=Uncertainty(UncertaintyConfig()), steps=3, card={"what": None})
+    judged = world.replaced(uncertainty=UncertaintyNetwork(UncertaintyConfig()), steps=3, card={"what": None})
     assert "uncertainty" in judged.spec.channels and "uncertainty" not in world.spec.channels
     assert judged.config.steps == 3 and world.config.steps == 1 and "what" not in judged.spec.card
     assert not judged.replaced(uncertainty=None).uncertainty and "more" not in world.spec.card
@@ -149,7 +149,9 @@ def test_parts_are_exchanged_and_the_old_world_stays():
 
 @pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
 def test_a_saved_world_is_the_same(tmp_path, more):
-    world = place(KINDS["axes"], **more).replaced(uncertainty=Uncertainty(UncertaintyConfig()), card={"note": "ö"})
+    world = place(KINDS["axes"], **more).replaced(
+        uncertainty=UncertaintyNetwork(UncertaintyConfig()), card={"note": "ö"}
+    )
     save_world(world, tmp_path / "one")
     first = load_world(tmp_path / "one")
     save_world(first, tmp_path / "two", remembered=tmp_path / "one")
@@ -184,9 +186,9 @@ def test_channels_that_were_not_learned_are_named_in_the_card():
 def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
     """No loop over the batch: the bundled world's generator runs as often for eight episodes as for one."""
     world, calls = terrella.load("doom-maze"), []
-    real = Generator.forward
+    real = UNet.forward
     monkeypatch.setattr(
-        Generator, "forward", lambda self, noisy, *rest: (calls.append(len(noisy)), real(self, noisy, *rest))[1]
+        UNet, "forward", lambda self, noisy, *rest: (calls.append(len(noisy)), real(self, noisy, *rest))[1]
     )
     walk(world, look=True, steps=1, batch=8)
     assert sum(calls) == 8 and len(calls) <= 2
@@ -195,7 +197,7 @@ def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
 @pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
 def test_a_whole_step_stays_on_the_worlds_device(more):
     """`meta` stands for any second device: what it gives to the CPU, or mixes with tensors of the CPU, is an error."""
-    world = place(KINDS["axes"], **more).replaced(uncertainty=Uncertainty(UncertaintyConfig())).to("meta")
+    world = place(KINDS["axes"], **more).replaced(uncertainty=UncertaintyNetwork(UncertaintyConfig())).to("meta")
     rng = make_rng(0)
     state = world.start(2, rng)
     for _ in range(2):

@@ -19,8 +19,8 @@ from terrella.worlds.objects import (
     NUMBER,
     PLACE,
     RESTED,
-    Objects,
-    ObjectsConfig,
+    Billboards,
+    BillboardsConfig,
     fresh,
     likest,
     noted,
@@ -35,10 +35,10 @@ def viewer(heading: float = 0.0) -> torch.Tensor:
     return planar_pose(0 * one, 0 * one, one, heading * one)
 
 
-def two_looks() -> Objects:
+def two_looks() -> Billboards:
     """A tall red look and a flat blue one; its network is as it was born."""
     torch.manual_seed(0)
-    objects = Objects(ObjectsConfig(actions=3, history=2, looks=4, moves=3, rows=4, starts=1)).eval()
+    objects = Billboards(BillboardsConfig(actions=3, history=2, looks=4, moves=3, rows=4, starts=1)).eval()
     objects.boxes[:] = 1e3
     for look, (colour, box) in enumerate([((200, 0, 0), (0.4, 0.4, 0, 1.6)), ((0, 0, 200), (0.8, 0.8, 0, 0.4))]):
         objects.pictures[look] = torch.tensor([*colour, 255], dtype=torch.uint8)[:, None, None].expand(4, *PICTURE)
@@ -47,7 +47,7 @@ def two_looks() -> Objects:
     return objects
 
 
-def sure(objects: Objects, look: int, move: int, gone: bool = False) -> Objects:
+def sure(objects: Billboards, look: int, move: int, gone: bool = False) -> Billboards:
     """The same, which always tells one thing."""
     for head, wanted in ((objects.next_look, look), (objects.next_move, move), (objects.goes, None)):
         head.weight.data.zero_()
@@ -58,14 +58,14 @@ def sure(objects: Objects, look: int, move: int, gone: bool = False) -> Objects:
     return objects
 
 
-def billboards(objects: Objects, *places: tuple[float, float, float]) -> torch.Tensor:
+def billboards(objects: Billboards, *places: tuple[float, float, float]) -> torch.Tensor:
     whole = objects.empty(1)
     for row, place in enumerate(places):
         whole[0, row] = fresh(row + 1, torch.tensor(place), RED)
     return whole
 
 
-def step(objects: Objects, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
+def step(objects: Billboards, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
     return objects.step(before, torch.tensor([seen]), viewer(), torch.zeros(1, 2, 3), chance.seeds(1, make_rng(0)))
 
 
@@ -101,7 +101,7 @@ def test_by_chance_as_often_as_told():
     assert torch.equal(looks, again)
 
 
-def shown(objects: Objects, there: torch.Tensor):
+def shown(objects: Billboards, there: torch.Tensor):
     """What evidence tells of a frame with these billboards: its cut, and number and place of each."""
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
     rgb, depth, instances = objects.paint(there, *behind, viewer(), CAMERA)
@@ -141,7 +141,7 @@ def test_who_stands_upright_stops_a_body_and_who_is_walked_through_does_not():
     assert (bodies(objects, there, 1.3) == NOWHERE).all()
 
 
-def bodies(objects: Objects, there: torch.Tensor, height: float) -> torch.Tensor:
+def bodies(objects: Billboards, there: torch.Tensor, height: float) -> torch.Tensor:
     pose = planar_pose(*torch.tensor([[0.0], [0.0], [height], [0.0]]))
     return objects.bodies(State({"billboards": there, "pose": pose}), 0.5)
 

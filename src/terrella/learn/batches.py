@@ -11,7 +11,7 @@ import torch
 from ..space.keyframes import Glimpse, Keyframes, gathered, look, retrieve
 from ..space.reproject import carry_unknown
 from ..worlds.config import THUMBNAIL, VideoConfig
-from ..worlds.generator import Conditioning, Generator, context_thumbnail, decode_depth, encode_depth, generate, pixels
+from ..worlds.generator import Conditioning, UNet, context_thumbnail, decode_depth, encode_depth, generate, pixels
 from .recording import Recording
 from .trainer import Now
 
@@ -38,7 +38,7 @@ class Batch:
 
 
 @torch.no_grad()
-def drawn_now(generator: Generator, shown: Conditioning, now: Now, steps: int = 1) -> torch.Tensor:
+def drawn_now(generator: UNet, shown: Conditioning, now: Now, steps: int = 1) -> torch.Tensor:
     """Frames [B, 4 or 5, H, W] as a generator under training draws them, on the CPU: see Dream."""
     batch, _, height, width = shown.last.shape
     noise = now.randn(batch, 4, height, width)

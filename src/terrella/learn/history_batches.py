@@ -9,8 +9,8 @@ import torch
 
 from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
+from ..worlds.frame_history import past
 from ..worlds.generator import Conditioning, context_thumbnail, encode_depth, pixels
-from ..worlds.history import past
 from .batches import Batch, Dream, coded
 from .recording import Recording
 from .trainer import Now

@@ -1,4 +1,4 @@
-"""What a batch teaches the generator of a place in which things move (worlds/moving.py)."""
+"""What a batch teaches the generator of a place in which things move (worlds/carried_frames.py)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 
 from ..space.keyframes import Glimpse, Keyframes
+from ..worlds.carried_frames import Frame, carry_frames
 from ..worlds.config import THUMBNAIL, VideoConfig
 from ..worlds.controls import BUTTONS
 from ..worlds.generator import Conditioning, context_thumbnail, decode_depth, encode_depth, pixels
-from ..worlds.moving import Frame, carry_frames
 from .batches import Batch, Dream, Views, coded
 from .recording import Recording
 from .trainer import Now

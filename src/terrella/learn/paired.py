@@ -11,7 +11,7 @@ import torch
 from ..core.errors import DatasetError
 from ..data import Dataset, check_game
 from ..space.keyframes import Keyframes
-from ..worlds.generator import Generator
+from ..worlds.generator import UNet
 from ..worlds.learned import LearnedWorld
 from .batches import Batch, Dream
 from .feeds import frames_feed
@@ -70,7 +70,7 @@ def paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, report: 
     return Paired(world, replace(recording, controls=controls).enough())
 
 
-def fingerprint(generator: Generator) -> str:
+def fingerprint(generator: UNet) -> str:
     """Of its weights, so that a run goes on only with the world that it began from."""
     digest = hashlib.sha256()
     for weight in generator.state_dict().values():

@@ -18,9 +18,9 @@ from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
 from ..space.reproject import least_around
+from ..worlds.carried_frames import covering, still
 from ..worlds.config import VideoConfig
 from ..worlds.controls import AXES, CHOICE, Controls
-from ..worlds.moving import covering, still
 from .trainer import Report
 
 THINGS = "observation.things"  # the channel that marks what may move or vanish

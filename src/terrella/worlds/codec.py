@@ -42,7 +42,7 @@ class CodecConfig:
     residual: bool = True
 
 
-class Seen(NamedTuple):
+class CodecInputs(NamedTuple):
     """What a frame is made from: `sources` uint8 [B, slots + 1, 3, H, W], the last frames, the newest first, and what the mosaic
     knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by the moves `along`
     int64 [B, H, W], by which the picture scrolls but for what lies `over` it (bool [B, H, W]); `went` [B, moves + 1, H, W], how
@@ -146,7 +146,7 @@ class Codec(nn.Module):
         logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
         return least_off(logits, self.moves)
 
-    def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> Seen:
+    def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:
         """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over: bool
         [B, H, W], the pixels that are no part of it."""
         memory = recalled(mosaic, self.config.size, self.moves[move])
@@ -157,9 +157,9 @@ class Codec(nn.Module):
         sources = torch.cat([frames, torch.where(known, memory[:, :3], scrolled)[:, None]], 1)
         went, _ = explained(frames[:, 1:2], frames[:, 0], self.moves)
         went = self._carried(preferred(went, last))
-        return Seen(sources, scrolled, known, along, over, went, self.common_colours(scrolled))
+        return CodecInputs(sources, scrolled, known, along, over, went, self.common_colours(scrolled))
 
-    def choices(self, seen: Seen, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def choices(self, seen: CodecInputs, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted"; and the pixels' features [B, HIDDEN,
         H, W]."""
         batch, (height, width), last = len(seen.known), self.config.size, torch.channels_last
@@ -188,7 +188,7 @@ class Codec(nn.Module):
         painted = torch.where(comes, UNKNOWN, painted)
         return torch.cat([moved, others, memory, painted], 1), features
 
-    def colours(self, seen: Seen, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
+    def colours(self, seen: CodecInputs, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
         """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1)
         often = (seen.common + 1e-3).log() @ self.common
@@ -209,7 +209,7 @@ class Codec(nn.Module):
         around = F.avg_pool2d(F.avg_pool2d(each, AROUND // 2), 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1)
         return torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
 
-    def drawn(self, seen: Seen, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+    def drawn(self, seen: CodecInputs, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
         share = choices.softmax(1)
         if share.device.type == "cpu":  # few pixels may be painted, in most frames

@@ -78,7 +78,7 @@ class VideoConfig:
     memory_mb: float = 16.0  # MiB of an episode's own memory (space/memory.py); with 0 it holds the last frame alone
     known_enough: float = 0.95  # share of a dreamt frame that memory knew, above which it is not kept as a keyframe
     new_view: tuple[float, float] = (0.4, 0.2)  # metres and radians from the nearest keyframe of its own
-    geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/history.py)
+    geometry: bool = True  # False: no depth and pose, the last frames stand for memory (worlds/frame_history.py)
     steps: int = 1  # flow-matching steps a frame
     vitals: tuple[float, ...] = ()  # with which episodes begin (names are its outcome's)
     residual: bool = False  # a frame is the newest slot and what changes in it, drawn at once: no mixture, no noise

@@ -29,17 +29,17 @@ from .body import Motion, MotionBody
 from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
-from .generator import Generator
-from .history import FrameHistory, Starts
+from .frame_history import FrameHistory, StartClips
+from .generator import UNet
+from .keyframe_scene import KeyframeScene
 from .latent import LatentWorld
 from .latent_network import LatentConfig, LatentNetwork
 from .learned import About, LearnedWorld
-from .objects import Objects, ObjectsConfig
-from .outcome import Constant, ConstantConfig, Outcome, OutcomeConfig
+from .objects import Billboards, BillboardsConfig
+from .outcome import ConstantConfig, ConstantOutcome, FrameOutcome, OutcomeConfig
 from .parts import Absent
-from .places import KeyframeScene
 from .splat import SplatWorld
-from .uncertainty import Uncertainty, UncertaintyConfig
+from .uncertainty import UncertaintyConfig, UncertaintyNetwork
 
 KIND, VERSION = "learned", 3
 LATENT, LATENT_VERSION = "latent", 1
@@ -271,7 +271,7 @@ def _places(config: KeyframesConfig, weights: Tensors, remembered: Tensors) -> K
 
 def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> FrameHistory:
     starts = _below(remembered, "starts")
-    begun = Starts.of(_unpack_frames(starts).unflatten(0, (-1, config.slots)), config.actions)
+    begun = StartClips.of(_unpack_frames(starts).unflatten(0, (-1, config.slots)), config.actions)
     if "actions" in starts:
         begun = replace(
             begun, actions=starts["actions"], vitals=starts["vitals"], known=starts.get("known", begun.known)
@@ -283,13 +283,13 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
 KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(restored(Motion(config), weights)))},
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
-    "generator": {"unet": (GeneratorConfig, _network(Generator)), "codec": (CodecConfig, _network(Codec))},
-    "objects": {"billboards": (ObjectsConfig, _network(Objects))},
+    "generator": {"unet": (GeneratorConfig, _network(UNet)), "codec": (CodecConfig, _network(Codec))},
+    "objects": {"billboards": (BillboardsConfig, _network(Billboards))},
     "outcome": {
-        "constant": (ConstantConfig, lambda config, weights, _: Constant(config)),
-        "frames": (OutcomeConfig, _network(Outcome)),
+        "constant": (ConstantConfig, lambda config, weights, _: ConstantOutcome(config)),
+        "frames": (OutcomeConfig, _network(FrameOutcome)),
     },
-    "uncertainty": {"network": (UncertaintyConfig, _network(Uncertainty))},
+    "uncertainty": {"network": (UncertaintyConfig, _network(UncertaintyNetwork))},
     "estimator": {"network": (EstimatorConfig, _network(Estimator))},
 }
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..space.keyframes import Glimpse, merge
+from .carried_frames import PLANES
 from .config import THUMBNAIL, GeneratorConfig
-from .moving import PLANES
 
 Network = TypeVar("Network", bound=nn.Module)
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
@@ -22,7 +22,7 @@ LASTING = 5.0  # by how much (a logit) the last frame is the likelier source whe
 @dataclass(frozen=True)
 class Conditioning:
     """What a frame is drawn from: what the scene knows of the view; `last` [B, 4, H, W], the last frame's colour in [0, 1]
-    carried into the view and its trust (where things move [B, 4 + PLANES, H, W], see moving.carry_frames); `context` [B, n],
+    carried into the view and its trust (where things move [B, 4 + PLANES, H, W], see carried_frames.py); `context` [B, n],
     the last frame's thumbnail and, in some worlds, the last actions; of a flat world its `mosaic` (space/mosaic.py), what
     lies `over` it (bool [B, H, W]), and `scroll` [B], by which of its moves most of the picture goes on."""
 
@@ -74,7 +74,7 @@ def down_and_up(net: Any, x: torch.Tensor, context: torch.Tensor) -> torch.Tenso
 
 
 @final
-class Generator(nn.Module):
+class UNet(nn.Module):
     """A U-Net that, from noise and what memory knows, predicts the clean frame (flow matching, x-prediction).
 
     Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what

@@ -66,7 +66,7 @@ class Outcomes(NamedTuple):
     done: torch.Tensor
 
 
-class Encoder(nn.Module):
+class LatentEncoder(nn.Module):
     """Picture and numbers to a latent; its projector ends in BatchNorm and one linear layer, as SIGReg asks for."""
 
     def __init__(self, config: LatentConfig):
@@ -169,7 +169,7 @@ class LatentNetwork(nn.Module):
         super().__init__()
         self.config = config
         latent, hidden, window = config.latent, config.hidden, config.history * config.latent
-        self.encoder = nn.Identity() if config.identity else Encoder(config)
+        self.encoder = nn.Identity() if config.identity else LatentEncoder(config)
         self.predictor = Ensemble(config.members, window + config.history * config.actions, hidden, latent)
         self.heads = nn.ModuleDict(
             {

@@ -24,17 +24,17 @@ from ..core.spec import Camera, Spec
 from ..core.state import State
 from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes
-from .arrival import NoEstimator
 from .body import MotionBody, NoBody
 from .config import VideoConfig
 from .controls import Controls
+from .frame_history import FrameHistory, StartClips
 from .generator import Conditioning, channels_last, generate
-from .history import FrameHistory, Starts
-from .objects import NoObjects, Objects
-from .outcome import Constant, ConstantConfig, Outcome
+from .keyframe_scene import KeyframeScene
+from .localisation import NoEstimator
+from .objects import Billboards, NoObjects
+from .outcome import ConstantConfig, ConstantOutcome, FrameOutcome
 from .parts import NOISE, Evidence
-from .places import KeyframeScene
-from .uncertainty import GONE, Asked, NoUncertainty, Uncertainty, gone_on
+from .uncertainty import GONE, NoUncertainty, UncertaintyNetwork, UncertaintyProbe, gone_on
 
 PATIENCE = 4096  # steps after which a frame is drawn though nobody looks: what waits is kept in memory
 
@@ -67,16 +67,16 @@ class LearnedWorld:
         scene: KeyframeScene | FrameHistory,
         generator: nn.Module,
         body: MotionBody | NoBody | None = None,
-        objects: Objects | NoObjects | None = None,
-        outcome: Outcome | Constant | None = None,
-        uncertainty: Uncertainty | Asked | NoUncertainty | None = None,
+        objects: Billboards | NoObjects | None = None,
+        outcome: FrameOutcome | ConstantOutcome | None = None,
+        uncertainty: UncertaintyNetwork | UncertaintyProbe | NoUncertainty | None = None,
         estimator: Estimator | NoEstimator | None = None,
     ):
         self.about, self.controls, self.scene = about, about.controls, scene
         self.generator = channels_last(_finished(generator))
         self.body = body or NoBody()
         self.objects = _finished(objects or NoObjects())
-        self.outcome = _finished(outcome or Constant(ConstantConfig()))
+        self.outcome = _finished(outcome or ConstantOutcome(ConstantConfig()))
         self.uncertainty = _finished(uncertainty or NoUncertainty())
         self.estimator = _finished(estimator or NoEstimator())
         self.history = max(self.body.history, scene.history)
@@ -102,7 +102,7 @@ class LearnedWorld:
         return self.scene.recorded
 
     @property
-    def starts(self) -> Keyframes | Starts:
+    def starts(self) -> Keyframes | StartClips:
         """Where episodes begin."""
         return self.scene.starts
 
@@ -201,7 +201,7 @@ class LearnedWorld:
         return self.objects.begin(state, pick, draw)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """Evidence into state, as the scene takes it (places.py, history.py); of a pose alone the frame is dreamt."""
+        """Evidence into state, as the scene takes it (keyframe_scene.py, frame_history.py); of a pose alone the frame is dreamt."""
         prior = None if prior is None else self.scene.adopted(prior)
         evidence = self.scene.evidence(observation, prior, self.estimator)
         seeds = chance.seeds(evidence.batch, rng, self.device)

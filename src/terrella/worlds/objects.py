@@ -41,7 +41,7 @@ FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
 
 
 @dataclass(frozen=True)
-class ObjectsConfig:
+class BillboardsConfig:
     """actions: numbers in an action; history: of the last actions that count, the present one among them; looks and moves:
     that it has room for (move 0 is none); rows: billboards of a place; starts: sets of them; hidden: width of the network."""
 
@@ -54,7 +54,7 @@ class ObjectsConfig:
     hidden: int = 192
 
 
-class Next(NamedTuple):
+class BillboardLogits(NamedTuple):
     """Logits of the next look [n, looks], of the move [n, moves] and of its being gone [n]."""
 
     look: torch.Tensor
@@ -63,7 +63,7 @@ class Next(NamedTuple):
 
 
 @final
-class Objects(nn.Module):
+class Billboards(nn.Module):
     """What the things of a place look like, and what they do next."""
 
     kind = "billboards"
@@ -75,7 +75,7 @@ class Objects(nn.Module):
     moves: torch.Tensor  # [moves, 3] metres
     begun: torch.Tensor  # [starts, rows, COLUMNS], those with which episodes begin
 
-    def __init__(self, config: ObjectsConfig):
+    def __init__(self, config: BillboardsConfig):
         super().__init__()
         self.config = config
         self.register_buffer("pictures", torch.zeros(config.looks, 4, *PICTURE, dtype=torch.uint8))
@@ -161,7 +161,7 @@ class Objects(nn.Module):
 
     # -- what happens -------------------------------------------------------------------------------------------------
 
-    def foresee(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> Next:
+    def foresee(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
         """What comes next of billboards [n, COLUMNS], seen from `pose` [n, 7] to which the actions [n, history, A], the newest
         last, have led."""
         apart, heading = billboards[:, PLACE] - pose[:, :3], yaw(pose)
@@ -179,7 +179,7 @@ class Objects(nn.Module):
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
-        return Next(next_look, self.next_move(known), self.goes(known)[:, 0])
+        return BillboardLogits(next_look, self.next_move(known), self.goes(known)[:, 0])
 
     def step(
         self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor

@@ -30,7 +30,7 @@ class ConstantConfig:
 
 
 @final
-class Constant:
+class ConstantOutcome:
     """The same reward for every step, and another for the last: where an episode ends is the body's to say."""
 
     kind, begins = "constant", ()
@@ -38,7 +38,7 @@ class Constant:
     def __init__(self, config: ConstantConfig):
         self.config = config
 
-    def to(self, device) -> Constant:
+    def to(self, device) -> ConstantOutcome:
         return self
 
     def channels(self) -> Channels:
@@ -80,7 +80,7 @@ class OutcomeConfig:
     begins: tuple[float, ...] = ()
 
 
-class Happened(NamedTuple):
+class OutcomePrediction(NamedTuple):
     """reward float32 [B], expected; done [B], a logit; vitals [B, V] after the step; hidden [B, hidden]."""
 
     reward: torch.Tensor
@@ -89,7 +89,7 @@ class Happened(NamedTuple):
     hidden: torch.Tensor
 
 
-class Logits(NamedTuple):
+class OutcomeLogits(NamedTuple):
     """reward [B, len(rewards)]; for each vital [B, len(changes)]; hidden [B, hidden]; seen and remembered [B, inner]."""
 
     reward: torch.Tensor
@@ -99,7 +99,7 @@ class Logits(NamedTuple):
 
 
 @final
-class Outcome(nn.Module):
+class FrameOutcome(nn.Module):
     """A small convolutional network over the frame before and the frame after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values that the recording knows (two-hot between them, as in Dreamer 3):
@@ -179,15 +179,17 @@ class Outcome(nn.Module):
             x = F.silu(layer(x))
         return F.silu(self.sum_up(F.adaptive_avg_pool2d(x, 4).flatten(1)))
 
-    def judge(self, seen: torch.Tensor, action: torch.Tensor, vitals: torch.Tensor, hidden: torch.Tensor) -> Logits:
+    def judge(
+        self, seen: torch.Tensor, action: torch.Tensor, vitals: torch.Tensor, hidden: torch.Tensor
+    ) -> OutcomeLogits:
         """From `seen` [B, 128]; action [B, actions]; vitals [B, V] before the step; hidden [B, hidden]."""
         spans = torch.tensor(self.config.spans, device=seen.device)
         hidden = self.remember(torch.cat([seen, action, vitals / spans], 1), hidden)
         known = torch.cat([seen, hidden], 1)
-        return Logits(self.paid(known), [head(known) for head in self.changed], hidden, known)
+        return OutcomeLogits(self.paid(known), [head(known) for head in self.changed], hidden, known)
 
     def ends(self, known: torch.Tensor, vitals: torch.Tensor) -> torch.Tensor:
-        """The logit [B] that it is over, of Logits.known and the vitals [B, V] after the step."""
+        """The logit [B] that it is over, of OutcomeLogits.known and the vitals [B, V] after the step."""
         spans = torch.tensor(self.config.spans, device=known.device)
         used_up = 4.0 * (vitals <= 0)  # loud, so that it is learned from few ends
         return self.ending(torch.cat([known, vitals / spans, used_up], 1))[:, 0]
@@ -200,7 +202,7 @@ class Outcome(nn.Module):
         vitals: torch.Tensor,
         hidden: torch.Tensor,
         seeds: torch.Tensor | None = None,
-    ) -> Happened:
+    ) -> OutcomePrediction:
         """The outcome of a step; arguments as for `seen` and `judge`. With `seeds` [B] (core/chance.py) each vital changes by
         chance, as likely as it should; without, by the likeliest."""
         found = self.judge(self.seen(before, after), action, vitals, hidden)
@@ -211,7 +213,7 @@ class Outcome(nn.Module):
             picked = logits.argmax(1) if seeds is None else chance.choice(seeds, chances, stream=CHANGES + column)
             moved.append(levels[picked])
         left = vitals.float() + torch.stack(moved, 1) if moved else vitals
-        return Happened(reward, self.ends(found.known, left).float(), left, found.hidden.float())
+        return OutcomePrediction(reward, self.ends(found.known, left).float(), left, found.hidden.float())
 
 
 def _going(batch: int, device) -> dict[str, torch.Tensor]:

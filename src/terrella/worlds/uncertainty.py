@@ -40,7 +40,7 @@ class UncertaintyConfig:
 
 
 @final
-class Uncertainty(nn.Module):
+class UncertaintyNetwork(nn.Module):
     """The network, and a monotone map (isotonic regression on other dreams) from its answer to the error that was found."""
 
     kind = "network"
@@ -103,7 +103,7 @@ class NoUncertainty(Absent):
 
 
 @final
-class Asked(Absent):
+class UncertaintyProbe(Absent):
     """In the place of an uncertainty: notes what one would be asked, for those who teach it."""
 
     def __init__(self, note: Callable[[Conditioning, torch.Tensor, torch.Tensor], None]):

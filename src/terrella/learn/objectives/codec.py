@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ...core.errors import DatasetError
 from ...space.matching import CLEAR, explained, preferred, scrolled
 from ...space.mosaic import remembered
-from ...worlds.codec import Codec, Scroll, Seen
+from ...worlds.codec import Codec, CodecInputs, Scroll
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
 from ..moves import mosaics
@@ -157,6 +157,6 @@ class CodecObjective:
             drawn = truth[:0]
         else:
             with torch.no_grad():
-                few = Seen(*(part[:dreamt] for part in seen))
+                few = CodecInputs(*(part[:dreamt] for part in seen))
                 drawn = codec.drawn(few, choices[:dreamt], features[:dreamt])
         return Loss("generator", pixels + 0.1 * colour.mean(), {"pixels": pixels, "colour": colour.mean()}), drawn

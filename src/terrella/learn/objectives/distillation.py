@@ -9,7 +9,7 @@ from collections.abc import Generator as Generating
 import numpy as np
 import torch
 
-from ...worlds.generator import Conditioning, Generator
+from ...worlds.generator import Conditioning, UNet
 from ..batches import Batch, drawn_now
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, sharpened, total, truth_losses
 from ..trainer import Average, Learner, Loss, Now, adamw, half_precision
@@ -23,7 +23,7 @@ class Matching:
     shown what the student was shown, so it is the distribution of this very frame that is matched.
     """
 
-    def __init__(self, teacher: Generator):
+    def __init__(self, teacher: UNet):
         self.teacher = copy.deepcopy(teacher).eval().requires_grad_(False)
         self.mimic = copy.deepcopy(teacher).train().requires_grad_(True)
         optimiser = torch.optim.AdamW(self.mimic.parameters(), 4e-4, (0.0, 0.99), weight_decay=0.0)
@@ -49,7 +49,7 @@ class Matching:
         return Loss("mimic", losses["rgb"] + 0.5 * losses["depth"], {"mimic": losses["rgb"]})
 
 
-def drawn(generator: Generator, noise: torch.Tensor, shown: Conditioning, steps: int, rng: np.random.Generator):
+def drawn(generator: UNet, noise: torch.Tensor, shown: Conditioning, steps: int, rng: np.random.Generator):
     """A frame [B, 4, H, W] as the generator has it after some of `steps`, drawn at random; only the last has a gradient
     (Self-Forcing: Huang et al. 2025)."""
     x, exit_at = noise, int(rng.integers(steps))
@@ -68,12 +68,12 @@ class Student:
     def __init__(
         self,
         name: str,
-        generator: Generator,
+        generator: UNet,
         flow_steps: int,
         rate: Callable[[Now], float],
         momentum: float,
         weights: tuple[float, float, float],
-        teacher: Generator | None,
+        teacher: UNet | None,
     ):
         self.name, self.flow_steps, self.weights = name, flow_steps, weights
         self.generator = copy.deepcopy(generator).train().requires_grad_(True)

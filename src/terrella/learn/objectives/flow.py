@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ...worlds.generator import Conditioning, Generator, channels_last
+from ...worlds.generator import Conditioning, UNet, channels_last
 from ..batches import Batch, drawn_now
 from ..losses import Critic, critic_learner, critic_loss, flow_losses, frame_losses, sharpened, total
 from ..trainer import Average, Loss, Now, adamw, warmed
@@ -21,9 +21,7 @@ class Flow:
 
     strides = 1  # losses of a batch that the generator descends
 
-    def __init__(
-        self, generator: Generator, flow_steps: int, learning_rate: float, critic_from: int, critic_weight: float
-    ):
+    def __init__(self, generator: UNet, flow_steps: int, learning_rate: float, critic_from: int, critic_weight: float):
         self.generator, self.critic = channels_last(generator), Critic()
         self.one_step, self.critic_from, self.critic_weight = flow_steps == 1, critic_from, critic_weight
         self.smooth = Average(self.generator, 0.999)

@@ -15,7 +15,7 @@ from ...core.world import make_rng
 from ...data import ClipCache
 from ...space.billboards import cut_out
 from ...space.camera import Intrinsics, project
-from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Objects, fresh, likest, marks, noted
+from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Billboards, fresh, likest, marks, noted
 from ..feeds import Drawn
 from ..recording import INSTANCES, OBJECTS, Recording
 from ..trainer import CPU, Loss, Now, Report, Run, Trainer, adamw, warmed
@@ -64,7 +64,7 @@ class Tokens(NamedTuple):
 
 def learn_objects(
     run: Run,
-    objects: Objects,
+    objects: Billboards,
     recording: Recording,
     rgb: Callable[[np.ndarray], np.ndarray],
     starts: torch.Tensor,
@@ -164,7 +164,7 @@ def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray
     return look
 
 
-def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
+def _follows(objects: Billboards, tokens: Tokens) -> torch.Tensor:
     """bool [looks + 1, looks]: a look follows itself, and what it was seen to more than by mistake."""
     looks, known = objects.config.looks, tokens.look != NONE
     pair = (tokens.billboards[known, LOOK].long() + 1) * looks + tokens.look[known]
@@ -173,7 +173,7 @@ def _follows(objects: Objects, tokens: Tokens) -> torch.Tensor:
     return seen | torch.cat([torch.zeros(1, looks), torch.eye(looks)]).bool()
 
 
-def _reach(objects: Objects, tokens: Tokens) -> torch.Tensor:
+def _reach(objects: Billboards, tokens: Tokens) -> torch.Tensor:
     """How near [looks], along x or y in metres, a camera can come to what looks upright: as near as it ever did (the nearest
     few of a thousand left out); 0 for what is low, and for all where it came into them."""
     look = tokens.billboards[:, LOOK].long()
@@ -217,7 +217,7 @@ def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
 
 
 def _followed(
-    objects: Objects, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
+    objects: Billboards, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
 ) -> tuple[Tokens, dict[int, list[torch.Tensor]]]:
     """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the billboards that
     waited in it. The recording is walked through as a dream is, one billboard after another."""
@@ -328,7 +328,7 @@ class Next:
     """What comes next of a thing: another look, a move, an end. Half of each batch are tokens in which something happens; each
     counts by how much likelier than evenly it was drawn, so that what is rare stays as rare as it is."""
 
-    def __init__(self, objects: Objects, tokens: Tokens, recording: Recording, batch: int = 512):
+    def __init__(self, objects: Billboards, tokens: Tokens, recording: Recording, batch: int = 512):
         self.objects, self.tokens, self.size = objects, tokens, batch
         look = tokens.look
         happens = ((look != NONE) & (look != tokens.billboards[:, LOOK])) | (tokens.move > 0) | tokens.gone

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ...data import ClipCache
-from ...worlds.outcome import Logits, Outcome, OutcomeConfig
+from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
 from ..feeds import Drawn
 from ..trainer import Learner, Loss, Now, Run, Trainer, warmed
 
@@ -90,7 +90,7 @@ class Pieces:
 
     def __init__(
         self,
-        outcome: Outcome,
+        outcome: FrameOutcome,
         rgb: Callable[[np.ndarray], torch.Tensor],
         happened: Happenings,
         batch: int = 12,
@@ -137,7 +137,7 @@ class Pieces:
 
 
 def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
-    """Trains the objective's Outcome in place; returns facts of the training."""
+    """Trains the objective's FrameOutcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
     trainer = Trainer(run, "outcome", Drawn(objective.picked), objective, steps)
@@ -148,7 +148,7 @@ def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
 
 def surprise(
     config: OutcomeConfig,
-    predicted: Logits,
+    predicted: OutcomeLogits,
     ends: torch.Tensor,
     reward: torch.Tensor,
     done: torch.Tensor,

@@ -23,7 +23,7 @@ from ...core.errors import DatasetError
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
-from ...worlds.uncertainty import CELLS, KNOTS, Asked, Uncertainty, UncertaintyConfig, clues
+from ...worlds.uncertainty import CELLS, KNOTS, UncertaintyConfig, UncertaintyNetwork, UncertaintyProbe, clues
 from ..feeds import Drawn
 from ..recording import Recording
 from ..run_folder import resume_file
@@ -69,7 +69,9 @@ class Rollout:
         return max(2, math.ceil(self.frames / (self.batch * self.horizon)))
 
 
-def learn_uncertainty(run: Run, world: LearnedWorld, recording: Recording, frames: int) -> tuple[Uncertainty, dict]:
+def learn_uncertainty(
+    run: Run, world: LearnedWorld, recording: Recording, frames: int
+) -> tuple[UncertaintyNetwork, dict]:
     """The uncertainty of `world` and what is known of it: its `sure` and `invents` levels, and of episodes that neither
     trained nor calibrated it the mean error and the mean that was expected."""
     horizon = _horizon(recording, frames)
@@ -102,7 +104,7 @@ def expected_s(world: LearnedWorld, recording: Recording, frames: int) -> float:
     dreamt_s, seen = _dreamt_s(world, recording, horizon)
     began = time.monotonic()
     with torch.random.fork_rng(devices=[]):
-        objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
+        objective = Errors(UncertaintyNetwork(UncertaintyConfig(seen.situation.shape[1])), seen)
     for step in range(3):
         now = Now(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
         for loss in objective.losses(objective.picked(now), now):
@@ -182,7 +184,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: Rollout, number: i
         seen = recording.evidence(world.config, rows)
         return {"rgb": seen["rgb"]} if alone else seen
 
-    dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=Asked(note))
+    dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=UncertaintyProbe(note))
     chance = make_rng(int(rng.integers(2**62)))
     state = dreamer.observe(evidence(begins), None, chance)
     for row in range(1, shown):
@@ -232,7 +234,7 @@ class Errors:
     """By the likelihood of errors that scatter exponentially around the expected one, of frames and of their cells: the
     expectation, not the median, is learned, and small errors count as much as large ones."""
 
-    def __init__(self, uncertainty: Uncertainty, seen: Dreamt):
+    def __init__(self, uncertainty: UncertaintyNetwork, seen: Dreamt):
         self.uncertainty, self.seen = uncertainty, seen
         self.modules = {"uncertainty": uncertainty}
         self.learners = {"uncertainty": adamw((uncertainty,), warmed(3e-3, 50), decay=1e-3)}
@@ -255,16 +257,16 @@ class Errors:
         yield Loss("uncertainty", loss, {"unlikely": loss})
 
 
-def fit(run: Run, seen: Dreamt, steps: int) -> Uncertainty:
+def fit(run: Run, seen: Dreamt, steps: int) -> UncertaintyNetwork:
     """An uncertainty that expects the errors that were `seen`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(run.seed)
-        objective = Errors(Uncertainty(UncertaintyConfig(seen.situation.shape[1])), seen)
+        objective = Errors(UncertaintyNetwork(UncertaintyConfig(seen.situation.shape[1])), seen)
     Trainer(run, "uncertainty", Drawn(objective.picked), objective, steps, device=CPU).train()
     return objective.uncertainty.eval().requires_grad_(False)
 
 
-def calibrate(uncertainty: Uncertainty, seen: Dreamt) -> None:
+def calibrate(uncertainty: UncertaintyNetwork, seen: Dreamt) -> None:
     """Isotonic regression (pool adjacent violators) of the error on the answer, in KNOTS bins of as many frames; and the
     levels at which the page of play calls a world sure or inventing."""
     answer = _learned(uncertainty, seen).clamp(0, 1)
@@ -283,13 +285,13 @@ def calibrate(uncertainty: Uncertainty, seen: Dreamt) -> None:
     uncertainty.invents.copy_(torch.maximum(rest, 1.5 * sure))
 
 
-def answers(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
+def answers(uncertainty: UncertaintyNetwork, seen: Dreamt) -> torch.Tensor:
     """The calibrated error that `uncertainty` expects of each frame [N]."""
     return uncertainty.calibrated(_learned(uncertainty, seen))
 
 
 @torch.inference_mode()
-def _learned(uncertainty: Uncertainty, seen: Dreamt) -> torch.Tensor:
+def _learned(uncertainty: UncertaintyNetwork, seen: Dreamt) -> torch.Tensor:
     """The error before it is calibrated [N]."""
     parts = torch.arange(len(seen.error)).split(256)
     return torch.cat([uncertainty(seen.clues[part].float(), seen.situation[part]).mean((1, 2)) for part in parts])

@@ -18,7 +18,7 @@ from ...space.estimator import save_estimator
 from ...space.keyframes import Keyframes
 from ...worlds.folder import load_world, save_world
 from ...worlds.learned import LearnedWorld
-from ...worlds.objects import Objects, ObjectsConfig
+from ...worlds.objects import Billboards, BillboardsConfig
 from ..objectives.estimator import learn_estimator, sight
 from ..objectives.objects import learn_objects
 from ..objectives.uncertainty import learn_uncertainty
@@ -141,7 +141,7 @@ def train_objects(
             f"{learned.spec.name} knows of no things that move; `terrella train video` makes worlds that do."
         )
     torch.manual_seed(config.seed)
-    objects = Objects(ObjectsConfig(learned.config.actions, learned.config.history))
+    objects = Billboards(BillboardsConfig(learned.config.actions, learned.config.history))
     pair = paired(learned.replaced(objects=objects), data, None, report)
     recording = pair.recording
     run = Run.of(out, config, report, frames=recording.cache.length)

@@ -18,12 +18,12 @@ from ...worlds.body import Motion, MotionBody
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
 from ...worlds.folder import save_world, with_kept
-from ...worlds.generator import Generator
-from ...worlds.history import FrameHistory, Starts
+from ...worlds.frame_history import FrameHistory, StartClips
+from ...worlds.generator import UNet
+from ...worlds.keyframe_scene import KeyframeScene
 from ...worlds.learned import About, LearnedWorld
-from ...worlds.objects import ROWS, STARTS, Objects, ObjectsConfig
-from ...worlds.outcome import Constant, ConstantConfig, Outcome
-from ...worlds.places import KeyframeScene
+from ...worlds.objects import ROWS, STARTS, Billboards, BillboardsConfig
+from ...worlds.outcome import ConstantConfig, ConstantOutcome, FrameOutcome
 from ..feeds import codec_feed, frames_feed
 from ..moves import Looks, frequent_moves, mosaics, overlay, palette
 from ..objectives.codec import CodecObjective, Spans
@@ -176,25 +176,25 @@ class _Learned:
             usable = Recording.of(recording.cache, recording.seen, config.keep_out).usable
             recording = replace(recording, usable=usable)
         self.recording = recording.enough()
-        known = ObjectsConfig(self.video.actions, self.video.history)
-        self.objects = Objects(known) if self.video.objects else None
+        known = BillboardsConfig(self.video.actions, self.video.history)
+        self.objects = Billboards(known) if self.video.objects else None
         self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable)
-        self.outcome: Outcome | None = None
+        self.outcome: FrameOutcome | None = None
         if self.happened.tells_something and (self.video.moving or not self.video.geometry):
             begins = _at_first(self.happened.vitals, recording)
             self.video = replace(self.video, vitals=begins)
-            self.outcome = Outcome(replace(self.happened.config(), begins=begins)).to(run.device)
+            self.outcome = FrameOutcome(replace(self.happened.config(), begins=begins)).to(run.device)
         self.memory = self._memory() if self.video.geometry else None
         fetches = self.memory is None and config.flow_steps == 1  # neither memory nor a flow draws frames
         self.flow = self._codec() if fetches else self._flow()
         self.motion = Motion(self.video.motion)
         self.facts: dict = {}
-        self.starts: Starts | None = None  # of a world without depth, made once
+        self.starts: StartClips | None = None  # of a world without depth, made once
 
     def _flow(self) -> Flow:
         config = self.config
         parts = config.flow_steps, config.learning_rate or 8e-4, config.critic_from, config.critic_weight
-        return Flow(Generator(self.video.generator), *parts)
+        return Flow(UNet(self.video.generator), *parts)
 
     def _codec(self) -> CodecObjective:
         """A codec that knows how pictures of the recording move, and their colours; the run keeps what was found."""
@@ -340,8 +340,8 @@ class _Learned:
         objects = copy.deepcopy(self.objects)
         return LearnedWorld(what, scene=scene, generator=generator, body=body, objects=objects, outcome=outcome)
 
-    def _outcome(self, constant: ConstantConfig) -> Outcome | Constant:
-        return Constant(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
+    def _outcome(self, constant: ConstantConfig) -> FrameOutcome | ConstantOutcome:
+        return ConstantOutcome(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
 
     def _card(self, trainer: Trainer) -> dict:
         recording, parts = self.recording, [self.flow.generator] + [self.motion] * (self.memory is not None)
@@ -364,7 +364,7 @@ class _Learned:
         first = np.intersect1d(self.recording.start, np.flatnonzero(self.recording.usable))
         return first[:: max(1, len(first) // STARTS)][:STARTS]
 
-    def _starts(self, moves: torch.Tensor, over: torch.Tensor | None) -> Starts:
+    def _starts(self, moves: torch.Tensor, over: torch.Tensor | None) -> StartClips:
         """Where episodes begin in a world without geometry: some 32 moments of the recording, evenly."""
         slots, recording = self.video.slots, self.recording
         since = np.arange(recording.cache.length) - recording.start
@@ -373,7 +373,9 @@ class _Learned:
             raise DatasetError(f"no episode is longer than the {slots} frames of history that one begins with.")
         rows = rows[:: max(1, len(rows) // 32)]
         frames = rows[:, None] - np.arange(slots)
-        begun = Starts.of(recording.rgb(frames.ravel()).view(*frames.shape, 3, *self.video.size), self.video.actions)
+        begun = StartClips.of(
+            recording.rgb(frames.ravel()).view(*frames.shape, 3, *self.video.size), self.video.actions
+        )
         acts, vitals = (
             recording.actions_before(rows, np.arange(1, slots + 1)),
             torch.from_numpy(self.happened.vitals[rows]),

@@ -28,7 +28,7 @@ TRUST = 0.03  # in a frame, against the one after it: what is merged from all of
 
 
 @dataclass(frozen=True)
-class Starts:
+class StartClips:
     """Where episodes begin, S pieces of recording, the newest first: frames uint8 [S, slots, 3, H, W]; the actions that led to
     them as networks take them [S, slots, A]; vitals [S, V]; what a mosaic knew of the frame before the newest, uint8 [S, 4, H,
     W] (colour and votes)."""
@@ -39,10 +39,10 @@ class Starts:
     known: torch.Tensor
 
     @staticmethod
-    def of(frames: torch.Tensor, actions: int) -> Starts:
+    def of(frames: torch.Tensor, actions: int) -> StartClips:
         """No button held, and no vitals."""
         known = torch.zeros(len(frames), 4, *frames.shape[3:], dtype=torch.uint8)
-        return Starts(frames, torch.zeros(*frames.shape[:2], actions), torch.zeros(len(frames), 0), known)
+        return StartClips(frames, torch.zeros(*frames.shape[:2], actions), torch.zeros(len(frames), 0), known)
 
 
 @final
@@ -52,7 +52,7 @@ class FrameHistory:
 
     kind, posed, camera = "history", False, None
 
-    def __init__(self, config: HistoryConfig, starts: Starts, over: torch.Tensor | None = None):
+    def __init__(self, config: HistoryConfig, starts: StartClips, over: torch.Tensor | None = None):
         self.config, self.starts = config, starts
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=starts.frames.device).view(-1, 2)
@@ -61,7 +61,7 @@ class FrameHistory:
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
     def to(self, device) -> FrameHistory:
-        starts = Starts(*(part.to(device) for part in vars(self.starts).values()))
+        starts = StartClips(*(part.to(device) for part in vars(self.starts).values()))
         return FrameHistory(self.config, starts, self.over.to(device))
 
     def with_memory(self, *given) -> FrameHistory:
@@ -89,7 +89,7 @@ class FrameHistory:
     def begin(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
         """Pieces of recordings, by chance; which of the starts they are [B]."""
         pick = (chance.uniform(seeds, (), stream=STARTS) * len(self.starts.frames)).long()
-        found = Starts(*(part[pick] for part in vars(self.starts).values()))
+        found = StartClips(*(part[pick] for part in vars(self.starts).values()))
         seen = {"frames": found.frames, "actions": found.actions.flip(1), "vitals": found.vitals}
         if self.config.moves:
             seen["mosaic"] = held_in(blank(len(pick), self.config.size, self.device), found.known)

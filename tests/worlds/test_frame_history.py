@@ -14,10 +14,10 @@ from terrella.core.errors import ActionError
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
-from terrella.worlds.generator import Generator
-from terrella.worlds.history import FrameHistory, Starts
+from terrella.worlds.frame_history import FrameHistory, StartClips
+from terrella.worlds.generator import UNet
 from terrella.worlds.learned import About, LearnedWorld
-from terrella.worlds.outcome import Outcome, OutcomeConfig
+from terrella.worlds.outcome import FrameOutcome, OutcomeConfig
 
 SIZE = (16, 24)
 
@@ -27,10 +27,10 @@ def made(controls: Controls, vitals: tuple[str, ...] = ()) -> LearnedWorld:
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), controls.numbers, SIZE, (8, 8), slots=4, geometry=False, residual=True)
     frames = torch.randint(0, 255, (3, 4, 3, *SIZE), dtype=torch.uint8)
     first = torch.tensor([[3.0], [2.0], [1.0]])[:, : len(vitals)]
-    starts = replace(Starts.of(frames, controls.numbers), actions=torch.rand(3, 4, controls.numbers), vitals=first)
+    starts = replace(StartClips.of(frames, controls.numbers), actions=torch.rand(3, 4, controls.numbers), vitals=first)
     changes, spans, begins = ((-1.0, 0.0),) * len(vitals), (3.0,) * len(vitals), (2.0,) * len(vitals)
-    outcome = Outcome(OutcomeConfig(controls.numbers, (0.0, 1.0), vitals, changes, spans, begins=begins))
-    scene, generator = FrameHistory(config.frames, starts), Generator(config.generator)
+    outcome = FrameOutcome(OutcomeConfig(controls.numbers, (0.0, 1.0), vitals, changes, spans, begins=begins))
+    scene, generator = FrameHistory(config.frames, starts), UNet(config.generator)
     return LearnedWorld(About("made", controls, 0.1), scene=scene, generator=generator, outcome=outcome)
 
 

@@ -9,7 +9,7 @@ from terrella.core.world import make_rng
 from terrella.space.camera import planar_pose
 from terrella.space.keyframes import Keyframes, look, retrieve
 from terrella.space.reproject import carry_things, carry_things_slowly
-from terrella.worlds.moving import Frame, carry_frames, still
+from terrella.worlds.carried_frames import Frame, carry_frames, still
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (24, 32)
 

@@ -23,10 +23,10 @@ from ..space.memory import RECORDED, ROWS, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
-from .arrival import AWAY_M, arrive
+from .carried_frames import Frame, carry_frames, covering, still
 from .config import KeyframesConfig
 from .generator import Conditioning, context_thumbnail, decode_depth, pixels
-from .moving import Frame, carry_frames, covering, still
+from .localisation import AWAY_M, arrive
 from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
 
 SEEN = "rgb", "depth", "things", "pose", "instances"  # of a frame, needed still two steps later, where things move
@@ -121,7 +121,7 @@ class KeyframeScene:
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
         """Evidence: rgb, depth and pose together; a pose alone, from which a frame is dreamt (it needs a prior); or a picture
         alone, seen from the prior's pose, or without a prior from the remembered place that it shows, else from an empty
-        corner (arrival.py), its depth then being the estimator's."""
+        corner (localisation.py), its depth then being the estimator's."""
         lone = None
         if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and estimator:
             observation, lone = self._arrived(observation, prior, estimator)

@@ -11,7 +11,7 @@ from terrella.core import make_rng
 from terrella.space.estimator import Estimator, EstimatorConfig
 from terrella.space.keyframes import Keyframes
 from terrella.space.recognise import thumbnails
-from terrella.worlds.arrival import AWAY_M, arrive
+from terrella.worlds.localisation import AWAY_M, arrive
 
 
 def test_two_pictures_arrive_each_in_its_own_place():
