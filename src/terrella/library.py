@@ -143,7 +143,7 @@ def load_policy(name: str | Path, spec: Spec, world: World | None = None) -> Pol
 def load_adapter(source: str) -> Adapter:
     """The `adapter` of a Python file, or of "FILE.py:NAME" the object of that name: it says where an environment has depth, poses
     and more (sim/gymnasium.py)."""
-    from .sim.opening import load_adapter
+    from .sim.environment_loading import load_adapter
 
     return load_adapter(source)
 

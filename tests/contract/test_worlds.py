@@ -11,7 +11,7 @@ from gymnasium import spaces
 import terrella
 from terrella.core import check_world
 from terrella.sim.gymnasium import GymnasiumWorld
-from terrella.sim.replay import Replay
+from terrella.sim.replay import ReplayWorld
 
 from ..robot import Robot
 
@@ -42,7 +42,7 @@ def test_a_recorded_episode():
         "pose": pose,
         "reward": rng.normal(size=9).astype(np.float32),
     }
-    check_world(Replay(channels, np.zeros((8, 6)), spaces.MultiBinary(6), 1 / 35), steps=12)
+    check_world(ReplayWorld(channels, np.zeros((8, 6)), spaces.MultiBinary(6), 1 / 35), steps=12)
 
 
 def test_the_real_game():

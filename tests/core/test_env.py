@@ -20,7 +20,7 @@ from terrella.core.errors import ActionError, ChannelError, TerrellaError
 from terrella.core.policy import Random
 from terrella.data import record
 from terrella.sim.gymnasium import GymnasiumWorld
-from terrella.sim.replay import Replay
+from terrella.sim.replay import ReplayWorld
 
 FRAMES = 5
 
@@ -40,7 +40,7 @@ def film():
         "rgb": np.zeros((FRAMES, 4, 6, 3), np.uint8) + frames.astype(np.uint8)[:, None, None, None],
     }
     given = {"observation": spaces.Box(0, FRAMES, (1,), np.float32)}
-    return Replay(channels, np.zeros(FRAMES - 1), spaces.Discrete(2), 0.1, spaces_given=given)
+    return ReplayWorld(channels, np.zeros(FRAMES - 1), spaces.Discrete(2), 0.1, spaces_given=given)
 
 
 class SingleView(gymnasium.Env):

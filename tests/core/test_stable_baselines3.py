@@ -10,7 +10,7 @@ import terrella
 from terrella import library
 from terrella.core.errors import TerrellaError
 from terrella.sim.gymnasium import GymnasiumWorld
-from terrella.sim.replay import Replay
+from terrella.sim.replay import ReplayWorld
 
 sb3 = pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is missing: pip install 'terrella[sb3]'")
 
@@ -22,7 +22,7 @@ def film():
     rgb = np.zeros((5, 48, 40, 3), np.uint8) + frames.astype(np.uint8)[:, None, None, None]
     channels = {"health": frames, "reward": frames, "rgb": rgb}
     given = {"health": spaces.Box(0, 5, (), np.float32)}
-    return Replay(channels, np.ones(4), spaces.Discrete(2, start=1), 0.1, spaces_given=given)
+    return ReplayWorld(channels, np.ones(4), spaces.Discrete(2, start=1), 0.1, spaces_given=given)
 
 
 def test_an_episode_that_ends_begins_anew_and_hands_over_its_last_observation(film):

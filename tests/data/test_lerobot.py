@@ -17,7 +17,7 @@ from terrella.care import doctor
 from terrella.data import ClipCache, Dataset
 from terrella.data.source import Readings, Sensor, Source, Take
 from terrella.exchange.convert import open_source, write_source
-from terrella.exchange.formats.lerobot import Rows
+from terrella.exchange.formats.lerobot import LeRobotRows
 from terrella.exchange.merging.write import merge_into
 
 PYTHON = os.environ.get("TERRELLA_LEROBOT_PYTHON")
@@ -162,7 +162,7 @@ def test_png_merged_tables_and_statistics_open_in_lerobot(tmp_path, monkeypatch)
             Take({camera.name: Readings(at, pictures), state.name: Readings(at, rng.random((length, 2)))}, "see")
         )
     source = Source("png", {camera.name: camera, state.name: state}, lambda: takes, 10.0)
-    write_source(source, tmp_path / "png", rows=Rows(pictures="png"))
+    write_source(source, tmp_path / "png", rows=LeRobotRows(pictures="png"))
     assert len(list((tmp_path / "png/meta/episodes/chunk-000").iterdir())) == 2
     facts = json.loads(_lerobot(READ, tmp_path / "png", (0, 8, 21)).splitlines()[-1])
     assert facts["lengths"] == [4, 5, 6, 7] and facts["length"] == 22

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from terrella.core.errors import DatasetError
 from terrella.data.source import Lazy, Readings, Sensor, Source, Take
-from terrella.exchange.browse import MARKS, Browse, Entry, pose_columns
+from terrella.exchange.browse import MARKS, Browse, EpisodeEntry, pose_columns
 
 CAMERA, STATE = "observation.images.front", "observation.state"
 
@@ -39,7 +39,7 @@ def source_of(count: int = 5, make=take_of, sensors=None) -> Source:
 
 def test_lists_and_reads_any_source(tmp_path):
     browse = Browse(source_of(), tmp_path / MARKS)
-    assert browse.entries == tuple(Entry(6, 0.55, f"task {number}") for number in range(5))
+    assert browse.entries == tuple(EpisodeEntry(6, 0.55, f"task {number}") for number in range(5))
     about = browse.about()
     assert [sensor["label"] for sensor in about["sensors"]] == ["front", "state"], "pictures come first"
     assert not about["can_export"]
@@ -53,7 +53,7 @@ def test_lists_and_reads_any_source(tmp_path):
 
 def test_a_list_and_an_opener_spare_the_walk(tmp_path):
     source = Source("far", SENSORS, lambda: Lazy(10_000, take_of))
-    browse = Browse(source, tmp_path / MARKS, entries=[Entry(6, 0.5)] * 10_000)
+    browse = Browse(source, tmp_path / MARKS, entries=[EpisodeEntry(6, 0.5)] * 10_000)
     assert browse.reading(9_999, CAMERA, 0).shape == (4, 6, 3)
     assert len(browse.listing()) == 10_000
 
@@ -66,7 +66,7 @@ def test_a_source_whose_takes_are_a_sequence_is_not_walked(tmp_path):
         return take_of(number)
 
     takes = Lazy(1000, opens)
-    browse = Browse(Source("lazy", SENSORS, lambda: takes), tmp_path / MARKS, entries=[Entry(6, 0.5)] * 1000)  # type: ignore[arg-type]
+    browse = Browse(Source("lazy", SENSORS, lambda: takes), tmp_path / MARKS, entries=[EpisodeEntry(6, 0.5)] * 1000)  # type: ignore[arg-type]
     assert browse.episode(900)["task"] == "task 900" and browse.episode(20)["task"] == "task 20"
     assert opened == [900, 20]
 
@@ -80,7 +80,7 @@ def test_at_most_two_takes_stay_open(tmp_path):
         return take
 
     source = Source("lazy", SENSORS, lambda: Lazy(8, opens))
-    browse = Browse(source, tmp_path / MARKS, entries=[Entry(6, 0.5)] * 8)
+    browse = Browse(source, tmp_path / MARKS, entries=[EpisodeEntry(6, 0.5)] * 8)
     for number in (0, 1, 0, 1, 2, 3, 4, 3):
         browse.series(number, STATE)
     gc.collect()
@@ -133,7 +133,7 @@ BROKEN_CLOCKS = {
 @pytest.mark.parametrize("clock", BROKEN_CLOCKS.values(), ids=BROKEN_CLOCKS)
 def test_a_broken_clock_is_that_sensors_fault_alone(tmp_path, clock):
     broken = {CAMERA: Readings(np.array(clock), np.zeros((3, 4, 6, 3), np.uint8))}
-    entries = [Entry(3, 0.2)]
+    entries = [EpisodeEntry(3, 0.2)]
     browse = Browse(source_of(1, lambda n: take_of(n, **broken)), tmp_path / MARKS, entries)
     facts = browse.episode(0)
     assert CAMERA in facts["sensors"][CAMERA]["fault"] and facts["sensors"][STATE] == {"count": 12, "fault": ""}
@@ -185,7 +185,7 @@ def test_a_recording_without_episodes_or_readings_opens(tmp_path):
 
 
 def test_a_source_that_shrank_is_a_sentence(tmp_path):
-    browse = Browse(source_of(2), tmp_path / MARKS, entries=[Entry(6, 0.5)] * 3)
+    browse = Browse(source_of(2), tmp_path / MARKS, entries=[EpisodeEntry(6, 0.5)] * 3)
     with pytest.raises(DatasetError, match="no episode 2 any more"):
         browse.episode(2)
     assert browse.episode(1)["task"] == "task 1"

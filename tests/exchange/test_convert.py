@@ -13,7 +13,7 @@ from PIL import Image
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Readings, Sensor, Source, Take
 from terrella.exchange import open_source, write_source
-from terrella.exchange.formats.lerobot import Rows
+from terrella.exchange.formats.lerobot import LeRobotRows
 
 FRONT, DEPTH = "observation.images.front", "observation.depth"
 SENSORS = [
@@ -80,7 +80,7 @@ def test_lerobot_with_png_is_the_identity(tmp_path_factory, seed, lengths, own_c
     if own_clocks:
         terminal = True
     source = some(seed, tuple(lengths), sensors, None if own_clocks else 10.0, terminal)
-    png = Rows(pictures="png")
+    png = LeRobotRows(pictures="png")
     write_source(source, folder / "one", rows=png)
     same(source, open_source(folder / "one"))
     write_source(open_source(folder / "one"), folder / "two", rows=png)
@@ -103,7 +103,7 @@ def test_every_format_of_numbers_gives_back_what_it_got(tmp_path, name):
     write_source(source, tmp_path / name, to)
     again = open_source(tmp_path / name, 10.0)
     same(source, again)
-    write_source(again, tmp_path / "rows", rows=Rows(pictures="png"))
+    write_source(again, tmp_path / "rows", rows=LeRobotRows(pictures="png"))
     assert Dataset(tmp_path / "rows").fps == 10
     same(source, open_source(tmp_path / "rows"))
 
@@ -122,7 +122,7 @@ def test_pictures_alone_go_out_and_come_back(tmp_path, to):
 
 def test_rows_follow_the_fps_that_is_asked_for(tmp_path):
     source = some(5, (21,), SENSORS[2:5], 10.0)
-    write_source(source, tmp_path / "slow", rows=Rows(fps=5.0))
+    write_source(source, tmp_path / "slow", rows=LeRobotRows(fps=5.0))
     dataset = Dataset(tmp_path / "slow")
     assert dataset.fps == 5 and dataset.length == 11
     take = next(iter(source.takes()))
@@ -131,7 +131,7 @@ def test_rows_follow_the_fps_that_is_asked_for(tmp_path):
     )
     full = dataset.readings(0, "observation.state")  # with its own clock it is all there
     np.testing.assert_array_equal(full.values, take.readings["observation.state"].values)
-    mixed = Rows(fps=20.0, policy="linear")
+    mixed = LeRobotRows(fps=20.0, policy="linear")
     write_source(source, tmp_path / "fast", rows=mixed)
     found = Dataset(tmp_path / "fast").episode(0, ["observation.state"])["observation.state"]
     np.testing.assert_allclose(found[::2], take.readings["observation.state"].values, atol=1e-12)
@@ -190,7 +190,7 @@ def test_takes_need_not_end_alike(tmp_path, kept):
 
 def test_statistics_are_of_every_number_and_of_png_pictures_too(tmp_path):
     source = some(12, (40,), SENSORS[:4])
-    write_source(source, tmp_path / "set", rows=Rows(pictures="png"))
+    write_source(source, tmp_path / "set", rows=LeRobotRows(pictures="png"))
     (take,) = source.takes()
     stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
     grid = take.readings["observation.grid"].values

@@ -149,7 +149,7 @@ def test_a_disk_that_fails_is_told_and_the_recording_goes_on(tmp_path, monkeypat
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(mcap_write.Recording, "flush", full)
+    monkeypatch.setattr(mcap_write.McapRecording, "flush", full)
     _until(lambda: bool(live.notes))
     for i in range(5):
         live.log("action", 1.0 + i, np.zeros(2, np.float32))
@@ -180,13 +180,13 @@ def test_readings_that_are_none_are_told_and_counted(tmp_path):
 
 
 def test_logging_never_waits_for_a_slow_disk(tmp_path, monkeypatch):
-    add = mcap_write.Recording.add
+    add = mcap_write.McapRecording.add
 
     def slow(*args):
         time.sleep(0.02)
         add(*args)
 
-    monkeypatch.setattr(mcap_write.Recording, "add", slow)
+    monkeypatch.setattr(mcap_write.McapRecording, "add", slow)
     monkeypatch.setattr("terrella.exchange.live._WAITING_COUNT", 8)
     with Live(tmp_path / "slow.mcap", SENSORS, "run") as live:
         begun = time.perf_counter()

@@ -13,11 +13,11 @@ from robots import arm, robot, rover
 from terrella.core.errors import DatasetError
 from terrella.data.source import Sensor
 from terrella.exchange.merging.mapping import (
-    Camera,
     Dimension,
+    MergedCamera,
     MergeMapping,
+    MergeRows,
     Number,
-    Rows,
     SourceMapping,
     Vector,
     affine,
@@ -112,7 +112,7 @@ def test_other_sensors_are_mapped_kept_or_left_out():
 def test_rates_and_sizes():
     small, big = arm("a", fps=10, size=(8, 12)), arm("b", fps=30, size=(48, 64))
     mapping = propose({"A": big, "B": small})
-    assert mapping.rows.fps == 10 and mapping.cameras["observation.images.front"] == Camera("image", 8, 12)
+    assert mapping.rows.fps == 10 and mapping.cameras["observation.images.front"] == MergedCamera("image", 8, 12)
     assert any("fitted from 48 x 64 into 8 x 12" in note for note in mapping.sources[0].notes)
     assert propose({"A": big, "B": small}, fps=20).rows.fps == 20
     assert propose({"A": rover()}).rows.fps == 10  # its camera's
@@ -206,7 +206,7 @@ numbers = st.one_of(
 mappings = st.builds(
     MergeMapping,
     st.builds(
-        Rows,
+        MergeRows,
         st.floats(0.1, 1000),
         st.sampled_from(["previous", "nearest"]),
         st.sampled_from(["previous", "nearest", "linear"]),
@@ -217,7 +217,7 @@ mappings = st.builds(
     st.dictionaries(words, st.builds(Dimension, words, words), max_size=3),
     st.dictionaries(
         words,
-        st.builds(Camera, st.sampled_from(["image", "depth"]), st.integers(1, 999), st.integers(1, 999)),
+        st.builds(MergedCamera, st.sampled_from(["image", "depth"]), st.integers(1, 999), st.integers(1, 999)),
         max_size=2,
     ),
     st.lists(

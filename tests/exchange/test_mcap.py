@@ -705,7 +705,7 @@ def test_paths_and_options_that_cannot_be_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("leaf", "missing"),
     [
-        ("encoder", "foxglove"),
+        ("message_encoder", "foxglove"),
         ("messages", "google.protobuf"),
         ("mcap_index", "zstandard"),
         ("mcap_write", "mcap.writer"),

@@ -17,11 +17,11 @@ from terrella.data import Dataset
 from terrella.data.resample import resample
 from terrella.data.source import Readings, Sensor, Source, Take
 from terrella.data.storage import durable
-from terrella.exchange.merging.mapping import Number, Rows, Vector, affine
+from terrella.exchange.merging.mapping import MergeRows, Number, Vector, affine
 from terrella.exchange.merging.mapping_file import read_mapping, write_mapping
 from terrella.exchange.merging.merge import letterbox, merge
 from terrella.exchange.merging.propose import propose
-from terrella.exchange.merging.report import Report, Running
+from terrella.exchange.merging.report import MergeReport, Running
 from terrella.exchange.merging.write import merge_into
 
 VECTORS = {"action", "observation.state", "next.reward", "next.done"}
@@ -129,7 +129,7 @@ def test_the_order_of_sources_only_permutes(seed, order):
     all_ = {"A": arm(seed=seed), "B": arm("other", seed=seed + 1, unit="deg"), "C": rover(seed=seed)}
     mapping = propose(all_)
     shuffled = replace(mapping, sources=tuple(next(s for s in mapping.sources if s.path == path) for path in order))
-    one, other = Report(), Report()
+    one, other = MergeReport(), MergeReport()
     first = {(t.facts["source"], t.facts["take"]): t for t in merged_takes(all_, mapping, one)[1]}
     second = {(t.facts["source"], t.facts["take"]): t for t in merged_takes(all_, shuffled, other)[1]}
     assert first.keys() == second.keys() and [path for path, _ in second][::2] == list(order)
@@ -169,7 +169,7 @@ def test_other_rates_keep_values_within_the_policy_and_returns_exactly(seed, fps
 def test_clocks_of_their_own_become_rows():
     body = rover(seconds=2)
     mapping = propose({"A": body, "B": arm()}, fps=20)
-    report = Report()
+    report = MergeReport()
     source, takes = merged_takes({"A": body, "B": arm()}, mapping, report)
     take, names = takes[0], list(mapping.state)
     rows = np.arange(41) / 20
@@ -206,7 +206,7 @@ def test_late_sensors_and_silences():
         {},
         {"observation.state": (np.zeros(0), np.zeros((0, 1)))},
     ]
-    report = Report()
+    report = MergeReport()
     source = {"A": robot("r", [state, camera], takes)}
     _, (take, blind) = merged_takes(source, report=report)
     rows = 0.4 + np.arange(46) / 10
@@ -229,7 +229,7 @@ def test_what_is_not_a_number_is_masked_and_counted():
     sensor = Sensor("observation.state", "vector", (2,), "float64", ("x", "y"))
     reward = Sensor("next.reward", "vector", (1,), "float32")
     values = np.array([[1, np.nan], [np.inf, 2], [1e300, 3], [4, 4]])
-    t, report = np.arange(4) / 10, Report()
+    t, report = np.arange(4) / 10, MergeReport()
     readings = {"observation.state": (t, values), "next.reward": (t, np.array([[1], [np.nan], [2], [3]], np.float32))}
     _, (take,) = merged_takes({"A": robot("r", [sensor, reward], [readings])}, report=report)
     assert stack(take, "observation.state").tolist() == [[1, 0], [0, 2], [0, 3], [4, 4]]
@@ -247,7 +247,7 @@ def test_statistics_are_those_of_the_valid_rows():
         "C": arm("other", rows=(40,), unit="deg", scale=90),
     }
     sources["B"] = replace(sources["B"], name="again")
-    report = Report()
+    report = MergeReport()
     _, takes = merged_takes(sources, report=report)
     assert report.complete
     first, second = report.embodiments()
@@ -312,7 +312,7 @@ def test_a_person_can_edit_the_mapping(tmp_path):
     first = replace(first, vectors={**first.vectors, "observation.state": Vector(tuple(numbers), "base")})
     first = replace(first, cameras={}, out={"observation.images.front": "it is dark"})
     write_mapping(replace(mapping, sources=(first, mapping.sources[1])), tmp_path / "m.toml")
-    report = Report()
+    report = MergeReport()
     source, takes = merged_takes(sources, read_mapping(tmp_path / "m.toml"), report)
     old = stack(next(iter(sources["A"].takes())), "observation.state")
     assert stack(takes[0], "observation.state_mask").tolist() == [[False, True, True]] * 6
@@ -325,14 +325,14 @@ def test_a_person_can_edit_the_mapping(tmp_path):
 
 
 def test_deltas_are_pointed_out():
-    report = Report()
+    report = MergeReport()
     sources = {"A": arm(fps=30), "B": arm("other", fps=10)}
     merged_takes(sources, report=report)
     assert "multiplied by 3" in report.text() and report.text().count("multiplied") == 1
 
 
 def test_reading_anew_counts_anew_and_stopping_is_seen():
-    report = Report()
+    report = MergeReport()
     source = merge({"A": arm()}, propose({"A": arm()}), report)
     next(iter(source.takes()))
     assert not report.complete and "not complete" in report.text() and report.embodiments()[0]["rows"] == 6
@@ -403,7 +403,7 @@ def test_a_source_without_takes_and_robots_without_anything_in_common():
         "video", [plain], [{"observation.images.video": (np.arange(3) / 10, np.ones((3, 4, 4, 3), np.uint8))}]
     )
     empty = Source("empty", arm().sensors, lambda: iter(()), fps=10, robot="empty")
-    report = Report()
+    report = MergeReport()
     source, takes = merged_takes({"V": video, "E": empty}, report=report)
     (take,) = takes
     assert len(take.readings["action"].values) == 0 and not stack(take, "action_mask").any()
@@ -414,7 +414,7 @@ def test_a_source_without_takes_and_robots_without_anything_in_common():
 def test_rows_may_have_no_limit_to_a_gap():
     state = Sensor("observation.state", "vector", (1,), "float32", ("x",))
     source = {"A": robot("r", [state], [{"observation.state": (np.array([0, 9.0]), np.array([[0], [9]], np.float32))}])}
-    mapping = replace(propose(source), rows=Rows(1.0, max_gap_s=None))
+    mapping = replace(propose(source), rows=MergeRows(1.0, max_gap_s=None))
     _, (take,) = merged_takes(source, mapping)
     assert stack(take, "observation.state")[:, 0].tolist() == list(range(10))
 
@@ -464,7 +464,7 @@ def test_wide_vectors_are_kept_whole():
     felt, seen = rng.normal(size=(4, 100)).astype(np.float32), rng.normal(size=(4, 2, 3)).astype(np.float32)
     felt[2, 7] = np.nan
     readings = {"observation.skin": (t, felt), "observation.grid": (t, seen), "observation.label": (t, [["a"]] * 4)}
-    report = Report()
+    report = MergeReport()
     sources = {"A": robot("soft hand", [skin, grid, label], [readings]), "B": arm()}
     _, takes = merged_takes(sources, report=report)
     kept = stack(takes[0], "observation.soft_hand.skin")
@@ -524,7 +524,7 @@ def test_rewards_between_rows_and_takes_of_one_row():
         "next.reward": ([0.05, 0.06], np.array([[2], [3]])),
     }
     single = {"observation.state": ([0.0], np.zeros((1, 1)))}
-    report = Report()
+    report = MergeReport()
     _, (take,) = merged_takes({"A": robot("r", [state, reward], [single, late])}, report=report)
     assert stack(take, "next.reward")[:, 0].tolist() == [5]
     assert stack(take, "next.reward_mask")[:, 0].tolist() == [True, False, False, False]

@@ -13,7 +13,7 @@ from tests.learn.stopping import goes_on_exactly, quiet
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import ClipCache, Dataset, Layout, Recorder
 from terrella.exchange import open_source, write_source
-from terrella.exchange.formats.lerobot import Rows
+from terrella.exchange.formats.lerobot import LeRobotRows
 from terrella.learn.latent_codes import labelled, map_keys
 from terrella.learn.objectives.latent_actions import posterior
 from terrella.learn.objectives.latent_model import Forward, warped
@@ -116,7 +116,7 @@ def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
 
 def write(run, recording, out):
     labels = labelled(run, recording, quiet)
-    write_source(labels.source, out, "lerobot", Rows(pictures="png"))
+    write_source(labels.source, out, "lerobot", LeRobotRows(pictures="png"))
     return labels
 
 

@@ -15,8 +15,8 @@ import terrella
 from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
 from terrella.core.spec import POSE, POSE_UNIT
+from terrella.sim.environment_loading import follow
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
-from terrella.sim.opening import follow
 
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
 

@@ -271,7 +271,7 @@ def test_what_is_seen_goes_together_in_any_order():
 
 @needs_mujoco
 def test_patterns_tile_and_differ():
-    from terrella.sim.mujoco_looks import PATTERNS, pattern
+    from terrella.sim.mujoco_appearance import PATTERNS, pattern
 
     rng = np.random.default_rng(0)
     made = [pattern(at, rng).astype(int) for at in range(PATTERNS)]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from terrella.core import State, make_rng, rollout
 from terrella.core.errors import ActionError, ObservationError, TerrellaError
-from terrella.sim.replay import Replay
+from terrella.sim.replay import ReplayWorld
 
 STEPS = 6
 ACTION = spaces.MultiBinary(2)
@@ -27,8 +27,8 @@ def episode(**more) -> dict[str, np.ndarray]:
     }
 
 
-def film(**more) -> Replay:
-    return Replay(episode(**more), np.zeros((STEPS, 2)), ACTION, 1 / 35)
+def film(**more) -> ReplayWorld:
+    return ReplayWorld(episode(**more), np.zeros((STEPS, 2)), ACTION, 1 / 35)
 
 
 @given(seed=st.integers(0, 2**31))
@@ -75,7 +75,7 @@ def test_arrays_tensors_and_memory_maps_are_shown_alike(tmp_path):
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     shown = []
     for channels in (arrays, mapped, tensors):
-        world, rng = Replay(channels, np.zeros((STEPS, 2)), ACTION, 0.1), make_rng(0)
+        world, rng = ReplayWorld(channels, np.zeros((STEPS, 2)), ACTION, 0.1), make_rng(0)
         state = world.imagine(world.start(2, rng), torch.zeros(2, 2), rng)
         shown.append(world.render(state, tuple(world.spec.channels)))
         shown[-1]["rgb"].zero_()  # what is handed out is not the recording
@@ -93,7 +93,7 @@ def test_bad_requests_are_answered_in_one_sentence():
     with pytest.raises(TerrellaError, match="6 actions has 7 frames"):
         film(reward=np.zeros(STEPS))
     with pytest.raises(TerrellaError, match="frames in each channel"):
-        Replay({}, np.zeros(0), ACTION, 0.1)
+        ReplayWorld({}, np.zeros(0), ACTION, 0.1)
     world, rng = film(), make_rng(0)
     with pytest.raises(ActionError):
         world.imagine(world.start(1, rng), torch.zeros(1, 3), rng)

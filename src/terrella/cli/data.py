@@ -91,10 +91,10 @@ def convert(
         episodes: Number of rollouts to draw from "gym:ID".
     """
     from ..exchange.convert import open_source, write_source
-    from ..exchange.formats.lerobot import Rows
+    from ..exchange.formats.lerobot import LeRobotRows
 
     found = open_source(source, fps, episodes, seed)
-    rows = Rows(fps if found.fps is None or fps != found.fps else None, policy, pictures)
+    rows = LeRobotRows(fps if found.fps is None or fps != found.fps else None, policy, pictures)
     with _whole_or_nothing(target), progress.shown(f"converting {found.name}") as report:
         left_out = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
     facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "left_out": left_out}
@@ -183,14 +183,14 @@ def label(
         frames: Number of its frames to use.
     """
     from ..exchange import write_source
-    from ..exchange.formats.lerobot import Rows
+    from ..exchange.formats.lerobot import LeRobotRows
     from ..learn import latent_codes
 
     with progress.shown("labelling") as report:
         keys = latent_codes.map_keys(run, labelled, report, frames, seed=seed) if labelled else None
         labels = latent_codes.labelled(run, folder, report, keys)
         pictures = "png" if labels.exact else "video"  # exact ones stay exact
-        facts = {**labels.facts, "notes": write_source(labels.source, out, "lerobot", Rows(pictures=pictures))}
+        facts = {**labels.facts, "notes": write_source(labels.source, out, "lerobot", LeRobotRows(pictures=pictures))}
     if keys:
         facts |= {"key_accuracy": keys.accuracy, "commonest_action": keys.commonest, "labelled_frames": keys.used}
     result({"dataset": str(out), **facts}, json)

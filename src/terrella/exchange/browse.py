@@ -31,12 +31,12 @@ _FORMS = {
     "points": "a cloud, [n, 3 or more]",
 }
 
-Report = Callable[[int, int], None]  # (episodes done, episodes in all)
-Export = Callable[[Path, Sequence[int], Report], Sequence[str] | None]  # gives notes on what was left out
+Progress = Callable[[int, int], None]  # (episodes done, episodes in all)
+Export = Callable[[Path, Sequence[int], Progress], Sequence[str] | None]  # gives notes on what was left out
 
 
 @dataclass(frozen=True)
-class Entry:
+class EpisodeEntry:
     """One line of the list of episodes.
 
     rows:    readings of its first camera (where it has none: of its first sensor).
@@ -49,11 +49,11 @@ class Entry:
     task: str = ""
 
     @staticmethod
-    def of(take: Take) -> Entry:
+    def of(take: Take) -> EpisodeEntry:
         cameras = [name for name in take.readings if name.startswith("observation.images")]
         first = next(iter([*cameras, *take.readings]), None)
         ends = [float(readings.time_s[-1]) for readings in take.readings.values() if len(readings.time_s)]
-        return Entry(len(take.readings[first].time_s) if first else 0, max(ends, default=0.0), take.task)
+        return EpisodeEntry(len(take.readings[first].time_s) if first else 0, max(ends, default=0.0), take.task)
 
 
 class Browse:
@@ -73,13 +73,13 @@ class Browse:
         self,
         source: Source,
         marks: str | Path,
-        entries: Sequence[Entry] | None = None,
+        entries: Sequence[EpisodeEntry] | None = None,
         export: Export | None = None,
     ):
         self.source, self._marks_path, self._export = source, Path(marks), export
         self._open = _Walk(source).take
         self._texts = {name for name, sensor in source.sensors.items() if sensor.dtype == "string"}
-        self.entries = tuple(entries if entries is not None else map(Entry.of, source.takes()))
+        self.entries = tuple(entries if entries is not None else map(EpisodeEntry.of, source.takes()))
         self._takes: OrderedDict[int, _OpenTake] = OrderedDict()
         self._bad = _read_marks(self._marks_path)
 
@@ -162,7 +162,7 @@ class Browse:
             ) from error
         self._bad = marked
 
-    def export(self, path: Path, keep: Sequence[int], report: Report) -> tuple[int, list[str]]:
+    def export(self, path: Path, keep: Sequence[int], report: Progress) -> tuple[int, list[str]]:
         """Writes the episodes `keep` into a new folder `path`; may run while other methods do, in its own thread.
 
         Returns how many episodes the folder has, and sentences on what was left out or changed.
@@ -357,7 +357,7 @@ def _read_marks(path: Path) -> frozenset[int]:
 
 
 def browse(
-    path: str | Path, carry: Callable[[Path, Path, Sequence[int], Report], Sequence[str]] | None = None
+    path: str | Path, carry: Callable[[Path, Path, Sequence[int], Progress], Sequence[str]] | None = None
 ) -> Browse:
     """A recording of any format, to be looked through.
 
@@ -370,7 +370,7 @@ def browse(
     else:
         marks = where / MARKS if where.is_dir() else where.with_name(f".{where.name}{MARKS}")
 
-    def write(out: Path, keep: Sequence[int], report: Report) -> list[str]:
+    def write(out: Path, keep: Sequence[int], report: Progress) -> list[str]:
         wanted = set(keep)
         chosen = replace(source, takes=lambda: (take for i, take in enumerate(source.takes()) if i in wanted))
         return write_source(chosen, out, "lerobot", progress=lambda done, _: report(done, len(keep)))
@@ -378,6 +378,6 @@ def browse(
     if not (where / INFO).exists():
         return Browse(source, marks, export=write)
     dataset = Dataset(path)
-    entries = [Entry(episode.length, episode.length / dataset.fps, episode.task) for episode in dataset.episodes]
+    entries = [EpisodeEntry(episode.length, episode.length / dataset.fps, episode.task) for episode in dataset.episodes]
     export = write if carry is None else lambda out, keep, report: carry(where, out, keep, report)
     return Browse(source, marks, entries, export=export)

@@ -127,7 +127,7 @@ def write_source(
     """Writes a Source at a new path, all of it or nothing; returns a sentence on each thing that was left out or changed,
     in reading it (`source.notes`) and in writing it.
 
-    to: None for what the path's name asks for. rows: formats.lerobot.Rows, how it becomes rows, for LeRobot alone.
+    to: None for what the path's name asks for. rows: formats.lerobot.LeRobotRows, how it becomes rows, for LeRobot alone.
     DatasetError where something lies there already, the disk is full, or the takes do not fit the format.
     """
     chosen, path = to or format_of(path), Path(path)

@@ -154,13 +154,13 @@ def _open(target: str, sensors: Mapping[str, Sensor], name: str, start_ns: int):
         return LiveServer(int(target), sensors, name)
     if not target.endswith(".mcap"):
         raise DatasetError(f"'{target}' is neither a port nor a file ending in .mcap; name one of these.")
-    from .formats.mcap_write import Recording
+    from .formats.mcap_write import McapRecording
 
     source = Source(name, sensors, lambda: iter(()))
     if Path(target).exists():
         raise DatasetError(f"'{target}' exists already; choose another name for the live log.")
     try:
         Path(target).parent.mkdir(parents=True, exist_ok=True)
-        return Recording(Path(target), sensors, source, Take({}, start_ns=start_ns), start_ns, jpeg=True)
+        return McapRecording(Path(target), sensors, source, Take({}, start_ns=start_ns), start_ns, jpeg=True)
     except OSError as error:
         raise DatasetError(f"'{target}' cannot be written ({error.strerror}); choose another place.") from error

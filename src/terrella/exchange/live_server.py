@@ -20,7 +20,7 @@ import numpy as np
 
 from ..core.errors import DatasetError
 from ..data.source import Sensor
-from .formats import encoder
+from .formats import message_encoder
 from .formats.mcap import topics
 
 try:
@@ -43,8 +43,8 @@ class LiveServer:
 
     def __init__(self, port: int, sensors: Mapping[str, Sensor], name: str):
         self._sensors, self._context = sensors, (context := foxglove.Context())  # channels end with their context
-        self._encoders = {key: encoder.Encoder(sensor, jpeg=True) for key, sensor in sensors.items()}
-        topic, calibration = topics(sensors), encoder.calibration_schema()
+        self._encoders = {key: message_encoder.MessageEncoder(sensor, jpeg=True) for key, sensor in sensors.items()}
+        topic, calibration = topics(sensors), message_encoder.calibration_schema()
 
         def channel(topic: str, schema: foxglove.Schema) -> foxglove.Channel:
             return foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=context)
@@ -53,7 +53,7 @@ class LiveServer:
         self._calibrations = {
             key: channel(topic[key] + "/calibration", calibration)
             for key, sensor in sensors.items()
-            if encoder.calibration(sensor, 0)
+            if message_encoder.calibration(sensor, 0)
         }
         largest = max((int(np.prod(it.shape)) * np.dtype(it.dtype).itemsize for it in sensors.values()), default=1)
         self._server = _serve(name, context, min(max(_BEHIND_BYTES // max(largest, 1), 16), 1024))
@@ -69,9 +69,9 @@ class LiveServer:
         if self._channels[name].has_sinks():
             self._channels[name].log(self._encoders[name](value, time_ns), log_time=time_ns)
         else:
-            encoder.checked(self._sensors[name], value)
+            message_encoder.checked(self._sensors[name], value)
         if name in self._calibrations and self._calibrations[name].has_sinks():
-            data = encoder.calibration(self._sensors[name], time_ns) or b""
+            data = message_encoder.calibration(self._sensors[name], time_ns) or b""
             self._calibrations[name].log(data, log_time=time_ns)
 
     def flush(self) -> None:

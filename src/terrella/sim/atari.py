@@ -12,7 +12,7 @@ from gymnasium.utils.seeding import np_random
 
 from ..core.errors import TerrellaError
 from .gymnasium import Adapter, GymnasiumWorld, check_size
-from .seeing import resized
+from .observation_channels import resized
 from .snapshot import NotCopyable
 
 FRAMES_PER_SECOND = 60

@@ -17,11 +17,11 @@ from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, REWARD, Camera, Spec, kind_of
 from ..core.state import State
 from ..core.world import make_rng
-from .opening import build, explained, picture_size
+from .environment_facts import EnvironmentFacts, facts_of
+from .environment_loading import build, explained, picture_size
+from .observation_channels import check_space, followed, parts_of, resized, space_of
 from .processes import MOST, Processes
-from .seeing import check_space, followed, parts_of, resized, space_of
 from .snapshot import NotCopyable, Snapshots
-from .told import Told, told_by
 
 _TRIALS, _TRIAL_STEPS = 3, 40
 
@@ -140,7 +140,7 @@ class GymnasiumWorld:
         self._adapter = replace(chosen, channels=settled)
         self._kept = {at: one.read for at, one in settled.items() if str(one.read).startswith("info.")}
         self._drawn = self._picture_size(seen, rgb)
-        self.spec = self._describe(told_by(self._env, chosen.action_names), dt_s)
+        self.spec = self._describe(facts_of(self._env, chosen.action_names), dt_s)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
@@ -319,7 +319,7 @@ class GymnasiumWorld:
             return height, width
         return picture_size(self._viewer, self._name) if rgb else None
 
-    def _describe(self, told: Told, dt_s: float | None) -> Spec:
+    def _describe(self, told: EnvironmentFacts, dt_s: float | None) -> Spec:
         channels = {name: part.space for name, part in self._parts.items() if name != "rgb"}
         channels |= {"reward": REWARD, "done": DONE}
         channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}

@@ -137,7 +137,7 @@ def _hung(model: Model) -> np.ndarray:
 
 
 def _dressed(high: float, what: str) -> Parameter:
-    """What is changed in the scene that is drawn, by sim/mujoco_looks.py: the model stays as it is."""
+    """What is changed in the scene that is drawn, by sim/mujoco_appearance.py: the model stays as it is."""
     return Parameter(0.0, 0.0, high, "", what, lambda model, file, value: None, True)
 
 

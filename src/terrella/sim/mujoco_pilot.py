@@ -11,15 +11,16 @@ import numpy as np
 import torch
 
 from .mujoco_model import mujoco
-from .mujoco_tasks import Body, motion, rotated
+from .mujoco_tasks import RobotLayout, motion, rotated
 
 VELOCITY, CLIMB, LEVEL, TURN = 2.0, 4.0, (60.0, 14.0), 6.0  # gains, 1/s, 1/s, (1/s², 1/s), 1/s
 PUSH, LIFT = 4.0, 6.0  # m/s² that are asked for at most: a tilt of 22 degrees
 
 
 class Multirotor:
-    """Actions: velocities forward, left and up in m/s, in the level frame that turns with the body, and turning in rad/s. A cascade
-    (Lee et al. 2010, "Geometric tracking control of a quadrotor", without its feed-forward): velocity, tilt, thrusts."""
+    """A cascaded controller: velocity, tilt, thrusts (Lee et al. 2010, "Geometric tracking control of a quadrotor", without its
+    feed-forward). Actions: velocities forward, left and up in m/s in the level frame that turns with the body; turning in rad/s.
+    """
 
     names, units = ("forward", "left", "up", "turn"), ("m/s", "m/s", "m/s", "rad/s")
     high = (3.0, 3.0, 1.5, 2.0)
@@ -29,7 +30,7 @@ class Multirotor:
     }  # fmt: skip
 
     def __init__(self, model: mujoco.MjModel):
-        """model: of one free body, whose actuators are thrusts at sites."""
+        """model: of one free robot, whose actuators are thrusts at sites."""
         sites = model.actuator_trnid[:, 0]
         place, gear = model.site_pos[sites] - model.body_ipos[1], model.actuator_gear
         wrench = np.stack(
@@ -39,14 +40,14 @@ class Multirotor:
         self._mass, self._inertia = float(model.body_mass[1]), torch.from_numpy(model.body_inertia[1].copy())
         self._gravity = -float(model.opt.gravity[2])
 
-    def __call__(self, body: Body, physics: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def __call__(self, robot: RobotLayout, physics: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Thrusts [B, rotors] in N of physics [B, n] and actions [B, 4]."""
-        velocity, spin, up = motion(body, physics)
-        turn = physics[:, body.qpos][:, 3:7]
+        velocity, spin, up = motion(robot, physics)
+        turn = physics[:, robot.qpos][:, 3:7]
         w, x, y, z = turn.unbind(1)
         heading = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         half = torch.stack([(heading / 2).cos(), 0 * w, 0 * w, -(heading / 2).sin()], 1)
-        level = rotated(half, physics[:, body.qvel][:, :3])  # in the frame that turns with the body alone
+        level = rotated(half, physics[:, robot.qvel][:, :3])  # in the frame that turns with the body alone
         push = (VELOCITY * (action[:, :2] - level[:, :2])).clamp(-PUSH, PUSH)
         lift = self._gravity + (CLIMB * (action[:, 2] - level[:, 2])).clamp(-LIFT, LIFT)
         wanted = torch.cat([push, torch.full_like(lift, self._gravity)[:, None]], 1)
@@ -58,4 +59,4 @@ class Multirotor:
         torque[:, 2] = TURN * (action[:, 3] - spin[:, 2])
         thrust = self._mass * lift / up[:, 2].clamp_min(0.5)
         asked = torch.cat([thrust[:, None], torque * self._inertia], 1) @ self._mix.T
-        return asked.clamp(body.low, body.high)
+        return asked.clamp(robot.low, robot.high)

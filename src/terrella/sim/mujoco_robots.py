@@ -17,7 +17,7 @@ from ..core.errors import TerrellaError
 from ..similar import did_you_mean
 from .mujoco_model import FREE, add_floor, mujoco, read
 from .mujoco_pilot import Multirotor
-from .mujoco_tasks import Free, Hold, Reach, Stepping, Task, VelocityTracking
+from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracking
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
@@ -50,7 +50,7 @@ class Robot:
 
     file: str
     what: str
-    task: Task = field(default_factory=Free)
+    task: RobotTask = field(default_factory=Free)
     servos: Mapping[str, Servo] = field(default_factory=dict)
     height: float | None = None
     pose: Mapping[str, float] = field(default_factory=dict)

@@ -20,7 +20,7 @@ MARKER = "marker"  # of a state, where a task keeps one: a point [B, 3], m, that
 
 
 @dataclass(frozen=True)
-class Body:
+class RobotLayout:
     """What a task knows of the robot. qpos, qvel: slices of the state's columns; hinges: which of those [n] each are of hinges and
     slides, so of no body that moves freely; home: qpos [nq] and ctrl [nu] at rest; low, high:
     [nu] of the controls; sensors: name -> slice of the sensors' columns; step_s: seconds of a control step."""
@@ -36,20 +36,20 @@ class Body:
     step_s: float
 
 
-class Task(Protocol):
+class RobotTask(Protocol):
     """`begin` changes the starts [B, nq], [B, nv] and gives tensors of its own for the state (`marker` is drawn); `judge`
     gives reward [B], fallen bool [B] and its tensors after a step; `channels` says what `see` shows."""
 
     rewards: bool
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]: ...
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]: ...
     def begin(
-        self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+        self, robot: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
     ) -> dict[str, torch.Tensor]: ...
     def judge(
-        self, body: Body, before: Tensors, after: Tensors
+        self, robot: RobotLayout, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]: ...
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor: ...
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor: ...
 
 
 class Free:
@@ -57,24 +57,29 @@ class Free:
 
     rewards = False
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
         width = (
-            len(body.home) + body.qvel.stop - body.qvel.start + sum(at.stop - at.start for at in body.sensors.values())
+            len(robot.home)
+            + robot.qvel.stop
+            - robot.qvel.start
+            + sum(at.stop - at.start for at in robot.sensors.values())
         )
         return {"observation": (numbers(width), "")}
 
-    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+    def begin(
+        self, robot: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         return {}
 
     def judge(
-        self, body: Body, before: Tensors, after: Tensors
+        self, robot: RobotLayout, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         batch = len(after["physics"])
         return torch.zeros(batch), torch.zeros(batch, dtype=torch.bool), {}
 
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
         physics = state["physics"]
-        return torch.cat([physics[:, body.qpos], physics[:, body.qvel], state["sensors"]], 1).float()
+        return torch.cat([physics[:, robot.qpos], physics[:, robot.qvel], state["sensors"]], 1).float()
 
 
 @dataclass(frozen=True)
@@ -98,19 +103,21 @@ class VelocityTracking:
         }
     )  # fmt: skip
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
-        if len(body.home) < 7 or len(body.home) != body.qvel.stop - body.qvel.start + 1:
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+        if len(robot.home) < 7 or len(robot.home) != robot.qvel.stop - robot.qvel.start + 1:
             raise TerrellaError("a velocity is tracked by a body that moves freely: its file begins with a free joint.")
         return {
             "observation": (
-                numbers(12 + len(body.home) - 7 + body.qvel.stop - body.qvel.start - 6 + len(body.rest)),
+                numbers(12 + len(robot.home) - 7 + robot.qvel.stop - robot.qvel.start - 6 + len(robot.rest)),
                 "",
             ),
             "command": (numbers(3), "m/s, m/s, rad/s"),
             "velocity": (numbers(3), "m/s, m/s, rad/s"),
         }
 
-    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+    def begin(
+        self, robot: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         joints = qpos.shape[1] - 7
         drawn = 2 * chance.uniform(seeds, (joints + qvel.shape[1] + 1,), _START).double() - 1
         qpos[:, 7:] += self.noise * drawn[:, :joints]
@@ -123,38 +130,38 @@ class VelocityTracking:
         return {"command": command}
 
     def judge(
-        self, body: Body, before: Tensors, after: Tensors
+        self, robot: RobotLayout, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         height, tilt = self.fallen[1], self.fallen[0]
-        up, qpos = motion(body, after["physics"])[2], after["physics"][:, body.qpos]
-        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * body.home[2])
-        return self._worth(body, before, after).clamp_min(0.0).float(), fallen, {"command": after["command"]}
+        up, qpos = motion(robot, after["physics"])[2], after["physics"][:, robot.qpos]
+        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * robot.home[2])
+        return self._worth(robot, before, after).clamp_min(0.0).float(), fallen, {"command": after["command"]}
 
-    def _worth(self, body: Body, before: Tensors, after: Tensors) -> torch.Tensor:
+    def _worth(self, robot: RobotLayout, before: Tensors, after: Tensors) -> torch.Tensor:
         """What a step is worth [B]."""
         physics, command, weights = after["physics"], after["command"], self.weights
-        qpos, (velocity, spin, up) = physics[:, body.qpos], motion(body, physics)
+        qpos, (velocity, spin, up) = physics[:, robot.qpos], motion(robot, physics)
         missed = (velocity[:, :2] - command[:, :2]).square().sum(1)
         turned = (spin[:, 2] - command[:, 2]).square()
-        span = (body.high - body.low) / 2
+        span = (robot.high - robot.low) / 2
         jerk = ((after["ctrl"] - before["ctrl"]) / span).square().sum(1)
         return (
             weights["alive"] + weights["velocity"] * torch.exp(-missed / 0.25) - weights["slow"] * missed.sqrt()
             + weights["turning"] * torch.exp(-turned / 0.25)
             - weights["bounce"] * velocity[:, 2].square() - weights["roll"] * spin[:, :2].square().sum(1)
             - weights["tilt"] * up[:, :2].square().sum(1) - weights["jerk"] * jerk
-            - weights["pose"] * (qpos[:, 7:] - body.home[7:]).square().sum(1)
+            - weights["pose"] * (qpos[:, 7:] - robot.home[7:]).square().sum(1)
         )  # fmt: skip
 
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
         if name == "command":
             return state["command"]
-        velocity, spin, up = motion(body, state["physics"])
+        velocity, spin, up = motion(robot, state["physics"])
         if name == "velocity":
             return torch.cat([velocity[:, :2], spin[:, 2:]], 1).float()
-        qpos, qvel = state["physics"][:, body.qpos], state["physics"][:, body.qvel]
-        meant = (state["ctrl"] - body.rest) / ((body.high - body.low) / 2)
-        away = qpos[:, 7:] - body.home[7:]
+        qpos, qvel = state["physics"][:, robot.qpos], state["physics"][:, robot.qvel]
+        meant = (state["ctrl"] - robot.rest) / ((robot.high - robot.low) / 2)
+        away = qpos[:, 7:] - robot.home[7:]
         return torch.cat([velocity, spin, up, state["command"], away, 0.1 * qvel[:, 6:], meant], 1).float()
 
 
@@ -173,17 +180,17 @@ class Stepping(VelocityTracking):
     lift_m: float = 0.08
     straight: tuple[int, ...] = (1, 2, 7, 8)
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
-        found = super().channels(body)
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+        found = super().channels(robot)
         wanted = [f"{kind}_{foot}" for foot in self.feet for kind in ("foot", "place", "speed")]
-        if missing := [name for name in wanted if name not in body.sensors]:
+        if missing := [name for name in wanted if name not in robot.sensors]:
             raise TerrellaError(
                 f"steps are judged by sensors that the file lacks: {', '.join(missing)} (touch, framepos, framelinvel)."
             )
         return found | {"observation": (numbers(found["observation"][0].shape[0] + 2), "")}
 
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
-        seen = super().see(body, state, name)
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+        seen = super().see(robot, state, name)
         angle = 2 * torch.pi * self._phase(state)
         return (
             seen if name != "observation" else torch.cat([seen, angle.sin()[:, None], angle.cos()[:, None]], 1).float()
@@ -192,15 +199,15 @@ class Stepping(VelocityTracking):
     def _phase(self, state: Tensors) -> torch.Tensor:
         return (state["physics"][:, 0] / self.period_s).remainder(1.0)
 
-    def _worth(self, body: Body, before: Tensors, after: Tensors) -> torch.Tensor:
-        worth, sensors, phase = super()._worth(body, before, after), after["sensors"], self._phase(after)
+    def _worth(self, robot: RobotLayout, before: Tensors, after: Tensors) -> torch.Tensor:
+        worth, sensors, phase = super()._worth(robot, before, after), after["sensors"], self._phase(after)
         for foot, ahead in self.feet.items():
-            load, place, speed = (sensors[:, body.sensors[f"{kind}_{foot}"]] for kind in ("foot", "place", "speed"))
+            load, place, speed = (sensors[:, robot.sensors[f"{kind}_{foot}"]] for kind in ("foot", "place", "speed"))
             down, stands = load[:, 0] > 1.0, (phase + ahead).remainder(1.0) < self.standing
             lifted = (place[:, 2] - self.lift_m).square()
             steps = 0.6 * (down == stands) - 40.0 * lifted * ~stands - 0.4 * speed.square().sum(1) * down
             worth = worth + steps / len(self.feet)
-        joints = (after["physics"][:, body.qpos][:, 7:] - body.home[7:])[:, list(self.straight)]
+        joints = (after["physics"][:, robot.qpos][:, 7:] - robot.home[7:])[:, list(self.straight)]
         return worth - joints.square().sum(1)
 
 
@@ -214,31 +221,33 @@ class Reach:
     low: tuple[float, float, float] = (0.2, -0.2, 0.1)
     high: tuple[float, float, float] = (0.45, 0.2, 0.4)
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
-        _check_hand(body, self.hand)
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+        _check_hand(robot, self.hand)
         return {
-            "observation": (numbers(sum(map(len, body.hinges)) + 6), ""),
+            "observation": (numbers(sum(map(len, robot.hinges)) + 6), ""),
             "goal": (numbers(3), "m"),
             "hand": (numbers(3), "m"),
         }
 
-    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+    def begin(
+        self, robot: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         low, high = torch.tensor(self.low), torch.tensor(self.high)
         goal = low + (high - low) * chance.uniform(seeds, (3,), _GOAL)
         return {"goal": goal, MARKER: goal.double()}
 
     def judge(
-        self, body: Body, before: Tensors, after: Tensors
+        self, robot: RobotLayout, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        away = (after["sensors"][:, body.sensors[self.hand]] - after["goal"]).norm(dim=1)
+        away = (after["sensors"][:, robot.sensors[self.hand]] - after["goal"]).norm(dim=1)
         return -away.float(), torch.zeros(len(away), dtype=torch.bool), {"goal": after["goal"]}
 
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
-        hand = state["sensors"][:, body.sensors[self.hand]]
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+        hand = state["sensors"][:, robot.sensors[self.hand]]
         if name != "observation":
             return state["goal"] if name == "goal" else hand.float()
         physics, goal = state["physics"], state["goal"]
-        at, speed = (physics[:, part][:, own] for part, own in zip((body.qpos, body.qvel), body.hinges))
+        at, speed = (physics[:, part][:, own] for part, own in zip((robot.qpos, robot.qvel), robot.hinges))
         return torch.cat([at, speed, goal, hand - goal], 1).float()
 
 
@@ -257,16 +266,18 @@ class Hold:
     dwell: int = 25
     start: tuple[float, float] = (1.5, 0.5)
 
-    def channels(self, body: Body) -> dict[str, tuple[spaces.Space, str]]:
-        _check_hand(body, self.hand)
-        joints = len(body.home)
-        if joints != body.qvel.stop - body.qvel.start:
+    def channels(self, robot: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+        _check_hand(robot, self.hand)
+        joints = len(robot.home)
+        if joints != robot.qvel.stop - robot.qvel.start:
             raise TerrellaError(
                 "holding a point is for hinges and slides; the file has a joint that moves freely or a ball."
             )
         return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
 
-    def begin(self, body: Body, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> dict[str, torch.Tensor]:
+    def begin(
+        self, robot: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         drawn = chance.uniform(seeds, (qpos.shape[1] + qvel.shape[1],), _START).double()
         angle, radius = chance.uniform(seeds, (2,), _GOAL).double().unbind(1)
         qpos += self.start[0] * (2 * drawn[:, : qpos.shape[1]] - 1)
@@ -278,33 +289,33 @@ class Hold:
         return {"goal": goal, MARKER: marker, "held": torch.zeros(len(goal), dtype=torch.int64)}
 
     def judge(
-        self, body: Body, before: Tensors, after: Tensors
+        self, robot: RobotLayout, before: Tensors, after: Tensors
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        away = self._apart(body, after).norm(dim=1)
-        speed = after["physics"][:, body.qvel].square().sum(1)
+        away = self._apart(robot, after).norm(dim=1)
+        speed = after["physics"][:, robot.qvel].square().sum(1)
         held = torch.where(away <= self.within, before["held"] + 1, 0)
         reward = torch.exp(-(away / self.within).square()) - 2 * away - 0.002 * speed
         return reward.float(), torch.zeros(len(away), dtype=torch.bool), {"goal": after["goal"], "held": held}
 
-    def see(self, body: Body, state: Tensors, name: str) -> torch.Tensor:
+    def see(self, robot: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
         if name == "success":
             return (state["held"] >= self.dwell).float()
-        apart = self._apart(body, state)
+        apart = self._apart(robot, state)
         if name == "away":
             return apart.norm(dim=1).float()
-        qpos, qvel = state["physics"][:, body.qpos], state["physics"][:, body.qvel]
+        qpos, qvel = state["physics"][:, robot.qpos], state["physics"][:, robot.qvel]
         return torch.cat([qpos.cos(), qpos.sin(), 0.2 * qvel, state["goal"], 10 * apart], 1).float()
 
-    def _apart(self, body: Body, state: Tensors) -> torch.Tensor:
+    def _apart(self, robot: RobotLayout, state: Tensors) -> torch.Tensor:
         """From the goal to the hand [B, 2], m."""
-        return state["sensors"][:, body.sensors[self.hand]][:, [0, 2]] - state["goal"]
+        return state["sensors"][:, robot.sensors[self.hand]][:, [0, 2]] - state["goal"]
 
 
-TASKS: Mapping[str, Callable[..., Task]] = {"hold": Hold, "reach": Reach, "velocity": VelocityTracking}
+TASKS: Mapping[str, Callable[..., RobotTask]] = {"hold": Hold, "reach": Reach, "velocity": VelocityTracking}
 _TOLD = "terrella."  # begins the names of what a file tells
 
 
-def task_of(spec: Any, name: str) -> Task:
+def task_of(spec: Any, name: str) -> RobotTask:
     """The task that an MJCF file tells of itself, none where it tells none, as in
 
         <custom><text name="terrella.task" data="hold"/><numeric name="terrella.ring" data="0.1 0.3"/></custom>
@@ -332,15 +343,15 @@ def task_of(spec: Any, name: str) -> Task:
     return TASKS[kind](**made)
 
 
-def _check_hand(body: Body, hand: str) -> None:
-    if hand not in body.sensors:
-        there = ", ".join(body.sensors) or "none"
+def _check_hand(robot: RobotLayout, hand: str) -> None:
+    if hand not in robot.sensors:
+        there = ", ".join(robot.sensors) or "none"
         raise TerrellaError(f"a hand is found by a sensor (framepos) of the name '{hand}'; the file has {there}.")
 
 
-def motion(body: Body, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def motion(robot: RobotLayout, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Velocity in m/s, spin in rad/s and the direction of up, each [B, 3] in the frame of the body that moves freely."""
-    turn, velocity = physics[:, body.qpos][:, 3:7], physics[:, body.qvel]
+    turn, velocity = physics[:, robot.qpos][:, 3:7], physics[:, robot.qvel]
     up = torch.zeros_like(velocity[:, :3])
     up[:, 2] = 1
     back = turn * torch.tensor([1.0, -1, -1, -1], dtype=turn.dtype)

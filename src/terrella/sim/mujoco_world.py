@@ -23,14 +23,14 @@ from ..core import chance
 from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
 from ..core.state import State
+from .mujoco_appearance import patterned
 from .mujoco_lidar import SITE, Lidar
-from .mujoco_looks import patterned
 from .mujoco_model import BALL, FREE, SLIDE, bare, compiled, complete, mujoco, read
 from .mujoco_parameters import TEXTURES, checked, parameters_of
-from .mujoco_pictures import Pictures, lens
+from .mujoco_renderer import MujocoRenderer, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
-from .mujoco_tasks import MARKER, Body, Task, numbers, task_of
+from .mujoco_tasks import MARKER, RobotLayout, RobotTask, numbers, task_of
 from .mujoco_warp import WarpStepper
 
 FILES = (".xml", ".mjcf", ".urdf")
@@ -68,7 +68,7 @@ class MujocoWorld:
         self,
         name: str | Path | Robot,
         *,
-        task: Task | None = None,
+        task: RobotTask | None = None,
         control_s: float | None = None,
         size: tuple[int, int] = (96, 128),
         cameras: Sequence[str] | None = None,
@@ -96,7 +96,7 @@ class MujocoWorld:
             0,
         )
         self._home = _home(self.file, robot)
-        self.task: Task = task or (robot.task if robot else task_of(spec, label))
+        self.task: RobotTask = task or (robot.task if robot else task_of(spec, label))
         self.body = _body(self.file, self._home, self._steps)
         self._cameras = _cameras(self._seen, cameras)
         self._kinds = ("rgb", *(kind for kind, asked in (("depth", depth), ("segmentation", segmentation)) if asked))
@@ -120,7 +120,7 @@ class MujocoWorld:
             raise TerrellaError("physics that differs from world to world is for the CPU; leave device out.")
         self._stepper = WarpStepper(self.file, self._device) if on_gpu else Stepper(self.file, stepped, self._threads)
         drawn = patterned(self._source, self.name) if TEXTURES in changes else copy(self._seen)
-        self._pictures = Pictures(drawn, seen, self._size)
+        self._pictures = MujocoRenderer(drawn, seen, self._size)
         self.spec = self._describe()
 
     def varying(self, names: Sequence[str]) -> MujocoWorld:
@@ -372,7 +372,7 @@ def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.nd
     return qpos, ctrl
 
 
-def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> Body:
+def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> RobotLayout:
     limited = model.actuator_ctrllimited.astype(bool)
     low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
     high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
@@ -388,7 +388,7 @@ def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int
     hinges = torch.from_numpy(model.jnt_qposadr[own]).long(), torch.from_numpy(model.jnt_dofadr[own]).long()
     plain = (torch.from_numpy(np.asarray(part, np.float64)) for part in (home[0], rest, low, high))
     at_home, at_rest, lowest, highest = plain
-    return Body(
+    return RobotLayout(
         slice(1, ends[0]),
         slice(*ends),
         hinges,

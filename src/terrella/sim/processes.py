@@ -25,7 +25,7 @@ MOST = 64
 Row = dict[str, np.ndarray]
 
 
-class Episode(Protocol):
+class ProcessEpisode(Protocol):
     """What a process holds: one episode at a time. `begin` and `move` give what is seen, a value [*shape] a channel."""
 
     def begin(self, seed: int) -> Row: ...
@@ -44,14 +44,14 @@ class _Seat:
 
 class Processes:
     """The verbs of a World over as many processes as the largest state has entries; `make`, which is sent to each, builds an
-    Episode there.
+    ProcessEpisode there.
 
     States are tickets: an entry is the number of an episode and of its step. A fresh start waits until it is first looked at or
     moved, and then takes a process that no other entry of that state has; so after `state.put(index, fresh)` it has that of the
     episode in whose place it was put.
     """
 
-    def __init__(self, name: str, make: Callable[[], Episode]):
+    def __init__(self, name: str, make: Callable[[], ProcessEpisode]):
         self._name, self._make = name, make
         self._seats: list[_Seat] = []
         self._waiting: dict[int, int] = {}  # number -> seed

@@ -13,7 +13,7 @@ from ..core.spec import DONE, Camera, Spec, shape_of, torch_dtype_of
 from ..core.state import State
 
 
-class Replay:
+class ReplayWorld:
     """One episode of T + 1 frames.
 
     channels:     name -> array or tensor [T + 1, ...], row t as a World would render it at frame t (so `reward` and

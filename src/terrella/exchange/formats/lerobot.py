@@ -27,7 +27,7 @@ def read(root: str | Path, fps: float | None = None) -> Source:
 
 
 @dataclass(frozen=True)
-class Rows:
+class LeRobotRows:
     """How a Source becomes rows.
 
     fps:      rows a second; None for the rows that the source has, or, where each sensor has its own clock, one row for
@@ -46,7 +46,7 @@ def write(
     source: Source,
     root: str | Path,
     progress: Callable[[int, int], None] | None = None,
-    how: Rows = Rows(),
+    how: LeRobotRows = LeRobotRows(),
     finish: Callable[[Path, list[str]], object] | None = None,
 ) -> list[str]:
     """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
@@ -75,7 +75,7 @@ def write(
     return notes
 
 
-def _write(source: Source, layout: Layout, root: Path, lead: str, how: Rows, progress) -> list[str]:
+def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRows, progress) -> list[str]:
     left_out, notes = [], dict[str, None]()  # each note once, in order
     with Recorder(root, layout, interrupted="discard") as recorder:
         for number, take in enumerate(source.takes()):
@@ -107,7 +107,7 @@ def _lead(source: Source, first: Take) -> str:
 _NONE = Readings(np.zeros(0), [])
 
 
-def _layout(source: Source, first: Take, lead: str, how: Rows) -> tuple[Layout, list[str]]:
+def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[Layout, list[str]]:
     at, notes = first.readings[lead].time_s, []
     rate = how.fps or source.fps or source.sensors[lead].rate_hz
     if rate is None:
@@ -152,12 +152,12 @@ def _layout(source: Source, first: Take, lead: str, how: Rows) -> tuple[Layout, 
     return layout, notes
 
 
-def _times(take: Take, layout: Layout, lead: str, how: Rows) -> np.ndarray:
+def _times(take: Take, layout: Layout, lead: str, how: LeRobotRows) -> np.ndarray:
     """float64 [T]: the times of a take's rows."""
     return take.readings.get(lead, _NONE).time_s if how.fps is None else row_times(take, layout.sensors, how.fps)
 
 
-def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, how: Rows) -> list[str]:
+def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, how: LeRobotRows) -> list[str]:
     layout, notes = recorder.layout, []
     recorder.task = take.task
     columns, exact = {}, set()

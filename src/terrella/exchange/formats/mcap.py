@@ -20,8 +20,8 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import messages, rows
-from .films import decodable, film
 from .mcap_index import Index, Messages, Metadata, Schema
+from .video_frames import decodable_messages, message_frames
 
 SOURCE, SENSORS, TAKE = "terrella.source", "terrella.sensors", "terrella.take"
 _KEYS = {"image": "observation.images", "depth": "observation.depth", "points": "observation.points"}
@@ -281,14 +281,14 @@ class _File:
             return said(group.fields(i))[1]
 
         format, count = said(first)[0], len(group.found.log_ns)
-        good = decodable(data, group.found.after_gap, format)
+        good = decodable_messages(data, group.found.after_gap, format)
         if not len(good):
             raise DatasetError("its video has no keyframe to start from")
         if begin := int(good[0]):
             self._note(group.topic, f"its first {begin} frames come before any keyframe and are left out")
         if lost := count - begin - len(good):
             self._note(group.topic, f"{lost} frames that follow a damaged chunk cannot be decoded and are left out")
-        decoder = film(lambda i: data(int(good[i])), len(good), format)
+        decoder = message_frames(lambda i: data(int(good[i])), len(good), format)
         sensor = self._declared_for(group)
         if sensor is None:
             sensor = Sensor("", "image", decoder(0).shape, "uint8", frame=str(first.get("frame_id") or ""))

@@ -14,9 +14,9 @@ from ...data.format import sensor_json
 from ...data.resample import clock_of
 from ...data.source import Readings, Sensor, Source, Take
 from ...data.storage import durable
-from . import encoder, rows
-from .encoder import Encoder
+from . import message_encoder, rows
 from .mcap import SENSORS, SOURCE, TAKE, topics
+from .message_encoder import MessageEncoder
 
 try:
     from foxglove import Schema
@@ -63,7 +63,7 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
     which = np.concatenate([np.arange(len(time_ns)) for time_ns in times] or [np.zeros(0, int)])
     order = np.argsort(np.concatenate([*times, np.zeros(0, np.int64)]), kind="stable")
     sensors = {name: source.sensors[name] for name in names}
-    with Recording(path, sensors, source, take, zero_ns) as recording:
+    with McapRecording(path, sensors, source, take, zero_ns) as recording:
         for done, at in enumerate(order.tolist()):
             name, i = names[whose[at]], int(which[at])
             value = np.asarray(take.readings[name].values[i])
@@ -79,7 +79,7 @@ def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
-class Recording:
+class McapRecording:
     """An MCAP file in the making: every sensor is declared first, then readings come in any order of sensors.
 
     What was added before a `flush` is found by `read` even if nothing is written after it. The file must be new.
@@ -97,7 +97,7 @@ class Recording:
         jpeg: bool = False,
     ):
         self._sensors = sensors
-        self._encoders = {name: Encoder(sensor, jpeg) for name, sensor in sensors.items()}
+        self._encoders = {name: MessageEncoder(sensor, jpeg) for name, sensor in sensors.items()}
         self._file = open(path, "xb")
         self._writer = Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(library="terrella")
@@ -110,12 +110,12 @@ class Recording:
         self._schemas: dict[str, int] = {}
         self._channels = {name: self._channel(topic[name], self._encoders[name].schema) for name in sensors}
         self._calibrations = {
-            name: self._channel(topic[name] + CALIBRATION_TOPIC, encoder.calibration_schema())
+            name: self._channel(topic[name] + CALIBRATION_TOPIC, message_encoder.calibration_schema())
             for name, sensor in sensors.items()
-            if encoder.calibration(sensor, 0)
+            if message_encoder.calibration(sensor, 0)
         }
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> McapRecording:
         return self
 
     def __exit__(self, kind, error, trace) -> None:
@@ -124,7 +124,7 @@ class Recording:
     def add(self, name: str, log_ns: int, value: np.ndarray) -> None:
         """One reading at a log time; DatasetError where it is not what its sensor declares, OSError from the disk."""
         if name in self._calibrations:  # once, with the first picture
-            data = encoder.calibration(self._sensors[name], log_ns) or b""
+            data = message_encoder.calibration(self._sensors[name], log_ns) or b""
             self._writer.add_message(self._calibrations.pop(name), log_ns, data, log_ns)
         data = self._encoders[name](value, log_ns)
         self._writer.add_message(self._channels[name], log_ns, data, log_ns)

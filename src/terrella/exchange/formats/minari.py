@@ -21,7 +21,7 @@ from ...data.source import Sensor, Source, Take
 from ...data.storage import durable
 from . import arrays, rows, spaces
 from .arrays import Place
-from .minari_stored import Episode, Shapes, open_storage
+from .minari_stored import Shapes, StoredEpisode, open_storage
 
 VERSION = "0.5.4"  # of the layout that `write` writes (the first with pictures that are not JPEG)
 _ID = re.compile(r"[-\w]+-v\d+", re.ASCII)
@@ -97,7 +97,7 @@ def _space(meta: dict, key: str, data: Path) -> dict:
     return found
 
 
-def _take(episode: Episode, where: str, sensors: Mapping, shapes: Shapes, texts: list[Place], fps: float) -> Take:
+def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, texts: list[Place], fps: float) -> Take:
     there = episode.arrays(shapes)
     steps = there["rewards",].shape[0] if ("rewards",) in there else 0
     if not steps:

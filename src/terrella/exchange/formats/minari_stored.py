@@ -21,7 +21,7 @@ _DEEPEST = 16
 Shapes = Mapping[Place, tuple[int, ...]]  # of one row of what the spaces name, which the storage may have packed
 
 
-class Episode(Protocol):
+class StoredEpisode(Protocol):
     """One episode as it is stored."""
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
@@ -37,7 +37,7 @@ class Episode(Protocol):
         ...
 
 
-def open_storage(data: Path, kind: object, count: int) -> Callable[[int], Episode]:
+def open_storage(data: Path, kind: object, count: int) -> Callable[[int], StoredEpisode]:
     """Opener of episode i of `count`; DatasetError where the storage is missing or of an unknown kind."""
     if kind == "hdf5":
         from .minari_hdf5 import Hdf5Episode  # only who has such a dataset needs its package

@@ -162,7 +162,7 @@ def role_of(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowCounts:
     """A take whose sensors agree row by row: `observations` rows, `steps` actions (one less, or as many)."""
 
     observations: int
@@ -170,7 +170,7 @@ class Rows:
     time_s: np.ndarray  # of the observations
 
 
-def rows_of(take: Take, where: str) -> Rows:
+def rows_of(take: Take, where: str) -> RowCounts:
     """How many rows a take has; DatasetError where its sensors do not march in step."""
     seen = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) == OBSERVATION}
     done = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) not in (OBSERVATION, INFO, "")}
@@ -190,7 +190,7 @@ def rows_of(take: Take, where: str) -> Rows:
         other = take.readings[name].time_s
         if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
             raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first.")
-    return Rows(count, steps, time_s)
+    return RowCounts(count, steps, time_s)
 
 
 def even(time_s: np.ndarray, fps: float | None) -> bool:

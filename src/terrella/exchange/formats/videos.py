@@ -18,8 +18,8 @@ from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from ...data.storage import durable
 from . import folders, rows
-from .films import Film
 from .folders import VIDEOS
+from .video_frames import FrameReader
 
 _CLOCK = Fraction(1, 1_000_000)  # ticks of the videos written
 _CODEC = {"preset": "veryfast", "crf": "18", "g": "8", "bf": "0", "threads": "1"}
@@ -71,14 +71,14 @@ class _Video:
     shape: tuple[int, ...]
     rate_hz: float | None
     time_s: np.ndarray
-    film: Film
+    frames: FrameReader
 
     def frame(self, i: int) -> np.ndarray:
-        picture = self.film(i)
+        picture = self.frames(i)
         if picture.shape != self.shape:
             raise DatasetError(f"the video {self.path} changes its size at frame {i}; cut it in two.")
         if i == len(self.time_s) - 1:
-            self.film.rest()
+            self.frames.rest()
         return picture
 
 
@@ -113,7 +113,7 @@ def _video(path: Path) -> _Video:
         times = [frame.time for frame in _decoded(path, None)]
         if None in times or any(a >= b for a, b in zip(times, times[1:])):
             times = [i / (rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
-    film = Film(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
+    film = FrameReader(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
     return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), film)
 
 

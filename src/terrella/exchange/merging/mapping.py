@@ -22,7 +22,7 @@ FOLLOWS = "next."  # next.reward, next.done, …: what followed a row
 
 
 @dataclass(frozen=True)
-class Rows:
+class MergeRows:
     """How the merged rows are made.
 
     fps:        rows a second.
@@ -48,7 +48,7 @@ class Dimension:
 
 
 @dataclass(frozen=True)
-class Camera:
+class MergedCamera:
     """One merged camera: kind "image" or "depth", size in pixels."""
 
     kind: Literal["image", "depth"]
@@ -108,10 +108,10 @@ class SourceMapping:
 class MergeMapping:
     """The whole file. Merged numbers and cameras come in the order in which they stand here."""
 
-    rows: Rows
+    rows: MergeRows
     action: Mapping[str, Dimension]
     state: Mapping[str, Dimension]
-    cameras: Mapping[str, Camera]
+    cameras: Mapping[str, MergedCamera]
     sources: tuple[SourceMapping, ...]
 
     def dimensions(self, sensor: str) -> Mapping[str, Dimension]:

@@ -45,13 +45,13 @@ from .mapping import (
     check_mapping,
     mask_of,
 )
-from .report import Report, SensorCount, SourceCount
+from .report import MergeReport, SensorCount, SourceCount
 
 
 def merge(
     sources: Mapping[str, Source],
     mapping: MergeMapping,
-    report: Report | None = None,
+    report: MergeReport | None = None,
     name: str = "merged",
     terminal: bool = True,
 ) -> Source:
@@ -61,7 +61,7 @@ def merge(
     report:   filled while the takes are read. DatasetError where the mapping does not suit the sources.
     """
     check_mapping(mapping, sources)
-    report = report if report is not None else Report()
+    report = report if report is not None else MergeReport()
     sensors = _sensors(mapping, sources)
 
     def takes() -> Iterator[Take]:
@@ -173,7 +173,7 @@ def _take(
     mapping: MergeMapping,
     sensors: Mapping[str, Sensor],
     count: SourceCount,
-    report: Report,
+    report: MergeReport,
     terminal: bool,
 ) -> Take | None:
     used = [name for name, vector in source.vectors.items() if any(number.to for number in vector.numbers)]

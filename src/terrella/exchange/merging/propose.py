@@ -18,11 +18,11 @@ from .mapping import (
     MADE,
     NAME,
     STATE,
-    Camera,
     Dimension,
+    MergedCamera,
     MergeMapping,
+    MergeRows,
     Number,
-    Rows,
     SourceMapping,
     Vector,
     mask_of,
@@ -116,7 +116,7 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
         )
     chosen = float(fps if fps is not None else min(known))
     gap = max([1.0, 3 / chosen, *(3 / rate for rate in [*known, *_clocks(sources)])])
-    return MergeMapping(Rows(chosen, max_gap_s=round(gap, 3)), action, state, cameras, tuple(mapped))
+    return MergeMapping(MergeRows(chosen, max_gap_s=round(gap, 3)), action, state, cameras, tuple(mapped))
 
 
 def _embodiments(sources: Mapping[str, Source]) -> dict[str, str]:
@@ -278,16 +278,16 @@ def _common_unit(part: list[_Place]) -> str:
     return units.pop() if len(units) == 1 else (basic(min(units)) if units else "")
 
 
-def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, Camera]:
+def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, MergedCamera]:
     """Every image and depth sensor by its name, at the size of its smallest; an image wins where kinds differ."""
-    found: dict[str, Camera] = {}
+    found: dict[str, MergedCamera] = {}
     for path, source in sources.items():
         for name, sensor in source.sensors.items():
             if sensor.kind not in ("image", "depth") or not name.startswith("observation.") or name in MADE:
                 continue
             if not NAME.fullmatch(name):
                 continue
-            camera, before = Camera(sensor.kind, *map(int, sensor.shape[:2])), found.get(name)
+            camera, before = MergedCamera(sensor.kind, *map(int, sensor.shape[:2])), found.get(name)
             if before and before.kind != camera.kind:
                 said = f"of kind {camera.kind} here and {before.kind} elsewhere."
                 notes[path].setdefault(said, []).append(name)
@@ -305,7 +305,7 @@ def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, Camera]:
 
 
 def _rest(
-    source: Source, embodiment: str, cameras: Mapping[str, Camera], mapped: set[str]
+    source: Source, embodiment: str, cameras: Mapping[str, MergedCamera], mapped: set[str]
 ) -> tuple[dict[str, str], dict[str, str]]:
     """(kept whole: sensor -> its name in the merged set; left out: sensor -> why), for whatever is not in `mapped`."""
     keep: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Report: what a merge did with every source: rows and gaps, what was left out, each robot's statistics."""
+"""MergeReport: what a merge did with every source: rows and gaps, what was left out, each robot's statistics."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SourceCount:
     notes: list[str] = field(default_factory=list)
 
 
-class Report:
+class MergeReport:
     """Filled while the takes of a merged source are read, begun anew when they are read anew.
 
     complete: whether the last reading reached the end.

@@ -16,7 +16,7 @@ from .mapping import ACTION, EMBODIMENT, MergeMapping, SourceMapping, check_mapp
 from .mapping_file import read_mapping, write_mapping
 from .merge import merge
 from .propose import propose
-from .report import Report
+from .report import MergeReport
 
 
 def merge_into(
@@ -53,7 +53,7 @@ def merge_into(
         return {"mapping": str(path), "notes": notes}, "\n".join(
             [*said, f"the mapping is {path}: edit it, then merge by it"]
         )
-    report = Report()
+    report = MergeReport()
     terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
     merged = merge(sources, found, report, out.name, terminal)
 

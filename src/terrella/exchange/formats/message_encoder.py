@@ -25,7 +25,7 @@ except ImportError as error:
 _JPEG_QUALITY = 90
 
 
-class Encoder:
+class MessageEncoder:
     """Makes messages of one sensor's readings; pictures become PNG (exact), or `jpeg`."""
 
     def __init__(self, sensor: Sensor, jpeg: bool = False):

@@ -19,7 +19,7 @@ DEFAULT_FPS = 10  # where an environment tells no frame rate
 
 
 @dataclass(frozen=True)
-class Told:
+class EnvironmentFacts:
     """names, keys: of the actions, as in Spec; dt_s: seconds in a step; how: what of this is from where, for people."""
 
     names: tuple[str, ...] = ()
@@ -28,7 +28,7 @@ class Told:
     how: Mapping[str, str] = field(default_factory=dict)
 
 
-def told_by(env: gymnasium.Env, names: Sequence[str] = ()) -> Told:
+def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
     """Asks the environment: `get_action_meanings` and the like, an `Actions` enum or whatever has "action" in its name and names
     each of them; `get_keys_to_action`; `dt`, `tau` or metadata["render_fps"]. `names` are taken where they
     are known already."""
@@ -39,7 +39,7 @@ def told_by(env: gymnasium.Env, names: Sequence[str] = ()) -> Told:
     table = _called(getattr(bare, "get_keys_to_action", None)) or getattr(bare, "keys_to_action", None)
     keys = told_keys(table, space) if isinstance(table, Mapping) else {}
     how["keys"] = "get_keys_to_action" if keys else "by the actions' names" if found else "chosen"
-    return Told(found, keys or default_keys(space, found), dt_s, how)
+    return EnvironmentFacts(found, keys or default_keys(space, found), dt_s, how)
 
 
 def _names(bare: gymnasium.Env, space: spaces.Space) -> tuple[tuple[str, ...], str]:

@@ -18,7 +18,7 @@ _CODECS = {"h264": "h264", "h265": "hevc"}
 _KEY_UNITS = {"h264": (lambda byte: byte & 31, {5}), "h265": (lambda byte: byte >> 1 & 63, set(range(16, 22)))}
 
 
-class Film:
+class FrameReader:
     """Pictures by number, uint8 [H, W, 3]: going on in order decodes each once, elsewhere begins at the last keyframe.
 
     begin(i) gives (number, frame) from keyframe i on; key(i) is the last keyframe not after frame i; show(frame) is its
@@ -70,7 +70,7 @@ class Film:
         raise DatasetError(f"frame {index} of {self._what} decodes to no picture; restore it from a copy.")
 
 
-def decodable(read: Callable[[int], bytes], after_gap: np.ndarray, format: str) -> np.ndarray:
+def decodable_messages(read: Callable[[int], bytes], after_gap: np.ndarray, format: str) -> np.ndarray:
     """int64 [m], ascending: which messages of a film can be decoded: those from a keyframe on, up to the next gap.
 
     read(i) gives the data of message i; after_gap bool [n]: whether messages are missing just before message i.
@@ -102,7 +102,7 @@ def is_key(data: bytes, format: str) -> bool:
     return False
 
 
-def film(read: Callable[[int], bytes], count: int, format: str) -> Film:
+def message_frames(read: Callable[[int], bytes], count: int, format: str) -> FrameReader:
     """The film of `count` messages, the first of which is a keyframe; read(i) gives the data of message i."""
 
     def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
@@ -132,4 +132,4 @@ def film(read: Callable[[int], bytes], count: int, format: str) -> Film:
                 return i
         raise DatasetError("no keyframe comes before it")
 
-    return Film(begin, last_key, lambda frame: frame.to_ndarray(format="rgb24"))
+    return FrameReader(begin, last_key, lambda frame: frame.to_ndarray(format="rgb24"))

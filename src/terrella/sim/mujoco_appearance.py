@@ -61,7 +61,7 @@ def _clouds(row: np.ndarray, column: np.ndarray, rng: np.random.Generator) -> np
     return (found - found.min()) / np.ptp(found)
 
 
-class Looks:
+class Appearance:
     """What `changes`, parameters by their column, say of looks; a model for textures is a `patterned` one."""
 
     def __init__(self, model: Any, changes: Mapping[int, Parameter]):

@@ -19,8 +19,8 @@ import numpy as np
 
 from ..core.errors import TerrellaError
 from ..core.spec import Camera
+from .mujoco_appearance import Appearance, put
 from .mujoco_canvas import Canvas, simplify
-from .mujoco_looks import Looks, put
 from .mujoco_model import mujoco
 from .mujoco_parameters import SEEN, Models, Parameter
 
@@ -34,7 +34,7 @@ def lens(model: mujoco.MjModel, name: str, size: tuple[int, int], pose: str) -> 
     return Camera((focal * size[0] / size[1], focal, 0.5, 0.5), size, pose)
 
 
-class Pictures:
+class MujocoRenderer:
     """Draws worlds of one model. `changes` are those of its parameters that are seen, by their column."""
 
     def __init__(self, model: mujoco.MjModel, changes: Mapping[int, Parameter], size: tuple[int, int]):
@@ -43,7 +43,7 @@ class Pictures:
         self._model = model
         self._data = mujoco.MjData(model)
         self._made: dict[str, Canvas | mujoco.Renderer] = {}
-        self._looks = Looks(model, changes)
+        self._looks = Appearance(model, changes)
         self._mark: np.ndarray | None = None
         self._row = np.zeros(0)
 
@@ -129,7 +129,7 @@ def _blind() -> bool:
     return mujoco.GLContext.__module__ == "mujoco.glfw" and sys.platform == "linux" and not os.environ.get("DISPLAY")
 
 
-def _closed(pictures: weakref.ref[Pictures]) -> None:
+def _closed(pictures: weakref.ref[MujocoRenderer]) -> None:
     held = pictures()
     if held is not None:
         with suppress(Exception):  # a thread that drew may still hold it: then the end of the process frees it
