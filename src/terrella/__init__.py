@@ -1,6 +1,6 @@
 """Terrella: worlds that are learned from recordings, played in a browser, planned in, and measured.
 
-`import terrella` imports nothing heavy and configures nothing; each name below is fetched when it is first used.
+`import terrella` imports nothing heavy and configures nothing; each name below is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ __version__ = "0.1.0"
 __all__ = ["Spec", "State", "World", "as_env", "as_sb3", "check_world", "load", "load_policy"]
 __all__ += ["make_rng", "rollout", "worlds"]
 
-_HOME = dict.fromkeys(["Spec", "State", "World", "check_world", "make_rng", "rollout"], ".core")
-_HOME |= {
+_HOME = {
+    **dict.fromkeys(["Spec", "State", "World", "check_world", "make_rng", "rollout"], ".core"),
     "as_env": ".core.env",
-    "as_sb3": ".library",
-    "load": ".library",
-    "load_policy": ".library",
-    "worlds": ".library",
+    **dict.fromkeys(["as_sb3", "load", "load_policy", "worlds"], ".library"),
 }
 
 

@@ -173,7 +173,7 @@ def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monk
         return explore(world, out, 20, seed, report, *rest, **more)
 
     monkeypatch.setattr("terrella.cli.learn.explore", slow)
-    monkeypatch.setattr("terrella.progress.LINE_EVERY_S", -1.0)
+    monkeypatch.setattr("terrella.workflows.progress.LINE_EVERY_S", -1.0)
     monkeypatch.setattr(Plan, "share_s", property(lambda plan: {RECORDING: 0.0, TRAINING: 1.0, SCORING: 1.0}))
     main(command(tmp_path / "slow"))
     assert enough == [False, False, False, True]

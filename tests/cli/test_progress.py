@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from terrella import progress
+from terrella.workflows import progress
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def clock(monkeypatch):
 
 
 def test_the_time_left_counts_what_this_run_did_alone(clock, capsys):
-    with progress.shown("recording") as report:
+    with progress.stage("recording", progress.Terminal()) as report:
         report(500, 1000)  # of an earlier run
         clock[0] += 60
         report(600, 1000)  # 100 in a minute: 400 take four more
@@ -23,7 +23,7 @@ def test_the_time_left_counts_what_this_run_did_alone(clock, capsys):
 
 
 def test_a_log_gets_few_lines_and_the_last(clock, capsys):
-    with progress.shown("recording") as report:
+    with progress.stage("recording", progress.Terminal()) as report:
         for done in range(1000):
             clock[0] += 0.1
             report(done + 1, 1000, "loss 1")
@@ -33,7 +33,7 @@ def test_a_log_gets_few_lines_and_the_last(clock, capsys):
 
 
 def test_another_stage_has_a_time_of_its_own(clock, capsys):
-    with progress.shown("training") as report:
+    with progress.stage("training", progress.Terminal()) as report:
         report(0, 10, "cache")
         clock[0] += 1000
         report(0.0, 1.0)

@@ -84,7 +84,7 @@ def play(
             raise TerrellaError(f"--record {record}: that is a file; give a folder.")
 
         layout, folder = Layout.of(worlds[0].spec), record
-        sink = lambda: Recorder(folder, keeper.noted(layout), "play")  # noqa: E731
+        sink = lambda: Recorder(folder, keeper.with_keys(layout), "play")  # noqa: E731
     names = [world.spec.name for world in worlds]
     driver: Any = Driving(worlds[0], worlds[1] if compare else None, agent, agent_ms).agents()
     if policy is not None:

@@ -213,7 +213,7 @@ def _record(
                 say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
 
             keeper = Keeper(world.spec)
-            sink = lambda: Recorder(out, keeper.noted(layout), "play", live=live)  # noqa: E731
+            sink = lambda: Recorder(out, keeper.with_keys(layout), "play", live=live)  # noqa: E731
             serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed, keep=keeper)
         else:
             with progress.shown("recording") as report:

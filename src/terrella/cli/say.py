@@ -1,15 +1,17 @@
-"""What every command says, and the options that many share."""
+"""What every command prints, and the options that many share."""
 
 from __future__ import annotations
 
 import json as json_text
-import sys
 from collections.abc import Mapping
 from typing import Annotated
 
 from tyro.conf import arg
 
-Json = Annotated[bool, arg(name="json", help="Print one JSON document on stdout instead of text.")]
+from ..workflows.progress import Terminal
+from ..workflows.results import Result
+
+Json = Annotated[bool, arg(help="Print one JSON document on stdout instead of text.")]
 Seed = Annotated[int, arg(help="The same seed gives the same result.")]
 Port = Annotated[int, arg(help="Port of the page; 0 picks a free one.")]
 Host = Annotated[
@@ -17,10 +19,12 @@ Host = Annotated[
 ]
 Token = Annotated[str | None, arg(help="Secret that the address of the page must contain.")]
 
+say = Terminal()  # the progress of every command
 
-def say(words: str) -> None:
-    """A sentence for the person, on stderr."""
-    print(words, file=sys.stderr, flush=True)
+
+def show(result: Result, json: bool) -> None:
+    """Prints the result of a workflow on stdout."""
+    print(json_text.dumps(result.to_json(), indent=1, default=str) if json else result.summary(), flush=True)
 
 
 def result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:
