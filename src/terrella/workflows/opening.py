@@ -76,14 +76,16 @@ class EnvironmentConfig:
                 raise TerrellaError("a MuJoCo model declares its own channels; leave --adapter out.")
             if "dt_s" in options:
                 options["control_s"] = options.pop("dt_s")
-            return library.load(name, **options, **({} if rgb else {"cameras": ()}))
+            return library.load(name, **options) if rgb else library.load(name, cameras=(), **options)
         if options and not name.startswith("gym:"):
             raise TerrellaError(
                 "--size, --fps and --adapter are for environments and MuJoCo; other worlds are as they are."
             )
-        return library.load(
-            name, **options, **({"forkable": True} if forkable else {}), **({} if rgb else {"rgb": False})
-        )
+        if forkable:
+            options["forkable"] = True
+        if not rgb:
+            options["rgb"] = False
+        return library.load(name, **options)
 
 
 def load_named(
