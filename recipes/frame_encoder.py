@@ -2,7 +2,7 @@
 
 python recipes/frame_encoder.py record OUT      # pictures.safetensors: games, drawings, classic control; 4 minutes
 python recipes/frame_encoder.py train OUT       # OUT/frame_encoder.safetensors and its SHA-256; 5 minutes of one core
-python recipes/frame_encoder.py table OUT       # the table of docs/log.md, on maps that training never saw
+python recipes/frame_encoder.py table OUT       # the table of docs/lab/log.md, on maps that training never saw
 
 Two lessons at once. Each picture is spoilt in one or two of a dozen ways, and two crops of it are spoilt alike: the eye
 must say how, and how much (regression), and it must know the other crop again among those of other pictures and of the

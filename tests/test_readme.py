@@ -13,8 +13,9 @@ import pytest
 from terrella.cli import main
 
 ROOT = Path(__file__).parents[1]
-PAGES = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")))}
-GUIDES = {name: page for name, page in PAGES.items() if name != "log.md"}
+PATHS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+GUIDES = {path.name: path.read_text(encoding="utf-8") for path in PATHS}
+LINKING = [*PATHS, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*/*.md"))]
 SNIPPETS = [
     pytest.param(name, snippet, id=f"{name}-{number}")
     for name, page in GUIDES.items()
@@ -63,12 +64,16 @@ def test_the_commands_of_the_guides_have_the_flags_that_they_name(command):
 
 def test_the_make_targets_of_the_readme_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in set(re.findall(r"^    make (\w+)", PAGES["README.md"], re.MULTILINE)):
+    for target in set(re.findall(r"^    make (\w+)", GUIDES["README.md"], re.MULTILINE)):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"README says `make {target}`, the Makefile has none"
 
 
-@pytest.mark.parametrize("page", GUIDES)
-def test_the_files_that_the_guides_link_are_there(page):
-    folder = ROOT if page == "README.md" else ROOT / "docs"
-    for link in re.findall(r"\]\(([\w./-]+)\)", PAGES[page]):
-        assert (folder / link).exists(), f"{page} links {link}"
+@pytest.mark.parametrize("path", LINKING, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_the_files_that_a_page_links_are_there(path):
+    for link in re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", path.read_text(encoding="utf-8")):
+        assert (path.parent / link).exists(), f"{path.name} links {link}"
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_a_guide_is_short_enough_to_be_read(name):
+    assert len(GUIDES[name].split()) <= 1_200 + 800 * (name == "README.md"), "tables and experiments belong in docs/lab"

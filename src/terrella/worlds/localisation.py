@@ -14,7 +14,7 @@ from ..space.recognise import recognise
 from .parts import Absent
 
 AWAY_M = 1000.0  # from the recordings, of a picture of elsewhere: nothing that they hold is seen from there
-ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # a picture is of a remembered place from there up (see docs/log.md)
+ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # a picture is of a remembered place from there up (see docs/lab/log.md)
 
 
 @final
