@@ -17,8 +17,8 @@ import torch
 import terrella
 from terrella.act.planning import Judge, Planner, Played, Revealed, SearchConfig, distance_to, negative_reward, play
 from terrella.core import make_rng
+from terrella.core.files import write_json
 from terrella.core.policy import Random
-from terrella.data.storage.durable import write_json
 from terrella.measure.statistics import Figure, mean_interval, wilson
 
 

@@ -15,10 +15,10 @@ from layouts import layout_of
 
 from terrella.care import doctor
 from terrella.care.doctor import being_written, examine
+from terrella.core import files
 from terrella.core.errors import DatasetError
 from terrella.data import Layout, Recorder
 from terrella.data.source import Sensor
-from terrella.data.storage import durable
 from terrella.data.storage.mp4 import Mp4Writer
 
 DATA = "data/chunk-000/file-001.parquet"
@@ -246,7 +246,7 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
     recorder = Recorder(recording, layout)
     for i in range(12):
         recorder.add(row(i), np.full(6, i % 2))
-    real, calls = getattr(durable, name), []
+    real, calls = getattr(files, name), []
 
     def failing(*args):
         calls.append(args)
@@ -254,7 +254,7 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
             raise Killed
         return real(*args)
 
-    monkeypatch.setattr(durable, name, failing)
+    monkeypatch.setattr(files, name, failing)
     with pytest.raises(Killed):
         recorder.end_episode()
     monkeypatch.undo()

@@ -400,12 +400,12 @@ def test_what_cannot_be_repaired_is_refused_clearly(recording, tmp_path):
 def test_a_full_disk_is_said_clearly(recording, tmp_path, monkeypatch):
     import errno
 
-    from terrella.data.storage import durable
+    from terrella.core import files
 
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(durable, "move_into_place", full)
+    monkeypatch.setattr(files, "move_into_place", full)
     with pytest.raises(DatasetError, match="the disk is full"):
         repair(recording, tmp_path / "out")
 
@@ -430,7 +430,7 @@ def test_ctrl_c_in_a_repair_says_that_nothing_was_written(recording, tmp_path, m
     def stopped(*given, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("terrella.data.storage.durable.move_into_place", stopped)
+    monkeypatch.setattr("terrella.core.files.move_into_place", stopped)
     with pytest.raises(SystemExit) as ended:
         main(["data", "doctor", str(recording), "--repair", "--out", str(tmp_path / "out")])
     assert ended.value.code == 130 and "nothing was written" in capsys.readouterr().err

@@ -17,10 +17,9 @@ from corridor import Corridor, keys
 from layouts import layout_of
 
 from terrella.care import doctor
-from terrella.core import make_rng
+from terrella.core import files, make_rng
 from terrella.core.errors import DatasetError
 from terrella.data import ClipCache, Dataset, Recorder, record
-from terrella.data.storage import durable
 
 LAYOUT = layout_of(10, ("go",), rgb=(16, 16), pose=True)
 
@@ -33,8 +32,8 @@ def _episode(recorder: Recorder, rows: int, value: float = 0.0) -> None:
 
 
 def _stop_at(monkeypatch, name: str, nth: int, error: BaseException) -> None:
-    """The nth call of durable.NAME raises instead."""
-    real, calls = getattr(durable, name), []
+    """The nth call of files.NAME raises instead."""
+    real, calls = getattr(files, name), []
 
     def failing(*args):
         calls.append(args)
@@ -42,7 +41,7 @@ def _stop_at(monkeypatch, name: str, nth: int, error: BaseException) -> None:
             raise error
         return real(*args)
 
-    monkeypatch.setattr(durable, name, failing)
+    monkeypatch.setattr(files, name, failing)
 
 
 SCRIPT = """

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from robots import arm, robot, rover
 
+from terrella.core import files
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset
 from terrella.data.resample import resample
 from terrella.data.source import Readings, Sensor, Source, Take
-from terrella.data.storage import durable
 from terrella.exchange.merging.mapping import MergeRows, Number, Vector, affine
 from terrella.exchange.merging.mapping_file import read_mapping, write_mapping
 from terrella.exchange.merging.merge import letterbox, merge
@@ -573,8 +573,8 @@ def test_a_merge_that_is_stopped_leaves_nothing(tmp_path, monkeypatch, stage, er
             raise error
         real(target, value)
 
-    real = durable.write_json
-    monkeypatch.setattr(durable, "write_json", stop)
+    real = files.write_json
+    monkeypatch.setattr(files, "write_json", stop)
     with pytest.raises((KeyboardInterrupt, DatasetError)):
         merge_into({"A": arm()}, tmp_path / "all")
     assert list(tmp_path.iterdir()) == []

@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ..core.errors import CheckpointError
+from ..core.files import replacing, write_text
 from ..core.spec import Spec
 from ..core.world import Observation
 from .actor_network import ActorConfig, ActorNetwork, check_seen
@@ -91,13 +92,9 @@ def write_policy(folder: str | Path, told: Mapping[str, Any], network: nn.Module
     folder = Path(folder)
     weights = {name: value.detach().cpu().clone().contiguous() for name, value in network.state_dict().items()}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        partial = folder / f"{WEIGHTS_FILE}.partial"
-        save_file(weights, partial)
-        partial.replace(folder / WEIGHTS_FILE)
-        partial = folder / f"{POLICY_FILE}.partial"
-        partial.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-        partial.replace(folder / POLICY_FILE)
+        with replacing(folder / WEIGHTS_FILE) as staged:
+            save_file(weights, staged)
+        write_text(folder / POLICY_FILE, json.dumps(told, indent=1) + "\n")
     except (OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy cannot be written to {folder} ({error}); free some space, or choose another folder."

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from ..core.errors import CheckpointError, TerrellaError
+from ..core.files import replacing
 from .actor import Actor
 
 
@@ -34,17 +35,13 @@ def write_onnx(actor: Actor, file: str | Path) -> dict[str, list[int]]:
     kinds = {name: torch.uint8 if len(shape) == 3 else torch.float32 for name, shape in actor.network.config.sees}
     seen = tuple(torch.zeros(2, *shape, dtype=kinds[name]) for name, shape in actor.network.config.sees)
     names = [*actor.sees, "action"]
-    part = Path(f"{file}.partial")
     try:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings(), torch.no_grad():
+        with replacing(file) as staged, warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # of tracing: what is asked of shapes does not depend on the numbers
             torch.onnx.export(
-                _Flat(actor).eval(), seen, str(part), input_names=names[:-1], output_names=names[-1:],
+                _Flat(actor).eval(), seen, str(staged), input_names=names[:-1], output_names=names[-1:],
                 dynamic_axes={name: {0: "batch"} for name in names}, dynamo=False,
             )  # fmt: skip
-        part.replace(file)
     except (OSError, RuntimeError) as error:
-        part.unlink(missing_ok=True)
         raise CheckpointError(f"{file} cannot be written ({error}); free some space, or choose another.") from error
     return {name: [-1, *shape] for name, shape in actor.network.config.sees}

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from ..core import files
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.features import decoded, sensors_of
 from ..data.format import ACTION_VALID, AUTOMATIC, INFO, TIME, Layout, schema, tidy
 from ..data.source import follows, is_action
 from ..data.staged import LOG, Staged, look, sampled
-from ..data.storage import durable, mp4
+from ..data.storage import mp4
 from ..data.storage.films import cut, whole_frames
 from ..data.storage.tables import read_json
 from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh
@@ -67,7 +68,7 @@ def repair(
         raise DatasetError(f"the mended copy cannot lie in {root} itself; choose another folder for it.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} is not empty; choose another folder for the mended copy.")
-    with durable.in_whole(out) as staged:
+    with files.creating(out) as staged:
         return _Mender(found, staged, keep, progress, allow_loss).mend()
 
 
@@ -333,7 +334,7 @@ class _Mender:
             kept = {key: value for key, value in self.found.info.items() if key not in info}
             if self.found.info.get("total_episodes") == info["total_episodes"] and "splits" in self.found.info:
                 kept["splits"] = self.found.info["splits"]
-            durable.write_json(self.out / INFO, _finite({**info, **kept}))
+            files.write_json(self.out / INFO, _finite({**info, **kept}))
 
 
 def _finite(value: object) -> object:

@@ -16,7 +16,7 @@ import torch
 from ..act.judging import CHUNK, Chunk
 from ..act.planning import Episode
 from ..core.errors import TerrellaError
-from ..data.storage.durable import write_json
+from ..core.files import write_json
 from ..measure.judged import CONTROL, DREAM, REAL, RETURN, SUCCESS
 
 SAVED_EVERY_S = 5.0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import TerrellaError
-from ..data.storage.durable import write_json
+from ..core.files import write_json
 
 RECORDING, TRAINING, SCORING = "recording", "training", "scoring"
 STARTING_S = 5.0  # of each stage: what is imported, and read again

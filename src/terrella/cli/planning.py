@@ -32,10 +32,10 @@ from ..act.planning import (
     play,
 )
 from ..core.errors import PlanningError, TerrellaError
+from ..core.files import write_json
 from ..core.policy import Policy, Random
 from ..core.spec import Spec
 from ..core.world import World, make_rng
-from ..data.storage.durable import write_json
 from ..measure.acted import compute_chart, film, film_strip, plan_page
 from ..measure.statistics import Figure, mean_interval, wilson
 from ..serve.picture import uncertainty_levels

@@ -22,11 +22,11 @@ from ..act.actor import Actor
 from ..act.belief import BeliefPolicy, actor_of
 from ..act.named import Slipping
 from ..core.errors import TerrellaError
+from ..core.files import write_json
 from ..core.policy import Policy
 from ..core.spec import AXES, shape_of
 from ..core.world import World, make_rng
 from ..data import Dataset, record
-from ..data.storage.durable import write_json
 from ..learn.recipes.latent import LatentTraining, train_latent
 from ..learn.recipes.policy import Practice, seen_unless_said, train_policy
 from ..measure.statistics import mean_interval

@@ -16,7 +16,7 @@ import torch
 
 from .. import library
 from ..core.errors import TerrellaError
-from ..data.storage.durable import write_json
+from ..core.files import write_json
 from ..measure.transferred import Played, as_dict, camera_table, table, transferred, verdict
 from ..measure.transferred_page import transferred_page
 from .beside import check_alike, sound

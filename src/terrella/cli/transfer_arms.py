@@ -14,9 +14,9 @@ from .. import library
 from ..act.actor import Actor
 from ..act.named import Slipping
 from ..act.planning.episodes import Judge, play
+from ..core.files import write_json
 from ..core.policy import Idle, Policy, Random
 from ..core.world import World
-from ..data.storage.durable import write_json
 from ..learn.feeds import Drawn
 from ..learn.objectives.regression import Regression, drawn_rows
 from ..learn.recipes.policy import Practice, train_policy

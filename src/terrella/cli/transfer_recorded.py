@@ -11,11 +11,11 @@ import torch
 
 from .. import library
 from ..core.errors import DatasetError
+from ..core.files import write_json
 from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data import Dataset
 from ..data.channels import check_game, facts_of
-from ..data.storage.durable import write_json
 from ..measure.statistics import Figure, mean_interval
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld

@@ -15,13 +15,13 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
+from ..core.files import FULL
 from . import stats
 from .channels import ACTION, DONE, REWARD, feature_of
 from .features import unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even
 from .source import Sensor, follows, is_action
 from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Parcel, Staged, about, growing, pack_row
-from .storage.durable import FULL
 from .storage.journal import Journal
 from .storage.mp4 import Mp4Writer, Pressure
 from .writer import Draft, Writer, fresh

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ..core import files
 from ..core.errors import DatasetError
 from . import stats
 from .channels import NAME
@@ -41,7 +42,6 @@ from .format import (
     where,
 )
 from .source import Sensor
-from .storage import durable
 
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
@@ -128,13 +128,14 @@ class Writer:
                 staged[stream_path(name, number, "mp4")] = draft.films[name]
         staged[EPISODES_PATH.format(**where(number))] = table = self.staging / "episode.parquet"
         pq.write_table(self._episode_table(number, draft, of_episode), table, **_CHECKED)
-        durable.sync_file(table)
+        files.sync_file(table)
         for path, file in staged.items():
-            durable.move_into_place(file, self.root / path)
+            files.move_into_place(file, self.root / path)
         merged = stats.merge([self._stats, of_episode])
-        durable.write_json(self.root / STATS, stats.to_json(merged))
-        durable.write_whole(self.root / TASKS, lambda path: pq.write_table(tasks_table(tasks), path, **_CHECKED))
-        durable.write_json(self.root / INFO, self._info(number + 1, self.rows + draft.length, len(tasks)))
+        files.write_json(self.root / STATS, stats.to_json(merged))
+        with files.replacing(self.root / TASKS) as path:
+            pq.write_table(tasks_table(tasks), path, **_CHECKED)
+        files.write_json(self.root / INFO, self._info(number + 1, self.rows + draft.length, len(tasks)))
         self.episodes, self.rows, self._stats, self._tasks = number + 1, self.rows + draft.length, merged, tasks
         return number
 
@@ -191,10 +192,10 @@ class Writer:
             stated = {"world": dict(layout.world), "sensors": _json(layout.sensors), "streams": _json(layout.streams)}
             stated |= {"channels": dict(layout.channels)} if layout.channels else {}
             try:
-                durable.write_json(self.root / WORLD, {**layout.facts, "version": 2, **stated, **facts})
+                files.write_json(self.root / WORLD, {**layout.facts, "version": 2, **stated, **facts})
             except (TypeError, ValueError) as error:
                 raise DatasetError(f"the facts of {self.root} are no JSON values ({error}); leave them out.") from error
-            durable.write_json(self.root / INFO, self._info(0, 0, 0))
+            files.write_json(self.root / INFO, self._info(0, 0, 0))
 
     def _reopen(self, info: dict) -> None:
         if info.get("codebase_version") != VERSION or not (self.root / WORLD).exists():
@@ -257,7 +258,7 @@ class Writer:
                 parts.append({name: stats.summarise(value, name in maps) for name, value in numbers.items()})
         if done != draft.length or done != len(task):
             raise DatasetError(f"an episode of {draft.length} rows came with {done}.")
-        durable.sync_file(file)
+        files.sync_file(file)
         return file, stats.merge(parts)
 
     def _stage_stream(self, sensor: Sensor, readings: Iterable[tuple[float, np.ndarray | None]]) -> Path:
@@ -272,7 +273,7 @@ class Writer:
                     offsets = np.cumsum([0, *map(len, values)])
                     columns.append(pa.LargeListArray.from_arrays(offsets, pa.array(np.concatenate(values))))
                 table.write_table(pa.Table.from_arrays(columns, schema=form))
-        durable.sync_file(file)
+        files.sync_file(file)
         return file
 
     def _episode_table(self, number: int, draft: Draft, of_episode: dict[str, stats.Summary]) -> pa.Table:
@@ -308,15 +309,16 @@ class Writer:
         }
 
 
-def _merge_tables(files: Sequence[Path], at: Mapping[str, int]) -> None:
+def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:
     """Makes one table of several of episodes, which lies where the first did; of a killed merge it has some rows already."""
-    table = pa.concat_tables([pq.ParquetFile(file).read() for file in files], promote_options="default")
+    table = pa.concat_tables([pq.ParquetFile(file).read() for file in tables], promote_options="default")
     table = table.take(np.unique(table["episode_index"].to_numpy(), return_index=True)[1])
     for key, value in at.items():
         place = table.schema.get_field_index(f"meta/episodes/{key}")
         table = table.set_column(place, f"meta/episodes/{key}", pa.array(np.full(len(table), value, np.int64)))
-    durable.write_whole(files[0], lambda path: pq.write_table(table, path, **_CHECKED))
-    for file in files[1:]:
+    with files.replacing(tables[0]) as path:
+        pq.write_table(table, path, **_CHECKED)
+    for file in tables[1:]:
         file.unlink()
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DatasetError
+from ..core.files import write_json
 from ..data.dataset import Dataset
 from ..data.format import INFO
 from ..data.resample import clock_of
 from ..data.source import Readings, Sensor, Source, Take
-from ..data.storage.durable import write_json
 from .convert import open_source, write_source
 from .poses import pose_columns
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..data.storage.durable import write_json
+from ..core.files import write_json
 from ..space.matching import fetched, half_a_pixel, scrolled
 from ..space.mosaic import blank, remembered
 

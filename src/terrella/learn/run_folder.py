@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import TrainingError
+from ..core.files import replacing, write_text
 
 LOG = "log.jsonl"
 
@@ -32,8 +33,8 @@ def save_run(
             tensors |= {f"{name}/{number}/{slot}": torch.as_tensor(value) for slot, value in slots.items()}
     whole = {key: value.detach().cpu().clone().contiguous() for key, value in tensors.items()}
     try:
-        save_file(whole, path.with_name(f"{path.name}.partial"), metadata={"facts": json.dumps(facts)})
-        path.with_name(f"{path.name}.partial").replace(path)
+        with replacing(path) as staged:
+            save_file(whole, staged, metadata={"facts": json.dumps(facts)})
     except (OSError, SafetensorError) as error:
         raise TrainingError(
             f"{path.parent} cannot be written ({error}); free some space and run the same command again, or give another --out."
@@ -98,9 +99,7 @@ def trim_log(folder: Path, stage: str, step: int) -> None:
     if not path.exists():
         return
     kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _before(line, stage, step)]
-    partial = path.with_name(f"{LOG}.partial")
-    partial.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-    partial.replace(path)
+    write_text(path, "".join(f"{line}\n" for line in kept))
 
 
 def _before(line: str, stage: str, step: int) -> bool:

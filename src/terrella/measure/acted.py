@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from ..core.files import replacing
 from ..data.storage.mp4 import Mp4Writer, finish
 from .page_parts import COLOURS, QUIET, figure_text, section, table_of
 from .plot import Line, line_chart
@@ -47,7 +48,8 @@ def film(
         _draw_divergence(draw, divergence, at, what, (4, size[0] + _LINE, wide - 4, tall - 4))
         writer.add(np.asarray(canvas))
     writer.close()
-    finish(growing, path)
+    with replacing(path) as staged:
+        finish(growing, staged)
     growing.unlink()
 
 

@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import TerrellaError
+from ..core.files import replacing
 from ..core.state import State
 from ..core.world import World, make_rng
 from .clips import Clip, evidence
@@ -87,9 +88,8 @@ class Store:
         if self.folder is None:
             return
         with writing(self.folder):
-            part = self.folder / f"{_digest(key)}.part"
-            save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, part)
-            part.replace(part.with_suffix(".safetensors"))
+            with replacing(self.folder / f"{_digest(key)}.safetensors", durable=False) as staged:
+                save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, staged)
 
 
 def _digest(text: str) -> str:

@@ -11,9 +11,9 @@ from pathlib import Path
 import av
 import numpy as np
 
+from ...core import files
 from ...core.errors import DatasetError
-from . import durable, mp4
-from .durable import FULL
+from . import mp4
 from .mp4 import Mp4Writer
 
 _MOST = 50_000_000  # frames of one file; more is damage
@@ -81,11 +81,11 @@ def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Re
                 try:
                     mp4.finish(path, target, count, at)
                 except (DatasetError, *mp4.BROKEN) as error:  # what this mp4 writer cannot hold may still be decoded
-                    if getattr(error, "errno", None) in FULL:
+                    if getattr(error, "errno", None) in files.FULL:
                         raise
             with suppress(DatasetError):
                 if np.array_equal(np.sort(reel(target, fps).frames), np.arange(count)):
-                    durable.sync_file(target)
+                    files.sync_file(target)
                     return True
     _encode(path, first, count, fps, target)
     return False

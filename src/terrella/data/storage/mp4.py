@@ -25,9 +25,9 @@ from av.container import InputContainer
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 
+from ...core import files
 from ...core.errors import DatasetError
 from ..source import Lazy
-from . import durable
 
 _RUN = struct.Struct(">II")  # flags and frames of a fragment's run
 _FIELDS = (0x100, 0x200, 0x400, 0x800)  # what a run may keep for each frame, four bytes each
@@ -238,7 +238,7 @@ def finish(path: Path, target: Path, frames: int | None = None, first: int = 0) 
             raise broken(path, str(error)) from error
     if not count:
         raise broken(path, "it holds no frame")
-    durable.sync_file(target)
+    files.sync_file(target)
     return count
 
 

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ...core import files
 from ...core.errors import DatasetError
 from ..format import contained, inside
-from . import durable
 
 BUDGET_BYTES = 8 << 30
 _LOCKS = 64
@@ -211,8 +211,8 @@ class Files:
                 part = self._ask(f"fetch {name}", get)
             except FileNotFoundError as error:
                 raise DatasetError(f"{name} is gone from {self.root}; open the recording anew.") from error
-            durable.sync_file(part)
-            os.replace(part, path)
+            files.sync_file(part)
+            files.move_into_place(part, path)
 
     def _ask(self, what: str, action: Callable[[Callable[[], None]], _Result]) -> _Result:
         """`action(alive)`, tried again where it fails; `alive()` says that it is getting on."""

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core import files
 from ...core.errors import DatasetError
 from ..channels import ESTIMATES, channel_of, feature_of, renamed
 from ..dataset import Dataset
 from ..format import INFO
 from ..source import Lazy
-from ..storage import durable
 from ..storage.remote import BUDGET_BYTES, LocalFiles
 
 Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]  # (dtype, shape of a row) by array
@@ -325,10 +325,10 @@ def finish(
     """
     np.save(staged / "episodes.npy", ranges)
     for name in [*arrays, "episodes"]:
-        durable.sync_file(staged / f"{name}.npy")
+        files.sync_file(staged / f"{name}.npy")
     unknown = {"action_names": [], "world": {}, "tasks": [], "keys": {}}
-    durable.write_json(staged / "about.json", {**unknown, **(facts or {}), "arrays": sorted(arrays), "fps": fps})
-    durable.move_into_place(staged, path)
+    files.write_json(staged / "about.json", {**unknown, **(facts or {}), "arrays": sorted(arrays), "fps": fps})
+    files.move_into_place(staged, path)
 
 
 def fill_episode(

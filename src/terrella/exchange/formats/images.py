@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ...core.errors import DatasetError
+from ...core.files import creating
 from ...data.source import Lazy, Readings, Sensor, Source, Take
-from ...data.storage import durable
 from . import folders, rows
 from .folders import IMAGES
 
@@ -131,7 +131,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     """
     cameras, left_out = folders.cameras(source, ("image", "depth"), "images")
     notes = dict.fromkeys(left_out)
-    with durable.in_whole(path) as staged:
+    with creating(path) as staged:
         staged.mkdir()
         for number, take in folders.numbered(source, cameras, progress):
             for name, readings in take.readings.items():

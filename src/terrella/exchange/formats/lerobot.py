@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.files import creating, not_written
 from ...data.dataset import Dataset
 from ...data.features import unit_of
 from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
 from ...data.source import Readings, Sensor, Source, Take, follows
-from ...data.storage import durable
 from . import rows
 
 
@@ -63,7 +63,7 @@ def write(
         raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
     lead = _lead(source, first)
     layout, notes = _layout(source, first, lead, how)
-    with durable.in_whole(root) as staged:
+    with creating(root) as staged:
         try:
             notes += _write(source, layout, staged, lead, how, progress)
             if finish:
@@ -71,7 +71,7 @@ def write(
         except DatasetError as error:
             if not isinstance(error.__cause__, OSError):
                 raise
-            raise durable.unwritten(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
+            raise not_written(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
     return notes
 
 

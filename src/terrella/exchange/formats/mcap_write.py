@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.files import creating, sync_file
 from ...data.format import sensor_json
 from ...data.resample import clock_of
 from ...data.source import Readings, Sensor, Source, Take
-from ...data.storage import durable
 from . import message_encoder, rows
 from .mcap import SENSORS, SOURCE, TAKE, topics
 from .message_encoder import MessageEncoder
@@ -35,7 +35,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     DatasetError where the path is taken, the disk is full, or a reading is not what its sensor declares.
     """
     path = Path(path)
-    with durable.in_whole(path) as staged:
+    with creating(path) as staged:
         for number, take in rows.numbered(source, None):
             if path.suffix == ".mcap" and number:
                 raise DatasetError(f"'{source.name}' has more than one take, and '{path}' is one file; name a folder.")
@@ -43,7 +43,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
                 staged.mkdir(exist_ok=True)
             target = staged if path.suffix == ".mcap" else staged / f"take-{number:06d}.mcap"
             _write_take(source, take, target, progress)
-            durable.sync_file(target)
+            sync_file(target)
     return []
 
 

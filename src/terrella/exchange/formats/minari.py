@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from ...data.storage import durable
 from . import arrays, rows, spaces
 from .arrays import Place
 from .minari_stored import Shapes, StoredEpisode, open_storage
@@ -140,7 +140,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     for name in source.sensors:
         if rows.role_of(name) == "" or source.sensors[name].kind == "points":
             notes[f"'{name}' has no place in Minari's layout and was left out."] = None
-    with durable.in_whole(path) as staged:
+    with creating(path) as staged:
         data = staged / "data"
         data.mkdir(parents=True)
         steps, number = 0, 0

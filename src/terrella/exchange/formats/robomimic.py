@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from ...data.storage import durable
 from . import arrays, hdf5, rows
 
 _NAMES = {
@@ -126,7 +126,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     """
     notes: dict[str, None] = {}
     known = _facts(source)
-    with durable.in_whole(path) as staged, hdf5.File(staged, "w") as file:
+    with creating(path) as staged, hdf5.File(staged, "w") as file:
         data, total = file.create_group("data"), 0
         for number, take in rows.numbered(source, progress):
             demo = data.create_group(_demo_name(take, data))

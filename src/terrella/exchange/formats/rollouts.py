@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from ...data.storage import durable
 from . import arrays, rows
 from .arrays import Array, Place
 
@@ -150,7 +150,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
     notes |= {
         f"'{name}' has no place in rollouts and was left out.": None for name in source.sensors if name not in keys
     }
-    with durable.in_whole(path) as staged:
+    with creating(path) as staged:
         staged.mkdir()
         for number, take in rows.numbered(source, progress):
             _write_take(staged / f"episode_{number}.npz", source, take, keys, f"take {number}")

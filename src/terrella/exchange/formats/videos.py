@@ -15,8 +15,8 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
+from ...core.files import creating
 from ...data.source import Lazy, Readings, Sensor, Source, Take
-from ...data.storage import durable
 from . import folders, rows
 from .folders import VIDEOS
 from .video_frames import FrameReader
@@ -151,7 +151,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
         height, width = source.sensors[name].shape[:2]
         if height % 2 or width % 2:
             raise DatasetError(f"'{name}' is {width} x {height}; H.264 needs even sizes: crop it, or write images.")
-    with durable.in_whole(path) as staged:
+    with creating(path) as staged:
         staged.mkdir()
         for number, take in folders.numbered(source, cameras, progress):
             begin = min(float(take.readings[name].time_s[0]) for name in cameras if name in take.readings)

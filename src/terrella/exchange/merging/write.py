@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from ...core import files
 from ...core.errors import DatasetError
 from ...data.format import WORLD
 from ...data.source import Source
-from ...data.storage import durable
 from ..formats import lerobot
 from .mapping import ACTION, EMBODIMENT, MergeMapping, SourceMapping, check_mapping
 from .mapping_file import read_mapping, write_mapping
@@ -59,8 +59,8 @@ def merge_into(
 
     def finish(folder: Path, notes: list[str]) -> None:
         about = json.loads((folder / WORLD).read_text(encoding="utf-8"))
-        durable.write_json(folder / WORLD, {**about, "embodiments": report.embodiments()})
-        durable.write_json(folder / "meta" / "merge.json", {**report.to_json(), "notes": notes})
+        files.write_json(folder / WORLD, {**about, "embodiments": report.embodiments()})
+        files.write_json(folder / "meta" / "merge.json", {**report.to_json(), "notes": notes})
         write_mapping(found, folder / "meta" / "merge.toml")
 
     try:

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
 from ...core.errors import DatasetError
+from ...core.files import replacing
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
@@ -155,8 +156,8 @@ def _kept(run: Run, world: LearnedWorld, recording: Recording, rollout: Rollout)
             if len(parts) >= 2 and time.monotonic() - began > run.budget.most_s("dreams"):
                 break
             made = dream(world, recording, rollout, number)
-            save_file({name: part.contiguous() for name, part in made._asdict().items()}, path.with_suffix(".partial"))
-            path.with_suffix(".partial").replace(path)
+            with replacing(path) as staged:
+                save_file({name: part.contiguous() for name, part in made._asdict().items()}, staged)
         parts.append(Dreamt(**load_file(path)))
         frames = (number + 1) * rollout.batch * rollout.horizon
         run.report(number + 1, rollout.batches, f"uncertainty: dreamt {frames:,} frames")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import torch
 
 from ...core.errors import DatasetError
+from ...core.files import not_written, replacing
 from ..edits import FARTHEST_M
 from ..raster import Gaussians
 from ..raster.move import turned
@@ -98,17 +97,11 @@ def write_scene(
 
 def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
     """`write` fills a neighbour of `path`, which then takes its place; DatasetError where it cannot be written."""
-    staged = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.new")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(staged)
-        os.replace(staged, path)
+        with replacing(path) as staged:
+            write(staged)
     except OSError as error:
-        raise DatasetError(
-            f"{path} was not written ({error.strerror}); free some space, or choose another place."
-        ) from error
-    finally:
-        staged.unlink(missing_ok=True)
+        raise not_written(path, error) from error
 
 
 def _axes(name: str) -> torch.Tensor:
