@@ -18,6 +18,7 @@ import io
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +50,14 @@ def arms(task: Task, world: World, actor: GoalActor, seed: int) -> dict[str, Cal
         return lambda: Acting(task, lambda goals: make(distance_to(world, goals, "last")), seed)
 
     varied = GoalActor(actor.network, world.spec, varied=True)
-    config = SearchConfig("icem", samples=64, iterations=5, horizon=HORIZON, block=BLOCK)
-    short = SearchConfig("icem", samples=16, iterations=2, horizon=HORIZON, block=BLOCK)
+    config = SearchConfig("icem", samples=64, iterations=5, horizon=HORIZON, block=BLOCK, replan=HORIZON)
+    short = SearchConfig("icem", samples=16, iterations=2, horizon=HORIZON, block=BLOCK, replan=HORIZON)
     return {
         "random": lambda: RandomPolicy(seed),
         "reaching": ours(lambda cost: Reaching(world, actor, cost)),
-        "icem": ours(lambda cost: Planner(world, cost, config, replan=HORIZON)),
-        "icem anew": ours(lambda cost: Planner(world, cost, config)),
-        "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied, replan=HORIZON)),
+        "icem": ours(lambda cost: Planner(world, cost, config)),
+        "icem anew": ours(lambda cost: Planner(world, cost, replace(config, replan=1))),
+        "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied)),
         "cem 300x30": cem,
     }
 

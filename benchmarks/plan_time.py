@@ -63,9 +63,9 @@ def decided(world: LatentWorld, samples: int, rounds: int, proposed: bool) -> Ca
     """A decision of iCEM that plans anew, as `judge.py` has it."""
     goal = {"rgb": torch.randint(0, 256, (64, 64, 3), dtype=torch.uint8)}
     seen = {"rgb": torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8)}
-    config = SearchConfig("icem", samples=samples, iterations=rounds, horizon=MOVES, block=BLOCK)
+    config = SearchConfig("icem", samples=samples, iterations=rounds, horizon=MOVES, block=BLOCK, replan=MOVES)
     actor = GoalActor(GoalNetwork(GoalConfig.of(world.spec)), world.spec, varied=True) if proposed else None
-    planner = Planner(world, distance_to(world, goal, "last"), config, proposal=actor, replan=MOVES)
+    planner = Planner(world, distance_to(world, goal, "last"), config, proposal=actor)
     return lambda: planner.act(seen, planner.begin(1, make_rng(0)), make_rng(0))
 
 

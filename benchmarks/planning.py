@@ -28,17 +28,18 @@ class Case:
 
     config: SearchConfig
     steps: int
-    replan: int = 1
     goal: tuple[float, ...] = ()
     done_is_success: bool = False
     samples: tuple[int, ...] = (2, 4, 8, 16, 32)
 
 
 CASES = {
-    "CartPole-v1": Case(SearchConfig("icem", iterations=2, horizon=15), 200, 5),
-    "Pendulum-v1": Case(SearchConfig("icem", iterations=2, horizon=10, block=2), 150, 2),
-    "Acrobot-v1": Case(SearchConfig("icem", iterations=2, horizon=12, block=6), 200, 3, done_is_success=True),
-    "MountainCar-v0": Case(SearchConfig("icem", iterations=2, horizon=15, block=10), 200, 5, done_is_success=True),
+    "CartPole-v1": Case(SearchConfig("icem", iterations=2, horizon=15, replan=5), 200),
+    "Pendulum-v1": Case(SearchConfig("icem", iterations=2, horizon=10, block=2, replan=2), 150),
+    "Acrobot-v1": Case(SearchConfig("icem", iterations=2, horizon=12, block=6, replan=3), 200, done_is_success=True),
+    "MountainCar-v0": Case(
+        SearchConfig("icem", iterations=2, horizon=15, block=10, replan=5), 200, done_is_success=True
+    ),
 }
 
 
@@ -61,7 +62,7 @@ def curve(name: str, case: Case, episodes: int) -> dict[str, dict[str, Figure]]:
         cost = distance_to(world, {"observation": torch.tensor(case.goal)})
     rows = {"random": figures(play(world, Random(world.spec), episodes, case.steps, 0, judge), case)}
     for samples in case.samples:
-        planner = Planner(world, cost, replace(case.config, samples=samples), replan=case.replan)
+        planner = Planner(world, cost, replace(case.config, samples=samples))
         played = play(world, planner, episodes, case.steps, 0, judge, world.spec.observes)
         rows[f"{samples} plans a round"] = figures(played, case)
         print(

@@ -185,9 +185,9 @@ class Mind:
 
     def __init__(self, dream, colours: list[int], body: Body):
         cost = Cost(("post",), lambda seen, goal: seen["post"].norm(dim=-1))
-        search = SearchConfig(samples=64, iterations=4, horizon=8, block=5)
+        search = SearchConfig(samples=64, iterations=4, horizon=8, block=5, replan=2)
         self.dream, self.colours, self.body = dream, colours, body
-        self.planner = Planner(dream, cost, search, replan=2)  # two moves of half a second
+        self.planner = Planner(dream, cost, search)  # two moves of half a second
 
     def begin(self, batch, rng):
         return Thinking(self.planner.begin(1, rng))

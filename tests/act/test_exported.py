@@ -12,7 +12,7 @@ from tests.worlds.test_latent import CHOICES, STEERING, made
 from terrella.act.goal_network import GoalActor, GoalConfig, GoalNetwork
 from terrella.act.planning import ActionModel, CostModel, Judge, Planner, SearchConfig, distance_to
 from terrella.cli.planning import _Case
-from terrella.cli.searching import Settled
+from terrella.cli.searching import Searching
 from terrella.core import make_rng
 from terrella.core.errors import PlanningError
 
@@ -86,8 +86,10 @@ def test_the_command_leaps_too_unless_it_is_told_when_to_trust():
     world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.1, "invents": 0.5}})
     world.leap, inner = lambda *given: leapt.append(1) or inner(*given), world.leap
     for trust in (None, 0.5):
-        searching = Settled("cem", samples=4, iterations=2, horizon=3, block=2, cost="last", trust=trust)
-        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0).planner(searching)
+        searching = Searching(SearchConfig("cem", 4, 2, 3, 2, trust=trust), cost="last")
+        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0).planner(
+            searching.search
+        )
         leapt.clear()
         planner.act({"rgb": info(1)["pixels"][0, :1]}, planner.begin(1, rng), rng)
         assert bool(leapt) == (trust is None)

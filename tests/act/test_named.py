@@ -69,7 +69,7 @@ def test_it_plans_with_settings():
     world = Point()
     planner = terrella.load_policy("plan:samples=8,horizon=3,search=cem,replan=2,trust=0.5", world.spec, world)
     assert isinstance(planner, Planner) and planner.sees == world.spec.observes
-    assert (planner.config.kind, planner.config.samples, planner.config.horizon) == ("cem", 8, 3)
+    assert (planner.config.search, planner.config.samples, planner.config.horizon) == ("cem", 8, 3)
     assert done_by("plan:samples=8,iterations=1", batch=4, plans_in=world).shape == (4, 2)
 
 

@@ -21,7 +21,7 @@ SEEN = ("observation",)
 
 
 def planner(world, kind, cost=None, **more):
-    options = {name: more.pop(name) for name in ("trust", "proposal", "proposals", "replan") if name in more}
+    options = {name: more.pop(name) for name in ("proposal", "proposals") if name in more}
     return Planner(world, cost or distance_to(world, GOAL), SearchConfig(kind, **{"horizon": 6, **more}), **options)
 
 
@@ -201,7 +201,7 @@ def test_a_revealed_simulator_is_a_world():
 
 def test_a_planner_in_the_simulator_keeps_the_pole_up():
     world = Revealed(GymnasiumWorld("CartPole-v1", rgb=False))
-    policy = Planner(world, negative_reward(world.spec), SearchConfig(samples=16, iterations=2, horizon=12), replan=3)
+    policy = Planner(world, negative_reward(world.spec), SearchConfig(samples=16, iterations=2, horizon=12, replan=3))
     mine = play(world, policy, 1, 200, 0, sees=world.spec.observes)
     floor = play(world, Random(world.spec), 8, 200, 0)
     assert mine.episodes[0].reward == 200

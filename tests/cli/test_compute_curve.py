@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from terrella.act.planning import Episode, Played
+from terrella.act.planning import Episode, Played, SearchConfig
 from terrella.cli.compute_curve import Point, helped, less
-from terrella.cli.searching import Searching
 from terrella.measure.statistics import wilson
 
-PLAIN = Searching(samples=16).settled({})
+PLAIN = SearchConfig(samples=16).filled()
 
 
 def test_plans_and_milliseconds_are_halved_and_two_plans_are_the_fewest():
     assert [one.samples for one in less(PLAIN)] == [2, 4, 8]
-    assert [one.samples for one in less(Searching(samples=64).settled({}))] == [4, 8, 16, 32]
-    by_the_clock = less(Searching(budget_ms=40).settled({}))
+    assert [one.samples for one in less(SearchConfig().filled())] == [4, 8, 16, 32]
+    by_the_clock = less(SearchConfig(budget_ms=40).filled())
     assert [one.budget_ms for one in by_the_clock] == [2.5, 5, 10, 20] and {one.samples for one in by_the_clock} == {64}
 
 

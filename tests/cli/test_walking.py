@@ -56,7 +56,7 @@ def test_each_episode_walks_to_a_view_that_is_far_enough_from_its_start():
 
     def walker(goal):
         goals.append(goal)
-        config = SearchConfig(**{**search_of(world.spec), "samples": 8})
+        config = SearchConfig(samples=8).filled(**search_of(world.spec))
         return goal.walker(Planner(world, goal.cost(world), config))
 
     played = walks.played(world, walker, 3, 60, 0, world.spec.observes, ("pose",), lambda done, total: None)

@@ -32,8 +32,9 @@ KNOWN = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "
     "FILE.py:NAME of your own; NAME@0.3 does something random three times in ten"
 )
-_SETTINGS = {"search": str, "samples": int, "iterations": int, "horizon": int, "block": int, "replan": int}
-_SETTINGS |= {"trust": float, "budget_ms": float}
+_SETTINGS = {
+    field.name: type(field.default) if isinstance(field.default, str | int) else float for field in fields(SearchConfig)
+}
 
 
 class Slipping:
@@ -143,18 +144,12 @@ def _planner(name: str, text: str, world: World | None, cost: Cost | None) -> Pl
             raise TerrellaError(
                 f"'{name}': {key} takes {'a whole number' if _SETTINGS[key] is int else 'a number'}."
             ) from error
-    if "search" in given:
-        given["kind"] = given.pop("search")
-        if given["kind"] not in get_args(Kind):
-            raise TerrellaError(
-                f"'{name}': there is no search '{given['kind']}'; there are {', '.join(get_args(Kind))}."
-            )
-    config = {field.name: given[field.name] for field in fields(SearchConfig) if field.name in given}
+    if given.get("search", "icem") not in get_args(Kind):
+        raise TerrellaError(f"'{name}': there is no search '{given['search']}'; there are {', '.join(get_args(Kind))}.")
     said = world.spec.card.get("uncertainty")
     invents = said.get("invents") if isinstance(said, dict) and "uncertainty" in world.spec.channels else None
-    trust = given.get("trust", invents)
     price = negative_reward(world.spec) if cost is None else cost
-    return Planner(world, price, SearchConfig(**config), trust, replan=given.get("replan", 1))
+    return Planner(world, price, SearchConfig(**{"trust": invents, **given}))
 
 
 def _own(name: str, spec: Spec) -> Policy:

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..act.planning import Played
+from ..act.planning import Played, SearchConfig
 from ..core.world import make_rng
 from ..measure.statistics import Figure, mean_interval
-from .searching import Settled
 
 DOUBLINGS = 5  # points of the curve, at most
 FEWEST = 2  # plans of a round that a search can do with
@@ -20,30 +19,30 @@ FEWEST = 2  # plans of a round that a search can do with
 class Point:
     """What a planner came to with so much compute. imagined: steps imagined for a decision, the median."""
 
-    searching: Settled
+    config: SearchConfig
     imagined: float
     worth: Figure
     played: Played
 
     @property
     def words(self) -> str:
-        return compute_of(self.searching)
+        return compute_of(self.config)
 
 
-def compute_of(asked: Settled) -> str:
-    """How much a search is given, in words."""
-    return f"{asked.samples} plans a round" if asked.budget_ms is None else f"{asked.budget_ms:g} ms a decision"
+def compute_of(config: SearchConfig) -> str:
+    """The compute of a search, in words."""
+    return f"{config.samples} plans a round" if config.budget_ms is None else f"{config.budget_ms:g} ms a decision"
 
 
-def less(searching: Settled) -> list[Settled]:
+def less(config: SearchConfig) -> list[SearchConfig]:
     """The settings with the plans of a round, or the time of a decision, halved again and again; the least first."""
     shares = range(DOUBLINGS - 1, 0, -1)
-    if searching.budget_ms is not None:
-        return [replace(searching, budget_ms=searching.budget_ms / 2**halvings) for halvings in shares]
+    if config.budget_ms is not None:
+        return [replace(config, budget_ms=config.budget_ms / 2**halvings) for halvings in shares]
     return [
-        replace(searching, samples=searching.samples >> halvings)
+        replace(config, samples=config.samples >> halvings)
         for halvings in shares
-        if searching.samples >> halvings >= FEWEST
+        if config.samples >> halvings >= FEWEST
     ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -103,7 +103,7 @@ class Driving:
         if not always and not (fits and tells_apart(world, cost, state)):
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
-        planner = Planner(world, cost, config, replan=min(moves, config.horizon))
+        planner = Planner(world, cost, replace(config, replan=min(moves, config.horizon)))
         return Agent("a planner for reward", planner, self.see, futures=self._futures(planner))
 
     def _futures(self, planner: Planner) -> Callable[[Any], Futures] | None:

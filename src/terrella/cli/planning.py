@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from ..act.planning import (
     Planner,
     Played,
     Revealed,
+    SearchConfig,
     distance,
     distance_to,
     negative_reward,
@@ -44,7 +45,7 @@ from .compute_curve import Point, compute_of, gain, helped, less
 from .goals import REWARD, read_goal
 from .named import Device, Environment, device_of, load_named
 from .say import Json, Seed, result, say
-from .searching import Searching, Settled
+from .searching import SEARCH_SETTINGS, Searching
 from .walking import WALK_S, Walks, is_recording, search_of, views_of
 
 WITHIN = 0.05  # unless it is said
@@ -58,7 +59,7 @@ class _Case:
     real: World
     goal: Mapping[str, torch.Tensor]
     judge: Judge
-    searching: Settled
+    searching: Searching
     episodes: int
     steps: int
     seed: int
@@ -68,13 +69,15 @@ class _Case:
     def within(self) -> float:
         return self.walks.within_m if self.walks else self.judge.within
 
-    def cost(self, searching: Settled) -> Cost:
-        return distance_to(self.world, self.goal, searching.cost) if self.goal else negative_reward(self.world.spec)
+    def cost(self) -> Cost:
+        return (
+            distance_to(self.world, self.goal, self.searching.cost) if self.goal else negative_reward(self.world.spec)
+        )
 
-    def planner(self, searching: Settled) -> Planner:
-        spec, trust, config = self.world.spec, searching.trust, searching.config
+    def planner(self, config: SearchConfig) -> Planner:
+        spec, trust = self.world.spec, config.trust
         leaps = (
-            bool(spec.leap) and config.block % spec.leap == 0 and searching.cost == "last"
+            bool(spec.leap) and config.block % spec.leap == 0 and self.searching.cost == "last"
         )  # they say no uncertainty
         if (
             trust is None
@@ -83,21 +86,20 @@ class _Case:
             and (levels := uncertainty_levels(spec))
         ):
             trust = levels[1]
-        told = searching.proposal
-        proposal = None if told is None else proposing(told, self.world)
-        return Planner(self.world, self.cost(searching), config, trust, proposal, replan=searching.replan)
+        name = self.searching.proposal
+        proposal = None if name is None else proposing(name, self.world)
+        return Planner(self.world, self.cost(), replace(config, trust=trust), proposal)
 
-    def walker(self, searching: Settled, goal: Destination) -> Policy:
+    def walker(self, config: SearchConfig, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
-        cost = goal.cost(self.world)
-        return goal.walker(Planner(self.world, cost, searching.config, searching.trust, replan=searching.replan))
+        return goal.walker(Planner(self.world, goal.cost(self.world), config))
 
-    def planned(self, searching: Settled, what: str, keep: tuple[str, ...] = ()) -> Played:
+    def planned(self, config: SearchConfig, what: str, keep: tuple[str, ...] = ()) -> Played:
         """Episodes of the planner."""
-        if searching.agent:
-            policy = policy_of(searching.agent, self.real.spec, self.world, self.cost(searching))
+        if agent := self.searching.agent:
+            policy = policy_of(agent, self.real.spec, self.world, self.cost())
         else:
-            policy = partial(self.walker, searching) if self.walks else self.planner(searching)
+            policy = partial(self.walker, config) if self.walks else self.planner(config)
         return self._played(policy, what, _seen_by(self), keep)
 
     def floor(self) -> Played:
@@ -158,15 +160,16 @@ def plan(
         out: Folder for the page, the film and plan.json; default: plans/ and the world's name.
     """
     if searching.agent:
-        searching.refuse(f"{searching.agent} acts in place of the search")
+        searching.refuse(f"{searching.agent} acts in place of the search", "cost", "proposal", *SEARCH_SETTINGS)
     case = _opened(name, environment, searching, aim, real, episodes, steps, device, seed)
     folder = out or Path("plans") / (re.sub(r"[^\w.-]+", "-", name.strip("/:")) or "world")
     keep = tuple(dict.fromkeys((*_seen_by(case), *compared(case.world.spec, case.real.spec), *_pictured(case))))
-    mine = case.planned(case.searching, "acting" if searching.agent else "planning", keep)
+    mine = case.planned(case.searching.search, "acting" if searching.agent else "planning", keep)
     floor = case.floor()
     points = _curve(case, mine) if curve and not searching.agent else []
     about = {"world": name, "real": real or name, **asdict(aim), "within": case.within}
-    asked = {key: value for key, value in asdict(case.searching).items() if value is not None}
+    acting = asdict(case.searching)
+    asked = {key: value for key, value in (acting.pop("search") | acting).items() if value is not None}
     facts = {
         **about,
         **asked,
@@ -232,20 +235,20 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
     views = None if aim.success else views_of(aim.goal, wanted, world, acted.spec)
     if views is not None:
         searching.refuse("who walks to places plans the way by the distance", "cost", "proposal", "agent")
-        settled = searching.settled(search_of(world.spec))
+        settled = searching.filled(**search_of(world.spec))
         walks = Walks(views, apart_m, within or NEAR_M)
         if len(views) > 1 and apart_m <= walks.within_m:
             raise TerrellaError(f"--apart is more than the {walks.within_m:g} m within which a view is reached.")
         limit = steps or acted.spec.max_episode_steps or round(WALK_S / acted.spec.dt_s)
         case = _Case(world, acted, wanted, Judge(), settled, episodes, limit, seed, walks)
-        case.walker(settled, Destination(views[0]))
+        case.walker(settled.search, Destination(views[0]))
         return case
     judge = _judge(aim, wanted, acted.spec)
     limit = steps or acted.spec.max_episode_steps or STEPS
     if not wanted:
         searching.refuse("a reward is summed up to the end of the episode", "cost")
-    case = _Case(world, acted, wanted, judge, searching.settled({}), episodes, limit, seed)
-    case.planner(case.searching)  # what does not fit is said before anything is played
+    case = _Case(world, acted, wanted, judge, searching.filled(), episodes, limit, seed)
+    case.planner(case.searching.search)  # what does not fit is said before anything is played
     return case
 
 
@@ -292,13 +295,13 @@ def _middle(values: list) -> Figure:
 def _curve(case: _Case, mine: Played) -> list[Point]:
     """The same starts with less and less compute, up to what was asked; nothing where a search imagines nothing."""
     points = []
-    for searching in [*less(case.searching), case.searching]:
-        whole = searching is case.searching
-        played = mine if whole else case.planned(searching, f"planning with {compute_of(searching)}")
+    asked = case.searching.search
+    for config in [*less(asked), asked]:
+        played = mine if config is asked else case.planned(config, f"planning with {compute_of(config)}")
         figures = _figures(played, case.seed)
         if "steps imagined" in figures:
             worth = figures["success" if "success" in figures else "return"]
-            points.append(Point(searching, figures["steps imagined"].value, worth, played))
+            points.append(Point(config, figures["steps imagined"].value, worth, played))
     return points
 
 
@@ -333,7 +336,7 @@ def _lines(
     lines += [f"{point.imagined:>10,.0f} imagined steps, {point.words}: {what} {point.worth}" for point in points]
     if len(points) > 1:
         lines.append(helped(points, what, case.seed))
-    if case.searching.budget_ms is not None:
+    if case.searching.search.budget_ms is not None:
         lines.append("planned by the clock: another run may differ")
     return lines
 

@@ -86,8 +86,8 @@ def judge_of(goal: Destination) -> Judge:
     return Judge({"pose": goal.pose[None]}, goal.near_m, apart=apart)
 
 
-def search_of(world: Spec) -> dict[str, int | str]:
-    """How a walker searches, unless it is said: a few short plans."""
+def search_of(world: Spec) -> dict[str, int]:
+    """The defaults of a walker's search: a few short plans."""
     return {"samples": SAMPLES, "iterations": 1, "horizon": MOVES, "block": max(1, round(STRIDE_S / world.dt_s))}
 
 

@@ -55,12 +55,10 @@ class Thought:
 class Planner:
     """Plans in `world` from what it observes, and acts.
 
-    cost:     what futures cost (costs.py). config: how to search (searches.py).
-    trust:    the horizon ends where half of the candidates pass this value of the channel `uncertainty`; None: never.
+    cost:     what futures cost (costs.py). config: how to search, and how much of a plan to execute (searches.py).
     proposal: a policy for the same actions whose `proposals` plans, rolled out in the world, are tried as well; the channels
               that it sees are `sees`, by default its own or all that a recording of the world would hold; the goal is among
               them, as `goal.` and its channel.
-    replan:   moves of a plan that are done before the next is made.
 
     Its memory is a list with a Thought for each episode. The same seed gives the same actions, and a batch those of its episodes
     alone, but for what the world's own arithmetic rounds (and unless a budget in milliseconds is set).
@@ -72,27 +70,25 @@ class Planner:
         world: World,
         cost: Cost,
         config: SearchConfig | None = None,
-        trust: float | None = None,
         proposal: Policy | None = None,
         proposals: int = 4,
         sees: Sequence[str] | None = None,
-        replan: int = 1,
     ):
-        config, spec = config or SearchConfig(), world.spec
+        config, spec = (config or SearchConfig()).filled(), world.spec
         if not spec.forkable or (spec.max_batch is not None and spec.max_batch < config.samples):
             raise PlanningError(
                 f"{spec.name} cannot be planned in: it holds {spec.max_batch or 'no'} futures at once, and states of it "
                 f"{'can' if spec.forkable else 'cannot'} be returned to. Learn a world of it first."
             )
-        if trust is not None and "uncertainty" not in spec.channels:
+        if config.trust is not None and "uncertainty" not in spec.channels:
             raise PlanningError(
                 f"{spec.name} has no channel 'uncertainty' that could end the horizon; leave `trust` out."
             )
-        if not 1 <= replan <= config.horizon:
+        if config.replan > config.horizon:
             raise PlanningError(f"a plan of {config.horizon} moves is made anew after 1 to {config.horizon} of them.")
         spec.check_channels(cost.channels)
         self.world, self.cost, self.config, self.moves = world, cost, config, moves_of(spec)
-        self._trust, self._proposal, self._proposals, self._replan = trust, proposal, proposals, replan
+        self._proposal, self._proposals = proposal, proposals
         named = getattr(proposal, "sees", spec.recorded) if sees is None else sees
         self._sees = tuple(name for name in named if name in spec.channels)
 
@@ -163,7 +159,7 @@ class Planner:
         names = thoughts[0].goal
         goal = {name: torch.cat([thought.goal[name] for thought in thoughts]) for name in names}
         seeds = [later(thought.seed, 4 * thought.step + _SEARCH) for thought in thoughts]
-        task = Task(self.world, self.moves, self.cost, state, goal, seeds, config.horizon, config.block, self._trust)
+        task = Task(self.world, self.moves, self.cost, state, goal, seeds, config.horizon, config.block, config.trust)
         proposed = None if self._proposal is None else self._proposals_of(state, thoughts)
         found = search(task, config, Hints(_stacked(thoughts, "belief"), _stacked(thoughts, "plan"), proposed))
         ms = 1e3 * (time.perf_counter() - began) / len(thoughts)
@@ -171,7 +167,7 @@ class Planner:
 
     def _thought(self, thought: Thought, task: Task, found: Found, entry: int, ms: float) -> Thought:
         plan, known = found.plan[entry], int(task.known[entry])
-        done = min(self._replan, known)
+        done = min(self.config.replan, known)
         fresh = self.moves.first(1, self.config.horizon, self.config.spread)[0]
         considered = self.moves.actions(torch.cat([plan[None], found.considered[entry, 1:]]))
         decision = Decision(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -24,40 +24,61 @@ Kind = Literal["cem", "icem", "mppi", "gradient", "tree", "random"]
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How to search.
+    """How a planner searches for plans, and how much of a plan it executes. A count of 0 takes its default (see `filled`)."""
 
-    kind:       cem (Rubinstein 1999, as in PETS), icem (Pinneri et al. 2020: coloured noise, kept elites, ever fewer candidates),
-                mppi (Williams et al. 2017, over elites as in TD-MPC2), gradient (Adam on the actions, in worlds that can be
-                differentiated), tree (a beam over choices; states that are reached twice are kept once), random (shooting).
-    samples:    plans that are tried in a round; iterations: rounds. A tree tries samples x iterations moves at each depth.
-    horizon:    moves of a plan; block: steps for which each is held.
-    elites:     the best plans of a round, of which the next is drawn; 0: an eighth of the samples.
-    spread:     first deviation of an axis, as a share of half its range. momentum: share of a belief that stays.
-    colour:     of icem's noise. keep: share of icem's elites that are tried again. decay: of icem's samples, by round.
-    temperature: of mppi, as a share of the elites' range of costs.
-    budget_ms:  rounds go on until so much time is over, instead of `iterations`; at least one is done. The outcome then depends
-                on how fast the machine is: the same seed need not give the same plan.
-    """
-
-    kind: Kind = "icem"
-    samples: int = 64
-    iterations: int = 5
-    horizon: int = 12
-    block: int = 1
-    elites: int = 0
-    spread: float = 0.5
-    momentum: float = 0.1
-    colour: float = 2.0
-    keep: float = 0.3
-    decay: float = 1.25
-    temperature: float = 0.5
+    search: Kind = "icem"
+    """icem: CEM with coloured noise and kept elites (Pinneri et al. 2020); cem (Rubinstein 1999, as in PETS); mppi (Williams et
+    al. 2017, over elites as in TD-MPC2); gradient: Adam on the actions of a differentiable world; tree: beam search over
+    discrete actions; random: random shooting."""
+    samples: int = 0
+    """Candidate plans per round; 0: 64, or 32 to walk to a place. A tree tries samples x iterations moves at each depth."""
+    iterations: int = 0
+    """Rounds per decision; 0: 5, or 1 to walk to a place."""
+    horizon: int = 0
+    """Moves per plan; 0: 12, or 4 to walk to a place."""
+    block: int = 0
+    """Environment steps for which each move is held; 0: 1, or those of 0.115 s to walk to a place."""
+    replan: int = 0
+    """Moves that are executed before the next plan is made; 0: 1, or the whole plan if only the end of the horizon counts."""
     budget_ms: float | None = None
+    """Search for this many milliseconds per decision, at least one round, in place of `iterations`. The same seed may then give
+    another plan on a slower machine."""
+    trust: float | None = None
+    """A plan is cut where half of the candidates pass this value of the world's channel `uncertainty`; None: never."""
+    elites: int = 0
+    """The best candidates of a round, to which the next round is fitted; 0: an eighth of the samples."""
+    spread: float = 0.5
+    """Initial standard deviation of an action axis, as a share of half its range."""
+    momentum: float = 0.1
+    """Share of the sampling distribution that is kept from round to round."""
+    colour: float = 2.0
+    """Exponent of icem's coloured noise."""
+    keep: float = 0.3
+    """Share of icem's elites that are tried again in the next round."""
+    decay: float = 1.25
+    """Factor by which icem's samples shrink per round."""
+    temperature: float = 0.5
+    """Of mppi's weights, as a share of the range of the elites' costs."""
 
     def __post_init__(self):
-        if min(self.samples, self.iterations, self.horizon, self.block) < 1 or self.samples < 2 or self.elites < 0:
-            raise PlanningError("samples are 2 or more; iterations, horizon and block 1 or more.")
+        counts = (self.samples, self.iterations, self.horizon, self.block, self.replan, self.elites)
+        if min(counts) < 0 or self.samples == 1:
+            raise PlanningError("samples are 2 or more; iterations, horizon, block and replan 1 or more.")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise PlanningError(f"a budget is a time above 0 ms; got {self.budget_ms:g}.")
+
+    def filled(
+        self, samples: int = 64, iterations: int = 5, horizon: int = 12, block: int = 1, replan: int = 1
+    ) -> SearchConfig:
+        """The same with these values in place of zeros."""
+        return replace(
+            self,
+            samples=self.samples or samples,
+            iterations=self.iterations or iterations,
+            horizon=self.horizon or horizon,
+            block=self.block or block,
+            replan=self.replan or replan,
+        )
 
     @property
     def best(self) -> int:
@@ -88,7 +109,7 @@ class Found:
 
 def search(task: Task, config: SearchConfig, hints: Hints | None = None) -> Found:
     """The best plan found. PlanningError where no candidate of an episode has a finite cost, or the search does not suit."""
-    return _SEARCHES[config.kind](task, config, hints or Hints())
+    return _SEARCHES[config.search](task, config.filled(), hints or Hints())
 
 
 def _rounds(config: SearchConfig) -> Iterator[int]:
@@ -104,7 +125,7 @@ def _rounds(config: SearchConfig) -> Iterator[int]:
 
 def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
     """CEM, iCEM and MPPI. The plan is iCEM's best of all, and of the others the last mean, if that has a cost."""
-    moves, seeds, icem = task.moves, torch.tensor(task.seeds), config.kind == "icem"
+    moves, seeds, icem = task.moves, torch.tensor(task.seeds), config.search == "icem"
     prior = moves.first(task.batch, task.horizon, config.spread)
     belief = prior if hints.belief is None else moves.reopened(hints.belief, config.spread)
     first = [each for each in (_single(hints.plan), hints.proposed) if each is not None]
@@ -123,7 +144,7 @@ def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
         codes, costs = _picked(codes, order), costs.gather(1, order)
         elites = codes[:, : config.best]
         best.look(codes[:, 0], costs[:, 0], task.shortened)
-        weights = _weights(costs[:, : config.best], config.temperature if config.kind == "mppi" else None)
+        weights = _weights(costs[:, : config.best], config.temperature if config.search == "mppi" else None)
         belief = config.momentum * belief + (1 - config.momentum) * moves.fitted(elites, weights)
     if not icem:
         mean = moves.best_of(belief)
