@@ -15,7 +15,7 @@ terrella train video recordings/monsters --out runs/monsters --name doom-corrido
 terrella train objects runs/monsters/world --data recordings/fights --out runs/monsters/things
 terrella score runs/monsters/things --data recordings/monsters-test --fresh --out scores/monsters --horizons 1 8 32 \
     --clips 24 --drift 0 --long-steps 0
-python benchmarks/things.py runs/monsters/things recordings/fights-test
+python lab/things.py runs/monsters/things recordings/fights-test
 
 terrella record doom --height 96 --scenario freedoom2/MAP01,MAP02,MAP05 --frames 18000 --seed 0 --out recordings/maps
 terrella record doom --height 96 --scenario freedoom2/MAP03 --frames 3000 --seed 1 --out recordings/map03

@@ -1,6 +1,6 @@
 """How far latent actions can be trusted: what the codes of a run of `terrella train latent-actions` explain of a recording.
 
-python benchmarks/latent_actions.py RUN RECORDING [--whole]
+python lab/latent_actions.py RUN RECORDING [--whole]
 """
 
 from __future__ import annotations

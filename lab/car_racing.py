@@ -1,6 +1,6 @@
 """CarRacing as a world: records 20,000 frames of a driver who keeps to the road that it sees, with lapses.
 
-    python recipes/car_racing.py record OUT       # OUT/rec (training) and OUT/test (other tracks), 64x64, exact pictures
+    python lab/car_racing.py record OUT       # OUT/rec (training) and OUT/test (other tracks), 64x64, exact pictures
     terrella train video OUT/rec --out OUT/run --name car-racing --size 64 64
     terrella score OUT/run --data OUT/test --fresh --out OUT/scores
 

@@ -1,11 +1,11 @@
 """Breakout learned by Terrella and by DIAMOND's own code from one recording in the same processor time, and scored alike.
 
     git clone https://github.com/eloialonso/diamond CHECKOUT       # MIT; Alonso et al. 2024
-    python recipes/atari.py record breakout OUT                    # OUT/rec, OUT/test
-    python recipes/atari_beside_diamond.py ours CHECKOUT OUT 20    # minutes on one thread; goes on where it stopped
-    python recipes/atari_beside_diamond.py theirs CHECKOUT OUT M   # its Denoiser, loss, sampler; M: cpu_s / 60 of OUT/run/cpu.json
-    python recipes/atari_beside_diamond.py score CHECKOUT OUT      # OUT/beside-terrella.json, OUT/beside-diamond.json
-    python recipes/atari_beside_diamond.py pace CHECKOUT OUT       # milliseconds a frame, in turns
+    python lab/atari.py record breakout OUT                    # OUT/rec, OUT/test
+    python lab/atari_beside_diamond.py ours CHECKOUT OUT 20    # minutes on one thread; goes on where it stopped
+    python lab/atari_beside_diamond.py theirs CHECKOUT OUT M   # its Denoiser, loss, sampler; M: cpu_s / 60 of OUT/run/cpu.json
+    python lab/atari_beside_diamond.py score CHECKOUT OUT      # OUT/beside-terrella.json, OUT/beside-diamond.json
+    python lab/atari_beside_diamond.py pace CHECKOUT OUT       # milliseconds a frame, in turns
 
 DIAMOND trains as its configuration for Atari says (batches of 32, AdamW 1e-4, 4 frames of context, 3 Euler steps), on the
 recorded actions; only what it reads them from is ours. Both see the same episodes and are scored on the other recording.

@@ -2,7 +2,7 @@
 al. 2022); all else is the first one's. Students that were pulled by the truth more and less are on average better than one
 that was pulled halfway.
 
-    python recipes/average.py OUT RUN:WEIGHT RUN:WEIGHT ...
+    python lab/average.py OUT RUN:WEIGHT RUN:WEIGHT ...
 """
 
 from __future__ import annotations

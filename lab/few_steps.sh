@@ -13,7 +13,7 @@ terrella train video $data --out runs/few-teacher --name teacher --no-geometry -
 terrella train distil runs/few-teacher --data $data --out runs/few-25 --steps 1400 --batch 12
 terrella train distil runs/few-teacher --data $data --out runs/few-40 --steps 1400 --batch 12 --truth-weight 0.4
 terrella train distil runs/few-teacher --data $data --out runs/few-60 --steps 1000 --batch 12 --truth-weight 0.6
-python recipes/average.py runs/few-mean runs/few-25:0.4 runs/few-40:0.4 runs/few-60:0.2
+python lab/average.py runs/few-mean runs/few-25:0.4 runs/few-40:0.4 runs/few-60:0.2
 terrella train dreams runs/few-25 --teacher runs/few-teacher --data $data --out runs/few-dreams --steps 60
 terrella record doom --scenario my_way_home --frames 24000 --seed 1 --out $data-test
 for run in few-teacher few-25 few-mean few-dreams; do

@@ -1,6 +1,6 @@
 """There and back: off by one action and back by another, in a game and in a world that learned it. What does the world still know?
 
-    python recipes/there_and_back.py islet gym:Islet-v0 --there left --back right --steps 100
+    python lab/there_and_back.py islet gym:Islet-v0 --there left --back right --steps 100
 
 Starts count from which the way is free: on the way back the game shows the pictures of the way there, but for what moved
 meanwhile; so nothing stops one on the way. With --shown the world is shown the way there, and dreams the way back alone. PSNR in

@@ -1,6 +1,6 @@
 """Breakout and Pong as worlds: records 100,000 steps of a player who follows the ball, and trains, scores and shows them.
 
-    python recipes/atari.py record breakout OUT          # OUT/rec (training) and OUT/test (other seed), 64x64, exact pictures
+    python lab/atari.py record breakout OUT          # OUT/rec (training) and OUT/test (other seed), 64x64, exact pictures
     terrella train video OUT/rec --out OUT/run --name breakout --size 64 64
     terrella score OUT/run --data OUT/test --fresh --out OUT/scores
 

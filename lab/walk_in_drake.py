@@ -1,7 +1,7 @@
 """A policy of a walking MuJoCo robot, in Drake: the same masses, joints, servos and touching geoms; other solver, other contacts.
 
     pip install drake
-    python benchmarks/walk_in_drake.py runs/go1 runs/rough idle random --episodes 60 --steps 500
+    python lab/walk_in_drake.py runs/go1 runs/rough idle random --episodes 60 --steps 500
 
 The compiled model is rebuilt body by body, and steps by `--step-s` (at 5 ms Drake's servos lag behind what smaller steps agree
 on); starts, commands, observations and the end of an episode are those of our task.

@@ -1,6 +1,6 @@
 """What the things of a learned world do, beside what they did in a recording that it never saw: who falls, who goes how far.
 
-    python benchmarks/things.py runs/monsters/things recordings/fights-test
+    python lab/things.py runs/monsters/things recordings/fights-test
 
 Stories begin with ten recorded frames; then the world's cast goes on by itself along the recorded poses and actions, and a
 second time as if ATTACK had never been pressed. Nothing is drawn: this is about what happens, `terrella score` about looks.

@@ -2,7 +2,7 @@
 friction, and the rotors' inertia put into the links.
 
     pip install pybullet
-    python benchmarks/arm_in_bullet.py transfers/arm/seed-0/nominal transfers/arm/seed-0/randomised --episodes 300
+    python lab/arm_in_bullet.py transfers/arm/seed-0/nominal transfers/arm/seed-0/randomised --episodes 300
 
 Starts, goals, observations and success are those of our task. Prints the successes here and in MuJoCo, from the same starts.
 """
