@@ -17,7 +17,7 @@ help:
 	@echo "make test-splats  try our files of Gaussians in Spark, three.js and PlayCanvas, and theirs in ours (npm; into ~/.cache/terrella)"
 	@echo "make judge   let stable-worldmodel's own harness judge our planners, in an environment of its own (it trains for some six minutes of one core first)"
 	@echo "make judge-cube   the same for OGBench's cube-single: our recordings of its scripted arm, its own five tasks"
-	@echo "make check   format, lint, types and the directions of imports"
+	@echo "make check   format, lint, types, the directions of imports and the house rules"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
 	@echo "make clean   remove .venv and caches"
@@ -25,22 +25,22 @@ help:
 play: $(VENV)/.ready-play
 	$(BIN)/terrella play doom-maze $(ARGS)
 
-# Two at a time, file by file; those that drive a browser afterwards, for its event loop lives in the process.
+# Two at a time, file by file; all files that drive a browser are one group (tests/conftest.py).
 PYTEST = $(BIN)/python -m pytest
-RUN_TESTS = $(PYTEST) -n 2 --dist loadfile -m "not browser$(1)" $(ARGS) && { $(PYTEST) -m "browser$(1)" $(ARGS) || [ $$? -eq 5 ]; }
+RUN_TESTS = $(PYTEST) -n 2 --dist loadgroup
 
 test: $(VENV)/.ready-dev
 	@sh tests/browser_setup.sh $(BIN)/python
-	$(call RUN_TESTS, and not slow)
+	$(RUN_TESTS) -m "not slow" $(ARGS)
 
 test-all: $(VENV)/.ready-dev
 	@sh tests/browser_setup.sh $(BIN)/python
-	$(call RUN_TESTS)
+	$(RUN_TESTS) $(ARGS)
 
 NUMERIC = tests/core tests/space tests/worlds tests/learn tests/measure
 test-portable: $(VENV)/.ready-dev
 	ATEN_CPU_CAPABILITY=default DNNL_MAX_CPU_ISA=SSE41 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OMP_NUM_THREADS=1 \
-	$(PYTEST) -q -n 2 --dist loadfile -m "not browser and not slow" $(NUMERIC) $(ARGS)
+	$(RUN_TESTS) -q -m "not browser and not slow" $(NUMERIC) $(ARGS)
 
 test-lerobot: $(VENV)/.ready-dev
 	@python=$$(sh tests/lerobot_setup.sh .venv-lerobot); \
@@ -62,6 +62,7 @@ check: $(VENV)/.ready-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/python lints/house.py
 
 format: $(VENV)/.ready-dev
 	$(BIN)/ruff check --fix .

@@ -30,9 +30,9 @@ def find_browser() -> str | None:
     return os.environ.get("TERRELLA_BROWSER") or next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
-    """Headless Chromium as a playwright `Browser`; skips, loudly, where there is none."""
+    """Headless Chromium as a playwright `Browser`, closed with the file: its event loop must not outlive it."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[dev]'")
     flags = [*QUIET, "--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else list(QUIET)
     with api.sync_playwright() as playwright:
@@ -44,12 +44,16 @@ def browser():
         chromium.close()
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Browser tests come last: playwright keeps an event loop running in this thread while its browser is open."""
+    """A file is one group for xdist, files with browser tests are one group together; within a file browser tests come last."""
+    browsing = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     for item in items:
+        item.add_marker(pytest.mark.xdist_group("browser" if item.path in browsing else item.path.as_posix()))
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker("browser")
-    items.sort(key=lambda item: "browser" in getattr(item, "fixturenames", ()))
+    order = {path: number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
+    items.sort(key=lambda item: (item.path not in browsing, order[item.path], item.get_closest_marker("browser") is not None))
 
 
 def pytest_terminal_summary(terminalreporter):
