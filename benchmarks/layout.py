@@ -17,7 +17,7 @@ import torch
 
 from terrella.core import make_rng
 from terrella.space.fitting import decibels
-from terrella.space.layout import build, understood
+from terrella.space.layout import build, parse_text
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.solids import Solids
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
@@ -50,10 +50,10 @@ def main() -> None:
     parser.add_argument("--walks", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=120)
     given = parser.parse_args()
-    build(understood("a tiny room", 1).plan, 1000)  # compiles what is not compiled yet
+    build(parse_text("a tiny room", 1).layout, 1000)  # compiles what is not compiled yet
     begun, used = time.perf_counter(), time.process_time()
-    heard = understood(TEXT, 3)
-    place = build(heard.plan)
+    heard = parse_text(TEXT, 3)
+    place = build(heard.layout)
     spent = time.perf_counter() - begun, time.process_time() - used
     print(
         f"words to {len(place.gaussians):,} Gaussians: {spent[1]:.2f} s of a processor, {spent[0]:.2f} s by the clock; bar 5 s"
@@ -65,7 +65,7 @@ def main() -> None:
         "built", place.gaussians, known, starts, SplatConfig(size=(96, 128), body=BODY), objects=place.objects,
         solids=place.solids, bodies=place.bodies,
     )  # fmt: skip
-    agreement(world, heard.plan.rooms, given.walks)
+    agreement(world, heard.layout.rooms, given.walks)
     walks(world, given.walks, given.steps)
     closure(world)
 

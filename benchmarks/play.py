@@ -29,9 +29,9 @@ FLAGS += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else [
 
 SERVER = """
 import sys, terrella
-from terrella.serve import serve
+from terrella.serve import ServeConfig, serve
 options = {"fast": True} if sys.argv[2:] == ["fast"] else {}
-serve([terrella.load(sys.argv[1], **options)], port=0, on_ready=lambda address: print(address, flush=True))
+serve([terrella.load(sys.argv[1], **options)], ServeConfig(port=0), on_ready=lambda address: print(address, flush=True))
 """
 
 OURS = """

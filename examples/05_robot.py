@@ -27,7 +27,7 @@ from terrella.core.errors import ContractError, TerrellaError
 from terrella.core.policy import Random
 from terrella.data import record
 from terrella.learn.recipes.latent import LatentTraining, train_latent
-from terrella.serve import serve
+from terrella.serve import ServeConfig, serve
 from terrella.serve.agent import Agent, Agents
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import ROBOTS
@@ -327,7 +327,7 @@ def main(
         return agent_of(walker, dream, [int((picture - picture.mean(-1, keepdim=True)).flatten(0, 1).amax(0).argmax())])
 
     agents = Agents(agent, pictures=True, words=understood, at_once=True)
-    serve([walker, Believed(dream)], port=port, policy=agents, on_ready=lambda at: print(f"\nopen {at}"))
+    serve([walker, Believed(dream)], ServeConfig(port=port), policy=agents, on_ready=lambda at: print(f"\nopen {at}"))
 
 
 if __name__ == "__main__":

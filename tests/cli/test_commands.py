@@ -142,7 +142,7 @@ def test_only_a_renderer_has_no_display(capsys, monkeypatch):
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_a_recording_of_nothing_is_refused(rows, tmp_path, capsys, monkeypatch):
-    def serve(worlds, sink_factory, **_):
+    def serve(worlds, _, *, sink_factory, **__):
         world, rng, sink = worlds[0], make_rng(0), sink_factory()
         shown = world.render(world.start(1, rng), list(world.spec.channels))
         for _ in range(rows):
@@ -160,10 +160,10 @@ def test_a_recording_of_nothing_is_refused(rows, tmp_path, capsys, monkeypatch):
     ids=["own", "strangers", "beside its game"],
 )
 def test_keys_set_on_the_page_are_kept_in_the_worlds_folder_and_told_in_recordings(tmp_path, monkeypatch, more, kept):
-    def serve(worlds, host, port, token, sink, *_, keep, kept_in, **__):
+    def serve(worlds, _, *, sink_factory, keep, kept_in, **__):
         keep(replace(worlds[0].spec, keys={"KeyX": [1.0]}))
         assert (str(tmp_path / "one") in kept_in) == bool(kept_in) == kept
-        sink().close()
+        sink_factory().close()
 
     monkeypatch.setattr("terrella.serve.serve", serve)
     save_world(place(Controls(CHOICE, (0.0,), (1.0,))), tmp_path / "one")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import pytest
 import uvicorn
 
-from terrella.serve.door import make_server, open_port
+from terrella.serve.http_server import make_server, open_port
 from terrella.serve.server import Sessions, build_app
 
 from .panorama import Panorama
@@ -61,7 +61,7 @@ def served(worlds, *, host="127.0.0.1", token=None, record=True, config=None, po
         sinks.append(ListSink())
         return sinks[-1]
 
-    sessions = Sessions(worlds, 0, sink_factory if record else None, policy=policy, config=config, **kept)
+    sessions = Sessions(worlds, config, sink_factory=sink_factory if record else None, policy=policy, **kept)
     server = make_server(build_app(sessions, host, token), listener, host, token, on_ready, websockets=True)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

@@ -76,7 +76,7 @@ def test_an_agent_that_fails_is_told_in_a_sentence_and_the_person_drives(fault, 
     timeline = Timeline([Panorama()], 0, policy=Agents(make))
     timeline.driver.let(True)
     timeline.step()
-    said = timeline.driver.said
+    said = timeline.driver.notice
     assert not timeline.driver.on and said.startswith("the agent stopped: ") and said.endswith("You drive.")
     words = {"error": "RuntimeError: the paint is wet", "sentence": "finite", "nan": "finite", "shape": "shape"}
     assert words.get(fault, "no reward") in said
@@ -84,7 +84,7 @@ def test_an_agent_that_fails_is_told_in_a_sentence_and_the_person_drives(fault, 
     timeline.step(["KeyW"])
     assert timeline.shown.episode_return == 1
     timeline.driver.let(True)
-    assert timeline.driver.said == ""
+    assert timeline.driver.notice == ""
 
 
 def test_a_goal_that_is_reached_ends_the_drive():
@@ -95,7 +95,7 @@ def test_a_goal_that_is_reached_ends_the_drive():
     timeline.driver.let(True)
     for _ in range(8):
         timeline.step()
-    assert not timeline.driver.on and timeline.driver.said == "reached: 0.5 m from the goal. You drive."
+    assert not timeline.driver.on and timeline.driver.notice == "reached: 0.5 m from the goal. You drive."
     assert float(timeline._states[0]["x"][0]) == pytest.approx(0.5), "and it goes no further"
 
 
@@ -105,8 +105,8 @@ def test_a_goal_that_does_not_come_nearer_ends_the_drive(away):
     timeline.driver.let(True)
     for _ in range(30):
         timeline.step()
-    assert not timeline.driver.on and ("cannot be reached" in timeline.driver.said) == (away == 3.0)
-    assert timeline.driver.said.endswith("You drive.")
+    assert not timeline.driver.on and ("cannot be reached" in timeline.driver.notice) == (away == 3.0)
+    assert timeline.driver.notice.endswith("You drive.")
 
 
 def test_after_a_rewind_the_agent_remembers_nothing():
@@ -311,7 +311,7 @@ def test_an_instruction_is_driven_at_once_and_forgotten_when_it_is_done():
     assert driver.on and driver.mark["words"] == "go north"
     far[0] = 0.1
     timeline.step()
-    assert not driver.on and driver.mark == NO_GOAL and "reached" in driver.said
+    assert not driver.on and driver.mark == NO_GOAL and "reached" in driver.notice
 
 
 def test_an_instruction_is_typed_on_the_page(serve_world, open_page):  # noqa: F811

@@ -71,7 +71,7 @@ def test_a_walker_goes_to_a_place_and_shows_what_it_considers():
     found = next(found for found in (timeline.consider() for _ in range(200)) if found)
     assert found["frames"] == 6 and found["plans"][0]["cost"] is not None
     driven(timeline, 60)
-    assert timeline.driver.said.startswith("reached: 0."), timeline.driver.said
+    assert timeline.driver.notice.startswith("reached: 0."), timeline.driver.notice
     assert float(timeline._states[0]["x"][0]) == pytest.approx(1.2, abs=0.55)
 
 
@@ -129,7 +129,7 @@ def test_an_agent_is_named_as_policies_are(name):
     timeline = Timeline([Panorama()], 0, policy=Driving(Panorama(), name=name).agents())
     timeline.driver.let(True)
     driven(timeline, 3)
-    assert timeline.driver.on and timeline.driver.name == name and timeline.driver.said == ""
+    assert timeline.driver.on and timeline.driver.name == name and timeline.driver.notice == ""
     assert bool(timeline.driver.described()["considers"]) == name.startswith("plan:") * ("@" not in name)
 
 

@@ -14,8 +14,8 @@ import torch
 from terrella.cli import main
 from terrella.cli.space import compared_with, place_of
 from terrella.library import load
-from terrella.serve.door import make_server, open_port
-from terrella.serve.place import PAGE, PlacePage, build_place, bundled
+from terrella.serve.http_server import make_server, open_port
+from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundled
 from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
 from terrella.space.occupancy import Occupancy, Walker
@@ -221,8 +221,8 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
 
 
 def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser, monkeypatch):
-    monkeypatch.setattr("terrella.serve.place.WHOLE", 2000)
-    monkeypatch.setattr("terrella.serve.place.FIRST", 500)
+    monkeypatch.setattr("terrella.serve.place_page.WHOLE", 2000)
+    monkeypatch.setattr("terrella.serve.place_page.FIRST", 500)
     save_splat(world(4000), tmp_path / "w")
     content = PlacePage(place_of(str(tmp_path / "w"))).html(EDITS[:1])
     early, _, late = content.partition(b'<script type="text/plain" id="rest">')
@@ -353,7 +353,7 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
     save_splat(world(1500), tmp_path / "w")
     folder = tmp_path / "w"
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
-    url = serving(build_place(place_of(str(folder)), lambda: read_edits(folder), save))
+    url = serving(build_place(EditablePlace(place_of(str(folder)), lambda: read_edits(folder), save)))
     page = opened(url)
     page.evaluate("terrella.editor.choose({ object: 1 })")
     assert page.evaluate("document.getElementById('count').textContent") == "40 selected: chair"
@@ -381,7 +381,7 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
         assert len(read_edits(folder)) == left
     foreign = post.replace('{"do": 1}', '{"do": "merge", "place": "/", "sha256": "0", "by": [0, 0, 0], "degrees": 0}')
     status, said = page.evaluate(foreign, page.evaluate("terrella.story.saved"))
-    assert status == 422 and "opened beside, nothing else" in said
+    assert status == 422 and "only the place that it was opened beside" in said
 
 
 def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, serving):
@@ -390,7 +390,7 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     folder, merge = tmp_path / "w", merging(tmp_path / "w", tmp_path / "other")
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
     beside = compared_with(str(tmp_path / "other"))
-    url = serving(build_place(place_of(str(folder)), lambda: read_edits(folder), save, beside=beside, merge=merge))
+    url = serving(build_place(EditablePlace(place_of(str(folder)), lambda: read_edits(folder), save, beside, merge)))
     page = opened(url)
     page.keyboard.press("KeyE")
     for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
@@ -407,7 +407,7 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     assert isinstance(after, SplatWorld) and np.allclose(rows(there["means"]), rows(after.gaussians.means), atol=1e-5)
     page.reload()
     until(page, "!!window.terrella && terrella.story.scene.length === 2100")
-    alone = opened(serving(build_place(place_of(str(folder)), list, save)))
+    alone = opened(serving(build_place(EditablePlace(place_of(str(folder)), list, save))))
     assert not alone.is_visible("#merging")
 
 

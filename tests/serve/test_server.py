@@ -18,9 +18,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from terrella.core.errors import ServeError
-from terrella.serve import door, serve
-from terrella.serve.door import open_port
+from terrella.serve import http_server, serve
 from terrella.serve.guard import RateLimit, is_loopback, refusal
+from terrella.serve.http_server import open_port
 from terrella.serve.server import ServeConfig
 
 from .panorama import Panorama, SlowDream
@@ -190,9 +190,9 @@ def test_the_rules_of_refusal():
 def test_an_address_that_others_reach_gets_a_token(token, serve_world, monkeypatch):
     seen = []
     monkeypatch.setattr("uvicorn.Server.run", lambda server, sockets: seen.append(server.config.app))
-    monkeypatch.setattr("terrella.serve.door.is_loopback", lambda host: False)
-    monkeypatch.setattr("terrella.serve.door.page_address", lambda host, port, token: seen.append(token))
-    serve([Panorama()], port=0, token=token)
+    monkeypatch.setattr("terrella.serve.http_server.is_loopback", lambda host: False)
+    monkeypatch.setattr("terrella.serve.http_server.page_address", lambda host, port, token: seen.append(token))
+    serve([Panorama()], ServeConfig(port=0, token=token))
     assert isinstance(seen[0], str) and len(seen[0]) > 16
 
 
@@ -219,7 +219,7 @@ def test_a_taken_port_is_one_clear_sentence():
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(ServeError, match=f"port {port} is in use"):
-            serve([Panorama()], port=port)
+            serve([Panorama()], ServeConfig(port=port))
     with pytest.raises(ServeError, match="no address"):
         open_port("no.such.host.invalid", 0)
     with pytest.raises(ServeError, match="no port"):
@@ -314,7 +314,7 @@ def closed(connection: socket.socket) -> bool:
     [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"POST /a HTTP/1.1\r\nHost: localhost\r\nContent-"],
 )
 def test_a_request_that_is_not_finished_in_time_is_closed(serve_world, monkeypatch, begun):
-    monkeypatch.setattr(door, "REQUEST_S", 0.3)
+    monkeypatch.setattr(http_server, "REQUEST_S", 0.3)
     server = serve_world()
     with raw(server) as slow:
         slow.sendall(begun)
@@ -322,7 +322,7 @@ def test_a_request_that_is_not_finished_in_time_is_closed(serve_world, monkeypat
 
 
 def test_a_second_request_has_a_deadline_too(serve_world, monkeypatch):
-    monkeypatch.setattr(door, "REQUEST_S", 0.5)
+    monkeypatch.setattr(http_server, "REQUEST_S", 0.5)
     server = serve_world()
     with raw(server) as slow:
         slow.sendall(b"GET /icon.svg HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -334,7 +334,7 @@ def test_a_second_request_has_a_deadline_too(serve_world, monkeypatch):
 
 
 def test_those_who_wait_cannot_lock_others_out(serve_world, monkeypatch, capfd):
-    monkeypatch.setattr(door, "MOST_WAITING", 8)
+    monkeypatch.setattr(http_server, "MOST_WAITING", 8)
     server = serve_world(token="sesame")
     with contextlib.ExitStack() as stack:
         idle = [stack.enter_context(raw(server)) for _ in range(60)]
@@ -349,7 +349,7 @@ def test_those_who_wait_cannot_lock_others_out(serve_world, monkeypatch, capfd):
 def test_running_out_of_descriptors_is_said_in_a_line(capfd):
     loop = asyncio.new_event_loop()
     try:
-        door.quiet_accepting(loop)
+        http_server.quiet_accepting(loop)
         for _ in range(100):
             error = OSError(errno.EMFILE, "Too many open files")
             loop.call_exception_handler({"message": "socket.accept() out of system resource", "exception": error})

@@ -187,8 +187,8 @@ def test_foreign_pages_are_refused(client, headers):
 def test_an_address_that_others_reach_gets_a_token(token, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr("uvicorn.Server.run", lambda server, sockets: None)
-    monkeypatch.setattr("terrella.serve.door.is_loopback", lambda host: False)
-    monkeypatch.setattr("terrella.serve.door.page_address", lambda host, port, token: seen.append(token))
+    monkeypatch.setattr("terrella.serve.http_server.is_loopback", lambda host: False)
+    monkeypatch.setattr("terrella.serve.http_server.page_address", lambda host, port, token: seen.append(token))
     view(browse_of(tmp_path), port=0, token=token)
     assert isinstance(seen[0], str) and len(seen[0]) > 16
 

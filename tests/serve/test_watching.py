@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from terrella.cli.space import shown_place
-from terrella.serve.watching import watched
+from terrella.serve.live_place import live_page
 
 from .test_place_page import opened, until, world  # noqa: F401
 
@@ -30,7 +30,7 @@ def making():
         address.append(one)
         ready.set()
 
-    with watched("127.0.0.1", 0, on_ready) as show:
+    with live_page("127.0.0.1", 0, on_ready) as show:
         show(lambda: shown_place(world(300)), {"step": 0, "steps": 100, "db": 12.0})
         assert ready.wait(60)
         yield address[0], show

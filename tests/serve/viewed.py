@@ -7,7 +7,7 @@ import threading
 
 import httpx
 
-from terrella.serve.door import make_server, open_port
+from terrella.serve.http_server import make_server, open_port
 from terrella.serve.viewer import build_viewer
 
 

@@ -11,7 +11,7 @@ import torch
 
 from terrella.core.errors import ContractError
 from terrella.space.kernels_numba.light import first_box
-from terrella.space.layout import build, looks, read_layout, understood, words
+from terrella.space.layout import build, looks, parse_text, read_layout, text_layout
 from terrella.space.layout.blocks import blocks_of
 from terrella.space.raster import rasterise
 
@@ -20,16 +20,16 @@ NEXT = {"name": "den", "at": [6.2, 0, 0], "size": [3, 4, 2.6], "walls": "dark re
 
 
 def test_words_become_a_plan():
-    heard = understood("a long room with two pillars and a red door, then a small blurbly kitchen with three chairs")
-    assert [room.name for room in heard.plan.rooms] == ["room", "kitchen"] and heard.unknown == ("blurbly",)
-    labels = [thing.label for thing in heard.plan.things]
-    assert labels.count("pillar") == 2 and labels.count("chair") == 3 and heard.plan.doors[0].look == "red"
-    assert heard.plan.rooms[0].size[0] > 1.5 * words.ROOMS["room"]["size"][0]
-    blocks_of(heard.plan)
+    heard = parse_text("a long room with two pillars and a red door, then a small blurbly kitchen with three chairs")
+    assert [room.name for room in heard.layout.rooms] == ["room", "kitchen"] and heard.unknown == ("blurbly",)
+    labels = [thing.label for thing in heard.layout.things]
+    assert labels.count("pillar") == 2 and labels.count("chair") == 3 and heard.layout.doors[0].look == "red"
+    assert heard.layout.rooms[0].size[0] > 1.5 * text_layout.ROOMS["room"]["size"][0]
+    blocks_of(heard.layout)
 
 
 def test_words_say_where():
-    plan = understood("a room with a window on the left and a sofa at the far wall in the room with brick walls").plan
+    plan = parse_text("a room with a window on the left and a sofa at the far wall in the room with brick walls").layout
     assert len(plan.rooms) == 1 and plan.rooms[0].walls == "brick"
     assert plan.windows[0].wall == "north" and plan.things[0].facing == "west"
 
@@ -37,35 +37,35 @@ def test_words_say_where():
 @pytest.mark.parametrize("text", ["", "xyzzy", "the very of", "!!! ???", "wooden red", "12"])
 def test_nothing_understood_is_said(text):
     with pytest.raises(ContractError, match="names a room or a thing"):
-        understood(text)
+        parse_text(text)
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_any_words_make_a_place_that_can_be_built(seed):
     rng = random.Random(seed)
     some = [
-        *words.ROOMS,
-        *sorted(words._THINGS),
-        *words.SIZES,
+        *text_layout.ROOMS,
+        *sorted(text_layout._THINGS),
+        *text_layout.SIZES,
         *looks.COLOURS,
-        *words.NUMBERS,
-        *words.SIDES,
+        *text_layout.NUMBERS,
+        *text_layout.SIDES,
         "with",
         "on",
         "the",
         "floor",
     ]
-    heard = understood("room " + " ".join(rng.choice(some) for _ in range(30)), seed)
-    blocks = blocks_of(heard.plan)
-    assert json.loads(json.dumps(heard.layout)) == heard.layout and read_layout(heard.layout) == heard.plan
+    heard = parse_text("room " + " ".join(rng.choice(some) for _ in range(30)), seed)
+    blocks = blocks_of(heard.layout)
+    assert json.loads(json.dumps(heard.document)) == heard.document and read_layout(heard.document) == heard.layout
     assert (blocks.solids[:, 3:] > blocks.solids[:, :3]).all()
 
 
 def test_the_same_seed_the_same_bytes():
     text = "a study with a desk, a chair, a lamp and three crates"
-    one, same, other = (understood(text, seed) for seed in (4, 4, 5))
-    assert one.layout == same.layout and one.layout["things"] != other.layout["things"]
-    first, again = build(one.plan, 3000), build(same.plan, 3000)
+    one, same, other = (parse_text(text, seed) for seed in (4, 4, 5))
+    assert one.document == same.document and one.document["things"] != other.document["things"]
+    first, again = build(one.layout, 3000), build(same.layout, 3000)
     assert all(torch.equal(a, b) for a, b in zip(vars(first.gaussians).values(), vars(again.gaussians).values()))
 
 
@@ -122,8 +122,8 @@ def test_rays_meet_the_side_that_they_should():
 
 
 def test_what_is_built_is_whole_and_lit():
-    heard = understood("a room with two windows, a table, and a bookshelf")
-    place = build(heard.plan, 20_000)
+    heard = parse_text("a room with two windows, a table, and a bookshelf")
+    place = build(heard.layout, 20_000)
     assert 12_000 < len(place.gaussians) < 40_000 and place.objects.max() == len(place.names) == 4
     pose = place.starts.clone()
     pose[:, 2] += 1.6
@@ -131,5 +131,5 @@ def test_what_is_built_is_whole_and_lit():
     assert seen.alpha.min() > 0.85 and seen.alpha.mean() > 0.98  # no hole anywhere around
     grey = seen.rgb.mean((0, 1))
     assert 0.3 < grey.mean() < 0.8 and grey.std() > 0.05
-    low, high = (torch.tensor(v) for v in (heard.plan.rooms[0].low, heard.plan.rooms[0].high))
+    low, high = (torch.tensor(v) for v in (heard.layout.rooms[0].low, heard.layout.rooms[0].high))
     assert ((place.gaussians.means > low - 0.2) & (place.gaussians.means < high + 0.2)).all()

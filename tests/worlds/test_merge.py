@@ -11,7 +11,7 @@ import torch
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
-from terrella.serve.frames import NAMES, FrameRenderer
+from terrella.serve.place_frames import NAMES, FrameRenderer
 from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
 from terrella.space.occupancy import Walker

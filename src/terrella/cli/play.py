@@ -57,7 +57,7 @@ def play(
     """
     from .. import library
     from ..core.errors import TerrellaError
-    from ..serve import serve
+    from ..serve import ServeConfig, serve
     from ..serve.guard import is_loopback
     from .driving import Driving
 
@@ -99,7 +99,8 @@ def play(
             say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
 
     keeping: dict[str, Any] = {"keep": keeper, "kept_in": keeper.place}
-    serve(worlds, host, port, token, sink, ready, seed, picture=picture, policy=driver, **keeping)
+    config = ServeConfig(host, port, token, seed)
+    serve(worlds, config, policy=driver, picture=picture, sink_factory=sink, on_ready=ready, **keeping)
 
 
 def _first_picture(path: Path, world: World) -> Any:

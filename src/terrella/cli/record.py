@@ -207,14 +207,15 @@ def _record(
     facts: dict[str, object] = {"dataset": str(out)}
     with _watched(recording.live_mcap, layout, world.spec.name, facts) as live:
         if recording.human:
-            from ..serve import serve
+            from ..serve import ServeConfig, serve
 
             def ready(address: str) -> None:
                 say(f"Open {address} and press the record button there; Ctrl-C here when you have played enough.")
 
             keeper = Keeper(world.spec)
             sink = lambda: Recorder(out, keeper.with_keys(layout), "play", live=live)  # noqa: E731
-            serve([world], port=recording.port, sink_factory=sink, on_ready=ready, seed=recording.seed, keep=keeper)
+            config = ServeConfig(port=recording.port, seed=recording.seed)
+            serve([world], config, sink_factory=sink, keep=keeper, on_ready=ready)
         else:
             with progress.shown("recording") as report:
                 done = explore(world, out, frames, recording.seed, report, pictures, policy, live=live)

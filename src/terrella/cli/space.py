@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from .. import progress
 from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..library import folder_of
-from ..space.edits import DEEDS, Edit, edited
+from ..space.edits import ACTIONS, Edit, edited
 from ..space.files import read_scene, replace_whole, write_scene
 from ..space.files.gltf_scene import GLTF_ENDINGS, GltfScene, read_gltf
 from ..space.files.spz import Version
@@ -38,7 +38,7 @@ from .space_build import COUNT, of_scene
 from .space_export import CELL_M, ENDINGS, FILM_S, Kind, check_options, write_other
 
 if TYPE_CHECKING:
-    from ..serve.place import PlaceScene
+    from ..serve.place_page import PlaceScene
 
 COARSE_M = 0.3  # cells that are wider let nobody through doors
 Axes = Literal["rdf", "rub", "flu"]
@@ -73,9 +73,9 @@ def fit(
 @contextlib.contextmanager
 def _watching(port: int) -> Iterator[Watch]:
     """A page on this machine that shows a fit."""
-    from ..serve.watching import watched
+    from ..serve.live_place import live_page
 
-    with watched("127.0.0.1", port, lambda address: say(f"watch it at {address}")) as show:
+    with live_page("127.0.0.1", port, lambda address: say(f"watch it at {address}")) as show:
         yield lambda make, facts: show(lambda: shown_place(make()), facts)
 
 
@@ -156,7 +156,7 @@ def export(
     }  # fmt: skip
     check_options(file, [name for name, said in given.items() if said])
     if file.suffix.lower() == ".html":
-        from ..serve.place import PlacePage
+        from ..serve.place_page import PlacePage
 
         place, edits = place_of(world), read_edits(folder_of(world))
         content = PlacePage(place).html(edits)
@@ -186,7 +186,7 @@ def view(
         beside: Another world of Gaussians, or a file of them (as `space import` reads them), that the page compares it with; a
             world can be merged there, too.
     """
-    from ..serve.place import serve_place
+    from ..serve.place_page import EditablePlace, serve_place
 
     folder, place = folder_of(world), place_of(world)
 
@@ -198,7 +198,7 @@ def view(
 
     other = None if beside is None else compared_with(beside)
     merge = None if beside is None or Path(beside).is_file() else _mergeable(folder, beside)
-    serve_place(place, lambda: read_edits(folder), save, port, host, token, ready, other, merge)
+    serve_place(EditablePlace(place, lambda: read_edits(folder), save, other, merge), port, host, token, ready)
 
 
 def _mergeable(folder: Path, other: str) -> Edit | None:
@@ -229,7 +229,7 @@ def shown_place(
 ) -> PlaceScene:
     """A world of Gaussians as a page takes it; `other` opens what an edit merges. Where nobody walks no floors and walls are read
     off the Gaussians."""
-    from ..serve.place import PlaceScene
+    from ..serve.place_page import PlaceScene
 
     config, seen = source.config, source.provenance == OBSERVED
     collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
@@ -309,7 +309,7 @@ def edit(
             new = _merging(folder, merge, move or (0.0, 0.0, 0.0), turn or 0.0)
         else:
             new = {"select": places or {"all": True}, "do": deeds[0]}
-            if name := DEEDS[deeds[0]][0]:
+            if name := ACTIONS[deeds[0]][0]:
                 new[name] = list(value) if isinstance(value := asked[deeds[0]], tuple) else value
         edited(opened.gaussians, [new], opened.objects, other_of(folder))  # refuses what cannot be done
         write_edits(folder, [*edits, new], undone[:-1] if redo else ())

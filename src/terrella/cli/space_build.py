@@ -43,7 +43,7 @@ def build(
     from ..core.errors import TerrellaError
     from ..space.files.gltf_scene import GLTF_ENDINGS, read_gltf
     from ..space.layout import build as built
-    from ..space.layout import read_layout, understood
+    from ..space.layout import parse_text, read_layout
 
     if (layout is None) == (text is None):
         raise TerrellaError('give a layout.json or a .glb, or --text "a long room with two pillars and a red door".')
@@ -54,8 +54,8 @@ def build(
     unknown: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     if text is not None:
-        heard = understood(text, seed or 0)
-        plan, unknown, left_out, said = heard.plan, heard.unknown, heard.left_out, heard.layout
+        heard = parse_text(text, seed or 0)
+        plan, unknown, left_out, said = heard.layout, heard.unknown, heard.left_out, heard.document
     else:
         plan = read_layout(layout or "")
         plan = plan if seed is None else replace(plan, seed=seed)

@@ -1,4 +1,4 @@
-"""What a person does at the page, as actions of a world: keys that are held, and axes of sticks, mouse and sliders."""
+"""The input of a page as actions of a world: keys that are held, and the axes of sticks, mouse and sliders."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gymnasium import spaces
 
 from ..core.spec import Spec, dtype_of, neutral_action
 
-MAX_AXES = 64  # that a page shows; an action's others rest
-_UNLIMITED = 1e6  # limits beyond this are none
+MAX_AXES = 64  # axes that a page shows; the others of an action stay at their neutral value
+_UNLIMITED = 1e6  # a limit beyond this counts as no limit
 
 
 def axes_of(spec: Spec) -> list[dict]:
-    """Name, unit, low, high, neutral and whole (whether it takes whole numbers only) of each axis, for the page's sliders.
+    """Name, unit, low, high, neutral and whole (whole numbers only) of each axis, for the page's sliders.
 
-    Only a Box has axes. An axis without limits goes as far as its keys do, or from -1 to 1.
+    Only a Box has axes. An axis without limits has the range of its keys, or -1 to 1.
     """
     space = spec.action
     if not isinstance(space, spaces.Box):
@@ -43,10 +43,10 @@ def axes_of(spec: Spec) -> list[dict]:
 def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) -> torch.Tensor:
     """The action [1, *spec.action.shape] of the keys held, oldest first, and of the values of the axes, in their units.
 
-    Buttons combine by element-wise maximum. A choice (Discrete), and each of several (MultiDiscrete), is the key pressed last
-    that says anything of it. An axis (Box) has the value given,
-    or that of the held key which is furthest from rest, so that a negative direction is not lost to a zero. Without any:
-    the neutral action. Keys that the world does not know count as nothing, values beyond its limits as the limit.
+    Buttons (MultiBinary) combine by element-wise maximum. A choice (Discrete, or each of a MultiDiscrete) is set by the key that
+    was pressed last and has a value for it. An axis (Box) has the value given, or that of the held key which is furthest from
+    neutral, so that a zero does not override a negative direction. Without input it is the neutral action. Unknown keys are
+    ignored, and values are clipped to the limits.
     """
     space = spec.action
     rows = [np.asarray(spec.keys[code], np.float64) for code in [*held, *_together(spec, held)] if code in spec.keys]
@@ -71,24 +71,23 @@ def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) 
 
 
 def keys_of(spec: Spec, action: torch.Tensor) -> list[str]:
-    """The keys that an action [1, *spec.action.shape] stands for, to be lit as a person's are: of buttons those that are down, of
-    choices what is chosen, of axes those that go at most twice as far. Of two keys that do the same, the first."""
+    """The keys that would give an action [1, *spec.action.shape], which the page highlights: the buttons that are down, the choices
+    made, and of an axis the keys whose value is at most twice as large. Of two keys with the same value, the first."""
     flat, rest = action[0].cpu().numpy().ravel().astype(np.float64), neutral_action(spec).ravel()
-    single = isinstance(spec.action, spaces.Box | spaces.MultiBinary)  # parts that are held each for itself
+    single = isinstance(spec.action, spaces.Box | spaces.MultiBinary)  # each part has keys of its own
     lit: dict[tuple[float, ...], str] = {}
     for code, value in spec.keys.items():
         row = np.asarray(value, np.float64)
-        says = row != (0 if single else rest)
+        sets = row != (0 if single else rest)
         meant = (flat == row) if not isinstance(spec.action, spaces.Box) else flat * np.sign(row) >= 0.5 * np.abs(row)
-        if says.any() and meant[says].all():
+        if sets.any() and meant[sets].all():
             lit.setdefault(tuple(value), code)
     return list(dict.fromkeys(part for code in lit.values() for part in code.split("+")))
 
 
 def _together(spec: Spec, held: Sequence[str]) -> list[str]:
-    """The combinations of keys ("ArrowUp+Space") that are held, those of most keys last; a key that does the same as another
-    counts as that."""
+    """The combinations of keys ("ArrowUp+Space") that are held, longest last. Keys with the same value stand in for one another."""
     same = {tuple(action): code for code, action in reversed(list(spec.keys.items()))}
     down = {*held, *(same[tuple(spec.keys[code])] for code in held if code in spec.keys)}
-    found = [code for code in spec.keys if "+" in code and down.issuperset(code.split("+"))]
-    return sorted(found, key=lambda code: code.count("+"))
+    held_together = [code for code in spec.keys if "+" in code and down.issuperset(code.split("+"))]
+    return sorted(held_together, key=lambda code: code.count("+"))

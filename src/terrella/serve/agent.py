@@ -1,4 +1,4 @@
-"""What a page is handed so that somebody else may drive: policies with a name, what they are to reach, and what they consider."""
+"""Agents that may drive in place of the person at the page: policies with a name, a goal, and the futures that they consider."""
 
 from __future__ import annotations
 
@@ -12,50 +12,44 @@ from ..core.policy import Policy
 from ..core.state import State
 from ..core.world import Observation, World
 
-# What plans would lead to: of each its cost, and pictures uint8 [T, H, W, 3], evenly spread in time. In pieces, so that a stream
-# can go on between them: None while it is not finished.
+# The predicted outcome of plans: for each its cost, and pictures uint8 [T, H, W, 3], evenly spread in time. It is computed in
+# pieces, so that the stream of frames goes on between them: None while it is not finished.
 Futures = Iterator[Sequence[tuple[float, torch.Tensor]] | None]
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy that may drive.
+    """A policy that may drive."""
 
-    name:    for people.
-    see:     what it observes of a state of the played world; None for all that a recording would hold.
-    away:    how far a state is from the goal, in `unit`; None where it has no goal. near: where it counts as reached.
-    futures: the policy's memory -> the futures that it considered last; None for a policy that considers none.
-    patience_s: of the world, within which it must have come nearer to its goal, or it gives up.
-    """
-
-    name: str
+    name: str  # for people
     policy: Policy
-    see: Callable[[State], Observation] | None = None
-    away: Callable[[State], float] | None = None
-    near: float = 0.0
+    see: Callable[[State], Observation] | None = (
+        None  # its observation of a state; default: the channels of a recording
+    )
+    away: Callable[[State], float] | None = (
+        None  # the distance of a state from the goal, in `unit`; None without a goal
+    )
+    near: float = 0.0  # the distance at which the goal counts as reached
     unit: str = ""
-    futures: Callable[[Any], Futures] | None = None
-    patience_s: float = 12.0
+    futures: Callable[[Any], Futures] | None = None  # from the policy's memory, the futures that it considered last
+    patience_s: float = 12.0  # it gives up if it has come no nearer to its goal in this time of the world
 
 
 @dataclass(frozen=True)
 class Agents:
-    """make:     the agent for a goal, channel -> [1, ...]; {} for none. TerrellaError for a goal that none can seek.
-    places:   it takes goals {"pose": x, y, and NaN for the rest}. pictures: goals that hold a picture, alone or with all
-              else that the world showed with it.
-    words:    an instruction that somebody types -> a goal; TerrellaError for words that say nothing that can be sought.
-    at_once:  it drives from the beginning, and again as soon as a person lets go of the controls; others must be let.
-    """
+    """Makes the agents of a page, and says which goals they take."""
 
-    make: Callable[[Observation], Agent]
-    places: bool = False
-    pictures: bool = False
-    words: Callable[[str], Observation] | None = None
-    at_once: bool = False
+    make: Callable[
+        [Observation], Agent
+    ]  # for a goal, channel -> [1, ...], {} for none; TerrellaError if none can seek it
+    places: bool = False  # whether goals may be places: {"pose": x, y, and NaN for the rest}
+    pictures: bool = False  # whether goals may be pictures, alone or with the other channels of their moment
+    words: Callable[[str], Observation] | None = None  # from an instruction to a goal, or TerrellaError
+    at_once: bool = False  # drives from the beginning, and whenever the person lets go; else the person must turn it on
 
 
 def agents_of(policy: Policy | Agents | None) -> Agents | None:
-    """A lone policy drives from the beginning, whenever nobody touches the controls."""
+    """Agents of a lone policy, which drives from the beginning, whenever nobody touches the controls."""
     if policy is None or isinstance(policy, Agents):
         return policy
     return Agents(lambda goal: Agent(type(policy).__name__.lower(), policy), at_once=True)

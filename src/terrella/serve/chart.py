@@ -1,8 +1,8 @@
-"""What a world remembers, for the page: its map, and its pictures with what it invented tinted.
+"""A world's memory, for the page: its map, and its pictures with the invented part tinted.
 
-It knows no kind of world: one with the channels `pose` and `places` [N, 4] (x, y in metres, heading in radians, kind: 0
-empty, 1 recorded, 2 observed, 3 imagined, 4 where one can stand) has a map of places, one with `mosaic` [H', W', 4] a map
-that is a picture; one with `known` [H, W] in 0..1 can be tinted.
+Channels decide, not the kind of world. With `pose` and `places` [N, 4] (x, y in metres, heading in radians, kind: 0 empty,
+1 recorded, 2 observed, 3 imagined, 4 walkable) it has a map of places; with `mosaic` [H', W', 4] its map is a picture; with
+`known` [H, W] in 0..1 its pictures can be tinted.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from ..core.state import State
 from ..core.world import World
 from ..space.camera import yaw
 
-AMBER = (1.25, 0.95, 0.5)  # of what is invented: its brightness in this colour
+AMBER = (1.25, 0.95, 0.5)  # the tint of invented pixels, times their brightness
 STRENGTH = 0.85
 PLACES, MOSAIC = "places", "mosaic"  # kinds of maps
 EVERY_S = {PLACES: 0.1, MOSAIC: 0.25}  # between two maps
-FINEST, QUALITY = 640, 85  # pixels across the image of a mosaic, at most; of its JPEG
+FINEST, QUALITY = 640, 85  # of the JPEG of a mosaic: most pixels across, and quality
 
 
 def mapped(spec: Spec) -> str:
-    """Which kind of map the world has; "" for none."""
+    """The kind of map that the world has; "" for none."""
     if {"pose", "places"} <= set(spec.channels):
         return PLACES
     return MOSAIC if {"rgb", "mosaic"} <= set(spec.channels) else ""
@@ -39,13 +39,13 @@ def knows_share(spec: Spec) -> bool:
 
 
 def chart(world: World, state: State) -> dict:
-    """The map of the first entry of `state`, as the page gets it (protocol.encode_event)."""
+    """The map of the first entry of `state`, in the form that protocol.encode_event documents."""
     return {PLACES: _places, MOSAIC: _mosaic}[mapped(world.spec)](world, state)
 
 
 def _places(world: World, state: State) -> dict:
-    """camera [x, y, heading], to the millimetre; known, the share of the picture that memory knew (None where the world does not
-    say); places, x, y, heading and kind of each, to the centimetre, in one flat list without the empty slots."""
+    """camera: [x, y, heading], to the millimetre. known: the share of the picture that comes from memory (None if the world has no
+    such channel). places: x, y, heading and kind of each, to the centimetre, in one flat list without empty slots."""
     wanted = ["pose", "places", *(["known"] if knows_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     held = seen["places"][seen["places"][:, 3] > 0]
@@ -57,8 +57,8 @@ def _places(world: World, state: State) -> dict:
 
 
 def _mosaic(world: World, state: State) -> dict:
-    """mosaic: as much of it around its middle as anything was seen in. size and view: how large that part and the picture in
-    its middle are; image: the part as a JPEG; mask: a PNG that is clear where nothing was seen; both in base64."""
+    """mosaic: the part around its middle that was seen. size: of that part. view: size of the picture in its middle. image: the
+    part as a JPEG. mask: a PNG that is transparent where nothing was seen. Both in base64."""
     whole = world.render(state, ("mosaic",))["mosaic"][0].cpu().numpy()
     height, width = world.spec.channels["rgb"].shape[:2]
     seen = whole[..., 3] > 0
@@ -74,14 +74,14 @@ def _mosaic(world: World, state: State) -> dict:
 
 
 def _margin(seen: np.ndarray, least: int) -> int:
-    """How much can be cut off both ends of `seen` [n] so that nothing seen is lost, and the `least` in the middle stays."""
+    """How much can be cut off both ends of `seen` [n] without losing a seen entry or one of the `least` in the middle."""
     ends = np.flatnonzero(seen)
     empty = min(int(ends[0]), len(seen) - 1 - int(ends[-1])) if len(ends) else len(seen)
     return min(empty, (len(seen) - least) // 2)
 
 
 def tinted(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """rgb uint8 [B, H, W, 3] in which what memory does not know (`known` [B, H, W] in 0..1) has turned to amber."""
+    """rgb uint8 [B, H, W, 3] with the pixels that are not `known` ([B, H, W] in 0..1) tinted in amber."""
     picture = rgb.float()
     brightness = picture @ torch.tensor([0.299, 0.587, 0.114], device=rgb.device)
     amber = brightness[..., None] * torch.tensor(AMBER, device=rgb.device) + 8

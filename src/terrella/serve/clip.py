@@ -1,4 +1,4 @@
-"""The recent past as an MP4 to keep or show: JPEGs decoded, set side by side, enlarged crisply."""
+"""The recent past as an MP4: the JPEGs of a moment side by side, enlarged by whole factors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MIN_HEIGHT = 480
 
 
 def make_clip(pictures: Sequence[tuple[bytes, ...]], dt_s: float) -> bytes:
-    """An H.264 MP4 of `pictures` (JPEGs per moment, of each world and camera), one frame each `dt_s` seconds."""
+    """An H.264 MP4 of `pictures` (JPEGs per moment, for each world and camera), one frame per `dt_s` seconds."""
     rate = Fraction(1 / dt_s).limit_denominator(1000)
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as file:

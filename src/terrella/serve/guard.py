@@ -1,4 +1,4 @@
-"""Who may speak to the server: host and origin checks, the token, rates, and the headers of every page."""
+"""Access to the server: host and origin checks, the token, rate limits, and the headers of every page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEADERS = {
 
 
 def is_loopback(host: str) -> bool:
-    """Whether `host` (a name or an address, without port) is this machine speaking to itself."""
+    """Whether `host` (a name or an address, without port) is this machine's own."""
     if host == "localhost":
         return True
     try:
@@ -35,20 +35,20 @@ def is_loopback(host: str) -> bool:
 
 
 def refusal(headers: dict[str, str], host: str, token: str | None, given: str | None) -> str:
-    """Why a request is refused, in one sentence; empty where it may pass.
+    """Why a request is refused, in one sentence; empty if it may pass.
 
-    A server on this machine only answers to this machine's names (a page elsewhere cannot reach it by pointing a name
-    of its own here), a browser must come from our own page (`Origin` is our `Host`), and the token must be right.
+    A server on this machine answers only to this machine's names (another site cannot reach it by DNS rebinding), a browser
+    must come from our own page (`Origin` equals `Host`), and the token must be right.
     """
-    asked, origin = headers.get("host", ""), headers.get("origin")
+    own, origin = headers.get("host", ""), headers.get("origin")
     try:
-        name = urlsplit(f"//{asked}").hostname or ""
+        name = urlsplit(f"//{own}").hostname or ""
         page = None if origin is None else urlsplit(origin)
     except ValueError:  # such as "["
         return "the Host or Origin header is no address; open the address that the server printed."
     if is_loopback(host) and not is_loopback(name):
         return "this server answers to localhost only; open the address that it printed."
-    if page is not None and (page.scheme not in ("http", "https") or page.netloc != asked):
+    if page is not None and (page.scheme not in ("http", "https") or page.netloc != own):
         return "another site's page may not use this server; open the address that it printed."
     if token and not hmac.compare_digest(token.encode(), (given or "").encode()):
         return "the token is missing or wrong; open the whole address that the server printed, with ?token=."
@@ -73,8 +73,8 @@ class RateLimit:
 
 
 class Guard:
-    """ASGI middleware: refuses whom `refusal` refuses, and puts `HEADERS` on every answer. The files that make up a page need
-    no token: there is nothing secret in them. `policy` takes the place of the Content-Security-Policy."""
+    """ASGI middleware: applies `refusal`, and puts `HEADERS` on every answer. The files of a page need no token: they hold nothing
+    secret. `policy` replaces the Content-Security-Policy."""
 
     def __init__(self, app: ASGIApp, host: str, token: str | None, files: Collection[str], policy: str | None = None):
         self._app, self._host, self._token, self._files = app, host, token, files
@@ -101,8 +101,8 @@ class Guard:
 
 
 async def _gone(receive: Receive) -> None:
-    """Waits until a refused WebSocket's connection is closed, as uvicorn's second message says (the first says that it will
-    be): it reports a handshake that ends sooner as an error of ours."""
+    """Waits until a refused WebSocket's connection is closed, which is uvicorn's second disconnect message. If the handler returned
+    earlier, uvicorn would report an error."""
     left = 2
     with contextlib.suppress(asyncio.TimeoutError):
         async with asyncio.timeout(10):

@@ -1,4 +1,4 @@
-"""The recent past of a session: pictures to show and states to go back to, within fixed budgets."""
+"""The recent past of a session, within fixed budgets: pictures to show, and states to go back to."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from ..core.state import State
 
 
 class Image(NamedTuple):
-    """A picture as the page gets it: of which world and through which of its cameras (by their places), and its JPEG."""
+    """A picture as the page gets it."""
 
-    world: int
-    camera: int
+    world: int  # its number on the page
+    camera: int  # its number among the cameras of that world
     jpeg: bytes
 
 
 @dataclass(frozen=True)
 class Moment:
-    """One step: its pictures and, where the worlds can fork, all that is needed to go on from it."""
+    """One step: its pictures and, if the worlds can fork, the states to go on from it."""
 
     step: int
     images: tuple[Image, ...]
     flags: int = 0
     episode_return: float = 0.0
     states: tuple[State, ...] | None = None
-    rngs: tuple[torch.Tensor, ...] | None = None  # the generators' states after this step
-    uncertainty: float = -1.0  # the error to expect of the last image, -1 where its world does not say
-    vitals: tuple[float, ...] = ()  # of the first world's player
+    rngs: tuple[torch.Tensor, ...] | None = None  # states of the random generators after this step
+    uncertainty: float = -1.0  # expected error of the last image; -1 if its world has no such channel
+    vitals: tuple[float, ...] = ()  # of the player of the first world
 
 
 class History:
-    """Moments in order. At most `frames` pictures; states only for the newest moments that fit in `state_bytes`.
+    """Moments in order: at most `frames` of them, and states of the newest that fit in `state_bytes`.
 
-    What a state keeps alive is counted: the storages of its tensors, and the rows of an arena that it points at (keyframes).
-    What several states share is counted once.
+    Counted are the storages of a state's tensors and the arena rows (keyframes) that it points at. Storage that several
+    states share is counted once.
     """
 
     def __init__(self, frames: int, state_bytes: int):
@@ -59,7 +59,7 @@ class History:
 
     @property
     def oldest_step(self) -> int:
-        """The oldest step that can be returned to; the newest one where no states are kept."""
+        """The oldest step that can be returned to; the newest step if no states are kept."""
         return self._stateful[0].step if self._stateful else self.newest.step
 
     def pictures(self) -> list[tuple[Image, ...]]:
@@ -117,7 +117,7 @@ class History:
 
 
 def _held(states: Sequence[State]) -> dict[Hashable, int]:
-    """The bytes of every storage, by its address, and of every row of an arena that states keep alive."""
+    """The bytes of each storage (by address) and of each arena row that the states keep alive."""
     held: dict[Hashable, int] = {}
     for state in states:
         for tensor in state.values():
@@ -125,5 +125,5 @@ def _held(states: Sequence[State]) -> dict[Hashable, int]:
             held[storage.data_ptr()] = storage.nbytes()
         for name, arena in state.arenas.items():
             rows = torch.unique(state[name]).tolist()
-            held |= {(id(arena), row): arena.row_bytes for row in rows if row}  # row 0 is nothing
+            held |= {(id(arena), row): arena.row_bytes for row in rows if row}  # row 0 is empty
     return held

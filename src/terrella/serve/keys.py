@@ -13,36 +13,35 @@ from ..core.keys import all_names, renamed
 from ..core.spec import CHOICE, Spec, neutral_action
 from .actions import axes_of
 
-MAX_ACTIONS = 256  # that a page lists; further ones are listed where they have a key
-Keep = Callable[[Spec], None]  # what is done with the spec once its keys were changed; TerrellaError where that fails
+MAX_ACTIONS = 256  # actions that a page lists; more are listed only if they have a key
+Keep = Callable[[Spec], None]  # stores a spec whose keys were changed; TerrellaError if that fails
 
 
 @dataclass(frozen=True)
 class Action:
-    """One thing to have a key for. value: the flat action; of: which of `Spec.action_names` is its name, None where that is made of
-    several; sign: what is said behind the name, as of the ends of an axis."""
+    """An action that can have a key."""
 
     name: str
-    value: tuple[float, ...]
-    of: int | None = None
-    sign: str = ""
+    value: tuple[float, ...]  # the flat action
+    of: int | None = None  # the index of its name in `Spec.action_names`; None if it combines several
+    sign: str = ""  # shown behind the name, for example at the ends of an axis
 
 
 @dataclass(frozen=True)
 class Rebound:
-    """What a page asks for. keys: code -> place in the list of actions; names: place -> name."""
+    """The keys and names that a page sets."""
 
-    keys: dict[str, int] = field(default_factory=dict)
-    names: dict[int, str] = field(default_factory=dict)
+    keys: dict[str, int] = field(default_factory=dict)  # code -> index in the list of actions
+    names: dict[int, str] = field(default_factory=dict)  # index -> name
 
 
 def actions_of(spec: Spec) -> list[Action]:
-    """What may have a key: each choice, each button, each value of several choices, each end of an axis; and what has one."""
-    found = [action for action, _ in zip(_single(spec), range(MAX_ACTIONS))]
+    """The actions that can have a key: choices, buttons, values of several choices, ends of axes; and all that have one."""
+    actions = [action for action, _ in zip(_single(spec), range(MAX_ACTIONS))]
     for value in spec.keys.values():
-        if _place(found, value) is None:
-            found.append(Action(_joined(spec, value), tuple(float(number) for number in value)))
-    return found
+        if _index(actions, value) is None:
+            actions.append(Action(_joined(spec, value), tuple(float(number) for number in value)))
+    return actions
 
 
 def _single(spec: Spec) -> Iterator[Action]:
@@ -77,7 +76,7 @@ def _tidy(name: str) -> str:
 
 
 def _joined(spec: Spec, value: list[float]) -> str:
-    """The words for an action of several parts."""
+    """The name of an action of several parts."""
     rest = 0 * np.asarray(value) if isinstance(spec.action, spaces.Box) else neutral_action(spec).ravel()
     numbers = not isinstance(spec.action, spaces.MultiBinary)
     names = [_tidy(name) for name in all_names(spec)]
@@ -85,26 +84,26 @@ def _joined(spec: Spec, value: list[float]) -> str:
     return ", ".join(parts) or "rest"
 
 
-def _place(actions: list[Action], value: list[float] | np.ndarray) -> int | None:
+def _index(actions: list[Action], value: list[float] | np.ndarray) -> int | None:
     return next((at for at, action in enumerate(actions) if np.allclose(action.value, value)), None)
 
 
 class KeyBook:
-    """The keys of the world that is played. `keep` is told of each change; with `kept_in`, the words for the place where it keeps
-    them, they are the world's keys from then on; without, each page has its own, and keeps them in its browser."""
+    """The keys of the played world. `keep` is called with each change. With `kept_in`, the name of the place where it stores
+    them, they hold for every page; without, each page has its own keys and stores them in its browser."""
 
     def __init__(self, spec: Spec, keep: Keep | None = None, kept_in: str = ""):
         self.spec, self.kept_in = spec, kept_in
         self._first, self._keep = spec, keep
         self.pages: set[Callable[[], None]] = set()  # called when a page has changed the keys, to look for news
-        self._actions = actions_of(spec)  # whose places pages speak of, so that they stay
+        self._actions = actions_of(spec)  # pages name actions by their index here, so the list never changes
 
     def described(self) -> dict:
-        """For a page: the actions with their names now and at first, code -> place of the keys now and at first, the place of the
-        choice that is made without a key, and where all that is kept."""
+        """For a page: the actions with their current and first names, the current and first keys (code -> index), the index of the
+        choice that is made without a key, and where the keys are stored."""
         names = self.spec.action_names
         resting = (
-            _place(self._actions, neutral_action(self._first).ravel()) if self.spec.action_mode == CHOICE else None
+            _index(self._actions, neutral_action(self._first).ravel()) if self.spec.action_mode == CHOICE else None
         )
         return {
             "actions": [
@@ -117,38 +116,38 @@ class KeyBook:
                 }
                 for each in self._actions
             ],
-            "keys": self._places(self.spec),
-            "first_keys": self._places(self._first),
+            "keys": self._indices(self.spec),
+            "first_keys": self._indices(self._first),
             "resting": resting,
             "kept_in": self.kept_in,
         }
 
-    def changed(self, asked: Rebound) -> Spec:
-        """The first spec with these keys and names; what rests goes on resting, whatever it is called. TerrellaError where there is
-        no such action, or two would have one name."""
+    def changed(self, change: Rebound) -> Spec:
+        """The first spec with these keys and names; the idle action stays the same, whatever its name. TerrellaError for an unknown
+        action, and for two actions of one name."""
         spec = self._first
-        if any(at >= len(self._actions) for at in (*asked.keys.values(), *asked.names)):
+        if any(at >= len(self._actions) for at in (*change.keys.values(), *change.names)):
             raise TerrellaError(f"{spec.name} has {len(self._actions)} actions to give keys to; reload the page.")
-        keys = {code: list(self._actions[at].value) for code, at in asked.keys.items()}
+        keys = {code: list(self._actions[at].value) for code, at in change.keys.items()}
         names: dict[int, str] = {}
-        for at, name in asked.names.items():
+        for at, name in change.names.items():
             place = self._actions[at].of
             if place is None:
-                raise TerrellaError(f"'{self._actions[at].name}' is made of other names; it has none of its own.")
+                raise TerrellaError(f"'{self._actions[at].name}' combines other actions; it has no name of its own.")
             names[place] = name
         return renamed(replace(spec, keys=keys), names)
 
     def keep(self, spec: Spec) -> None:
-        """TerrellaError where it cannot be kept; it is in use all the same."""
+        """Uses these keys and stores them. TerrellaError if they cannot be stored; they are in use all the same."""
         self.spec = spec if self.kept_in else self.spec
         if self._keep is not None:
             self._keep(spec)
 
     def news(self, spec: Spec) -> Spec | None:
-        """The world's keys, where they are others than those of `spec`, which a page uses; None where each page has its own."""
+        """The world's spec, if its keys differ from those of the page's `spec`; None if not, or if each page has its own."""
         same = (spec.keys, spec.action_names) == (self.spec.keys, self.spec.action_names)
         return None if same or not self.kept_in else self.spec
 
-    def _places(self, spec: Spec) -> dict[str, int]:
-        found = {code: _place(self._actions, value) for code, value in spec.keys.items()}
-        return {code: at for code, at in found.items() if at is not None}
+    def _indices(self, spec: Spec) -> dict[str, int]:
+        indices = {code: _index(self._actions, value) for code, value in spec.keys.items()}
+        return {code: at for code, at in indices.items() if at is not None}

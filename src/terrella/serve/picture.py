@@ -1,4 +1,4 @@
-"""Pictures that people bring: bytes of an image file, from the disk or the page, as a frame of the world's size."""
+"""Image files from the disk or the page, as frames of the world's size."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from ..core.errors import ServeError
 from ..core.spec import Spec
 
-FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP", "TIFF", "PPM")  # that are tried: a small part of what Pillow can read
+FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP", "TIFF", "PPM")  # a small part of what Pillow can read
 MAX_FILE = 2**26  # bytes of a file
 MAX_PIXELS = 2**26
-MAX_DROPPED_PIXELS = 2**22  # of one from the page, which scales it down itself
-_GROUND = (40, 40, 44)  # behind what is transparent
+MAX_DROPPED_PIXELS = 2**22  # of a picture from the page, which scales it down itself
+_GROUND = (40, 40, 44)  # behind transparent pixels
 
 
 def read_picture(path: str | Path, size: tuple[int, int]) -> torch.Tensor:
-    """The image file at `path` as `picture_of` gives it; ServeError where there is none that can be read."""
+    """The image file at `path` as `picture_of` returns it; ServeError if it cannot be read."""
     path = Path(path)
     try:
         if not path.is_file():
@@ -37,8 +37,8 @@ def read_picture(path: str | Path, size: tuple[int, int]) -> torch.Tensor:
 def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS, name: str = "this") -> torch.Tensor:
     """An image of any size and aspect, upright as its EXIF says, cut from its middle and scaled: uint8 [H, W, 3] of `size`.
 
-    Its size is checked before a pixel is decoded, and none of Pillow's plug-ins outside FORMATS see it. ServeError where it
-    is no such image, is damaged, or has more than `most_pixels`.
+    Its size is checked before a pixel is decoded, and only Pillow's plug-ins for FORMATS read it. ServeError if it is another
+    kind of file, is damaged, or has more than `most_pixels`.
     """
     height, width = size
     try:
@@ -54,7 +54,7 @@ def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise ServeError(f"{name} has too many pixels; scale it to at most {most_pixels / 1e6:.0f} million.") from error
     except UnidentifiedImageError as error:
-        raise ServeError(f"{name} is no image that is known here: JPEG, PNG, WebP, GIF, BMP or TIFF.") from error
+        raise ServeError(f"{name} is no image of a known format: JPEG, PNG, WebP, GIF, BMP or TIFF.") from error
     except Exception as error:  # a decoder is fed a stranger's bytes, and may raise anything
         raise ServeError(
             f"{name} is an image that cannot be decoded ({type(error).__name__}); save it again."
@@ -74,17 +74,17 @@ def strip_of(pictures: torch.Tensor, height: int = 72) -> str:
 
 
 def uncertainty_levels(spec: Spec) -> tuple[float, float] | None:
-    """For a world that has the channel `uncertainty`: the value that is usual for it, and from which it invents."""
+    """For a world with the channel `uncertainty`: its usual value, and the value above which most of the picture is invented."""
     if "uncertainty" not in spec.channels:
         return None
-    said = spec.card.get("uncertainty")
-    known = said if isinstance(said, dict) else {}
-    sure, invents = (_share(known.get(name), usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
+    card = spec.card.get("uncertainty")
+    levels = card if isinstance(card, dict) else {}
+    sure, invents = (_share(levels.get(name), usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
     return sure, max(invents, 1.01 * sure)
 
 
 def _share(value: object, usual: float) -> float:
-    """What a stranger's card says, if it is a share of full brightness."""
+    """A number of an untrusted card, if it is a share of full brightness, else the usual value."""
     return float(value) if isinstance(value, int | float) and 0 < value <= 1 else usual
 
 

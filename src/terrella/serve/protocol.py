@@ -38,44 +38,39 @@ _IMAGE = struct.Struct("<BBHI")  # world, camera, 0, bytes
 
 @dataclass(frozen=True)
 class HeldControls:
-    """What is held from now on: keys in the order they were pressed, and the value of each axis in the world's units.
+    """What a person holds from now on."""
 
-    `id` grows with each message, `t` is the page's clock.
-    """
-
-    id: int
-    held: tuple[str, ...] = ()
-    axes: tuple[float, ...] = ()
-    t: float = 0.0
+    id: int  # grows with each message
+    held: tuple[str, ...] = ()  # keys, in the order they were pressed
+    axes: tuple[float, ...] = ()  # the value of each axis, in the world's units
+    t: float = 0.0  # the page's clock, s
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What the agent is to reach: the place `at` on the map, x and y in metres; `here`: the moment shown, as soon as a person lets
-    it drive; `picture`: the bytes of an image file; `words`: an instruction. Nothing of these: no goal any more."""
+    """A goal for the agent, one of these. Without any, there is no goal any more."""
 
-    at: tuple[float, float] | None = None
-    here: bool = False
-    picture: bytes = b""
-    words: str = ""
+    at: tuple[float, float] | None = None  # a place on the map, x and y in metres
+    here: bool = False  # the moment shown, once the agent may drive
+    picture: bytes = b""  # the bytes of an image file
+    words: str = ""  # an instruction
 
 
 @dataclass(frozen=True)
 class Show:
-    """What the page shows from now on: `map` asks for chart events, `invented` for tinted pictures, `futures` for what the agent
-    considers; cameras are picture channels, none for the main one."""
+    """What the page shows from now on."""
 
-    map: bool
-    invented: bool
-    cameras: tuple[str, ...] = ()
-    futures: bool = False
+    map: bool  # asks for chart events
+    invented: bool  # asks for pictures with invented pixels tinted
+    cameras: tuple[str, ...] = ()  # picture channels; () for the main one
+    futures: bool = False  # asks for the futures that the agent considers
 
 
 def encode_frame(
     moment: Moment, seq: int, oldest: int, newest: int, controls: HeldControls, made_ms: float, server_s: float
 ) -> bytes:
-    """One moment as the page gets it. seq counts messages (the page acknowledges it); oldest..newest is what can be rewound
-    to; `controls`, of which id and time are echoed, are the latest that this step obeyed; vitals are in the order of hello."""
+    """One moment as the page gets it. seq counts messages, and the page acknowledges it. oldest..newest are the steps that can be
+    rewound to. `controls` are the latest that this step used; their id and time are echoed. Vitals are in the order of hello."""
     parts = [
         _HEADER.pack(
             VERSION, moment.flags, len(moment.images), seq & U32, moment.step, oldest, newest, controls.id, made_ms,
@@ -88,8 +83,8 @@ def encode_frame(
 
 
 def parse_message(data: str | bytes) -> tuple[str, Any]:
-    """A message from a page, its kind and its value: text is JSON of a kind in `_READERS`, bytes are a picture's file, with
-    which a new episode begins; after a byte 0 they are a goal's. ProtocolError says what is wrong with it."""
+    """A message from a page: its kind and its value. Text is JSON of a kind in `_READERS`. Bytes are an image file, with which a
+    new episode begins; after a byte 0, an image file that is the goal. ProtocolError for a malformed message."""
     if isinstance(data, bytes):
         if not 0 < len(data) <= MAX_PICTURE:
             raise ProtocolError(f"a picture of {len(data)} bytes came; at most {MAX_PICTURE} are taken.")
@@ -150,15 +145,15 @@ _CODE = r"[A-Z][A-Za-z0-9]{0,31}(\+[A-Z][A-Za-z0-9]{0,31}){0,3}"  # KeyboardEven
 
 _READERS: dict[str, Callable[[dict], Any]] = {
     "pause": lambda body: None,
-    "resume": lambda body: None,  # goes on; out of the past, back to the newest moment
-    "branch": lambda body: None,  # goes on from the moment shown; what came after it is forgotten
+    "resume": lambda body: None,  # goes on; from the past, back to the newest moment
+    "branch": lambda body: None,  # goes on from the moment shown and forgets the later ones
     "sync": lambda body: None,  # the dream observes the game beside it
     "controls": _controls,
     "keys": _rebound,  # the keys and names of the actions from now on
     "ack": lambda body: _integer(body, "seq", 0, U32),  # of a frame that has arrived
     "restart": lambda body: None if body.get("seed") is None else _integer(body, "seed", 0, 2**31 - 1),
-    "rewind": lambda body: _integer(body, "steps", -U32, U32),  # back from the moment shown, and stand there
-    "seek": lambda body: _integer(body, "step", 0, U32),  # stand there, or at the nearest that is remembered
+    "rewind": lambda body: _integer(body, "steps", -U32, U32),  # back from the moment shown, paused there
+    "seek": lambda body: _integer(body, "step", 0, U32),  # to this moment or the nearest that is kept, paused there
     "record": lambda body: _switch(body, "on"),
     "drive": lambda body: _switch(body, "on"),  # whether the agent drives, until a person touches the controls
     "goal": _goal,
@@ -192,7 +187,7 @@ def _switch(body: dict, name: str) -> bool:
 
 
 def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
-    """A list of short strings, () where there is none."""
+    """A list of short strings; () if it is absent."""
     value = body.get(name, [])
     if not isinstance(value, list) or len(value) > most or not all(isinstance(k, str) and len(k) <= 64 for k in value):
         raise ProtocolError(f"'{name}' must be a list of at most {most} {what}.")
@@ -200,22 +195,20 @@ def _names(body: dict, name: str, most: int, what: str) -> tuple[str, ...]:
 
 
 def encode_event(kind: str, **body) -> str:
-    """A JSON message to the page: hello, status, error, keys: what another page has set (KeyBook.described), chart: the map
-    of a moment, or agent, acted, goal and futures.
+    """A JSON message to the page: hello, status, error, or one of these.
 
-    agent: whether it is driving, its name, said: the last thing to know of it, thinks_ms of its longer decisions, away from its
-    goal in unit (or null), and whether it considers futures. acted: its action of the last step as held keys and, of axes, as
-    numbers; nothing of either where the person acts. goal: the place `at` on the map, or image, a JPEG in base64, or words; null
-    for what it is not.
-    futures: step at which they were asked for, and plans, the chosen one first, then others down to the worst: the cost of each
-    (null where that is no number) and image, a JPEG in base64 of as many frames as `frames` says side by side, from the moment of
-    the decision to the plan's end.
-
-    chart: world (its number on the page), step, camera [x, y in metres, heading in radians], known (the share of its picture
-    that memory reconstructs, or null), and where they have changed since the last chart, places: x, y, heading and kind
-    (1 recorded, 2 observed, 3 imagined, 4 where one can stand) of each, in one flat list. Of a flat world: world, step, and
-    where it has changed, mosaic: size [width, height in pixels] of what was seen around the picture in its middle, view, the
-    size of that, and in base64 image, a JPEG, and mask, a PNG that is clear where nothing was seen.
+    keys:    keys that another page has set (KeyBook.described).
+    agent:   driving, name; said: its latest news; thinks_ms: the 90th percentile of its decisions; away: its distance from the
+             goal, in unit, or null; considers: whether it has futures to show.
+    acted:   the agent's last action, as held keys and, for axes, as numbers; both empty if the person acted.
+    goal:    at: a place on the map; image: a JPEG in base64; words. Each is null unless it is the goal.
+    futures: step at which they were requested, and plans, from the chosen one down to the worst: cost (null if not finite), and
+             image, a JPEG in base64 of `frames` frames side by side, from the decision to the plan's end.
+    chart:   world (its number on the page) and step, then camera [x, y in metres, heading in radians], known (the share of its
+             picture that comes from memory, or null) and, if they changed since the last chart, places: x, y, heading and kind
+             (1 recorded, 2 observed, 3 imagined, 4 walkable) of each, in one flat list. For a flat world instead, if it
+             changed, mosaic: size [width, height in pixels] of the part that was seen, view: size of the picture in its middle,
+             and in base64 image, a JPEG, and mask, a PNG that is transparent where nothing was seen.
     """
     return json.dumps({"type": kind, **body}, allow_nan=False)
 

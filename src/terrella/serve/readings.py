@@ -1,4 +1,4 @@
-"""How readings travel to the page of a recording: JPEG, half-float depth, points, and series as fine as a screen shows."""
+"""Encodings of sensor readings for the page of a recording: JPEG, half-float depth, points, and series at screen resolution."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 MOST_POINTS = 60_000  # of one cloud; more are thinned evenly
 MOST_COLUMNS = 64  # of one vector
 _DEPTH_ACROSS = 512
-_FARTHEST_M = 65504.0  # that a half float can say
+_FARTHEST_M = 65504.0  # the largest half float
 
 
 def picture(rgb: np.ndarray, across: int, quality: int = 88) -> bytes:
@@ -25,7 +25,7 @@ def picture(rgb: np.ndarray, across: int, quality: int = 88) -> bytes:
 def depth(depth_m: np.ndarray, span_m: tuple[float, float]) -> bytes:
     """Little-endian uint32 h, w, float32 near and far of the colours in metres, then float16 [h, w] metres.
 
-    What lies beyond 65 km is infinitely far.
+    Beyond 65 km it is inf.
     """
     step = -(-max(depth_m.shape) // _DEPTH_ACROSS) or 1
     shown = depth_m[::step, ::step]
@@ -35,7 +35,7 @@ def depth(depth_m: np.ndarray, span_m: tuple[float, float]) -> bytes:
 
 
 def depth_span(samples: list[np.ndarray]) -> tuple[float, float]:
-    """Near and far in metres between which nearly all measured depths lie; (0, 1) where nothing was hit."""
+    """Near and far, in metres, of 98% of the measured depths; (0, 1) without any."""
     seen = [sample[(sample > 0) & (sample < _FARTHEST_M)] for sample in samples]
     seen = np.concatenate(seen) if seen else np.zeros(0)
     if not seen.size:
@@ -45,7 +45,7 @@ def depth_span(samples: list[np.ndarray]) -> tuple[float, float]:
 
 
 def points(cloud: np.ndarray) -> bytes:
-    """Little-endian uint32 n, k, then float32 [n, k]: at most MOST_POINTS, without those that have no place."""
+    """Little-endian uint32 n, k, then float32 [n, k]: at most MOST_POINTS, without those that are not finite."""
     cloud = cloud[np.isfinite(cloud[:, :3]).all(axis=1)]
     cloud = cloud[:: max(1, -(-len(cloud) // MOST_POINTS))].astype("<f4")
     return struct.pack("<II", *cloud.shape) + cloud.tobytes()
@@ -62,11 +62,11 @@ EXACT, ENVELOPE = 0, 1
 def series(
     time_s: np.ndarray, values: np.ndarray, start_s: float, stop_s: float, buckets: int, pick: bool = False
 ) -> bytes:
-    """A vector between two times, with one reading more on either side: exact where that is at most two readings a
-    bucket; else the least and greatest of each bucket, or (`pick`) every so-manyth reading.
+    """A vector between two times, with one more reading on either side. It is exact if there are at most two readings per
+    bucket, else the minimum and maximum of each bucket or, with `pick`, every n-th reading.
 
     Little-endian uint32 mode, n, k, index of the first reading; float64 [n] seconds; then EXACT: float64 [n, k];
-    ENVELOPE: float64 [n, k] least, float64 [n, k] greatest, buckets without readings left out. NaN stays NaN.
+    ENVELOPE: float64 [n, k] minima, float64 [n, k] maxima, without empty buckets. NaN stays NaN.
     """
     first = max(0, int(np.searchsorted(time_s, start_s, "left")) - 1)
     last = min(len(time_s), int(np.searchsorted(time_s, stop_s, "right")) + 1)

@@ -1,4 +1,4 @@
-"""What is played, as rows of a dataset: each observation with the action, reward and end that followed it."""
+"""Play as rows of a dataset: each observation with the action, reward and end that followed it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SinkFactory = Callable[[], Sink]
 
 
 class SessionRecording:
-    """Off until `begin`. Play goes on where a recording cannot: `fault` then says why it stopped."""
+    """A recording of a session, off until `begin`. If writing fails it stops, `fault` says why, and play goes on."""
 
     def __init__(self, factory: SinkFactory | None):
         self.fault = ""
@@ -69,7 +69,7 @@ class SessionRecording:
         self._sink = None
 
     def _try(self, do: Callable[[Sink], object]) -> None:
-        """Does it, if anything is recorded; the recording stops where that cannot be done."""
+        """Calls `do` if a recording is on; stops the recording if that fails."""
         sink = self._sink
         try:
             if sink is not None:

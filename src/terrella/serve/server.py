@@ -1,4 +1,4 @@
-"""The web server: the page, its one WebSocket, clips to download, and the sessions behind them."""
+"""The server of a world's page: the page, its one WebSocket, clips to download, and the sessions behind them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from .actions import axes_of
 from .agent import Agents, agents_of
 from .chart import knows_share, mapped
 from .clip import make_clip
-from .door import application, serve_page
 from .guard import RateLimit
+from .http_server import application, serve_page
 from .keys import Keep, KeyBook
 from .picture import uncertainty_levels
 from .recording import SinkFactory
@@ -37,42 +37,43 @@ from .timeline import Timeline, check_playable, no_rewind, vitals
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """seats: sessions at once (a world that cannot fork has one); grace_s: how long a session outlives its socket;
-    idle_s: how long a silent, paused one keeps its seat; per_s and burst: messages a page may send; faults: those without a
-    meaning, before its socket is closed; history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory
-    for the states among them."""
+    """Where the page of a world is served, and what its sessions may use."""
 
-    seats: int = 4
-    grace_s: float = 120.0
-    idle_s: float = 1800.0
-    per_s: float = 240.0
-    burst: float = 480.0
-    faults: int = 20
-    history_s: float = 30.0
-    state_mb: int = 256
+    host: str = "127.0.0.1"  # the address to listen on
+    port: int = 8765  # 0 picks a free one
+    token: str | None = None  # a secret that the page's address must contain
+    seed: int = 0  # of each session's first episode
+    seats: int = 4  # sessions at once; a world that cannot fork has one
+    grace_s: float = 120.0  # how long a session outlives its socket
+    idle_s: float = 1800.0  # how long a silent, paused session keeps its seat
+    per_s: float = 240.0  # messages per second that a page may send in the long run
+    burst: float = 480.0  # messages that it may send at once
+    faults: int = 20  # malformed messages after which its socket is closed
+    history_s: float = 30.0  # seconds of pictures that are kept, for rewinding and clips
+    state_mb: int = 256  # memory for the states among them, in MiB
 
 
 class Sessions:
-    """The sessions of one server, their one worker thread and their seats; the arguments are those of `serve`."""
+    """The sessions of one server, their one worker thread and their seats. The arguments are those of `serve`."""
 
     def __init__(
         self,
         worlds: Sequence[World],
-        seed: int = 0,
+        config: ServeConfig | None = None,
+        *,
         sink_factory: SinkFactory | None = None,
         picture: torch.Tensor | None = None,
         policy: Policy | Agents | None = None,
-        config: ServeConfig | None = None,
         keep: Keep | None = None,
         kept_in: str = "",
     ):
         check_playable(worlds)
         self.worlds, self.config = tuple(worlds), config or ServeConfig()
         self._sink_factory, self._agents = sink_factory, agents_of(policy)
-        kept = self.config.history_s, self.config.state_mb
+        seed, budgets = self.config.seed, (self.config.history_s, self.config.state_mb)
         self._book = KeyBook(worlds[0].spec, keep, kept_in)
         self._make_timeline = lambda: Timeline(
-            self.worlds, seed, sink_factory, picture, self._agents, *kept, keys=self._book.spec
+            self.worlds, seed, sink_factory, picture, self._agents, *budgets, keys=self._book.spec
         )
         self._seats = self.config.seats if all(world.spec.forkable for world in worlds) else 1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="world")
@@ -83,7 +84,7 @@ class Sessions:
         return self._open[name][0] if name in self._open else None
 
     def open(self) -> Session:
-        """A new session; ServeError where every seat is taken by somebody present."""
+        """A new session; ServeError if every seat is taken by a page that is open."""
         if len(self._open) >= self._seats:
             absent = [session for session, _ in self._open.values() if not session.connected]
             if not absent:
@@ -96,7 +97,7 @@ class Sessions:
         return session
 
     def sweep(self) -> None:
-        """Ends the sessions whose socket has been gone, or whose player silent, for too long."""
+        """Ends the sessions without a socket for too long, and those without a message for too long."""
         now, config = time.monotonic(), self.config
         for session, task in list(self._open.values()):
             gone = session.detached_at is not None and now - session.detached_at > config.grace_s
@@ -116,7 +117,7 @@ class Sessions:
         task.add_done_callback(self._ended.discard)
 
     def hello(self, session: Session, resumed: bool) -> str:
-        """All that the page needs to know about the worlds."""
+        """The message that describes the worlds to the page."""
         labels = ("game", "dream") if len(self.worlds) == 2 else ("",)
         return protocol.encode_event(
             "hello",
@@ -245,28 +246,34 @@ async def _listen(websocket: WebSocket, session: Session, config: ServeConfig) -
 
 def serve(
     worlds: Sequence[World],
-    host: str = "127.0.0.1",
-    port: int = 8765,
-    token: str | None = None,
-    sink_factory: SinkFactory | None = None,
-    on_ready: Callable[[str], None] | None = None,
-    seed: int = 0,
     config: ServeConfig | None = None,
-    picture: torch.Tensor | None = None,
+    *,
     policy: Policy | Agents | None = None,
+    picture: torch.Tensor | None = None,
+    sink_factory: SinkFactory | None = None,
     keep: Keep | None = None,
     kept_in: str = "",
+    on_ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Serves the page until interrupted. One world is played; of two, the first is the game and the second its dream.
-    Episodes begin with the `picture`, uint8 [H, W, 3] (picture.py), where one is given. A `policy` drives while nobody
-    touches the controls; Agents (agent.py) when a person lets them. `keep` is called with the spec
-    whenever a person has changed the keys on a page; `kept_in` says, in words, where it keeps them for all pages, and is ""
-    where each page keeps its own, in its browser.
+    """Serves the page of one world, or of a game and a learned world side by side, until interrupted.
 
-    `on_ready` gets the address to open. On any address but this machine's own a token is mandatory: where none is
-    given one is made, and the address carries it. ServeError where the port is taken or a world shows no picture.
+    On any address but this machine's own a token is mandatory: one is made if the config has none. ServeError where the
+    port is taken or a world renders no pictures.
+
+    Args:
+        worlds:       The world that is played; or the game, and the learned world that is compared with it.
+        policy:       A policy acts whenever nobody touches the controls. Agents (agent.py) act when a person lets them.
+        picture:      uint8 [H, W, 3] (picture.py), the first frame of each episode.
+        sink_factory: Makes the dataset to which the page records.
+        keep:         Called with the spec whenever a person has changed the keys on a page.
+        kept_in:      Where `keep` stores them for all pages, in words; "" if each page keeps its own in the browser.
+        on_ready:     Called with the address to open, which carries the token.
     """
-    sessions = Sessions(worlds, seed, sink_factory, picture, policy, config, keep, kept_in)
+    config = config or ServeConfig()
+    sessions = Sessions(
+        worlds, config, sink_factory=sink_factory, picture=picture, policy=policy, keep=keep, kept_in=kept_in
+    )
     # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
     torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
-    serve_page(lambda token: build_app(sessions, host, token), host, port, token, on_ready, websockets=True)
+    build = lambda token: build_app(sessions, config.host, token)  # noqa: E731
+    serve_page(build, config.host, config.port, config.token, on_ready, websockets=True)

@@ -1,4 +1,4 @@
-"""A session: one person's timeline, paced by the world's clock and by what their browser has acknowledged."""
+"""A session: one person's timeline, paced by the world's clock and by the frames that their browser has acknowledged."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from .protocol import HeldControls, Show
 from .timeline import Timeline
 
 MAX_UNACKED = 2
-FUTURES_SHARE = 0.4  # of the worker's time, at most, for showing what an agent considers
-FUTURES_EVERY_S = 0.5  # between two of them
+FUTURES_SHARE = 0.4  # of the worker's time, at most, for the futures that an agent considers
+FUTURES_EVERY_S = 0.5  # at least, between two of them
 
 
 class Session:
-    """Steps its timeline only while fewer than `MAX_UNACKED` frames are on their way; the latest controls win.
+    """Steps its timeline only while fewer than `MAX_UNACKED` frames are under way. The latest controls win.
 
-    `run` is its one task. Messages other than controls and acknowledgements are obeyed in order between steps, so the
-    timeline is never touched by two verbs at once. Without a socket it stands still and waits to be attached again; what
-    it was recording is closed then, for another page may want to record.
+    `run` is its one task. Messages other than controls and acknowledgements are executed in order between steps, so that two
+    never touch the timeline at once. Without a socket it pauses and waits to be attached again; its recording is closed then,
+    because another page may want to record.
     """
 
     def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor, book: KeyBook | None = None):
@@ -49,11 +49,13 @@ class Session:
         self._wake = asyncio.Event()
         self._sent = self._acked = 0
         self._paused = self._closed = False
-        self._unseen: Moment | None = None  # a moment to show that no step made: after a rewind, restart, reconnect
+        self._unseen: Moment | None = (
+            None  # a moment to send that is not a new step: after a rewind, restart or reconnect
+        )
         self._error = ""
-        self._sent_last: dict[str, dict[str, object]] = {}  # events that tell what is so, by kind
+        self._sent_last: dict[str, dict[str, object]] = {}  # the last event of each kind that reports a state
         self._show = Show(map=False, invented=False)
-        self._charted: dict[str, Any] = {}  # what the page has on its map
+        self._charted: dict[str, Any] = {}  # the map that the page has
         self._chart_due = self._futures_due = 0.0
         self._due = 0.0
 
@@ -68,7 +70,7 @@ class Session:
         return self._socket is not None
 
     def attach(self, socket: WebSocket) -> WebSocket | None:
-        """Plays on through `socket`; gives the socket that was attached until now."""
+        """Goes on through `socket`; returns the socket that was attached until now."""
         before, self._socket = self._socket, socket
         self.detached_at, self._acked, self._sent_last = None, self._sent, {}
         self._controls = HeldControls(0)  # a new page counts its messages anew
@@ -79,7 +81,7 @@ class Session:
         return before
 
     def detach(self, socket: WebSocket) -> None:
-        """The socket is gone; the timeline waits, and its recording is closed."""
+        """Forgets a socket that is gone: the timeline pauses, and its recording is closed."""
         if self._socket is socket:
             self._commands.append(("record", False))
             self._wake.set()
@@ -88,7 +90,7 @@ class Session:
             self.detached_at = time.monotonic()
 
     def hear(self, kind: str, value: Any = None, socket: WebSocket | None = None) -> None:
-        """A message of the player; one that a replaced socket still had in its buffer counts no more."""
+        """Takes a message of the player. Messages of a socket that was replaced are ignored."""
         if socket is not None and socket is not self._socket:
             return
         self.heard_at = time.monotonic()
@@ -101,13 +103,13 @@ class Session:
                 self._wake.set()
             return
         elif kind in ("seek", "picture") and self._commands and self._commands[-1][0] == kind:
-            self._commands[-1] = kind, value  # a scrubbed timeline: only the latest place matters
+            self._commands[-1] = kind, value  # while scrubbing, only the latest matters
         elif len(self._commands) < 64:
             self._commands.append((kind, value))
         self._wake.set()
 
     async def pictures(self) -> list[tuple[bytes, ...]]:
-        """The JPEGs of the recent past; none before the world has started."""
+        """The JPEGs of the recent past; empty before the world has started."""
         return await self._work(self.timeline.pictures) if self.timeline else []
 
     def close(self) -> None:
@@ -137,7 +139,7 @@ class Session:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """A world is a stranger's code: the server outlives what it raises."""
+        """Shows an exception of the world. A world may be anybody's code, so no exception ends the server."""
         reason = str(error)
         if not isinstance(error, TerrellaError):
             traceback.print_exc(file=sys.stderr)
@@ -173,7 +175,7 @@ class Session:
             alarm.cancel()
             return
         dt_s = timeline.spec.dt_s
-        self._due = max(self._due + dt_s, now - dt_s)  # a late step is caught up, a long wait is not
+        self._due = max(self._due + dt_s, now - dt_s)  # catches up after a late step, not after a long wait
         try:
             controls, moment, made_ms = await self._work(self._step, timeline)
         except Exception as error:
@@ -181,7 +183,7 @@ class Session:
         await self._send(moment, timeline, made_ms, controls)
 
     def _step(self, timeline: Timeline) -> tuple[HeldControls, Moment, float]:
-        """In the worker: the controls are read as late as can be."""
+        """In the worker, so that the controls are read as late as possible."""
         begun, controls = time.perf_counter(), self._controls
         moment = timeline.step(controls.held, controls.axes)
         return controls, moment, (time.perf_counter() - begun) * 1e3
@@ -234,13 +236,13 @@ class Session:
         return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
 
     async def _send_keys(self, timeline: Timeline | None) -> None:
-        """The keys that another page has set."""
+        """Sends the keys that another page has set."""
         if self._book is not None and timeline is not None and (news := self._book.news(timeline.obeyed)) is not None:
             timeline.obeyed = news
             await self._event("keys", **self._book.described())
 
     async def _send_status(self, timeline: Timeline | None) -> None:
-        """What the page shows of the session, where that has changed since it was sent."""
+        """Sends the state of the session if it changed since it was last sent."""
         status: dict[str, object] = {"text": self._error}
         if timeline is not None:
             status |= {
@@ -248,22 +250,22 @@ class Session:
                 "driving": timeline.driver.on, "seed": timeline.seed, "notice": timeline.notice,
             }  # fmt: skip
         if timeline is not None or self._error:
-            await self._news("status", status)
+            await self._send_changed("status", status)
 
     async def _send_agent(self, timeline: Timeline | None) -> None:
-        """Who drives, and the agent's action of the last step as keys and axes."""
+        """Sends who drives, the goal, and the agent's last action as keys and axes."""
         if timeline is None or timeline.driver.agents is None:
             return
         driver = timeline.driver
-        await self._news("agent", driver.described())
-        await self._news("goal", driver.mark)
+        await self._send_changed("agent", driver.described())
+        await self._send_changed("goal", driver.mark)
         if not driver.on or driver.acted is None:
-            return await self._news("acted", {"held": [], "axes": []})
+            return await self._send_changed("acted", {"held": [], "axes": []})
         axes = driver.acted.double().flatten().tolist()[:MAX_AXES] if axes_of(timeline.spec) else []
-        await self._news("acted", {"held": keys_of(timeline.obeyed, driver.acted), "axes": axes})
+        await self._send_changed("acted", {"held": keys_of(timeline.obeyed, driver.acted), "axes": axes})
 
-    async def _news(self, kind: str, body: dict[str, object]) -> None:
-        """Sends what is so where it has changed since it was sent."""
+    async def _send_changed(self, kind: str, body: dict[str, object]) -> None:
+        """Sends an event if it changed since it was last sent."""
         if body != self._sent_last.get(kind):
             await self._event(kind, **body)
             self._sent_last[kind] = body
@@ -283,28 +285,28 @@ class Session:
             await self._futures(timeline)
 
     async def _futures(self, timeline: Timeline) -> None:
-        """A piece of what the agent considers, and then nothing of it for as long as keeps it to its share of the time."""
+        """Sends another piece of the futures that the agent considers, then waits until they take no more than their share."""
         began = time.perf_counter()
-        found = await self._extra(timeline.consider)
+        futures = await self._extra(timeline.consider)
         ended = time.perf_counter()
-        self._futures_due = ended + (1 / FUTURES_SHARE - 1) * (ended - began) + (FUTURES_EVERY_S if found else 0.0)
-        if found is not None:
-            await self._event("futures", **found)
+        self._futures_due = ended + (1 / FUTURES_SHARE - 1) * (ended - began) + (FUTURES_EVERY_S if futures else 0.0)
+        if futures is not None:
+            await self._event("futures", **futures)
 
     async def _chart(self, timeline: Timeline) -> None:
         self._chart_due = time.perf_counter() + EVERY_S[timeline.mapped]
-        found = await self._extra(timeline.chart)
-        if found is not None:
-            large = {name: found.pop(name) for name in ("places", "mosaic") if name in found}
-            news = {name: value for name, value in large.items() if value != self._charted.get(name)}
-            self._charted |= news
-            await self._event("chart", **found, **news)
+        chart = await self._extra(timeline.chart)
+        if chart is not None:
+            large = {name: chart.pop(name) for name in ("places", "mosaic") if name in chart}
+            changed = {name: value for name, value in large.items() if value != self._charted.get(name)}
+            self._charted |= changed
+            await self._event("chart", **chart, **changed)
 
     async def _extra(self, function: Callable, *arguments):
-        """What is shown beyond the step itself; None, and no more of it, where the world fails."""
+        """Computes what is shown besides the step; if the world fails, None, and no more of it."""
         try:
             return await self._work(function, *arguments)
-        except Exception:  # a world is a stranger's code: play goes on without
+        except Exception:  # a world may be anybody's code: play goes on without
             traceback.print_exc(file=sys.stderr)
             self._show = Show(map=False, invented=False)
             return None

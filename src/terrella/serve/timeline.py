@@ -1,4 +1,4 @@
-"""A timeline: one world, or a game with a dream beside it, stepped by a person or an agent, with its past and its recording."""
+"""A timeline: one world, or a game with a learned world beside it, with its past and its recording."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ JPEG_QUALITY = 90
 
 
 def vitals(spec: Spec) -> list[str]:
-    """The channels that are one number of the player's, such as health, which the page shows beside the score."""
+    """The channels that are single numbers, such as health, which the page shows beside the score."""
     others = ("reward", "done", "uncertainty")
     return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
 
 
 def _alike(one: Spec, other: Spec, name: str) -> bool:
-    """Whether both show the channel, in the same form."""
+    """Whether both have the channel, with the same shape."""
     return name in one.channels and name in other.channels and one.channels[name].shape == other.channels[name].shape
 
 
 def no_rewind(worlds: Sequence[World]) -> str:
-    """Why there is no way back in these worlds; empty where there is."""
+    """Why these worlds cannot go back in time; empty if they can."""
     fixed = next((world.spec.name for world in worlds if not world.spec.forkable), "")
     return f"{fixed} is a running game: it cannot go back in time." if fixed else ""
 
 
 def check_playable(worlds: Sequence[World]) -> None:
-    """ServeError where these worlds cannot be shown on one page, with the reason."""
+    """ServeError if these worlds cannot be shown on one page."""
     if len(worlds) not in (1, 2):
         raise ServeError(f"a page shows one world or two side by side; got {len(worlds)}.")
     for world in worlds:
@@ -64,11 +64,10 @@ def check_playable(worlds: Sequence[World]) -> None:
 
 
 class Timeline:
-    """Not thread-safe, and slow: the session calls it from one worker thread, a verb at a time.
+    """Not thread-safe, and slow: the session calls it from one worker thread, one method at a time.
 
-    The first world is the one that is played; a dream beside it follows. policy: who may drive in place of the person
-    (driver.py). history_s: seconds of pictures kept (for rewinding and clips); state_mb: memory for the states among them.
-    keys: the spec with other keys than the world's own.
+    The first world is played; a learned world beside it, the dream, gets the same actions. policy: may drive in place of the
+    person (driver.py). history_s, state_mb: as in ServeConfig. keys: the spec with other keys than the world's own.
     """
 
     def __init__(
@@ -84,15 +83,15 @@ class Timeline:
     ):
         check_playable(worlds)
         self.worlds, self.spec = tuple(worlds), worlds[0].spec
-        self.obeyed = self.spec if keys is None else keys  # whose keys a person presses
+        self.obeyed = self.spec if keys is None else keys  # the spec whose keys a person presses
         self.no_rewind = no_rewind(worlds)
-        self.notice = ""  # something that a person should know, in one sentence
+        self.notice = ""  # a message for the person, in one sentence
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
         self.driver = Driver(agents_of(policy), worlds[0])
         self.recording = SessionRecording(sink_factory)
         frames = int(min(max(history_s / self.spec.dt_s, 64), 4096))
         self.history = History(frames, state_mb * 2**20)
-        self.shown: Moment  # that the timeline stands at: the newest, unless it was rewound
+        self.shown: Moment  # the newest moment, or the one that was rewound to
         self._picture = picture
         self.restart(seed)
 
@@ -102,11 +101,11 @@ class Timeline:
 
     @property
     def mapped(self) -> str:
-        """Which kind of map `chart` gives; "" for none."""
+        """The kind of map that `chart` returns; "" for none."""
         return next((kind for world in reversed(self.worlds) if (kind := mapped(world.spec))), "")
 
     def pictures(self) -> list[tuple[bytes, ...]]:
-        """The JPEGs of the recent past, oldest first, up to the moment shown, while the same cameras were looked through."""
+        """The JPEGs of the recent past, oldest first, up to the moment shown, as far back as the same cameras were shown."""
         past = self.history.pictures()
         past = past[: len(past) - (self.history.newest.step - self.shown.step)]
         views = [image[:2] for image in past[-1]]
@@ -115,16 +114,16 @@ class Timeline:
 
     @torch.inference_mode()
     def chart(self) -> dict | None:
-        """The map of the moment shown, of the last world that has one, as the page gets it; None where none has."""
+        """The map at the moment shown, of the last world that has one, as the page gets it; None if none has."""
         number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
         if number is None:
             return None
-        found = chart(self.worlds[number], (self.shown.states or self._states)[number])
-        return {"world": number, "step": self.shown.step, **found}
+        state = (self.shown.states or self._states)[number]
+        return {"world": number, "step": self.shown.step, **chart(self.worlds[number], state)}
 
     @torch.inference_mode()
     def consider(self) -> dict | None:
-        """A piece of the work of showing what the agent considers; as the page gets it where that is done (protocol.py)."""
+        """Imagines another piece of the futures that the agent considers; returns them as the page gets them when complete."""
         futures = self.driver.consider()
         if not futures:
             return None
@@ -135,8 +134,8 @@ class Timeline:
 
     @torch.inference_mode()
     def images(self, moment: Moment, invented: bool = False) -> tuple[Image, ...]:
-        """The moment through the cameras that are shown now, and with what was invented tinted if asked, as far as the moment's
-        states are kept."""
+        """The moment through the cameras shown now, with invented pixels tinted if `invented`; without the moment's states,
+        its pictures as they are."""
         views = tuple((number, camera) for number in range(len(self.worlds)) for camera in self._shown_of(number))
         if moment.states is None or (not invented and views == tuple(image[:2] for image in moment.images)):
             return moment.images
@@ -150,12 +149,12 @@ class Timeline:
                 images.append(Image(number, camera, encode_jpeg(picture)))
         return tuple(images)
 
-    # -- verbs --------------------------------------------------------------------------------------------------
+    # -- commands -----------------------------------------------------------------------------------------------
 
     @torch.inference_mode()
     def restart(self, seed: int, same_picture: bool = True) -> Moment:
-        """Begins anew from `seed`, and from the picture that this episode began with, if any; the past is forgotten, once the
-        new episode has begun."""
+        """A new episode from `seed`, and from the picture that this episode began with, if any. The past is forgotten once the new
+        episode has begun."""
         picture = self._picture if same_picture else None
         rngs = tuple(make_rng(seed) for _ in (*self.worlds, "policy"))
         states = self._starts(rngs, picture)
@@ -165,7 +164,7 @@ class Timeline:
 
     @torch.inference_mode()
     def step(self, held: Sequence[str] = (), axes: Sequence[float] = ()) -> Moment:
-        """One step of every world under what is held, or under the agent; after `done`, the first moment of a new episode."""
+        """One step of every world, with the action of the person or the agent; after `done`, the first moment of a new episode."""
         if self.rewound:
             self._return_to(self.history.newest)
         if self.shown.flags & DONE:
@@ -176,7 +175,7 @@ class Timeline:
         return self._show(self.shown.step + 1, 0, action)
 
     def stand_at(self, step: int) -> Moment:
-        """Shows a remembered moment without going on from it."""
+        """Shows a moment of the past without going on from it."""
         if self.no_rewind:
             raise ServeError(self.no_rewind)
         self.shown = self.history.at(step)
@@ -184,7 +183,7 @@ class Timeline:
 
     @torch.inference_mode()
     def branch(self) -> Moment:
-        """Goes on from the moment shown: what came after it is forgotten, and the same actions lead to the same frames."""
+        """Goes on from the moment shown and forgets the later ones. The same actions lead to the same frames."""
         if self.rewound:
             self.recording.end_episode()
             self.history.forget_after(self.shown.step)
@@ -197,7 +196,7 @@ class Timeline:
 
     @torch.inference_mode()
     def enter(self, data: bytes) -> Moment:
-        """A new episode that begins with a picture, the bytes of an image file; the past stays."""
+        """A new episode that begins with a picture, the bytes of an image file. The past stays."""
         height, width = self.spec.channels["rgb"].shape[:2]
         picture = picture_of(data, (height, width), MAX_DROPPED_PIXELS, "this picture")
         states = self._starts(self._rngs, picture)
@@ -208,12 +207,12 @@ class Timeline:
 
     @torch.inference_mode()
     def seek(self, goal: Goal) -> None:
-        """Gives the agent a goal; ServeError where it takes none of its kind."""
+        """Gives the agent a goal; ServeError if it takes no such goals."""
         agents = self.driver.agents
         if goal.at is not None:
             if agents is None or not agents.places:
                 raise ServeError(
-                    "the agent here walks to no place: it takes a world that tells its pose, and can be planned in."
+                    "the agent here cannot walk to a place: that takes a world with a pose in which one can plan."
                 )
             pose = torch.tensor([[*goal.at, *[torch.nan] * 5]])
             return self.driver.seek({"pose": pose}, {"at": list(goal.at)})
@@ -224,7 +223,7 @@ class Timeline:
         if not goal.here and not goal.picture:
             return self.driver.seek({})
         if agents is None or not agents.pictures:
-            raise ServeError("the agent here seeks no picture: nobody can plan in this world.")
+            raise ServeError("the agent here cannot seek a picture: this world cannot be planned in.")
         if goal.picture:
             height, width = self.spec.channels["rgb"].shape[:2]
             seen = {"rgb": picture_of(goal.picture, (height, width), MAX_DROPPED_PIXELS, "this picture")[None]}
@@ -234,7 +233,7 @@ class Timeline:
 
     @torch.inference_mode()
     def sync(self) -> Moment:
-        """The dream observes the game as it is now."""
+        """Lets the dream observe the current state of the game."""
         if len(self.worlds) != 2:
             raise ServeError("there is no game beside this world to observe; play with --compare.")
         if self.rewound or self.shown.flags & DONE:
@@ -243,11 +242,11 @@ class Timeline:
         return self._show(self.shown.step + 1, 0, None)
 
     def look(self, cameras: Sequence[str]) -> None:
-        """Shows the pictures of these channels from now on; of a world that has none of them, its main one."""
+        """Shows the pictures of these channels from now on; for a world that has none of them, its main camera."""
         self.cameras = tuple(cameras) or ("rgb",)
 
     def record(self, on: bool) -> None:
-        """Begins or ends writing the played world (the game, where two are shown) to a dataset."""
+        """Begins or ends recording the played world (of two, the game) to a dataset."""
         if on:
             self.recording.begin()
         else:
@@ -261,7 +260,7 @@ class Timeline:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _shown_of(self, number: int) -> dict[int, str]:
-        """The cameras of a world that are shown: their place among its own, and their channels."""
+        """The cameras of a world that are shown: number -> channel."""
         known = dict(enumerate(self.worlds[number].spec.kinds("rgb")))
         return {at: name for at, name in known.items() if name in self.cameras} or {0: known[0]}
 
@@ -279,7 +278,7 @@ class Timeline:
         return self._show(step, FRESH, None)
 
     def _entered(self, picture: torch.Tensor, rng: torch.Generator) -> State:
-        """The played world after it observed `picture`; a notice says so where it is unlike what the world knows."""
+        """The state of the played world after it observed `picture`. A notice says if the picture is unlike its training data."""
         world = self.worlds[0]
         if len(self.worlds) == 2:
             raise ServeError("a comparison cannot start from a picture: the game cannot; play without --compare.")
@@ -296,7 +295,7 @@ class Timeline:
         return state
 
     def _dream_of(self, game: State, rng: torch.Generator) -> State:
-        """The dream after it observed the game."""
+        """The state of the dream after it observed the game."""
         dream = self.worlds[1]
         missing = [name for name in dream.spec.observes if name not in self.spec.channels]
         if missing or not dream.spec.observes:
@@ -340,7 +339,7 @@ class Timeline:
         return moment
 
     def _observed(self, number: int) -> Mapping[str, torch.Tensor]:
-        """What is shown of a world; of the one that is recorded, all."""
+        """The channels of a world that are shown, and those that are recorded."""
         spec = self.worlds[number].spec
         wanted = [*self._shown_of(number).values(), "uncertainty"]
         if number == 0:
@@ -358,6 +357,6 @@ class Timeline:
 
 
 def encode_jpeg(rgb: torch.Tensor) -> bytes:
-    """One JPEG of rgb uint8 [1, H, W, 3]; colours are not subsampled, for small pictures are shown large."""
+    """One JPEG of rgb uint8 [1, H, W, 3], without chroma subsampling, because small pictures are shown large."""
     picture = np.ascontiguousarray(rgb[0].cpu().numpy())
     return simplejpeg.encode_jpeg(picture, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="444")

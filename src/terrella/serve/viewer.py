@@ -1,4 +1,4 @@
-"""The page of a recording: its files, its readings as the page asks for them, marks and the export of the good ones."""
+"""The page of a recording: its readings, marks for bad episodes, and the export of the good ones."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .door import application, posted, serve_page
+from .http_server import application, posted, serve_page
 
-_LONGEST_MESSAGE = 4096  # bytes that the page may post at once
-_BUCKETS = 4096  # of one series, at most
+_LONGEST_MESSAGE = 4096  # bytes of a POST, at most
+_BUCKETS = 4096  # of a series, at most
 
 
 class Viewable(Protocol):
-    """A recording that can be looked at. Methods are called by one thread at a time; only `export` runs beside others.
+    """A recording that can be viewed. One thread calls its methods; only `export` runs beside others.
 
-    Each may raise a TerrellaError, whose sentence the page shows. Sensors are known by their names, of kind "image",
-    "depth", "points" or "vector"; episodes by their number from 0.
+    Each may raise a TerrellaError, whose sentence the page shows. A sensor has a name and a kind: "image", "depth", "points" or
+    "vector". Episodes are numbered from 0.
     """
 
     def about(self) -> dict:
         """JSON: name, robot, fps (or None), notes (sentences), can_export, and sensors, a list of: name, label, kind,
         shape, dtype, names and units (one per number of a vector or column of points), frame, rate_hz (or None), camera
-        (None, or its intrinsics, size, pose and mount as the world declares them), and pose: None, or the columns of x
-        and y, `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
+        (None, or its intrinsics, size, pose and mount as in the spec), and pose: None, or the columns of x and y,
+        `quaternion` [w, x, y, z] or None, `yaw` or None, and `degrees`."""
         ...
 
     def listing(self) -> list[dict]:
@@ -46,15 +46,15 @@ class Viewable(Protocol):
 
     def episode(self, number: int) -> dict:
         """JSON: number, seconds, task, start_ns (text or None), language ([[time_s, text], ...]), and sensors: name ->
-        count and fault (a sentence, "" where it can be shown); sensors that the episode lacks are left out."""
+        count and fault (a sentence, "" if it can be shown), without the sensors that the episode lacks."""
         ...
 
     def times(self, number: int, sensor: str) -> np.ndarray:
-        """float64 [n] ascending: when each reading was taken, in seconds since the episode began."""
+        """float64 [n] ascending: the time of each reading, in seconds since the episode began."""
         ...
 
     def reading(self, number: int, sensor: str, index: int) -> np.ndarray:
-        """image uint8 [H, W, 3]; depth [h, w] metres, inf where nothing was hit; points [n, k], x, y, z first."""
+        """image uint8 [H, W, 3]; depth [h, w] metres, inf without a hit; points [n, k], x, y, z first."""
         ...
 
     def series(self, number: int, sensor: str) -> np.ndarray:
@@ -66,18 +66,18 @@ class Viewable(Protocol):
         ...
 
     def mark(self, number: int, bad: bool) -> None:
-        """Marks an episode bad or good, for good."""
+        """Marks an episode as bad or good, and saves that."""
         ...
 
     def export(self, path: Path, keep: Sequence[int], report: Callable[[int, int], None]) -> tuple[int, list[str]]:
-        """Writes the episodes `keep` as a new recording into the folder `path`, which does not exist; calls
-        `report(done, of)` now and then, lets what that raises pass, and leaves nothing half-written behind. Returns
-        how many episodes were written, and sentences on what was left out or changed."""
+        """Writes the episodes `keep` as a new recording into the folder `path`, which does not exist. It calls
+        `report(done, of)` now and then, passes on its exceptions, and leaves no half-written files. Returns the number of
+        episodes written, and sentences about losses and changes."""
         ...
 
 
 class Exporting:
-    """One export at a time, in a thread of its own, into a folder that the server chose."""
+    """One export at a time, in its own thread, into the folder that the server chose."""
 
     def __init__(self, viewable: Viewable, path: Path | None):
         self._viewable, self.path = viewable, path
@@ -86,7 +86,7 @@ class Exporting:
         self.status: dict = {"state": "idle", "text": "", "done": 0, "of": 0}
 
     def start(self, keep: Sequence[int]) -> None:
-        """ServeError where there is nowhere to write to, nothing to write, or one is under way."""
+        """ServeError without a folder or episodes to write, or while another export is under way."""
         if self.path is None:
             raise ServeError("this page was opened for looking only; start it with a folder to export to.")
         if self._thread is not None and self._thread.is_alive():
@@ -100,7 +100,7 @@ class Exporting:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends what is under way at its next report, and waits for it."""
+        """Ends the running export at its next report, and waits for it."""
         self._stopped = True
         if self._thread is not None:
             self._thread.join()
@@ -114,7 +114,7 @@ class Exporting:
         try:
             count, notes = self._viewable.export(path, keep, self._report)
             words = f"{count} episode{'s' * (count != 1)} written to {path}"
-            words += f" from {len(keep)} that were to be kept" if count != len(keep) else ""
+            words += f" of {len(keep)} marked good" if count != len(keep) else ""
             text = "; ".join([words, *(note.rstrip(".") for note in notes)])
             self.status = {**self.status, "state": "done", "text": text, "done": len(keep), "of": len(keep)}
         except (TerrellaError, OSError) as error:
@@ -124,8 +124,8 @@ class Exporting:
             raise
 
 
-class _Desk:
-    """Answers the page: one method a route, run by the one thread that touches the recording."""
+class _Routes:
+    """Answers the page: one method per route, run by the one thread that reads the recording."""
 
     def __init__(self, viewable: Viewable, exporting: Exporting):
         self._viewable, self._exporting = viewable, exporting
@@ -175,19 +175,19 @@ class _Desk:
         return JSONResponse(self._exporting.status)
 
     def _sensor(self, request: Request) -> str:
-        place = request.path_params["sensor"]
-        if place >= len(self._names):
-            raise ServeError(f"this recording has {len(self._names)} sensors, no sensor {place}; reload the page.")
-        return self._names[place]
+        number = request.path_params["sensor"]
+        if number >= len(self._names):
+            raise ServeError(f"this recording has {len(self._names)} sensors, no sensor {number}; reload the page.")
+        return self._names[number]
 
     def _span(self, number: int, sensor: str) -> tuple[float, float]:
-        """The colours' near and far, from a few readings of the episode."""
+        """Near and far of the depth colours, from a few readings of the episode."""
         if (number, sensor) not in self._spans:
             count = len(self._viewable.times(number, sensor))
             looks = sorted({(2 * part + 1) * count // 10 for part in range(5)})
             samples = []
             for at in looks:
-                with contextlib.suppress(TerrellaError):  # a broken one is named where it is shown
+                with contextlib.suppress(TerrellaError):  # the page reports a broken reading when it shows it
                     samples.append(self._viewable.reading(number, sensor, at)[::4, ::4])
             if len(self._spans) > 256:
                 self._spans.clear()
@@ -217,7 +217,7 @@ def build_viewer(
 ) -> Starlette:
     """The ASGI application of `view`."""
     exporting = Exporting(viewable, Path(export_to) if export_to is not None else None)
-    desk = _Desk(viewable, exporting)
+    answers = _Routes(viewable, exporting)
     worker = ThreadPoolExecutor(1, thread_name_prefix="recording")
 
     @contextlib.asynccontextmanager
@@ -239,19 +239,19 @@ def build_viewer(
         return route
 
     routes = [
-        Route("/about", asks(desk.about)),
-        Route("/episode/{number:int}", asks(desk.episode)),
-        Route("/times/{number:int}/{sensor:int}", asks(desk.times)),
-        Route("/series/{number:int}/{sensor:int}", asks(desk.series)),
-        Route("/reading/{number:int}/{sensor:int}/{index:int}", asks(desk.reading)),
-        Route("/mark", asks(desk.mark, _mark_of), methods=["POST"]),
-        Route("/export", asks(desk.export), methods=["GET", "POST"]),
+        Route("/about", asks(answers.about)),
+        Route("/episode/{number:int}", asks(answers.episode)),
+        Route("/times/{number:int}/{sensor:int}", asks(answers.times)),
+        Route("/series/{number:int}/{sensor:int}", asks(answers.series)),
+        Route("/reading/{number:int}/{sensor:int}/{index:int}", asks(answers.reading)),
+        Route("/mark", asks(answers.mark, _mark_of), methods=["POST"]),
+        Route("/export", asks(answers.export), methods=["GET", "POST"]),
     ]
     return application("view/index.html", routes, lifespan, host, token)
 
 
 async def _mark_of(request: Request) -> tuple[int, bool]:
-    """The posted episode, and whether it is bad; ServeError where that is not what was posted."""
+    """The episode that was posted, and whether it is bad; ServeError for another body."""
     try:
         body = json.loads(await posted(request, _LONGEST_MESSAGE))
         number, bad = body["episode"], body["bad"]
@@ -273,8 +273,8 @@ def view(
     """Serves the page of a recording until interrupted.
 
     `on_ready` gets the address to open. `export_to` is the one folder into which the page may export; it must not exist
-    yet. On any address but this machine's own a token is mandatory: where none is given one is made, and the address
-    carries it. ServeError where the port is taken.
+    yet. On any address but this machine's own a token is mandatory: one is made if none is given, and the address carries
+    it. ServeError where the port is taken.
     """
     build = lambda token: build_viewer(viewable, host, token, export_to)  # noqa: E731
     serve_page(build, host, port, token, on_ready, websockets=False)

@@ -29,7 +29,7 @@ from .raster.gaussians import plain_sh
 from .raster.move import turned
 
 SELECTIONS = {"box": 6, "sphere": 4, "brush": 4, "plane": 4, "object": 1, "all": 0}  # and how many numbers each takes
-DEEDS = {
+ACTIONS = {
     "move": ("by", 3), "duplicate": ("by", 3), "turn": ("degrees", 1), "scale": ("factor", 1), "recolour": ("colour", 3),
     "delete": ("", 0),
 }  # fmt: skip
@@ -153,22 +153,22 @@ def selected(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.T
 
 
 def _done(some: Gaussians, edit: Edit) -> Gaussians:
-    deed = edit.get("do")
-    if not isinstance(deed, str) or deed not in DEEDS:
-        raise ContractError(f"an edit does one of {', '.join(DEEDS)}; got {deed!r}.")
-    name, count = DEEDS[deed]
+    action = edit.get("do")
+    if not isinstance(action, str) or action not in ACTIONS:
+        raise ContractError(f"an edit does one of {', '.join(ACTIONS)}; got {action!r}.")
+    name, count = ACTIONS[action]
     numbers, means = _numbers(edit.get(name), count, name), some.means.double()
     middle = (means.amin(0) + means.amax(0)) / 2
-    if deed in ("move", "duplicate"):
+    if action in ("move", "duplicate"):
         return replace(some, means=(means + numbers.double()).float())
-    if deed == "turn":
+    if action == "turn":
         return _turned(some, float(numbers), middle, middle)
-    if deed == "scale":
+    if action == "scale":
         if not float(numbers) > 0:
             raise ContractError("a place is scaled by a factor above 0.")
         grown = turned(some, torch.eye(3), float(numbers))
         return replace(grown, means=((means - middle) * float(numbers) + middle).float())
-    if deed == "recolour":
+    if action == "recolour":
         if numbers.min() < 0 or numbers.max() > 1:
             raise ContractError("a colour is red, green and blue from 0 to 1.")
         return replace(some, sh=torch.cat([plain_sh(numbers.expand(len(some), 3)), 0 * some.sh[:, 1:]], 1))

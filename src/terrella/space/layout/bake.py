@@ -32,7 +32,7 @@ _AXES = ((1, 2), (0, 2), (0, 1))  # the two axes along a side, for each axis acr
 
 
 @dataclass(frozen=True)
-class Built:
+class BuiltPlace:
     """A place built of a plan: Gaussians, the object of each int32 [N] (0: the building), names of objects 1, 2, ...; solids
     float32 [S, 6], boxes that stop bodies, and int32 [S] the object of each that can be pushed (0: none); starts [R, 7], a pose on
     the floor of each room (the height is the floor's)."""
@@ -64,7 +64,7 @@ class _Grid:
         return found
 
 
-def build(plan: RoomLayout, count: int = 120_000) -> Built:
+def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
     """The place of a plan, of about `count` Gaussians. ContractError for what does not fit. The same plan, the same numbers."""
     blocks = blocks_of(plan)
     boxes, bodies = blocks.boxes, blocks.bodies
@@ -78,7 +78,7 @@ def build(plan: RoomLayout, count: int = 120_000) -> Built:
     spacing = np.clip(apart / np.sqrt(fine), FINEST_M, 0.3)
     cells = _some(_grid(boxes, spacing), boxes, air, bodies)
     colours = _brightness(plan, blocks, boxes, cells, texels, bare, light)
-    return Built(
+    return BuiltPlace(
         _gaussians(cells, colours),
         torch.from_numpy(np.asarray(blocks.objects, np.int32)[cells.blocks]),
         tuple(blocks.names),

@@ -1,4 +1,4 @@
-// The Gaussians of a place as columns, unpacked from what serve/place.py packed.
+// The Gaussians of a place as columns, unpacked from what serve/place_page.py packed.
 
 const UNPACKED = { means: 3, quats: 4, scales: 3, colours: 3, opacities: 1 };
 

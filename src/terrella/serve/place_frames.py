@@ -1,4 +1,4 @@
-"""Frames of a place, drawn on the server for browsers that cannot draw it."""
+"""Frames of a place, rendered on the server for browsers that cannot."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ FARTHEST_M = 1e6
 
 
 class FrameRenderer:
-    """Pictures of Gaussians, objects int32 [N], after the `edits` of the moment, of which `other` opens what they merge; one
-    is drawn at a time."""
+    """Renders Gaussians (objects int32 [N]) after the current `edits`, one frame at a time. `other` opens the places that they
+    merge."""
 
     def __init__(
         self,
@@ -34,13 +34,13 @@ class FrameRenderer:
         self._scene, self._done, self._other = gaussians, "[]", other
 
     def draw(self, view: Mapping[str, str]) -> bytes:
-        """A JPEG from an eye at x, y, z (metres) that looks along `heading` and `pitch` (radians, upwards); half of what it sees at
-        a distance of 1 is `wide` and `tall`; width and height in pixels. ServeError for what is no such view."""
+        """A JPEG from a camera at x, y, z (metres) that looks along `heading` and `pitch` (radians, upwards). `wide` and `tall` are
+        half the size of its view at distance 1; width and height are in pixels. ServeError for a malformed view."""
         try:
             x, y, z, heading, pitch, wide, tall, width, height = (float(view[name]) for name in NAMES)
         except (KeyError, ValueError) as error:
             raise ServeError(f"a view is {', '.join(NAMES)}; reload the page.") from error
-        inside = all(abs(one) < FARTHEST_M for one in (x, y, z, heading, pitch))  # what is no number is not
+        inside = all(abs(one) < FARTHEST_M for one in (x, y, z, heading, pitch))  # false for NaN
         inside = inside and all(NARROWEST < half < WIDEST for half in (wide, tall))
         if not inside or not all(SMALLEST <= size <= LARGEST for size in (width, height)):
             raise ServeError(
@@ -49,9 +49,9 @@ class FrameRenderer:
         c, s, cp, sp = math.cos(heading / 2), math.sin(heading / 2), math.cos(pitch / 2), -math.sin(pitch / 2)
         pose = torch.tensor([[x, y, z, c * cp, -s * sp, c * sp, s * cp]])
         with self._alone, torch.no_grad():
-            told = json.dumps(list(edits := self._edits()))
-            if told != self._done:
-                self._scene, self._done = edited(self._source, edits, self._objects, self._other).gaussians, told
+            text = json.dumps(list(edits := self._edits()))
+            if text != self._done:
+                self._scene, self._done = edited(self._source, edits, self._objects, self._other).gaussians, text
             lens = (0.5 / wide, 0.5 / tall, 0.5, 0.5)
             seen = rasterise(self._scene, pose, lens, (round(height), round(width))).rgb[0]
         picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous()

@@ -1,5 +1,4 @@
-"""A place of Gaussians as one HTML file that draws, walks and edits by itself, also from a disk; and a server that keeps its
-edits."""
+"""A place of Gaussians as one HTML file that draws, walks and edits without a server, and a server that saves its edits."""
 
 from __future__ import annotations
 
@@ -31,15 +30,13 @@ from ..space.occupancy import Occupancy, Walker, samples
 from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
-from .door import WEB, application, posted, serve_page
-from .frames import FrameRenderer
+from .http_server import WEB, application, posted, serve_page
+from .place_frames import FrameRenderer
 
 PAGE = WEB / "place"
 MOST_STARTS = 64
-WHOLE, FIRST = (
-    150_000,
-    50_000,
-)  # Gaussians: of more, so many spread over all of them come first, and show the place meanwhile
+WHOLE = 150_000  # a place of at most this many Gaussians is sent in one part
+FIRST = 50_000  # of a larger place this many, spread evenly, are sent first; the page shows them while the rest arrives
 LONGEST_EDITS = 1 << 22  # bytes
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
@@ -47,36 +44,34 @@ _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.
 
 @dataclass(frozen=True)
 class PlaceScene:
-    """What the page shows: Gaussians before all edits, of which `seen` bool [N] were observed, and objects int32 [N] says to which
-    object each belongs (0: none) of those that `names` lists; starts [S, 7] poses; what is solid and who walks; pace and keep as a
-    SplatConfig has them, and dt_s of a step; `other` opens the place that an edit merges."""
+    """The content of the page of a place."""
 
     name: str
-    gaussians: Gaussians
-    seen: torch.Tensor
-    objects: torch.Tensor
-    starts: torch.Tensor
-    collider: Occupancy | Solids
+    gaussians: Gaussians  # N, before all edits
+    seen: torch.Tensor  # bool [N], which of them were observed
+    objects: torch.Tensor  # int32 [N], the object that each belongs to (0: none)
+    starts: torch.Tensor  # float32 [S, 7], poses
+    collider: Occupancy | Solids  # what stops a walker
     body: Walker
-    pace: Sequence[float]
-    keep: Sequence[float]
-    dt_s: float
-    names: Sequence[str] = ()
-    other: Callable[[Edit], PlaceScene] | None = None
+    pace: Sequence[float]  # as in SplatConfig
+    keep: Sequence[float]  # as in SplatConfig
+    dt_s: float  # duration of a step
+    names: Sequence[str] = ()  # of the objects 1, 2, ...
+    other: Callable[[Edit], PlaceScene] | None = None  # opens the place that an edit merges
 
 
 class PlacePage:
-    """The page of a place, to compare with `beside` if that is given, and to merge with it if `merge` says how an edit does. It
-    loads nothing from anywhere: `policy` is its Content-Security-Policy."""
+    """The page of a place. It can be compared with the place `beside`, and merged with it by the edit `merge`. It loads nothing
+    from anywhere: `policy` is its Content-Security-Policy."""
 
     def __init__(self, place: PlaceScene, beside: PlaceScene | None = None, merge: Edit | None = None):
         self._place, self._beside, self._compared = place, None, ""
-        self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # what merges bring to it
+        self.merged: dict[tuple[str, str], tuple[dict[str, Any], str]] = {}  # the places that merges add
         if beside is not None:
-            told, self._compared = _whole(beside)
-            self._beside = {**told, "name": beside.name, "merge": merge}
+            about, self._compared = _packed_whole(beside)
+            self._beside = {**about, "name": beside.name, "merge": merge}
             if merge is not None:
-                self.merged[_key(merge)] = {**told, "sha256": merge["sha256"]}, self._compared
+                self.merged[_merge_key(merge)] = {**about, "sha256": merge["sha256"]}, self._compared
         first = len(place.gaussians) if len(place.gaussians) <= WHOLE else FIRST
         self._packed, *parts = packed_place(place, first)
         self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
@@ -88,14 +83,17 @@ class PlacePage:
         )
 
     def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "") -> bytes:
-        """HTML in UTF-8, with the edits so far. `save`: the address to which it posts edits; without one it offers them as a
-        file. `watch`: the address that has newer states of a place that is being made, which is not edited meanwhile. `frames`: the
-        address that draws for browsers that cannot."""
-        place, merged = self._place, list({_key(edit): self._brought(edit) for edit in merges(edits)}.values())
+        """The page with these edits, as HTML in UTF-8.
+
+        save:   the address to which it posts edits; without one it offers them as a file.
+        watch:  the address of newer states of a place that is being fitted, which cannot be edited meanwhile.
+        frames: the address that draws for browsers that cannot.
+        """
+        place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
-            "boxes": _boxes(place), "edits": list(edits), "merged": [told for told, _ in merged],
+            "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside,
         }  # fmt: skip
         parts = {
@@ -104,32 +102,32 @@ class PlacePage:
             "merged": " ".join(data for _, data in merged),
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
-        return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text).encode()
+        return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text).encode()
 
-    def _brought(self, edit: Edit) -> tuple[dict[str, Any], str]:
-        """What a merge brings, as the page has it: what is said of it, and its Gaussians."""
-        key = _key(edit)
+    def _opened(self, edit: Edit) -> tuple[dict[str, Any], str]:
+        """The place that a merge adds, as the page reads it: its description and its packed Gaussians."""
+        key = _merge_key(edit)
         if key not in self.merged and self._place.other:
-            told, packed = _whole(self._place.other(edit))
-            self.merged[key] = {**told, "sha256": key[1]}, packed
+            about, packed = _packed_whole(self._place.other(edit))
+            self.merged[key] = {**about, "sha256": key[1]}, packed
         return self.merged[key]
 
 
-def _key(edit: Edit) -> tuple[str, str]:
-    """What a merge brings, and how it was then."""
+def _merge_key(edit: Edit) -> tuple[str, str]:
+    """The place that a merge adds, and its version."""
     return edit["place"], edit["sha256"]
 
 
-def _whole(place: PlaceScene) -> tuple[dict[str, Any], str]:
-    """What scene.js unpacks of a place that comes in one: what is said of it, and its columns in gzip and base64."""
+def _packed_whole(place: PlaceScene) -> tuple[dict[str, Any], str]:
+    """A place in one part, as scene.js unpacks it: its description, and its columns in gzip and base64."""
     packed = gzip.compress(_packed(place, torch.ones(len(place.gaussians), dtype=torch.bool)), 6, mtime=0)
-    told = {"count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names)}
-    return told, base64.b64encode(packed).decode()
+    about = {"count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names)}
+    return about, base64.b64encode(packed).decode()
 
 
 def packed_place(place: PlaceScene, first: int) -> tuple[dict[str, Any], bytes, bytes]:
-    """What scene.js and solid.js unpack: `count`, `first` and `solid`; what is solid and the columns of so many Gaussians,
-    which are spread over all, in gzip; and the columns of the rest, empty where there is none."""
+    """A place as scene.js and solid.js unpack it: a description with `count`, `first` and `solid`; in gzip, what is solid and the
+    columns of `first` Gaussians, spread evenly; and in gzip the columns of the rest, empty if there is none."""
     count, (solid, cubes) = len(place.gaussians), _packed_solid(place.collider)
     chosen = torch.zeros(count, dtype=torch.bool)
     chosen[torch.arange(first) * count // max(first, 1)] = True
@@ -139,7 +137,7 @@ def packed_place(place: PlaceScene, first: int) -> tuple[dict[str, Any], bytes, 
 
 
 def bundled(path: Path) -> str:
-    """A script and all that it imports from its own folder as one: each module a function that returns what it exports."""
+    """A script with all its imports from its own folder as one script: each module is a function that returns its exports."""
     order: list[Path] = []
 
     def visit(file: Path) -> None:
@@ -154,7 +152,7 @@ def bundled(path: Path) -> str:
 
 def _module(file: Path, last: bool) -> str:
     text = _IMPORT.sub(
-        lambda found: f"const {{ {found[1].replace(' as ', ': ')} }} = m_{found[2]};\n", file.read_text("utf-8")
+        lambda match: f"const {{ {match[1].replace(' as ', ': ')} }} = m_{match[2]};\n", file.read_text("utf-8")
     )
     names = [name for _, name in _EXPORT.findall(text)]
     body = _EXPORT.sub(r"\1", text)
@@ -166,7 +164,7 @@ def _hash(text: str) -> str:
 
 
 def _packed(place: PlaceScene, chosen: torch.Tensor) -> bytes:
-    """The columns of some Gaussians that scene.js reads: places whole, for edits choose by them; the rest in bytes."""
+    """The columns of some Gaussians that scene.js reads: means in float32, because edits select by them, the rest in bytes."""
     scene = place.gaussians.at(chosen)
     if place.objects.numel() and int(place.objects.max()) > 65535:
         raise ServeError(f"{place.name} has more than 65,535 objects, and a page shows no more.")
@@ -179,8 +177,8 @@ def _packed(place: PlaceScene, chosen: torch.Tensor) -> bytes:
 
 
 def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]:
-    """What solid.js reads: a bit for each cube, and for solid ones a byte that says where in it the surface is; boxes
-    need nothing."""
+    """A collider as solid.js reads it: a bit for each cell, and for a solid cell a byte, the height of the surface in it. Boxes
+    are sent as numbers instead."""
     if isinstance(occupancy, Solids):
         return {}, b""
     solid = occupancy.solid.numpy()
@@ -200,44 +198,45 @@ def _boxes(place: PlaceScene) -> list[list[float]]:
 
 
 def _by_bytes(numbers: np.ndarray, kind: str) -> bytes:
-    """All first bytes, then all second ones: they compress better so."""
+    """All first bytes, then all second bytes, ...: this compresses better."""
     flat = np.ascontiguousarray(numbers).ravel().astype(kind)
     return flat.view(np.uint8).reshape(len(flat), -1).T.tobytes()
 
 
-def build_place(
-    place: PlaceScene,
-    edits: Callable[[], Sequence[Edit]],
-    save: Callable[[str], None],
-    host: str = "127.0.0.1",
-    token: str | None = None,
-    beside: PlaceScene | None = None,
-    merge: Edit | None = None,
-) -> Starlette:
-    """The ASGI application of a place: its page with the `edits` so far, and /edits, to which it posts those that it knows to be
-    saved and those that are to be, as lines of JSON; `save` keeps them or raises a TerrellaError, whose sentence the page shows.
-    `beside` is what the place can be compared with, and merged with as `merge` says."""
-    page, alone, frames = (
-        PlacePage(place, beside, merge),
-        threading.Lock(),
-        FrameRenderer(place.gaussians, place.objects, edits, place.other),
-    )
+@dataclass(frozen=True)
+class EditablePlace:
+    """A place with the edits that its page shows and changes."""
 
-    def kept(content: bytes) -> None:
-        told = json.loads(content)
-        with alone:
-            if [json.loads(line) for line in told["saved"].splitlines() if line] != list(edits()):
+    scene: PlaceScene
+    edits: Callable[[], Sequence[Edit]]  # those in force now
+    save: Callable[
+        [str], None
+    ]  # replaces them with lines of JSON, or raises a TerrellaError, whose sentence the page shows
+    beside: PlaceScene | None = None  # a place to compare it with
+    merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
+
+
+def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
+    """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
+    to be saved and those to save; and /frame, which draws for browsers that cannot."""
+    scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
+    frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
+
+    def save(content: bytes) -> None:
+        posted_edits = json.loads(content)
+        with lock:
+            if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
-            lines = [json.loads(line) for line in told["lines"].splitlines() if line]
-            if any(_key(edit) not in page.merged for edit in merges(lines)):
+            lines = [json.loads(line) for line in posted_edits["lines"].splitlines() if line]
+            if any(_merge_key(edit) not in page.merged for edit in merges(lines)):
                 raise ServeError(
-                    "this page merges what it was opened beside, nothing else: `terrella space view PLACE --beside OTHER`."
+                    "this page merges only the place that it was opened beside: `terrella space view PLACE --beside OTHER`."
                 )
-            save(told["lines"])
+            place.save(posted_edits["lines"])
 
     async def keep(request: Request) -> PlainTextResponse:
         try:
-            await run_in_threadpool(kept, await posted(request, LONGEST_EDITS))
+            await run_in_threadpool(save, await posted(request, LONGEST_EDITS))
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             return PlainTextResponse("edits are lines of JSON; reload the page.", 422)
         except TerrellaError as error:
@@ -255,26 +254,20 @@ def build_place(
         yield
 
     routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
-    return application(
-        lambda: page.html(edits(), "/edits", frames="/frame"), routes, lifespan, host, token, page.policy
-    )
+    html = lambda: page.html(place.edits(), "/edits", frames="/frame")  # noqa: E731
+    return application(html, routes, lifespan, host, token, page.policy)
 
 
 def serve_place(
-    place: PlaceScene,
-    edits: Callable[[], Sequence[Edit]],
-    save: Callable[[str], None],
+    place: EditablePlace,
     port: int = 8767,
     host: str = "127.0.0.1",
     token: str | None = None,
     on_ready: Callable[[str], None] | None = None,
-    beside: PlaceScene | None = None,
-    merge: Edit | None = None,
 ) -> None:
-    """Serves the page of a place until interrupted; `edits`, `save`, `beside` and `merge` as `build_place` has them.
+    """Serves the page of a place until interrupted.
 
-    On any address but this machine's own a token is mandatory, for the page can change the place: where none is given one is
-    made, and the address carries it. ServeError where the port is taken.
+    On any address but this machine's own a token is mandatory, because the page can change the place: one is made if none
+    is given, and the address that `on_ready` gets carries it. ServeError where the port is taken.
     """
-    build = lambda token: build_place(place, edits, save, host, token, beside, merge)  # noqa: E731
-    serve_page(build, host, port, token, on_ready, websockets=False)
+    serve_page(lambda token: build_place(place, host, token), host, port, token, on_ready, websockets=False)

@@ -1,4 +1,4 @@
-"""What our pages share: the port, the files, and HTTP connections of which only so many may wait, and none for long."""
+"""The HTTP server of every page: the port, the files, and limits on how many connections may wait, and how long."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from .guard import Guard, is_loopback
 WEB = Path(__file__).parent / "web"
 KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 REQUEST_S = 10.0  # from the first to the last byte of a request
-MOST_WAITING = 64  # connections that have not finished a request; beyond it the oldest of them goes
+MOST_WAITING = 64  # connections with an unfinished request; beyond it the oldest is dropped
 COMPLAIN_EVERY_S = 60.0
 
 
 def open_port(host: str, port: int) -> socket.socket:
-    """A listening socket; ServeError where the address cannot be had. Port 0 takes any free one."""
+    """A listening socket; ServeError if the address is not available. Port 0 takes any free one."""
     if not 0 <= port < 2**16:
         raise ServeError(f"{port} is no port; choose one from 1 to 65535 with --port (0 takes any that is free).")
     try:
@@ -75,9 +75,12 @@ def application(
     token: str | None,
     policy: str | None = None,
 ) -> Starlette:
-    """A page as an ASGI application. index: the file below web/ that is shown first, or what gives its content, which nobody
-    sees without the token; `host` is the address that it is bound to, which decides what Host headers it answers to;
-    `policy`: its own Content-Security-Policy."""
+    """A page as an ASGI application.
+
+    index:  the first file, below web/; or a function that makes its content, which nobody sees without the token.
+    host:   the address that it is bound to, which decides the Host headers that it answers.
+    policy: its own Content-Security-Policy.
+    """
     kinds = {f"/{file.relative_to(WEB).as_posix()}": KINDS.get(file.suffix) for file in WEB.rglob("*.*")}
     contents = {path: ((WEB / path[1:]).read_bytes(), kind) for path, kind in kinds.items() if kind}
     if isinstance(index, str):
@@ -109,7 +112,7 @@ def application(
 
 
 async def posted(request: Request, most: int) -> bytes:
-    """What was posted; ServeError for more than `most` bytes."""
+    """The body of a POST; ServeError for more than `most` bytes."""
     content = b""
     async for part in request.stream():
         content += part
@@ -126,8 +129,8 @@ def make_server(
     on_ready: Callable[[str], None] | None,
     websockets: bool,
 ) -> uvicorn.Server:
-    """The server of a page, not yet running: `run(sockets=[listener])` it, set `should_exit` to stop it; `websockets`: the
-    page has one. `on_ready` gets the address to open."""
+    """The server of a page, not yet running: `run(sockets=[listener])` runs it, and `should_exit` stops it. websockets: whether
+    the page has one. `on_ready` gets the address to open."""
     url = page_address(host, listener.getsockname()[1], token)
     app.state.on_ready = lambda: on_ready and on_ready(url)
     settings = uvicorn.Config(
@@ -146,8 +149,8 @@ def serve_page(
     on_ready: Callable[[str], None] | None,
     websockets: bool,
 ) -> None:
-    """Serves the application that `build(token)` gives until interrupted. On any address but this machine's own a token is
-    mandatory: where none is given one is made, and the address carries it. ServeError where the port is taken."""
+    """Serves the application that `build(token)` returns until interrupted. On any address but this machine's own a token is
+    mandatory: one is made if none is given, and the address carries it. ServeError where the port is taken."""
     if not token and not is_loopback(host):
         token = secrets.token_urlsafe(16)
     with contextlib.closing(open_port(host, port)) as listener:
@@ -158,7 +161,7 @@ def serve_page(
 
 @contextlib.contextmanager
 def _ended_like_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM end the process as Ctrl-C does, so that worlds with processes of their own can take them along."""
+    """Lets SIGTERM end the process as Ctrl-C does, so that worlds can end their own processes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -170,7 +173,7 @@ def _ended_like_ctrl_c() -> Iterator[None]:
 
 
 def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:
-    """Where connections cannot be accepted (no file descriptors are left), a line now and then instead of a trace for each."""
+    """If connections cannot be accepted (no file descriptors are left), prints a line now and then, not a trace for each."""
     complained = -COMPLAIN_EVERY_S
 
     def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -185,13 +188,13 @@ def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:
 
 
 class GuardedConnection(H11Protocol):
-    """uvicorn's connection with a deadline for each request. A request that is whole is answered without one; a
-    WebSocket takes the connection over, and is let in or refused by its own handshake."""
+    """uvicorn's connection with a deadline for receiving each request. A complete request has no deadline, nor has a WebSocket
+    once it takes over the connection."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
-        found = vars(self.server_state).setdefault("waiting", OrderedDict())  # oldest first
-        self._waiting: OrderedDict[GuardedConnection, asyncio.TimerHandle] = found
+        waiting = vars(self.server_state).setdefault("waiting", OrderedDict())  # oldest first
+        self._waiting: OrderedDict[GuardedConnection, asyncio.TimerHandle] = waiting
         if len(self._waiting) >= MOST_WAITING:
             next(iter(self._waiting)).drop()
         self._await_request()
@@ -212,7 +215,7 @@ class GuardedConnection(H11Protocol):
         super().connection_lost(exc)
 
     def drop(self) -> None:
-        """Closes the connection at once: its other end is not waited for."""
+        """Closes the connection at once, without waiting for the other end."""
         self._stop_waiting()
         self.transport.abort()
 

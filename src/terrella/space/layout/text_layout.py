@@ -57,7 +57,7 @@ MOST_EACH = 24
 
 
 @dataclass
-class _Asked:
+class _ItemText:
     """A thing asked for: how many, of which kind, which look, how large beside the usual, and where."""
 
     label: str
@@ -68,25 +68,25 @@ class _Asked:
 
 
 @dataclass
-class _RoomAsked:
+class _RoomText:
     kind: str
     scale: tuple[float, float, float]
     looks: dict[str, str] = field(default_factory=dict)
-    things: list[_Asked] = field(default_factory=list)
+    things: list[_ItemText] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class Understood:
-    """The plan of a text, what layout.json says of it, words that were not understood, and things for which there was no place."""
+class ParsedText:
+    """A layout that was described in words."""
 
-    plan: RoomLayout
-    layout: dict[str, Any]
-    unknown: tuple[str, ...]
-    left_out: tuple[str, ...]
+    layout: RoomLayout
+    document: dict[str, Any]  # the same, as layout.json has it
+    unknown: tuple[str, ...]  # words that were not understood
+    left_out: tuple[str, ...]  # things for which there was no place
 
 
-def understood(text: str, seed: int = 0) -> Understood:
-    """The plan that a text describes; ContractError where no word of it names a room or a thing."""
+def parse_text(text: str, seed: int = 0) -> ParsedText:
+    """The layout that a text describes; ContractError if none of its words names a room or a thing."""
     rooms, unknown = _parsed(text)
     if not rooms:
         raise ContractError(
@@ -117,12 +117,12 @@ def understood(text: str, seed: int = 0) -> Understood:
     for at, asked in enumerate(rooms):
         following = at + 1 < len(rooms)
         left_out += furnished(layout, at, asked.things, following, seed)
-    return Understood(read_layout(layout), layout, tuple(unknown), tuple(left_out))
+    return ParsedText(read_layout(layout), layout, tuple(unknown), tuple(left_out))
 
 
-def _parsed(text: str) -> tuple[list[_RoomAsked], list[str]]:
+def _parsed(text: str) -> tuple[list[_RoomText], list[str]]:
     """Rooms and what is in them; the words that were not understood."""
-    rooms: list[_RoomAsked] = []
+    rooms: list[_RoomText] = []
     unknown: list[str] = []
     words: list[str] = re.findall(r"[a-z0-9#]+", text.lower())[:400]
     count, scale, look, placed, definite, last = 1, (1.0, 1.0, 1.0), [], False, False, None
@@ -137,16 +137,16 @@ def _parsed(text: str) -> tuple[list[_RoomAsked], list[str]]:
             if not (
                 rooms and (definite or placed) and count == 1 and not look
             ):  # "in the middle of the room" is no new one
-                rooms.append(_RoomAsked(noun, scale, {"walls": " ".join(look)} if look else {}))
+                rooms.append(_RoomText(noun, scale, {"walls": " ".join(look)} if look else {}))
                 last = None
             count, scale, look, placed = 1, (1.0, 1.0, 1.0), [], False
         elif noun in _SURFACES and (look or not placed):
-            rooms = rooms or [_RoomAsked("room", (1.0, 1.0, 1.0))]
+            rooms = rooms or [_RoomText("room", (1.0, 1.0, 1.0))]
             rooms[-1].looks |= {noun: " ".join(look)} if look else {}
             count, scale, look = 1, (1.0, 1.0, 1.0), []
         elif noun in _THINGS and not (noun == "rug" and following in _SURFACES):
-            rooms = rooms or [_RoomAsked("room", (1.0, 1.0, 1.0))]
-            last = _Asked(noun, count, " ".join(look), scale)
+            rooms = rooms or [_RoomText("room", (1.0, 1.0, 1.0))]
+            last = _ItemText(noun, count, " ".join(look), scale)
             rooms[-1].things.append(last)
             count, scale, look, placed = 1, (1.0, 1.0, 1.0), [], False
         elif word in SIZES:

@@ -1,4 +1,4 @@
-"""The page of a place that is still being made: it shows the newest state, and whoever makes it waits for nobody."""
+"""The page of a place while it is being fitted: it shows the newest state, and the fit never waits for it."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from .door import application, make_server, open_port
-from .place import PlacePage, PlaceScene, packed_place
+from .http_server import application, make_server, open_port
+from .place_page import PlacePage, PlaceScene, packed_place
 
 Show = Callable[[Callable[[], PlaceScene], Mapping[str, Any]], None]
 STARTS_S = 20.0
 
 
 class Newest:
-    """The newest state that was shown: packed when a page asks for it, once."""
+    """The newest state of the place, packed once, when a page asks for it."""
 
     def __init__(self):
         self._lock, self._packed, self._page = threading.Lock(), (0, b"", b""), (0, b"")
         self._newest: tuple[int, Callable[[], PlaceScene] | None, Mapping[str, Any]] = 0, None, {}
 
     def show(self, make: Callable[[], PlaceScene], facts: Mapping[str, Any]) -> None:
-        """`make` gives the place as it is now; facts: `step`, `steps` and `db` (PSNR), for the page's head."""
+        """`make` returns the place as it is now. facts: `step`, `steps` and `db` (PSNR), for the page's header."""
         self._newest = self._newest[0] + 1, make, facts
 
     def html(self) -> bytes:
-        """The page with the state of the moment, made once for each state."""
+        """The page with the newest state, made once for each state."""
         with self._lock:
             number, make, _ = self._newest
             assert make is not None
@@ -42,7 +42,7 @@ class Newest:
             return self._page[1]
 
     def answer(self, after: int) -> tuple[bytes, bytes] | None:
-        """What is said of the newest state, as JSON, and its columns in gzip; None where it is not newer than `after`."""
+        """The newest state: its description as JSON, and its columns in gzip; None if it is not newer than `after`."""
         with self._lock:
             number, make, facts = self._newest
             if number <= after or make is None:
@@ -55,17 +55,17 @@ class Newest:
 
 
 @contextlib.contextmanager
-def watched(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator[Show]:
-    """Serves a page, in a thread, as long as the block lasts: the block calls what it gets, `Show`, at once and then now and then.
+def live_page(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator[Show]:
+    """Serves a page in a thread while the block runs. The block calls the `Show` that it gets at once, and then now and then.
     ServeError where the port is taken."""
     newest = Newest()
 
     async def now(request: Request) -> Response:
         after = request.query_params.get("after", "0")
-        found = await run_in_threadpool(newest.answer, int(after[:18]) if after.isdecimal() else 0)
-        if found is None:
+        answer = await run_in_threadpool(newest.answer, int(after[:18]) if after.isdecimal() else 0)
+        if answer is None:
             return Response(status_code=204)
-        about, data = found
+        about, data = answer
         return Response(len(about).to_bytes(4, "little") + about + data, media_type="application/octet-stream")
 
     @contextlib.asynccontextmanager
