@@ -11,12 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
-from terrella.cli.space import shown_place
 from terrella.core.errors import ServeError
 from terrella.serve.place_frames import FrameRenderer
 from terrella.serve.place_page import EditablePlace, build_place
 from terrella.space.camera import planar_pose
 from terrella.space.raster import rasterise
+from terrella.workflows.splat_places import page_scene
 
 from .test_place_page import opened, serving, until, world  # noqa: F401
 
@@ -65,7 +65,7 @@ def test_other_views_are_refused(wrong):
 
 
 def test_without_webgl_the_server_draws_and_one_walks(serving, browser):  # noqa: F811
-    url = serving(build_place(EditablePlace(shown_place(world(1500)), list, lambda text: None)))
+    url = serving(build_place(EditablePlace(page_scene(world(1500)), list, lambda text: None)))
     page = browser.new_page(viewport={"width": 320, "height": 240})
     page.add_init_script(WITHOUT)
     page.goto(url)

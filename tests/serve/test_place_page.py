@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from terrella.cli import main
-from terrella.cli.space import compared_with, place_of
 from terrella.library import load
 from terrella.serve.http_server import make_server, open_port
 from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundled
@@ -20,6 +19,7 @@ from terrella.space.camera import planar_pose
 from terrella.space.edits import edited
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import rasterise
+from terrella.workflows.splat_places import compared_scene, unedited_scene
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import checked_edits, merging, read_edits, save_splat, write_edits
 
@@ -104,7 +104,7 @@ def test_modules_become_one_script():
 
 def test_the_page_says_only_what_it_should(tmp_path):
     save_splat(world(300), tmp_path / "w")
-    page = PlacePage(place_of(str(tmp_path / "w")))
+    page = PlacePage(unedited_scene(str(tmp_path / "w")))
     text = page.html([{"select": {"all": True}, "do": "delete", "note": "</script><script>"}]).decode()
     assert "unsafe" not in page.policy and "http" not in page.policy
     assert text.count("</script>") == 6 and "<title>a &lt;room&gt;" in text and "{{" not in text
@@ -224,7 +224,7 @@ def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser
     monkeypatch.setattr("terrella.serve.place_page.WHOLE", 2000)
     monkeypatch.setattr("terrella.serve.place_page.FIRST", 500)
     save_splat(world(4000), tmp_path / "w")
-    content = PlacePage(place_of(str(tmp_path / "w"))).html(EDITS[:1])
+    content = PlacePage(unedited_scene(str(tmp_path / "w"))).html(EDITS[:1])
     early, _, late = content.partition(b'<script type="text/plain" id="rest">')
     (tmp_path / "early.html").write_bytes(early)
     (tmp_path / "whole.html").write_bytes(early + b'<script type="text/plain" id="rest">' + late)
@@ -308,7 +308,7 @@ def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened,
     for name, least in (("taken.ply", 40), ("taken.spz", 30)):  # exported, imported again, and compared
         assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / name)]) == 0
         assert main(["space", "import", str(tmp_path / name), "--out", str(tmp_path / f"{name}.w")]) == 0
-        html = PlacePage(place_of(str(tmp_path / "w")), compared_with(str(tmp_path / f"{name}.w")))
+        html = PlacePage(unedited_scene(str(tmp_path / "w")), compared_scene(str(tmp_path / f"{name}.w")))
         (tmp_path / f"{name}.html").write_bytes(html.html(read_edits(tmp_path / "w")))
         beside = opened((tmp_path / f"{name}.html").as_uri())
         beside.keyboard.press("KeyB")
@@ -341,7 +341,7 @@ def test_a_place_is_compared_with_what_it_was_and_with_another(tmp_path, opened)
     assert page.evaluate("document.getElementById('compare').hidden")
 
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "other.ply")]) == 0
-    html = PlacePage(place_of(str(tmp_path / "w")), compared_with(str(tmp_path / "other.ply"))).html([])
+    html = PlacePage(unedited_scene(str(tmp_path / "w")), compared_scene(str(tmp_path / "other.ply"))).html([])
     (tmp_path / "beside.html").write_bytes(html)
     page = opened((tmp_path / "beside.html").as_uri())
     page.keyboard.press("KeyB")
@@ -353,7 +353,7 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
     save_splat(world(1500), tmp_path / "w")
     folder = tmp_path / "w"
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
-    url = serving(build_place(EditablePlace(place_of(str(folder)), lambda: read_edits(folder), save)))
+    url = serving(build_place(EditablePlace(unedited_scene(str(folder)), lambda: read_edits(folder), save)))
     page = opened(url)
     page.evaluate("terrella.editor.choose({ object: 1 })")
     assert page.evaluate("document.getElementById('count').textContent") == "40 selected: chair"
@@ -389,8 +389,10 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
         save_splat(world(many), tmp_path / name)
     folder, merge = tmp_path / "w", merging(tmp_path / "w", tmp_path / "other")
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
-    beside = compared_with(str(tmp_path / "other"))
-    url = serving(build_place(EditablePlace(place_of(str(folder)), lambda: read_edits(folder), save, beside, merge)))
+    beside = compared_scene(str(tmp_path / "other"))
+    url = serving(
+        build_place(EditablePlace(unedited_scene(str(folder)), lambda: read_edits(folder), save, beside, merge))
+    )
     page = opened(url)
     page.keyboard.press("KeyE")
     for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
@@ -407,7 +409,7 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     assert isinstance(after, SplatWorld) and np.allclose(rows(there["means"]), rows(after.gaussians.means), atol=1e-5)
     page.reload()
     until(page, "!!window.terrella && terrella.story.scene.length === 2100")
-    alone = opened(serving(build_place(EditablePlace(place_of(str(folder)), list, save))))
+    alone = opened(serving(build_place(EditablePlace(unedited_scene(str(folder)), list, save))))
     assert not alone.is_visible("#merging")
 
 

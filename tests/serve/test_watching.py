@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from terrella.cli.space import shown_place
 from terrella.serve.live_place import live_page
+from terrella.workflows.splat_places import page_scene
 
 from .test_place_page import opened, until, world  # noqa: F401
 
@@ -31,7 +31,7 @@ def making():
         ready.set()
 
     with live_page("127.0.0.1", 0, on_ready) as show:
-        show(lambda: shown_place(world(300)), {"step": 0, "steps": 100, "db": 12.0})
+        show(lambda: page_scene(world(300)), {"step": 0, "steps": 100, "db": 12.0})
         assert ready.wait(60)
         yield address[0], show
 
@@ -47,7 +47,7 @@ def test_newer_states_are_told_once(making):
     made = []
     for step in range(3):
         show(
-            lambda step=step: made.append(step) or shown_place(world(310 + step)),
+            lambda step=step: made.append(step) or page_scene(world(310 + step)),
             {"step": step, "steps": 100, "db": 13.0},
         )
     status, content = fetched(f"{address}now?after={about['number']}")
@@ -59,6 +59,6 @@ def test_the_page_shows_what_is_newest_and_outlives_the_fit(opened, making):  # 
     address, show = making
     page = opened(address)
     assert page.evaluate("document.getElementById('edit').hidden")
-    show(lambda: replace(shown_place(world(700)), name="later"), {"step": 50, "steps": 100, "db": 23.4})
+    show(lambda: replace(page_scene(world(700)), name="later"), {"step": 50, "steps": 100, "db": 23.4})
     until(page, "terrella.story.scene.length === 700 && terrella.idle")
     assert page.evaluate("document.getElementById('what').textContent") == "700 Gaussians · step 50 of 100 · 23.4 dB"

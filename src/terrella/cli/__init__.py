@@ -41,7 +41,7 @@ COMMANDS = {
     "export policy": ("export:policy", "write a learned policy as an ONNX file that runs without PyTorch"),
     "score": ("score:score", "compare a world's predictions with a recording"),
     "space fit": ("space:fit", "make a place of Gaussians of a recording with depth and poses"),
-    "space build": ("space_build:build", "make a place to walk in of words, or of a layout of rooms and furniture"),
+    "space build": ("space:build", "make a place to walk in of words, or of a layout of rooms and furniture"),
     "space import": ("space:import_", "make a world of a file of another tool (.ply, .spz, .sog, .glb)"),
     "space export": ("space:export", "write a world's Gaussians for other tools, or as a page to walk in"),
     "space view": ("space:view", "walk in a place and edit it by hand, drawn by your browser"),

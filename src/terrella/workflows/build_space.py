@@ -1,0 +1,188 @@
+"""Makes places of Gaussians: fitted to a recording or pictures, built of words, a layout or triangles, or read from a file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from ..core.errors import DatasetError, TerrellaError
+from ..learn.recipes.splat import SplatFit, Watch, fit_splat
+from ..serve.live_place import live_page
+from ..space.files import read_scene, replace_whole
+from ..space.files.gltf_scene import GLTF_ENDINGS, GltfScene, read_gltf
+from ..space.layout import BuiltPlace, ParsedText, build, parse_text, read_layout
+from ..space.layout.meshes import of_triangles
+from ..space.occupancy import Walker
+from ..space.raster import Gaussians
+from ..space.raster.move import turned
+from ..worlds.additions import INVENTED, OBSERVED
+from ..worlds.splat import SplatConfig, SplatWorld
+from ..worlds.splat_folder import save_splat, world_of
+from .progress import Progress, silent, stage
+from .splat_places import SpaceResult, page_scene
+
+LAYOUT_FILE = "layout.json"
+WALKER = Walker(eye_m=1.65, step_m=0.35)  # in places that are built
+
+
+@dataclass(frozen=True)
+class BuildSpaceConfig:
+    """How a place is built."""
+
+    text: str | None = None
+    """Words instead of a layout: "a long room with two pillars and a red door". Their layout is saved as OUT/layout.json."""
+    gaussians: int = 120_000
+    """About how many Gaussians."""
+    seed: int | None = None
+    """Seed of everything that the words or the layout leave open."""
+    size: tuple[int, int] = (192, 256)
+    """Height and width of the pictures, in pixels."""
+
+
+@dataclass(frozen=True)
+class ImportSpaceConfig:
+    """How a file is read."""
+
+    axes: Literal["rdf", "rub", "flu"] | None = None
+    """Axes of the file: rdf (x right, y down, z forward: usual in .ply), rub (x right, y up, z back: usual in .spz), or flu
+    (x forward, y left, z up: Terrella's)."""
+    scale: float = 1.0
+    """Metres per unit of the file."""
+    size: tuple[int, int] = (192, 256)
+    """Height and width of the pictures, in pixels."""
+
+
+def fit_space(
+    data: str, out: str, config: SplatFit, *, watch_port: int | None = None, progress: Progress = silent
+) -> SpaceResult:
+    """Fits Gaussians to a recording with poses or to pictures, and saves OUT/world. An earlier run goes on.
+
+    watch_port: serves a page that shows the fit meanwhile; 0 takes any free port.
+    """
+    with contextlib.ExitStack() as stack:
+        watch = None if watch_port is None else stack.enter_context(_watched(watch_port, progress))
+        facts = fit_splat(data, out, config, stack.enter_context(stage("fitting", progress)), watch)
+    (ours, ours_by), (copied, copied_by) = facts["held_out_db"], facts["nearest_picture_db"]
+    lines = [
+        f"{facts['gaussians']:,} Gaussians from {facts['pictures']} pictures in {facts['seconds']:.0f} s",
+        f"{facts['held_out']} held-out pictures: {ours:.1f} dB (+-{ours_by:.1f}); copying the nearest picture: "
+        f"{copied:.1f} (+-{copied_by:.1f})",
+        f"walk in it: terrella play {facts['world']}",
+    ]
+    if facts["left_out"]:
+        lines.append(f"left out, blurred or without overlap: {', '.join(facts['left_out'])}")
+    return SpaceResult(facts, tuple(lines))
+
+
+@contextlib.contextmanager
+def _watched(port: int, progress: Progress) -> Iterator[Watch]:
+    with live_page("127.0.0.1", port, lambda address: progress(f"watch it at {address}")) as show:
+        yield lambda make, facts: show(lambda: page_scene(make()), facts)
+
+
+def import_space(file: Path, out: Path, config: ImportSpaceConfig, *, progress: Progress = silent) -> SpaceResult:
+    """Makes a world of a file of Gaussians, or of the triangles of a .glb or .gltf."""
+    if not 0 < config.scale < float("inf") or not _is_size(config.size):
+        raise TerrellaError("--scale is above 0, and --size from 8 to 4096 pixels a side.")
+    if file.suffix.lower() in GLTF_ENDINGS and config.axes is None:
+        scene = read_gltf(file, config.scale)
+        if isinstance(scene, GltfScene):
+            return _of_triangles(scene, file, out, BuildSpaceConfig.gaussians, config.size)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gaussians = read_scene(file, config.axes)
+    for warning in caught:
+        progress(f"{file}: {warning.message}")
+    if config.scale != 1:
+        gaussians = turned(gaussians, torch.eye(3), config.scale)
+    save_splat(world_of(gaussians, file.stem, {"file": file.name}, _splat_config(config.size)), out)
+    facts = {"gaussians": len(gaussians), "world": str(out)}
+    return SpaceResult(facts, (f"{len(gaussians):,} Gaussians; terrella play {out}",))
+
+
+def build_space(layout: Path | None, out: Path, config: BuildSpaceConfig) -> SpaceResult:
+    """Builds a world of a layout.json, of the triangles of a .glb or .gltf, or of words. The same seed gives the same bytes."""
+    if (layout is None) == (config.text is None):
+        raise TerrellaError('give a layout.json or a .glb, or --text "a long room with two pillars and a red door".')
+    if not 1000 <= config.gaussians <= 2_000_000 or not _is_size(config.size):
+        raise TerrellaError("--gaussians is from 1,000 to 2,000,000, and --size from 8 to 4096 pixels a side.")
+    if layout is not None and layout.suffix.lower() in GLTF_ENDINGS:
+        return _of_triangles(read_gltf(layout), layout, out, config.gaussians, config.size)
+    if layout is None:
+        parsed = parse_text(config.text or "", config.seed or 0)
+    else:
+        rooms = read_layout(layout)
+        rooms = rooms if config.seed is None else replace(rooms, seed=config.seed)
+        parsed = ParsedText(rooms, asdict(rooms), (), ())
+    place = build(parsed.layout, config.gaussians)
+    _save_built(place, parsed, out, config)
+    return _built_result(place, parsed, out)
+
+
+def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResult:
+    movable = [place.names[number - 1] for number in sorted(set(place.bodies.tolist()) - {0})]
+    facts = {
+        "world": str(out), "gaussians": len(place.gaussians), "rooms": len(parsed.layout.rooms), "objects": list(place.names),
+        "movable": movable, "not_understood": list(parsed.unknown), "no_place_for": list(parsed.left_out),
+    }  # fmt: skip
+    contents = ", ".join(place.names) or "nothing"
+    lines = [f"{len(place.gaussians):,} Gaussians, {len(parsed.layout.rooms)} room(s), {contents} in them"]
+    if movable:
+        without = "" if find_spec("mujoco") else " (once MuJoCo is installed: pip install 'terrella[mujoco]')"
+        lines.append(f"can be pushed: {', '.join(movable)}{without}")
+    if parsed.unknown:
+        lines.append(f"not understood: {', '.join(parsed.unknown)}")
+    if parsed.left_out:
+        lines.append(f"no place was left for: {', '.join(parsed.left_out)}")
+    return SpaceResult(facts, (*lines, f"walk in it: terrella play {out}"))
+
+
+def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildSpaceConfig) -> None:
+    starts = place.starts.clone()
+    starts[:, 2] += WALKER.eye_m
+    provenance = OBSERVED if config.text is None else INVENTED  # a layout states everything, words leave much open
+    card = {"objects": list(place.names), **({"text": config.text} if config.text else {})}
+    origin = torch.full((len(place.gaussians),), provenance, dtype=torch.uint8)
+    world = SplatWorld(
+        parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,
+        place.solids, place.bodies,
+    )  # fmt: skip
+    save_splat(world, out)
+    replace_whole(out / LAYOUT_FILE, lambda file: file.write_text(json.dumps(parsed.document, indent=1) + "\n"))
+
+
+def _of_triangles(
+    scene: GltfScene | Gaussians, file: Path, out: Path, gaussians: int, size: tuple[int, int]
+) -> SpaceResult:
+    """Makes a world of the triangles of a file."""
+    if not isinstance(scene, GltfScene):
+        raise DatasetError(f"{file} holds Gaussians; `terrella space import` makes a world of them.")
+    splats, objects, solids = of_triangles(scene, gaussians)
+    names = list(scene.names)
+    card = {"file": file.name, "objects": names}
+    save_splat(world_of(splats, file.stem, card, _splat_config(size, WALKER), objects, solids), out)
+    facts: Mapping[str, Any] = {
+        "world": str(out), "gaussians": len(splats), "triangles": len(scene.corners), "objects": names,
+        "lights": len(scene.lights), "boxes": None if solids is None else len(solids),
+    }  # fmt: skip
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    text = f"{len(splats):,} Gaussians of {len(scene.corners):,} triangles, {len(scene.lights)} light(s): {shown}"
+    return SpaceResult(facts, (text, f"walk in it: terrella play {out}"))
+
+
+def _is_size(size: tuple[int, int]) -> bool:
+    """Whether pictures may have this height and width, in pixels."""
+    return min(size) >= 8 and max(size) <= 4096
+
+
+def _splat_config(size: tuple[int, int], walker: Walker | None = None) -> SplatConfig:
+    """A camera with square pixels whose picture is 90 degrees wide."""
+    return SplatConfig((0.5, 0.5 * size[1] / size[0], 0.5, 0.5), size, body=walker or Walker())

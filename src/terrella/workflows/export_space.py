@@ -1,0 +1,167 @@
+"""Writes a place for other tools: Gaussians (PLY, SPZ, GLB), a mesh (GLB), a panorama (PNG), a film (MP4) or a page (HTML)."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import simplejpeg
+import torch
+from PIL import Image
+
+from ..core.errors import DatasetError, TerrellaError
+from ..library import folder_of
+from ..serve.clip import make_clip
+from ..serve.place_page import PlacePage
+from ..space.camera import planar_pose
+from ..space.files import AXES, replace_whole, write_scene
+from ..space.files.glb import encode_gaussians, encode_mesh
+from ..space.files.spz import Version
+from ..space.mesh import collider_mesh, fused, viewpoints
+from ..space.raster import rasterise
+from ..space.raster.move import turned
+from ..worlds.splat import SplatWorld
+from ..worlds.splat_folder import read_edits
+from .splat_places import SpaceResult, open_splat, unedited_scene
+
+OPTIONS = {  # the files that each option is for
+    "axes": (".ply", ".spz"),
+    "compressed": (".ply",),
+    "spz": (".spz",),
+    "kind": (".glb",),
+    "cell": (".glb",),
+    "seconds": (".mp4",),
+    "path": (".mp4",),
+}
+FRAMES_PER_S = 30  # of a film
+MOST_FACES = 5_000_000
+
+
+@dataclass(frozen=True)
+class ExportSpaceConfig:
+    """How a place is written."""
+
+    axes: Literal["rdf", "rub", "flu"] | None = None
+    """Axes of the file; default: rdf for .ply and rub for .spz."""
+    compressed: bool = False
+    """Write SuperSplat's compressed form of .ply."""
+    spz: Version = 3
+    """Version of an .spz: 3, which Spark opens, or 4, which PlayCanvas' engine opens."""
+    kind: Literal["mesh", "collider", "gaussians"] = "mesh"
+    """Content of a .glb: a mesh with colours, the mesh that stops bodies, or the Gaussians (KHR_gaussian_splatting)."""
+    cell: float = 0.05
+    """Size of a cell of the mesh, in metres."""
+    seconds: float = 8.0
+    """Duration of the film, in seconds."""
+    path: Path | None = None
+    """Path of the film: a JSON list of [x, y, z, degrees]. Default: a look around from each start."""
+
+
+def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResult:
+    """Writes a world of Gaussians to `file`, whose ending decides the format. The file is replaced as a whole."""
+    suffix = file.suffix.lower()
+    for field in fields(config):
+        if getattr(config, field.name) != field.default and suffix not in OPTIONS[field.name]:
+            kinds = " and ".join(OPTIONS[field.name])
+            raise TerrellaError(f"--{field.name} is for {kinds} files; leave it out for {file.name}.")
+    if suffix == ".html":
+        scene = unedited_scene(world)
+        content, facts = PlacePage(scene).html(read_edits(folder_of(world))), {"gaussians": len(scene.gaussians)}
+    elif suffix in (".glb", ".png", ".mp4"):
+        content, facts = _drawn(open_splat(world), suffix, config)
+    else:
+        opened = open_splat(world)
+        write_scene(opened.gaussians, file, config.axes, "compressed" if config.compressed else "", config.spz)
+        content, facts = None, {"gaussians": len(opened.gaussians)}
+    if content is not None:
+        replace_whole(file, lambda staged: staged.write_bytes(content))
+    return SpaceResult({**facts, "bytes": file.stat().st_size, "file": str(file)})
+
+
+def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[bytes, Mapping[str, Any]]:
+    """A mesh, a panorama or a film: the bytes of its file, and its figures."""
+    if not len(world.gaussians):
+        raise DatasetError(f"{world.name} has no Gaussian left; undo an edit.")
+    if not all(bool(part.isfinite().all()) for part in vars(world.gaussians).values()):
+        raise DatasetError(
+            f"{world.name} has Gaussians whose numbers are not finite; undo an edit, or import its file again."
+        )
+    with torch.no_grad():
+        if suffix == ".glb":
+            return _glb(world, config)
+        return _panorama(world) if suffix == ".png" else _film(world, config)
+
+
+def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
+    rot = torch.tensor(AXES["rub"], dtype=torch.float32)
+    if config.kind == "gaussians":
+        return encode_gaussians(turned(world.gaussians, rot), world.name), {"gaussians": len(world.gaussians)}
+    if not 0.005 <= config.cell <= 10:
+        raise TerrellaError("--cell is from 0.005 to 10 metres.")
+    if config.kind == "collider":
+        mesh = collider_mesh(world.collider)
+    else:
+        eyes = viewpoints(world.gaussians, world.collider, world.starts, world.config.body)
+        mesh = fused(world.gaussians, eyes, config.cell)
+    if len(mesh.faces) > MOST_FACES:
+        raise TerrellaError(
+            f"the mesh has {len(mesh.faces):,} faces, {MOST_FACES:,} is the most; ask for a larger --cell."
+        )
+    facts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    return encode_mesh(replace(mesh, vertices=mesh.vertices @ rot.T), world.name), facts
+
+
+def _panorama(world: SplatWorld, height: int = 1024) -> tuple[bytes, dict[str, Any]]:
+    """The view all around from the first start, equirectangular, twice as wide as high."""
+    seen = rasterise(world.gaussians, world.starts[:1], None, (height, 2 * height)).rgb[0]
+    picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0)
+    buffer = io.BytesIO()
+    Image.fromarray(picture.numpy()).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue(), {"size": [2 * height, height], "pose": [round(v, 3) for v in world.starts[0].tolist()]}
+
+
+def _film(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
+    if not 0.5 <= config.seconds <= 600:
+        raise TerrellaError("--seconds is from 0.5 to 600.")
+    poses = _eased(_stations(world, config.path), round(config.seconds * FRAMES_PER_S))
+    height = 480
+    size = (height, round(height * world.config.size[1] / world.config.size[0]) // 2 * 2)
+    pictures = []
+    for pose in poses:
+        seen = rasterise(world.gaussians, pose[None], world.config.camera, size).rgb[0]
+        picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+        pictures.append((simplejpeg.encode_jpeg(picture, quality=95, colorspace="RGB", colorsubsampling="444"),))
+    return make_clip(pictures, 1 / FRAMES_PER_S), {"pictures": len(pictures), "size": list(size[::-1])}
+
+
+def _stations(world: SplatWorld, path: Path | None) -> torch.Tensor:
+    """The points and headings [S, 4] (metres, radians) that a film passes: those of a file, or a turn at each start."""
+    if path is None:
+        stations = []
+        for start in world.starts[:6]:
+            heading = 2 * math.atan2(float(start[6]), float(start[3]))
+            stations += [[*start[:3].tolist(), heading + turn * math.pi / 2] for turn in range(5)]
+        return torch.tensor(stations)
+    try:
+        given = torch.tensor(json.loads(path.read_text()), dtype=torch.float32)
+    except (OSError, ValueError, TypeError) as error:
+        raise DatasetError(f"{path} cannot be read as a path ({error}); give a list of [x, y, z, degrees].") from error
+    if given.ndim != 2 or given.shape[1] != 4 or len(given) < 2 or not bool(given.isfinite().all()):
+        raise DatasetError(f"{path} is a list of two or more [x, y, z, degrees]; its shape is {list(given.shape)}.")
+    return torch.cat([given[:, :3], given[:, 3:].deg2rad()], 1)
+
+
+def _eased(stations: torch.Tensor, count: int) -> torch.Tensor:
+    """`count` poses from the first station to the last, easing in and out of each."""
+    at = torch.linspace(0, len(stations) - 1, count).clamp_max(len(stations) - 1 - 1e-4)
+    first = at.long()
+    share = at - first
+    share = (share * share * (3 - 2 * share))[:, None]
+    turn = (stations[1:, 3] - stations[:-1, 3] + math.pi) % (2 * math.pi) - math.pi
+    step = torch.cat([stations[1:, :3] - stations[:-1, :3], turn[:, None]], 1)
+    return planar_pose(*(stations[first] + share * step[first]).unbind(1))

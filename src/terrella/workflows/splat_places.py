@@ -1,0 +1,97 @@
+"""Opens places of Gaussians by name, as worlds and as the content of their pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import ContractError, TerrellaError
+from ..library import folder_of
+from ..serve.place_page import EditablePlace, PlaceScene
+from ..space.edits import Edit
+from ..space.files import read_scene
+from ..space.solids import Solids
+from ..worlds.additions import OBSERVED
+from ..worlds.folder import open_world
+from ..worlds.splat import SplatConfig, SplatWorld
+from ..worlds.splat_folder import checked_edits, merging, other_of, read_edits, source_of, world_of, write_edits
+
+
+@dataclass(frozen=True)
+class SpaceResult:
+    """What a command made of a place."""
+
+    facts: Mapping[str, Any]
+    """Figures, names and paths, as JSON has them."""
+    lines: tuple[str, ...] = field(default=())
+    """The same for people."""
+
+    def to_json(self) -> dict[str, Any]:
+        return dict(self.facts)
+
+    def summary(self) -> str:
+        return "\n".join(self.lines or (f"{name}: {value}" for name, value in self.facts.items()))
+
+
+def open_splat(name: str) -> SplatWorld:
+    """The world of Gaussians of that name; TerrellaError for another kind of world."""
+    world = open_world(folder_of(name))
+    if not isinstance(world, SplatWorld):
+        raise TerrellaError(
+            f"{name} is no world of Gaussians; `terrella space fit` and `space import` make such worlds."
+        )
+    return world
+
+
+def page_scene(
+    source: SplatWorld, other: Callable[[Edit], PlaceScene] | None = None, walked: bool = True
+) -> PlaceScene:
+    """A world of Gaussians as the content of a page.
+
+    other:  opens the place that an edit merges.
+    walked: if nobody walks in it, floors and walls are not computed from the Gaussians.
+    """
+    config, seen = source.config, source.provenance == OBSERVED
+    collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
+    return PlaceScene(
+        source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
+        config.keep, config.dt_s, source.object_names, other,
+    )  # fmt: skip
+
+
+def unedited_scene(world: str) -> PlaceScene:
+    """The content of the page of a world of Gaussians, before all edits."""
+    open_splat(world)  # refuses other kinds of worlds
+    other = other_of(folder_of(world))
+    return page_scene(source_of(folder_of(world)), lambda edit: page_scene(other(edit), walked=False))
+
+
+def compared_scene(name: str) -> PlaceScene:
+    """The place that a page is compared with: a world of Gaussians after its edits, or a file in its usual axes."""
+    file = Path(name)
+    return page_scene(world_of(read_scene(file), file.name, {}, SplatConfig()) if file.is_file() else open_splat(name))
+
+
+def editable_place(world: str, beside: str | None = None) -> EditablePlace:
+    """A world of Gaussians as a page edits it: edits that are saved on the page are saved in the world's folder.
+
+    beside: another world, or a file of Gaussians, to compare it with. A world can be merged on the page, too.
+    """
+    folder = folder_of(world)
+    return EditablePlace(
+        unedited_scene(world),
+        lambda: read_edits(folder),
+        lambda text: write_edits(folder, checked_edits(folder, text)),
+        None if beside is None else compared_scene(beside),
+        None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
+    )
+
+
+def _merge_of(folder: Path, other: str) -> Edit | None:
+    """The edit that merges a world; None if one of the two contains the other."""
+    try:
+        return merging(folder, folder_of(other))
+    except ContractError:
+        return None
