@@ -26,7 +26,7 @@ from gymnasium import spaces
 from ogbench.manipspace.oracles.markov.cube_markov import CubeMarkovOracle
 from trained import trained, words
 
-from terrella.act.planning import Reaching, distance_to
+from terrella.act.planning import GoalBeliefPolicy, distance_to
 from terrella.core.spec import DONE, Spec
 from terrella.data import Layout, Recorder
 from terrella.measure.statistics import wilson
@@ -163,7 +163,9 @@ def arms(world: Any, actor: Any, seed: int) -> dict[str, Callable[[np.ndarray], 
         return lambda seen: rng.uniform(-1, 1, (len(seen), len(ACTIONS))).astype(np.float32)
 
     def reaching(goals: np.ndarray) -> Act:
-        policy = Reaching(world, actor, distance_to(world, {"observation": torch.from_numpy(numbers(goals))}, "last"))
+        policy = GoalBeliefPolicy(
+            world, actor, distance_to(world, {"observation": torch.from_numpy(numbers(goals))}, "last")
+        )
         rng = torch.Generator().manual_seed(seed)
         memory = policy.begin(len(goals), rng)
 

@@ -32,7 +32,7 @@ from stable_worldmodel.solver import CEMSolver
 from trained import trained, words
 
 from terrella.act.goal_network import GoalActor
-from terrella.act.planning import Cost, CostModel, Planner, Reaching, SearchConfig, distance_to
+from terrella.act.planning import Cost, CostModel, GoalBeliefPolicy, Planner, SearchConfig, distance_to
 from terrella.core import World
 from terrella.measure.statistics import wilson
 
@@ -54,7 +54,7 @@ def arms(task: Task, world: World, actor: GoalActor, seed: int) -> dict[str, Cal
     short = SearchConfig("icem", samples=16, iterations=2, horizon=HORIZON, block=BLOCK, replan=HORIZON)
     return {
         "random": lambda: RandomPolicy(seed),
-        "reaching": ours(lambda cost: Reaching(world, actor, cost)),
+        "reaching": ours(lambda cost: GoalBeliefPolicy(world, actor, cost)),
         "icem": ours(lambda cost: Planner(world, cost, config)),
         "icem anew": ours(lambda cost: Planner(world, cost, replace(config, replan=1))),
         "icem+reaching": ours(lambda cost: Planner(world, cost, short, proposal=varied)),

@@ -15,7 +15,16 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella.act.planning import Judge, Planner, Played, Revealed, SearchConfig, distance_to, negative_reward, play
+from terrella.act.planning import (
+    FullyObserved,
+    Planner,
+    PlayResult,
+    SearchConfig,
+    SuccessCriterion,
+    distance_to,
+    negative_reward,
+    play,
+)
 from terrella.core import make_rng
 from terrella.core.files import write_json
 from terrella.core.policy import Random
@@ -43,7 +52,7 @@ CASES = {
 }
 
 
-def figures(played: Played, case: Case) -> dict[str, Figure]:
+def figures(played: PlayResult, case: Case) -> dict[str, Figure]:
     """What episodes were worth, and what a decision took."""
     found = played.episodes
     worth = {"return": mean_interval(torch.tensor([one.reward for one in found]), make_rng(0))}
@@ -55,8 +64,8 @@ def figures(played: Played, case: Case) -> dict[str, Figure]:
 
 def curve(name: str, case: Case, episodes: int) -> dict[str, dict[str, Figure]]:
     """Random play, and the planner with each number of samples, from the same starts."""
-    world = Revealed(terrella.load(f"gym:{name}", rgb=False))
-    judge = Judge(channel="done") if case.done_is_success else Judge()
+    world = FullyObserved(terrella.load(f"gym:{name}", rgb=False))
+    judge = SuccessCriterion(channel="done") if case.done_is_success else SuccessCriterion()
     cost = negative_reward(world.spec)
     if case.goal:
         cost = distance_to(world, {"observation": torch.tensor(case.goal)})

@@ -21,7 +21,7 @@ import torch
 from gymnasium import spaces
 
 import terrella
-from terrella.act.planning import Cost, Planner, SearchConfig, Thought, imagined
+from terrella.act.planning import Cost, Planner, PlannerMemory, SearchConfig, imagined_futures
 from terrella.core import State, chance
 from terrella.core.errors import ContractError, TerrellaError
 from terrella.core.policy import Random
@@ -173,7 +173,7 @@ def understood(words: str) -> dict[str, torch.Tensor]:
 class Thinking:
     """A mind's memory: what its planner remembers, and how many of its posts it has been at."""
 
-    thoughts: list[Thought]
+    thoughts: list[PlannerMemory]
     reached: int = 0
 
 
@@ -208,7 +208,7 @@ class Mind:
     def considers(self, memory):
         """The futures of the last plan, as pictures."""
         thought, colour = memory.thoughts[0], self.colours[memory.reached]
-        return imagined(Sketched(self.dream, colour), self.planner.cost, thought, self.planner.config.block)
+        return imagined_futures(Sketched(self.dream, colour), self.planner.cost, thought, self.planner.config.block)
 
 
 class Sketched:

@@ -21,7 +21,7 @@ import tyro
 import terrella
 from terrella.core import make_rng
 from terrella.core.policy import Policy
-from terrella.measure.judged import share
+from terrella.measure.policy_evaluation import percent
 from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_world import MujocoWorld
@@ -115,7 +115,9 @@ def main(policies: tyro.conf.Positional[list[Path]], /, episodes: int = 300, see
     arm = Arm(world.file, float(world.file.opt.timestep))
     for folder in policies:
         policy = terrella.load_policy(str(folder), world.spec)
-        told = [share(clopper_pearson(successes(world, policy, episodes, seed, one), episodes)) for one in (arm, None)]
+        told = [
+            percent(clopper_pearson(successes(world, policy, episodes, seed, one), episodes)) for one in (arm, None)
+        ]
         print(f"{folder}: {told[0]} of {episodes} episodes in Bullet, {told[1]} in MuJoCo", flush=True)
 
 

@@ -225,7 +225,7 @@ def compare(name: str, checkout: Path, out: Path, longest: int) -> None:
 
 def pace(checkout: Path, out: Path, rounds: int = 6, steps: int = 10) -> dict[str, list[float]]:
     """Milliseconds a frame at batch 1, in turns so that both meet the same machine: the least, the median and the most."""
-    from terrella.measure.roll import actions_at, fold_context
+    from terrella.measure.rollouts import actions_at, fold_context
 
     arms = {name: arm(name, checkout, out) for name in ("terrella", "diamond")}
     cache = ClipCache.open(out / "test", SIZE)

@@ -48,7 +48,7 @@ import terrella
 from terrella.core import make_rng
 from terrella.core.policy import Policy
 from terrella.core.state import State
-from terrella.measure.judged import share
+from terrella.measure.policy_evaluation import percent
 from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import FREE, mujoco
 from terrella.sim.mujoco_world import MujocoWorld
@@ -225,7 +225,7 @@ def told(walks: list[Walk]) -> str:
         "within 20%": sum(one.followed for one in walks),
         "both": sum(one.stood and one.followed for one in walks),
     }
-    shares = (f"{what} {count}, {share(clopper_pearson(count, len(walks)))}" for what, count in counts.items())
+    shares = (f"{what} {count}, {percent(clopper_pearson(count, len(walks)))}" for what, count in counts.items())
     return f"{'; '.join(shares)} of {len(walks)}"
 
 

@@ -53,7 +53,9 @@ def pytest_collection_modifyitems(items):
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker("browser")
     order = {path: number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
-    items.sort(key=lambda item: (item.path not in browsing, order[item.path], item.get_closest_marker("browser") is not None))
+    items.sort(
+        key=lambda item: (item.path not in browsing, order[item.path], item.get_closest_marker("browser") is not None)
+    )
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -135,7 +135,7 @@ def load_policy(name: str | Path, spec: Spec, world: World | None = None) -> Pol
            such). With @0.3 behind it each action is a random one instead with probability 0.3.
     Raises TerrellaError where there is none of that name, or where it is for other actions.
     """
-    from .act.named import policy_of
+    from .act.policies_by_name import policy_of
 
     return policy_of(str(name), spec, world)
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork, symexp, symlog
-from terrella.act.belief import actor_of
+from terrella.act.belief import load_learned_policy
 from terrella.core.errors import ActionError, ChannelError, CheckpointError
 from terrella.core.policy import Policy, act
 from terrella.core.spec import DONE, REWARD, Spec
@@ -78,12 +78,12 @@ def test_draws_come_as_often_as_they_are_likely(name: str) -> None:
     actor = actor_for(SPACES[name])
     one = {at: value.expand(4096, *value.shape[1:]) for at, value in seen(1, make_rng(4)).items()}
     distribution = actor.network(one)
-    drawn = distribution.draw(make_rng(5))
+    drawn = distribution.sample(make_rng(5))
     surprise, entropy = -distribution.log_prob(drawn), distribution.entropy(drawn)
     if name == "axes":  # the entropy is that of what tanh leaves of the draw
         surprise = surprise + (1 - torch.tanh(drawn).square()).log().sum(1)
     assert abs(float(surprise.mean() - entropy.mean())) < 0.1
-    best = distribution.log_prob(distribution.likeliest())
+    best = distribution.log_prob(distribution.mode())
     assert (best >= distribution.log_prob(drawn) - 1e-5).all()
 
 
@@ -103,7 +103,7 @@ def test_symlog_and_back() -> None:
 @pytest.mark.parametrize("name", SPACES)
 def test_what_is_saved_is_what_is_loaded(name: str, tmp_path) -> None:
     actor = actor_for(SPACES[name], ("state", "rgb"), greedy=True)
-    actor.network.eyes.settle(seen(32, make_rng(8)))
+    actor.network.eyes.fit_normalization(seen(32, make_rng(8)))
     actor.card["what"] = "a toy"
     actor.save(tmp_path / "run" / "policy")
     again = Actor.load(tmp_path / "run", actor.spec)
@@ -171,7 +171,7 @@ def test_a_policy_of_what_a_world_makes_of_things_acts_through_that_world(tmp_pa
     actor = Actor(ActorNetwork(ActorConfig.of(world.spec, ("latent",), hidden=8)).requires_grad_(False), world.spec)
     actor.save(tmp_path)
     real = Spec("real", SPACES["axes"], CHANNELS, (), 0.1)
-    policy = actor_of(tmp_path, real, world)
+    policy = load_learned_policy(tmp_path, real, world)
     seen = {"state": torch.randn(3, 3)}
     memory = policy.begin(3, rng)
     for step in (1, 2):
@@ -179,4 +179,4 @@ def test_a_policy_of_what_a_world_makes_of_things_acts_through_that_world(tmp_pa
         assert memory["steps"].tolist() == [step] * 3
     assert torch.equal(action, actor.act({"latent": 2 * seen["state"]}, None, rng)[0])
     with pytest.raises(ChannelError, match="sees 'latent', which real does not show"):
-        actor_of(tmp_path, real)
+        load_learned_policy(tmp_path, real)

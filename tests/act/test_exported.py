@@ -10,7 +10,7 @@ from tests.act.tiny_worlds import Point
 from tests.worlds.test_latent import CHOICES, STEERING, made
 
 from terrella.act.goal_network import GoalActor, GoalConfig, GoalNetwork
-from terrella.act.planning import ActionModel, CostModel, Judge, Planner, SearchConfig, distance_to
+from terrella.act.planning import ActionModel, CostModel, Planner, SearchConfig, SuccessCriterion, distance_to
 from terrella.cli.planning import _Case
 from terrella.cli.searching import Searching
 from terrella.core import make_rng
@@ -87,7 +87,7 @@ def test_the_command_leaps_too_unless_it_is_told_when_to_trust():
     world.leap, inner = lambda *given: leapt.append(1) or inner(*given), world.leap
     for trust in (None, 0.5):
         searching = Searching(SearchConfig("cem", 4, 2, 3, 2, trust=trust), cost="last")
-        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, Judge(), searching, 1, 1, 0).planner(
+        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, SuccessCriterion(), searching, 1, 1, 0).planner(
             searching.search
         )
         leapt.clear()

@@ -8,7 +8,15 @@ import torch
 from gymnasium import spaces
 from tests.act.tiny_worlds import Broken, Grid, Point, Windy
 
-from terrella.act.planning import Judge, Planner, Revealed, SearchConfig, distance_to, negative_reward, play
+from terrella.act.planning import (
+    FullyObserved,
+    Planner,
+    SearchConfig,
+    SuccessCriterion,
+    distance_to,
+    negative_reward,
+    play,
+)
 from terrella.core import check_world, make_rng, rollout
 from terrella.core.errors import ChannelError, ContractError, ObservationError, PlanningError
 from terrella.core.policy import Random, Reactive
@@ -178,7 +186,7 @@ def test_a_budget_in_time_is_kept():
 
 def test_episodes_are_judged_from_unsolved_starts():
     world = Point()
-    judge = Judge({"observation": torch.zeros(1, 2)}, within=0.1)
+    judge = SuccessCriterion({"observation": torch.zeros(1, 2)}, within=0.1)
     cost = distance_to(world, {"observation": torch.zeros(2)})
     mine = play(world, planner(world, "icem", cost), 12, 20, 0, judge, SEEN, SEEN, 2)
     floor = play(world, Random(world.spec), 12, 20, 0, judge, SEEN, SEEN, 12)
@@ -189,18 +197,18 @@ def test_episodes_are_judged_from_unsolved_starts():
         assert len(one.seen) == one.steps + 1 == len(one.actions) + 1 and one.nearest <= 0.1
     assert not mine.episodes[2].seen
     with pytest.raises(PlanningError, match="already solved"):
-        play(world, Random(world.spec), 4, 5, 0, Judge({"observation": torch.zeros(1, 2)}, within=2.0), SEEN)
+        play(world, Random(world.spec), 4, 5, 0, SuccessCriterion({"observation": torch.zeros(1, 2)}, within=2.0), SEEN)
 
 
 def test_a_revealed_simulator_is_a_world():
-    world = Revealed(GymnasiumWorld("CartPole-v1", rgb=False))
+    world = FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False))
     assert "observes" in check_world(world, steps=10)
     with pytest.raises(PlanningError, match="cannot be planned in"):
-        Revealed(GymnasiumWorld("CartPole-v1", rgb=False, forkable=False))
+        FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False, forkable=False))
 
 
 def test_a_planner_in_the_simulator_keeps_the_pole_up():
-    world = Revealed(GymnasiumWorld("CartPole-v1", rgb=False))
+    world = FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False))
     policy = Planner(world, negative_reward(world.spec), SearchConfig(samples=16, iterations=2, horizon=12, replan=3))
     mine = play(world, policy, 1, 200, 0, sees=world.spec.observes)
     floor = play(world, Random(world.spec), 8, 200, 0)

@@ -11,14 +11,14 @@ from gymnasium import spaces
 
 from terrella.act.planning import (
     Destination,
+    FullyObserved,
     Navigator,
     Planner,
-    Revealed,
     SearchConfig,
+    cost_discriminates,
     distance,
     distance_to,
-    search_within,
-    tells_apart,
+    search_config_within,
 )
 from terrella.act.planning.routes import STRIDE_M, routes_to
 from terrella.core import Spec, State, check_world
@@ -68,7 +68,7 @@ class Yard:
 
 
 def walk(place, steps=120, shown=("pose", "places")):
-    world = Revealed(Yard())
+    world = FullyObserved(Yard())
     cost = distance_to(world, {"pose": torch.tensor([*place, *[torch.nan] * 5])})
     way = Navigator(Planner(world, cost, SearchConfig(samples=24, iterations=2, horizon=5)), place)
     rng = make_rng(0)
@@ -144,16 +144,16 @@ def test_a_place_that_could_not_be_walked_to_is_avoided():
 
 
 def test_a_search_is_paced_and_knows_whether_there_is_anything_to_plan_for():
-    world = Revealed(Yard())
+    world = FullyObserved(Yard())
     state = world.start(1, make_rng(0))
     near = distance_to(world, {"pose": torch.tensor([1.0, 0.0, *[torch.nan] * 5])})
-    config, fits = search_within(world, near, state, 1e4)
+    config, fits = search_config_within(world, near, state, 1e4)
     assert fits and config.horizon == 16 and config.samples == 32
-    config, fits = search_within(world, near, state, 1e-3)
+    config, fits = search_config_within(world, near, state, 1e-3)
     assert not fits and config.horizon == 4 and config.samples == 8
-    assert tells_apart(world, near, state)
+    assert cost_discriminates(world, near, state)
     same = distance_to(world, {"pose": torch.tensor([torch.nan, torch.nan, 0.0, *[torch.nan] * 4])})
-    assert not tells_apart(world, same, state)
+    assert not cost_discriminates(world, same, state)
 
 
 def test_both_quaternions_of_a_rotation_are_as_far_from_a_goal():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from terrella.act.planning import Episode, Played, SearchConfig
+from terrella.act.planning import PlayedEpisode, PlayResult, SearchConfig
 from terrella.cli.compute_curve import Point, helped, less
 from terrella.measure.statistics import wilson
 
@@ -39,5 +39,5 @@ def test_whether_it_helped_is_told_with_its_plateau(reached, said):
     assert said in helped(points, "success", 0)
 
 
-def _played(reached: int) -> Played:
-    return Played([Episode(success=at < reached) for at in range(20)], 0)
+def _played(reached: int) -> PlayResult:
+    return PlayResult([PlayedEpisode(success=at < reached) for at in range(20)], 0)

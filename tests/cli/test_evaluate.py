@@ -7,7 +7,7 @@ import json
 import pytest
 from tests.cli.tiny import NAME
 
-from terrella.act.judging import Bench
+from terrella.act.paired_evaluation import PairedEvaluation
 from terrella.cli import main
 from terrella.cli.evaluate import labels_of
 
@@ -31,7 +31,7 @@ def test_a_dream_that_is_reality_agrees_and_what_was_stopped_goes_on(capsys, tmp
     assert max(whole["curves"]["observation"]["value"]) < 1e-5
     assert "<svg" in (tmp_path / "whole" / "evaluate.html").read_text()
 
-    play, played = Bench.play, []
+    play, played = PairedEvaluation.play, []
 
     def stopped(bench, *told):
         played.append(told)
@@ -39,7 +39,7 @@ def test_a_dream_that_is_reality_agrees_and_what_was_stopped_goes_on(capsys, tmp
             raise KeyboardInterrupt
         return play(bench, *told)
 
-    monkeypatch.setattr(Bench, "play", stopped)
+    monkeypatch.setattr(PairedEvaluation, "play", stopped)
     assert main(["evaluate", *FIVE, "--out", str(tmp_path / "part")]) == 130
     assert "the same command goes on" in capsys.readouterr().err
     part = evaluated(capsys, *FIVE, "--out", str(tmp_path / "part"))

@@ -12,8 +12,16 @@ from tests.act.tiny_worlds import Grid, Point
 from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.act.goal_network import GoalActor
-from terrella.act.named import policy_of, proposing
-from terrella.act.planning import Judge, Planner, Reaching, SearchConfig, distance_to, negative_reward, play
+from terrella.act.planning import (
+    GoalBeliefPolicy,
+    Planner,
+    SearchConfig,
+    SuccessCriterion,
+    distance_to,
+    negative_reward,
+    play,
+)
+from terrella.act.policies_by_name import policy_of, proposal_policy
 from terrella.cli import main
 from terrella.core.errors import ActionError, ChannelError, CheckpointError, PlanningError, TrainingError
 from terrella.core.policy import Random
@@ -62,8 +70,8 @@ def test_it_reaches_goals_that_random_play_does_not(made):
     assert facts["action_explained"]["1"] > 0.9 > facts["action_explained"]["5"] > 0
     cost = distance_to(world, goal, "last")
     acting = policy_of(str(folder / "run"), world.spec, world, cost)
-    assert isinstance(acting, Reaching)
-    judge = Judge({name: value[None] for name, value in goal.items()}, within=0.04)
+    assert isinstance(acting, GoalBeliefPolicy)
+    judge = SuccessCriterion({name: value[None] for name, value in goal.items()}, within=0.04)
     mine, floor = (
         play(world, policy, 20, 25, 0, judge, ("observation",)).episodes for policy in (acting, Random(world.spec))
     )
@@ -90,7 +98,7 @@ def test_episodes_at_once_have_their_own_goals_and_do_what_each_would_alone(made
     seen, rng = {"observation": torch.tensor([[1.0, 1.0]]).expand(3, -1)}, make_rng(0)
 
     def moved(rows):
-        policy = Reaching(world, actor, distance_to(world, {"observation": goals[rows]}))
+        policy = GoalBeliefPolicy(world, actor, distance_to(world, {"observation": goals[rows]}))
         memory = policy.begin(len(goals[rows]), rng)
         for _ in range(2):
             action, memory = policy.act({"observation": seen["observation"][rows]}, memory, rng)
@@ -110,7 +118,7 @@ def test_a_search_that_hardly_searches_is_better_for_its_proposals(made):
         played = play(world, Planner(world, cost, config, proposal=proposal), 6, 6, 0, None, ("observation",), kept=0)
         return np.mean([one.best_cost for one in played.episodes])
 
-    assert ended(proposing(str(folder / "run"), world)) < 0.7 * ended(None)
+    assert ended(proposal_policy(str(folder / "run"), world)) < 0.7 * ended(None)
 
 
 def test_it_goes_on_exactly(made, tmp_path):

@@ -90,7 +90,7 @@ def test_it_is_exported_with_its_normalisation(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'terrella[fast]'")
     pytest.importorskip("onnx", reason="pip install 'terrella[fast]'")
     network = ActorNetwork(ActorConfig.of(Hold.spec, ("at",), hidden=16))
-    network.eyes.settle({"at": 3 + 2 * torch.randn(100, 1, generator=make_rng(0))})
+    network.eyes.fit_normalization({"at": 3 + 2 * torch.randn(100, 1, generator=make_rng(0))})
     with torch.no_grad():
         network.think[-1].weight.mul_(100)
     actor = Actor(network.eval(), Hold.spec)

@@ -12,7 +12,7 @@ def test_joules_of_counters_that_begin_again_and_of_no_machine_as_a_whole(tmp_pa
         folder.mkdir()
         for file, text in (("name", name), ("energy_uj", "9000000"), ("max_energy_range_uj", "9999999")):
             (folder / file).write_text(f"{text}\n")
-    meter = acceleration.Meter()
+    meter = acceleration.EnergyMeter()
     assert meter.how.startswith("RAPL") and meter.joules() == 0
     (tmp_path / "intel-rapl:0" / "energy_uj").write_text("2000000")  # over its end
     (tmp_path / "intel-rapl:1" / "energy_uj").write_text("9500000")
@@ -20,4 +20,4 @@ def test_joules_of_counters_that_begin_again_and_of_no_machine_as_a_whole(tmp_pa
     assert meter.joules() == 3.5
     (tmp_path / "intel-rapl:0" / "name").unlink()
     (tmp_path / "intel-rapl:1" / "name").unlink()
-    assert acceleration.Meter().how.startswith("estimated")
+    assert acceleration.EnergyMeter().how.startswith("estimated")

@@ -17,8 +17,8 @@ from terrella.measure.agreement import (
     ranks,
     spearman,
 )
-from terrella.measure.judged import as_dict, judge, table, verdict
-from terrella.measure.judged_page import judged_page
+from terrella.measure.policy_evaluation import as_dict, evaluate_policies, table, verdict
+from terrella.measure.policy_evaluation_page import policy_evaluation_page
 
 RNG = torch.Generator()
 
@@ -116,7 +116,7 @@ def scores_of(dream, real, control=None, measure="return"):
 )
 def test_the_verdict_comes_first(make, said):
     scores, names = scores_of(*make())
-    found = judge(scores, {}, names, 0)
+    found = evaluate_policies(scores, {}, names, 0)
     lines = verdict(found)
     assert said in lines[0] and all("nan" not in line for line in lines)
     assert lines == as_dict(found)["verdict"] and len(table(found)[1]) == len(names) + 1
@@ -126,7 +126,7 @@ def test_a_verdict_is_doubted_where_a_control_that_answers_to_nothing_ranks_as_w
     dream, real = drawn(True)
     for control, doubted in ((dream, True), (drawn(False)[0], False)):
         scores, names = scores_of(dream, real, control)
-        assert ("this proves little" in verdict(judge(scores, {}, names, 0))[0]) is doubted
+        assert ("this proves little" in verdict(evaluate_policies(scores, {}, names, 0))[0]) is doubted
 
 
 def test_successes_have_wilsons_intervals_and_curves_their_page():
@@ -134,11 +134,11 @@ def test_successes_have_wilsons_intervals_and_curves_their_page():
     scores, names = scores_of(dream, real, measure="success")
     curve = [0.0, 0.1, 0.2, math.nan]
     followed = {name: {"x": curve, "x of the start": curve, "uncertainty": [0.0, 0.3, 0.4, 0.5]} for name in names}
-    found = judge(scores, followed, names, 0)
+    found = evaluate_policies(scores, followed, names, 0)
     assert found.what == "success" and found.dream.scale == 1
     assert 0 <= found.rows["p0"]["real"].low and "error in x" in " ".join(verdict(found))
     assert len(found.curves["x"].value) == 3 and found.expected == 1
-    page = judged_page("judged <here>", found, {"in": "a & b"})
+    page = policy_evaluation_page("judged <here>", found, {"in": "a & b"})
     assert "judged &lt;here&gt;" in page and "a &amp; b" in page and page.count("<svg") > 4 and "NaN" not in page
     json.dumps(as_dict(found))
 
@@ -146,6 +146,6 @@ def test_successes_have_wilsons_intervals_and_curves_their_page():
 def test_without_reality_the_dream_alone_is_told():
     scores, names = scores_of(*drawn(True))
     alone = {name: {arm: found for arm, found in arms.items() if arm != "real"} for name, arms in scores.items()}
-    found = judge(alone, {}, names, 0)
+    found = evaluate_policies(alone, {}, names, 0)
     assert found.dream is None and "In the dream the best of 10 is p9" in verdict(found)[0]
-    assert "--real" in verdict(found)[0] and "<svg" in judged_page("x", found, {})
+    assert "--real" in verdict(found)[0] and "<svg" in policy_evaluation_page("x", found, {})

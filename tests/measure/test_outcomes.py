@@ -14,7 +14,7 @@ from terrella.core import Spec, State, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.spec import DONE, REWARD
 from terrella.measure import CLIPS, ENDINGS, Exam, ExamConfig, examine
-from terrella.measure.outcomes import auc, correlation, outcomes, passages
+from terrella.measure.outcomes import auc, clips_with_endings, correlation, outcome_rows
 
 HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -70,7 +70,7 @@ def exam_rows(clips, real, horizons=(4, 16)):
 
 
 def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
-    shown = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
+    shown = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
     rows = exam_rows(*shown)
     for horizon in (4, 16):
         assert rows["right", horizon, "return error"].figure.value == rows["right", horizon, "error"].figure.value == 0
@@ -87,7 +87,7 @@ def test_a_world_that_is_right_errs_in_nothing_and_a_blind_one_as_a_copy_does():
 
 
 def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
-    shown = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 20, make_rng(1))
+    shown = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 20, make_rng(1))
     short = [(clip, real) for clip, real in zip(*shown) if not real.all()]
     assert len(short) >= 10
     for clip, real in short:
@@ -100,12 +100,14 @@ def test_half_of_the_passages_run_into_an_end_and_stand_still_after_it():
 def test_after_an_end_the_actions_are_legal(space):
     cache = recording()
     cache.action = np.ones_like(cache.action)
-    for clip, _ in zip(*passages(cache, replace(Game().spec, action=space), (0, 1, 2), 5, 16, 20, make_rng(1))):
+    for clip, _ in zip(
+        *clips_with_endings(cache, replace(Game().spec, action=space), (0, 1, 2), 5, 16, 20, make_rng(1))
+    ):
         assert all(space.contains(row.astype(space.dtype).reshape(space.shape)[()]) for row in clip.action)
 
 
 def test_nothing_but_the_end_is_judged_after_an_end():
-    clips, real = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
+    clips, real = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
     exam = Exam({"right": Game()}, {CLIPS: {"recorded": clips}}, ExamConfig((4, 16), ()))
     going = torch.from_numpy(np.stack(real))
     dreamt = {name: torch.from_numpy(np.stack([clip.channels[name][5:] for clip in clips])) for name in ("health",)}
@@ -116,7 +118,7 @@ def test_nothing_but_the_end_is_judged_after_an_end():
     dreamt = {name: torch.where(after, 99.0, values) for name, values in dreamt.items()}
     rows = [
         row
-        for row in outcomes(exam, "recorded", "right", clips, going, dreamt)
+        for row in outcome_rows(exam, "recorded", "right", clips, going, dreamt)
         if row.what in ("error", "return error")
     ]
     assert len(rows) == 4 and all(row.figure.value == 0 for row in rows)
@@ -124,7 +126,7 @@ def test_nothing_but_the_end_is_judged_after_an_end():
 
 
 def test_results_of_another_recording_do_not_count():
-    clips, real = passages(recording(), Game().spec, (0, 1, 2), 5, 16, 4, make_rng(0))
+    clips, real = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 4, make_rng(0))
     brighter = [replace(clip, channels={**clip.channels, "rgb": clip.channels["rgb"] + 1}) for clip in clips]
     prints = [
         Exam({"right": Game()}, {CLIPS: {"recorded": some}}, ExamConfig()).fingerprint() for some in (clips, brighter)
@@ -147,14 +149,14 @@ def test_correlation_is_pearsons():
 
 def test_what_is_too_short_is_refused():
     with pytest.raises(DatasetError, match="longer than"):
-        passages(recording((4, 5)), Game().spec, (0, 1), 5, 8, 4, make_rng(0))
+        clips_with_endings(recording((4, 5)), Game().spec, (0, 1), 5, 8, 4, make_rng(0))
 
 
 def test_passages_stay_where_they_may():
     cache = recording()
     allowed = np.zeros(cache.length, bool)
     allowed[cache.episodes[1][0] + 3 : cache.episodes[1][1] - 2] = True
-    shown = passages(
+    shown = clips_with_endings(
         cache, Game().spec, (0, 1, 2), 2, 4, 12, make_rng(0), lambda cache, first, stop: allowed[first:stop]
     )
     for clip, real in zip(*shown):

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from panorama import Panorama, card_of, some_clips
 
 from terrella.core import make_rng
-from terrella.measure.risk import risk
+from terrella.measure.risk import risk_coverage_report
 
 
 def errors(clips: int = 6, steps: int = 50) -> torch.Tensor:
@@ -16,7 +16,7 @@ def errors(clips: int = 6, steps: int = 50) -> torch.Tensor:
 
 
 def figures(wrong, uncertainty):
-    found = risk("new", "memory", "predicted", wrong, uncertainty, make_rng(1))
+    found = risk_coverage_report("new", "memory", "predicted", wrong, uncertainty, make_rng(1))
     return {row.what: row for row in found.rows}, found.curves
 
 

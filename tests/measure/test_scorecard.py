@@ -13,8 +13,15 @@ from panorama import Panorama, card_of, exam_of, recording, some_clips
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
 from terrella.measure import Album, ExamConfig, as_dict, examine, to_json, verdict
-from terrella.measure.album import look
-from terrella.measure.closure import go, rows_of, turn_way, walk_way, walkers, yaw_way
+from terrella.measure.album import appearance
+from terrella.measure.closure import (
+    clips_that_walk,
+    rows_of,
+    run_round_trip,
+    turn_round_trip,
+    walk_round_trip,
+    yaw_round_trip,
+)
 from terrella.measure.endurance import NAMES, long_rollout, still_rows
 from terrella.measure.endurance import rows_of as stretches
 from terrella.measure.fidelity import PSNR_CAP_DB
@@ -222,32 +229,32 @@ def test_one_clip_has_figures_without_intervals_and_no_other_actions(clips):
 
 def closure(world, clips, way, batch=12):
     """The rows of a way there and back: of the frame after coming back, and of the far view seen again."""
-    return rows_of(("recorded", "a"), way, go(world, clips[:batch], way, make_rng(0)), lambda: make_rng(0))
+    return rows_of(("recorded", "a"), way, run_round_trip(world, clips[:batch], way, make_rng(0)), lambda: make_rng(0))
 
 
 def test_closure_of_a_perfect_world_closes(clips):
-    back, again = closure(Panorama(), clips, yaw_way(180))
+    back, again = closure(Panorama(), clips, yaw_round_trip(180))
     assert not back.void and back.figure.value > 45 and back.baselines["far view"].value < 20
-    gone = go(Panorama(), clips, yaw_way(180), make_rng(0))
+    gone = run_round_trip(Panorama(), clips, yaw_round_trip(180), make_rng(0))
     frames = gone["frames"][0].numpy()
     assert back.horizon == 120 and frames.shape == (6, 24, 32, 3) and again.figure.value > 45
     assert np.array_equal(frames[1], frames[3]) and not np.array_equal(frames[0], frames[2])
 
 
 def test_closure_of_a_static_world_is_void(clips):
-    back, again = closure(Panorama("static"), clips, yaw_way(180))
+    back, again = closure(Panorama("static"), clips, yaw_round_trip(180))
     assert back.void and again.void and back.figure.value == PSNR_CAP_DB
 
 
 def test_closure_of_a_forgetful_world_does_not_close(clips):
-    back, _ = closure(Panorama("forgetful"), clips, yaw_way(180))
+    back, _ = closure(Panorama("forgetful"), clips, yaw_round_trip(180))
     assert not back.void and back.figure.high < 20
 
 
 def test_a_walk_there_and_back_closes_where_the_place_is_remembered():
-    clips = walkers(some_clips(8, 64), 100)
+    clips = clips_that_walk(some_clips(8, 64), 100)
     assert clips and all(clip.walked_m()[49] >= 1 for clip in clips)
-    done = {flaw: closure(Panorama(flaw), clips, walk_way(100)) for flaw in ("", "static", "forgetful")}
+    done = {flaw: closure(Panorama(flaw), clips, walk_round_trip(100)) for flaw in ("", "static", "forgetful")}
     assert done[""][0].figure.value > 45 and done[""][0].horizon == 100 and "m away" in done[""][0].note
     assert done["static"][0].void and not done["forgetful"][0].void and done["forgetful"][0].figure.high < 20
     assert done[""][1].figure.value > 45 > 20 > done["forgetful"][1].figure.high
@@ -268,10 +275,10 @@ def test_a_world_without_poses_is_turned_by_its_actions(clips):
 
     left, right = torch.tensor([0, 1, 0]), torch.tensor([0, 0, 1])
     start = Panorama()._state(torch.from_numpy(np.stack([clips[0].pose[0]] * 4)))
-    back, _ = closure(Keyed(), clips, turn_way(left, right, "left and right", 60), batch=4)
+    back, _ = closure(Keyed(), clips, turn_round_trip(left, right, "left and right", 60), batch=4)
     assert back.horizon == 60 and back.figure.value > 20 > back.baselines["far view"].value
     with pytest.raises(ObservationError, match="does not observe 'pose'"):
-        closure(Keyed(), clips, yaw_way(90), batch=4)
+        closure(Keyed(), clips, yaw_round_trip(90), batch=4)
 
 
 def long_report(world, clips, steps, album=None, rollouts=8):
@@ -339,7 +346,7 @@ def test_the_album_finds_the_nearest_view_and_no_far_one():
     pose = torch.from_numpy(cache.pose[[5, 150]])
     rows = album.nearest(pose)
     assert torch.equal(album.place[rows], pose[:, :3])
-    assert torch.allclose(album.looks(rows), look(torch.from_numpy(cache.rgb[rows.numpy()])))
+    assert torch.allclose(album.appearances(rows), appearance(torch.from_numpy(cache.rgb[rows.numpy()])))
     assert album.nearest(pose + torch.tensor([100.0, 0, 0, 0, 0, 0, 0])).tolist() == [-1, -1]
     others = album.nearest(pose, torch.tensor([0, 1]))
     assert all(row < 0 or album.episode[row] != episode for row, episode in zip(others.tolist(), (0, 1)))

@@ -14,7 +14,7 @@ from panorama import SHORT, STEP_M, TURN_RAD, Panorama, card_of, exam_of, look, 
 
 from terrella.core import Spec, State, check_world, make_rng
 from terrella.measure import CLIPS, Exam, ExamConfig, clips_from_cache, examine, verdict
-from terrella.measure.turning import scrolls, turns
+from terrella.measure.turning import scrolling_actions, turning_actions
 
 KINDS = {
     "buttons": spaces.MultiBinary(3),
@@ -68,7 +68,7 @@ def steered(kind: str):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("posed", (True, False))
 def test_the_actions_that_turn_are_found_in_the_world_or_in_the_recording(kind, posed):
-    found = turns(Steered(kind=kind, posed=posed), steered(kind), make_rng(0))
+    found = turning_actions(Steered(kind=kind, posed=posed), steered(kind), make_rng(0))
     assert found is not None
     left, right, name, speed = found
     assert name == {"buttons": "b and c", "choice": "d and c", "axes": "+c and -c"}[kind]
@@ -82,9 +82,11 @@ def test_nothing_that_turns_is_no_error():
         def imagine(self, state, action, rng):
             return self._next(state, move(state["pose"], action.float() * torch.tensor([1.0, 0, 0])))
 
-    assert turns(Rail(), some_clips(2), make_rng(0)) is None
+    assert turning_actions(Rail(), some_clips(2), make_rng(0)) is None
     assert (
-        turns(Panorama("blind"), [replace(c, channels={"rgb": c.channels["rgb"]}) for c in some_clips(2)], make_rng(0))
+        turning_actions(
+            Panorama("blind"), [replace(c, channels={"rgb": c.channels["rgb"]}) for c in some_clips(2)], make_rng(0)
+        )
         is None
     )
 
@@ -126,7 +128,7 @@ class Strip:
 
 
 def test_the_actions_that_scroll_a_flat_world_and_undo_each_other_are_found():
-    found = scrolls(Strip(), some_clips(2), make_rng(0))
+    found = scrolling_actions(Strip(), some_clips(2), make_rng(0))
     assert found is not None
     one, other, name, speed = found
     assert (one.tolist(), other.tolist(), name) == ([0, 1, 0], [0, 0, 1], "b and c") and speed == pytest.approx(3)
@@ -135,7 +137,7 @@ def test_the_actions_that_scroll_a_flat_world_and_undo_each_other_are_found():
         def imagine(self, state, action, rng):
             return state
 
-    assert scrolls(Frozen(), some_clips(2), make_rng(0)) is None
+    assert scrolling_actions(Frozen(), some_clips(2), make_rng(0)) is None
 
 
 @pytest.mark.parametrize("fades, worst, best", [(0, 60, 99), (20, 20, 25)])

@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 from PIL import Image
 
-from terrella.act.planning import Planner, Revealed, SearchConfig, distance_to, imagined
+from terrella.act.planning import FullyObserved, Planner, SearchConfig, distance_to, imagined_futures
 from terrella.core.errors import ContractError, PlanningError, ProtocolError, ServeError
 from terrella.core.policy import Idle, Reactive
 from terrella.core.spec import Spec
@@ -215,15 +215,15 @@ def test_futures_come_in_pieces_only_while_the_agent_drives():
 
 
 def test_what_a_planner_considered_is_imagined_anew():
-    world = Revealed(Panorama())
+    world = FullyObserved(Panorama())
     cost = distance_to(world, {"pose": torch.tensor([5.0, *[torch.nan] * 6])})
     planner = Planner(world, cost, SearchConfig(samples=8, iterations=1, horizon=5))
     rng = make_rng(0)
     memory = planner.begin(1, rng)
     state = world.start(1, rng)
-    assert list(imagined(world, cost, memory[0])) == []
+    assert list(imagined_futures(world, cost, memory[0])) == []
     _, memory = planner.act(world.render(state, world.spec.observes), memory, rng)
-    *waiting, found = imagined(world, cost, memory[0], count=4)
+    *waiting, found = imagined_futures(world, cost, memory[0], count=4)
     assert waiting == [None] * 6 and 2 <= len(found) <= 3
     assert found[0].cost == pytest.approx(memory[0].decision.cost, rel=1e-5) and found[0].cost == min(found)[0]
     assert all(one.pictures.shape == (4, 48, 64, 3) for one in found)

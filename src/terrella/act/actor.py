@@ -49,7 +49,7 @@ class Actor:
         """The actions [B, *action.shape], on the network's device."""
         check_seen(self.network.config, observation)
         distribution = self.network(observation)
-        drawn = distribution.likeliest() if self.greedy else distribution.draw(rng)
+        drawn = distribution.mode() if self.greedy else distribution.sample(rng)
         return self.network.config.actions(drawn, self.spec), None
 
     def save(self, folder: str | Path) -> None:

@@ -11,7 +11,7 @@ from torch import nn
 
 from ..core.errors import ActionError, ChannelError, TerrellaError
 from ..core.spec import BUTTONS, CHOICE, Spec, dtype_of, shape_of
-from .distributions import ActionDistribution, Axes, Buttons, Choices
+from .distributions import ActionDistribution, Bernoulli, Categorical, SquashedGaussian
 
 AXES = "axes"
 CELLS = 4  # a side: of what is left of a picture
@@ -70,8 +70,8 @@ class ActorConfig:
     def distribution(self, found: torch.Tensor) -> ActionDistribution:
         """The distribution that [N, outputs] stand for."""
         if self.mode == CHOICE:
-            return Choices(self.counts, found)
-        return Buttons(found) if self.mode == BUTTONS else Axes(found)
+            return Categorical(self.counts, found)
+        return Bernoulli(found) if self.mode == BUTTONS else SquashedGaussian(found)
 
     def actions(self, drawn: torch.Tensor, spec: Spec) -> torch.Tensor:
         """Draws [N, D] as the world of `spec` takes them; of axes with gradients."""
@@ -115,7 +115,7 @@ def _actions(spec: Spec) -> tuple[str, tuple[int, ...], tuple[float, ...], tuple
     return mode, shape_of(spec.action), tuple(low.ravel().tolist()), tuple(high.ravel().tolist())
 
 
-class Eyes(nn.Module):
+class ObservationEncoder(nn.Module):
     """Observations to features [N, width]: numbers in symlogs of deviations from their mean, pictures by strided
     convolutions. settle: tells it the mean and the deviation of the numbers."""
 
@@ -146,7 +146,7 @@ class Eyes(nn.Module):
         found = [seen[name].to(self.mean.device).float().reshape(-1, width) for name, width in self.config.numbers]
         return torch.cat(found, 1)
 
-    def settle(self, seen: Mapping[str, torch.Tensor]) -> None:
+    def fit_normalization(self, seen: Mapping[str, torch.Tensor]) -> None:
         """Mean and deviation of what was seen; of what never varies, the deviation is 1."""
         if self.config.numbers:
             flat = self.flat(seen).double()
@@ -161,14 +161,14 @@ class ActorNetwork(nn.Module):
 
     def __init__(self, config: ActorConfig):
         super().__init__()
-        self.config, self.eyes = config, Eyes(config)
-        self.think = perceptron(self.eyes.width, config.hidden, config.layers, config.outputs, gain=0.01)
+        self.config, self.eyes = config, ObservationEncoder(config)
+        self.think = mlp(self.eyes.width, config.hidden, config.layers, config.outputs, gain=0.01)
 
     def forward(self, seen: Mapping[str, torch.Tensor]) -> ActionDistribution:
         return self.config.distribution(self.think(self.eyes(seen)))
 
 
-def perceptron(into: int, hidden: int, layers: int, out: int, gain: float) -> nn.Sequential:
+def mlp(into: int, hidden: int, layers: int, out: int, gain: float) -> nn.Sequential:
     """Layers with LayerNorm and SiLU; the last one's weights are small by `gain`."""
     parts: list[nn.Module] = []
     for layer in range(layers):

@@ -14,7 +14,7 @@ from ..core.state import State
 from ..core.world import Observation, World
 from .actor import Actor, policy_folder, read_policy
 from .goal_network import KIND, GoalActor
-from .planning import Cost, Reaching
+from .planning import Cost, GoalBeliefPolicy
 
 
 @final
@@ -35,7 +35,7 @@ class BeliefPolicy:
         return action, self.world.imagine(state, action, rng)
 
 
-def actor_of(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
+def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
     """The learned policy of a folder, for the actions of `spec`; where it sees what that does not show but `world` does, through
     the world; one for goals, towards the goal of `cost`. ActionError, ChannelError or PlanningError where it does not fit."""
     if read_policy(policy_folder(folder)).get("kind") == KIND:
@@ -43,7 +43,7 @@ def actor_of(folder: str | Path, spec: Spec, world: World | None = None, cost: C
             raise PlanningError(
                 f"{folder} is a policy for goals: it needs the world that it was learned in, and a goal."
             )
-        return Reaching(world, GoalActor.load(folder, world.spec), cost)
+        return GoalBeliefPolicy(world, GoalActor.load(folder, world.spec), cost)
     try:
         return Actor.load(folder, spec)
     except ChannelError:

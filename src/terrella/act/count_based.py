@@ -24,7 +24,7 @@ _KINDS = {"seek": 0.65, "hold": 0.2, "mash": 0.1, "rest": 0.05}
 _STILL = 1.0  # grey levels by which the most changed hundredth of a small picture changes where something happened
 
 
-class Findings:
+class NoveltyModel:
     """What was found out of a world over all episodes: how often each cell of each grid was seen, what each action was
     worth there, how often each changed what is seen at all, and which lengths of holding it brought news."""
 
@@ -110,7 +110,7 @@ class CountBased:
 
     def __init__(self, spec: Spec, log: Path | None = None):
         self.spec, self.arms = spec, _arms(spec)
-        self.findings, self.log = Findings(len(self.arms)), log
+        self.findings, self.log = NoveltyModel(len(self.arms)), log
         self.channel = next((name for name in ("rgb", "observation", *spec.channels) if name in spec.channels), "")
         self._open: list[_Play] = []
 

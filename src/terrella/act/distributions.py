@@ -14,23 +14,23 @@ import torch.nn.functional as F
 
 from ..core import chance
 
-EVEN = 0.01  # share of the probability that is spread over all choices (DreamerV3, Hafner et al. 2023)
-LEAST, MOST = 0.05, 1.0  # deviation of an axis before tanh
+UNIFORM_SHARE = 0.01  # share of the probability that is spread over all choices (DreamerV3, Hafner et al. 2023)
+MIN_STD, MAX_STD = 0.05, 1.0  # deviation of an axis before tanh
 _STREAM = 11
 
 
 @dataclass(frozen=True)
-class Choices:
+class Categorical:
     """One choice of several, or several such: logits [N, sum(counts)]."""
 
     counts: tuple[int, ...]
     logits: torch.Tensor
 
-    def draw(self, rng: torch.Generator) -> torch.Tensor:
+    def sample(self, rng: torch.Generator) -> torch.Tensor:
         seeds = chance.seeds(len(self.logits), rng, self.logits.device)
         return torch.stack([chance.choice(seeds, p, _STREAM + n) for n, p in enumerate(self._shares())], 1).float()
 
-    def likeliest(self) -> torch.Tensor:
+    def mode(self) -> torch.Tensor:
         return torch.stack([p.argmax(1) for p in self._shares()], 1).float()
 
     def log_prob(self, drawn: torch.Tensor) -> torch.Tensor:
@@ -44,20 +44,20 @@ class Choices:
 
     def _shares(self) -> list[torch.Tensor]:
         parts = self.logits.split(list(self.counts), 1)
-        return [(1 - EVEN) * part.softmax(1) + EVEN / part.shape[1] for part in parts]
+        return [(1 - UNIFORM_SHARE) * part.softmax(1) + UNIFORM_SHARE / part.shape[1] for part in parts]
 
 
 @dataclass(frozen=True)
-class Buttons:
+class Bernoulli:
     """Each button for itself: logits [N, D]."""
 
     logits: torch.Tensor
 
-    def draw(self, rng: torch.Generator) -> torch.Tensor:
+    def sample(self, rng: torch.Generator) -> torch.Tensor:
         seeds = chance.seeds(len(self.logits), rng, self.logits.device)
         return (chance.uniform(seeds, self.logits.shape[1:], _STREAM) < self._share()).float()
 
-    def likeliest(self) -> torch.Tensor:
+    def mode(self) -> torch.Tensor:
         return (self.logits > 0).float()
 
     def log_prob(self, drawn: torch.Tensor) -> torch.Tensor:
@@ -69,21 +69,21 @@ class Buttons:
         return (torch.special.entr(share) + torch.special.entr(1 - share)).sum(1)
 
     def _share(self) -> torch.Tensor:
-        return (1 - EVEN) * self.logits.sigmoid() + EVEN / 2
+        return (1 - UNIFORM_SHARE) * self.logits.sigmoid() + UNIFORM_SHARE / 2
 
 
 @dataclass(frozen=True)
-class Axes:
+class SquashedGaussian:
     """Normal before tanh: found [N, 2 D], means and what deviations are made of. Draws have gradients."""
 
     found: torch.Tensor
 
-    def draw(self, rng: torch.Generator) -> torch.Tensor:
+    def sample(self, rng: torch.Generator) -> torch.Tensor:
         mean, deviation = self._shape()
         seeds = chance.seeds(len(mean), rng, mean.device)
         return mean + deviation * chance.normal(seeds, mean.shape[1:], _STREAM)
 
-    def likeliest(self) -> torch.Tensor:
+    def mode(self) -> torch.Tensor:
         return self._shape()[0]
 
     def log_prob(self, drawn: torch.Tensor) -> torch.Tensor:
@@ -101,7 +101,7 @@ class Axes:
 
     def _shape(self) -> tuple[torch.Tensor, torch.Tensor]:
         mean, raw = self.found.chunk(2, 1)
-        return 3 * torch.tanh(mean / 3), LEAST + (MOST - LEAST) * torch.sigmoid(raw)
+        return 3 * torch.tanh(mean / 3), MIN_STD + (MAX_STD - MIN_STD) * torch.sigmoid(raw)
 
 
-ActionDistribution = Choices | Buttons | Axes
+ActionDistribution = Categorical | Bernoulli | SquashedGaussian

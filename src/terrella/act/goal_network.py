@@ -15,7 +15,7 @@ from ..core.errors import ChannelError
 from ..core.spec import Spec, shape_of
 from ..core.world import Observation
 from .actor import load_network, write_policy
-from .actor_network import ActorConfig, perceptron
+from .actor_network import ActorConfig, mlp
 from .distributions import ActionDistribution
 
 KIND, VERSION = "goal-actor", 1
@@ -56,8 +56,8 @@ class GoalNetwork(nn.Module):
         super().__init__()
         self.config = config
         both = 2 * config.latent
-        self.act = perceptron(both + 1, config.hidden, config.layers, config.actor.outputs, gain=0.1)
-        self.far = perceptron(both, config.hidden, config.layers, 1, gain=0.1)
+        self.act = mlp(both + 1, config.hidden, config.layers, config.actor.outputs, gain=0.1)
+        self.far = mlp(both, config.hidden, config.layers, 1, gain=0.1)
 
     def forward(self, latent: torch.Tensor, goal: torch.Tensor, steps: torch.Tensor) -> ActionDistribution:
         """Of the actions from latents [N, D] that are at goals [N, D] after `steps` [N]."""
@@ -104,7 +104,7 @@ class GoalActor:
         goal = goal.to(latent).expand(len(latent), -1)
         steps = self.network.steps(latent, goal) * memory.to(latent)
         config = self.network.config.actor
-        return config.actions(self.network(latent, goal, steps).likeliest(), self.spec), memory
+        return config.actions(self.network(latent, goal, steps).mode(), self.spec), memory
 
     def save(self, folder: str | Path) -> None:
         """Writes the folder, each file whole; CheckpointError where it cannot be written."""

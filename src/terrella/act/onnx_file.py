@@ -22,7 +22,7 @@ class _Flat(nn.Module):
         self.network, self.actor = actor.network, actor
 
     def forward(self, *seen: torch.Tensor) -> torch.Tensor:
-        likeliest = self.network(dict(zip(self.actor.sees, seen))).likeliest()
+        likeliest = self.network(dict(zip(self.actor.sees, seen))).mode()
         return self.network.config.actions(likeliest, self.actor.spec)
 
 

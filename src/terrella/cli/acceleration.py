@@ -10,13 +10,14 @@ import torch
 from tyro.conf import Positional
 
 from .. import library
-from ..act.named import policy_of, seen_by
 from ..act.planning.episodes import play
+from ..act.policies_by_name import policy_of
 from ..core.errors import TerrellaError
+from ..core.policy import observed_channels
 from ..core.spec import BUTTONS, CHOICE
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import device_of
-from ..measure.acceleration import Meter, Pace, horizon, pace
+from ..measure.acceleration import EnergyMeter, Throughput, measure_throughput, usable_horizon
 from ..measure.statistics import Figure, ratio_interval
 from .beside import STEPS, check_alike, sound
 from .evaluate import table_lines
@@ -64,11 +65,11 @@ def acceleration(
     if real is not None:
         check_alike(mine.spec, real.spec)
     arms = {"world": mine, **({"beside": real} if real else {})}
-    timed: dict[str, dict[int, list[Pace]]] = {arm: {batch: [] for batch in batches} for arm in arms}
+    timed: dict[str, dict[int, list[Throughput]]] = {arm: {batch: [] for batch in batches} for arm in arms}
     for turn in range(turns):
         for batch in batches:
             for arm, one in arms.items():
-                timed[arm][batch].append(pace(one, batch, seconds, seed + turn))
+                timed[arm][batch].append(measure_throughput(one, batch, seconds, seed + turn))
     found = {arm: [_median(paces) for paces in by.values()] for arm, by in timed.items()}
     facts = _facts(world, beside, mine, found)
     if real is not None:
@@ -84,7 +85,9 @@ def retained(real: World, agent: str, reference: str, episodes: int, seed: int) 
     def returns(name: str) -> torch.Tensor:
         policy = policy_of(name, real.spec, real)
         steps = real.spec.max_episode_steps or STEPS
-        played = play(real, policy, episodes, steps, seed, sees=seen_by(policy, real.spec) if name != "random" else ())
+        played = play(
+            real, policy, episodes, steps, seed, sees=observed_channels(policy, real.spec) if name != "random" else ()
+        )
         return torch.tensor([one.reward for one in played.episodes])
 
     floor = returns("random")
@@ -101,18 +104,18 @@ def _limited(world: World) -> bool:
     return all(bool(np.isfinite(limit).all()) for limit in world.spec.action_limits)
 
 
-def _median(paces: list[Pace]) -> Pace:
-    return Pace(
+def _median(paces: list[Throughput]) -> Throughput:
+    return Throughput(
         paces[0].batch, statistics.median(p.aggregate for p in paces), statistics.median(p.joules for p in paces)
     )
 
 
-def _facts(world: str, beside: str | None, mine: World, found: dict[str, list[Pace]]) -> dict[str, object]:
-    best = {arm: max(paces, key=lambda pace: pace.aggregate) for arm, paces in found.items()}
+def _facts(world: str, beside: str | None, mine: World, found: dict[str, list[Throughput]]) -> dict[str, object]:
+    best = {arm: max(paces, key=lambda one: one.aggregate) for arm, paces in found.items()}
     facts: dict[str, object] = {"world": world, "beside": beside, "control_step_s": mine.spec.dt_s}
     facts |= {
         "threads": torch.get_num_threads(),
-        "joules": Meter().how + ("" if device_of(mine).type == "cpu" else ", without the GPU"),
+        "joules": EnergyMeter().how + ("" if device_of(mine).type == "cpu" else ", without the GPU"),
     }
     facts |= {f"{arm}_paces": [{**asdict(one), "stream": one.stream} for one in paces] for arm, paces in found.items()}
     facts |= {f"{arm}_best": asdict(one) for arm, one in best.items()}
@@ -124,10 +127,10 @@ def _facts(world: str, beside: str | None, mine: World, found: dict[str, list[Pa
 def _horizon(mine: World, real: World, seed: int) -> dict[str, float] | str:
     if not mine.spec.observes or any(name not in real.spec.channels for name in mine.spec.observes):
         return "not measured: the world does not observe what the simulator shows"
-    return asdict(horizon(mine, real, real.spec.max_episode_steps or STEPS, seed=seed))
+    return asdict(usable_horizon(mine, real, real.spec.max_episode_steps or STEPS, seed=seed))
 
 
-def _lines(facts: dict, found: dict[str, list[Pace]]) -> list[str]:
+def _lines(facts: dict, found: dict[str, list[Throughput]]) -> list[str]:
     heads = ["", "streams", "imagined s / wall s", "of each stream", "J / imagined s"]
     names = {"world": facts["world"], "beside": facts["beside"]}
     rows = [

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..act.planning import Played, SearchConfig
+from ..act.planning import PlayResult, SearchConfig
 from ..core.world import make_rng
 from ..measure.statistics import Figure, mean_interval
 
@@ -22,7 +22,7 @@ class Point:
     config: SearchConfig
     imagined: float
     worth: Figure
-    played: Played
+    played: PlayResult
 
     @property
     def words(self) -> str:
@@ -59,7 +59,7 @@ def helped(points: Sequence[Point], what: str, seed: int) -> str:
     return f"Thinking longer helps, {between}; {plateau}."
 
 
-def gain(mine: Played, other: Played, what: str, seed: int) -> Figure:
+def gain(mine: PlayResult, other: PlayResult, what: str, seed: int) -> Figure:
     """By how much one is better than another, start by start."""
     worth = lambda one: float(bool(one.success)) if what == "success" else one.reward  # noqa: E731
     apart = [worth(one) - worth(beside) for one, beside in zip(mine.episodes, other.episodes)]

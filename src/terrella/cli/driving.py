@@ -11,20 +11,21 @@ import torch
 
 from .. import library
 from ..act.explorer import Explorer
-from ..act.named import Slipping, seen_by
 from ..act.planning import (
     STRIDE_S,
     Destination,
+    FullyObserved,
     Planner,
-    Revealed,
+    cost_discriminates,
     distance,
     distance_to,
-    imagined,
+    imagined_futures,
     negative_reward,
-    search_within,
-    tells_apart,
+    search_config_within,
 )
+from ..act.policies_by_name import NoisyPolicy
 from ..core.errors import PlanningError
+from ..core.policy import observed_channels
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
@@ -66,10 +67,10 @@ class Driving:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
             return found
         policy = library.load_policy(self.name, self.played.spec, self.world)
-        plans = policy.policy if isinstance(policy, Slipping) else policy
+        plans = policy.policy if isinstance(policy, NoisyPolicy) else policy
         if isinstance(plans, Planner):
             return Agent(self.name, policy, self.see, futures=self._futures(plans) if plans is policy else None)
-        sees = seen_by(policy, self.played.spec)
+        sees = observed_channels(policy, self.played.spec)
         return Agent(self.name, policy, lambda state: self.played.render(state, sees))
 
     # -- where it plans -----------------------------------------------------------------------------------------------
@@ -80,7 +81,7 @@ class Driving:
         game that can neither be copied nor was learned."""
         if self.learned is not None:
             return self.learned
-        return Revealed(self.played, here=True) if self.played.spec.forkable else None
+        return FullyObserved(self.played, here=True) if self.played.spec.forkable else None
 
     def see(self, state: State) -> Observation:
         """What a planner is shown of a state of the world that is played."""
@@ -99,8 +100,8 @@ class Driving:
         if world is None or "reward" not in world.spec.channels:
             return None
         cost, state = negative_reward(world.spec), self._first(world)
-        config, fits = search_within(world, cost, state, self.budget_ms)
-        if not always and not (fits and tells_apart(world, cost, state)):
+        config, fits = search_config_within(world, cost, state, self.budget_ms)
+        if not always and not (fits and cost_discriminates(world, cost, state)):
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
         planner = Planner(world, cost, replace(config, replan=min(moves, config.horizon)))
@@ -111,7 +112,7 @@ class Driving:
         if "rgb" not in planner.world.spec.channels:
             return None
         world, cost, block = planner.world, planner.cost, planner.config.block
-        return lambda memory: imagined(world, cost, memory[0], block)
+        return lambda memory: imagined_futures(world, cost, memory[0], block)
 
     def _seeking(self, goal: Observation) -> Agent:
         """A planner for a goal: a place to walk to, else a state in numbers, else a picture."""
@@ -128,7 +129,7 @@ class Driving:
         whole = {name: goal[name] for name in source.spec.observes if name in goal}
         latent = "latent" in source.spec.channels and set(whole) == set(source.spec.observes) and whole
         cost = distance_to(source, whole) if latent else distance_to(world, aim, latent=False)
-        config, _ = search_within(world, cost, self._first(world), self.budget_ms, block=2)
+        config, _ = search_config_within(world, cost, self._first(world), self.budget_ms, block=2)
         planner = Planner(world, cost, config)
 
         def away(state: State) -> float:
@@ -142,7 +143,7 @@ class Driving:
         goal = Destination(pose)
         cost = goal.cost(world)
         block = max(1, round(STRIDE_S / world.spec.dt_s))
-        config, _ = search_within(world, cost, self._first(world), self.budget_ms, block)
+        config, _ = search_config_within(world, cost, self._first(world), self.budget_ms, block)
         planner = Planner(world, cost, config)
 
         def away(state: State) -> float:

@@ -12,15 +12,15 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from .. import library, progress
-from ..act.judging import CHUNK, Bench, Chunk, check_finite
-from ..act.named import policy_of, seen_by
-from ..act.planning import Cost, Judge, Revealed, distance_to
+from ..act.paired_evaluation import CHUNK, Chunk, PairedEvaluation, check_finite
+from ..act.planning import Cost, FullyObserved, SuccessCriterion, distance_to
+from ..act.policies_by_name import policy_of
 from ..core.errors import PlanningError, TerrellaError
-from ..core.policy import Policy
+from ..core.policy import Policy, observed_channels
 from ..core.spec import Spec
 from ..core.world import World
-from ..measure.judged import RANDOM, as_dict, judge, table, verdict
-from ..measure.judged_page import judged_page
+from ..measure.policy_evaluation import RANDOM, as_dict, evaluate_policies, table, verdict
+from ..measure.policy_evaluation_page import policy_evaluation_page
 from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
 from .goals import REWARD, read_goal
 from .judged_log import JudgedLog, crc_of, fingerprint
@@ -34,7 +34,7 @@ Inside = Annotated[str, arg(name="in", help="The world to judge them in: what `t
 class _Case:
     """What is asked, with the worlds open. spec: of the channels that both show, which policies may be shown."""
 
-    bench: Bench
+    bench: PairedEvaluation
     spec: Spec
     cost: Cost | None
 
@@ -80,7 +80,7 @@ def evaluate(
     case = _opened(inside, environment, real, steps, goal, within, success, device, seed)
     every = names if RANDOM in names else (*names, RANDOM)
     for name in every:  # what does not fit is said before anything is played
-        case.spec.check_channels(seen_by(case.load(name), case.spec))
+        case.spec.check_channels(observed_channels(case.load(name), case.spec))
     asked = {"in": inside, "world": None if library.is_truth(inside) else fingerprint(library.folder_of(inside))}
     asked |= {"real": real, "goal": goal, "within": within, "success": success, "steps": case.bench.steps, "seed": seed}
     files = {"goal": goal, "adapter": (environment.adapter or "").rpartition(":")[0] or environment.adapter}
@@ -127,7 +127,7 @@ def _report(log: JudgedLog, names: tuple[str, ...], episodes: int, folder: Path,
     labels = labels_of((*names, RANDOM))
     scores = {labels[name]: log.scores(name, episodes) for name in dict.fromkeys((*names, RANDOM))}
     followed = {labels[name]: log.followed(name) for name in names if log.followed(name)}
-    found = judge(scores, followed, [labels[name] for name in names], seed)
+    found = evaluate_policies(scores, followed, [labels[name] for name in names], seed)
     facts = {
         **log.asked,
         "episodes": episodes,
@@ -136,7 +136,7 @@ def _report(log: JudgedLog, names: tuple[str, ...], episodes: int, folder: Path,
     }
     title = f"{facts['in']}: {len(names)} polic{'y' if len(names) == 1 else 'ies'} judged"
     page = folder / "evaluate.html"
-    page.write_text(judged_page(title, found, facts), encoding="utf-8")
+    page.write_text(policy_evaluation_page(title, found, facts), encoding="utf-8")
     whole = sound({**as_dict(found), **facts, "names": {labels[name]: name for name in names}, "page": str(page)})
     log.save(whole)
     result(whole, json, "\n".join([*verdict(found), "", *table_lines(*table(found)), "", f"the page: {page}"]))
@@ -175,7 +175,9 @@ def _opened(inside, environment, real, steps, goal, within, success, device, see
             f"{real} does not show {', '.join(unseen)}, so nobody can tell whether the goal is reached: name a channel that "
             "can with --success."
         )
-    judged = Judge({} if success else {at: value[None] for at, value in wanted.items()}, within, success or "")
+    judged = SuccessCriterion(
+        {} if success else {at: value[None] for at, value in wanted.items()}, within, success or ""
+    )
     unpaid = [name for name, spec in specs.items() if "reward" not in spec.channels]
     if unpaid and not judged.judges:
         raise PlanningError(
@@ -188,13 +190,13 @@ def _opened(inside, environment, real, steps, goal, within, success, device, see
     known = compared(dream.spec, acted.spec) if acted else ()
     known = tuple(name for name in known if len(both[name].shape or ()) == 1 or name in dream.spec.observes)
     cost = distance_to(dream, wanted) if wanted else None
-    return _Case(Bench(dream, acted, judged, limit, seed, known), spec, cost)
+    return _Case(PairedEvaluation(dream, acted, judged, limit, seed, known), spec, cost)
 
 
 def _truth(name: str, environment: Environment) -> World:
     """A simulator in place of a dream: one that can be put where the real one stands, if it can be copied."""
     try:
-        return Revealed(open_copied(name, environment))
+        return FullyObserved(open_copied(name, environment))
     except TerrellaError:
         return environment.open(name)
 

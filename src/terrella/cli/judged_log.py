@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from ..act.judging import CHUNK, Chunk
-from ..act.planning import Episode
+from ..act.paired_evaluation import CHUNK, Chunk
+from ..act.planning import PlayedEpisode
 from ..core.errors import TerrellaError
 from ..core.files import write_json
-from ..measure.judged import CONTROL, DREAM, REAL, RETURN, SUCCESS
+from ..measure.policy_evaluation import CONTROL, DREAM, REAL, RETURN, SUCCESS
 
 SAVED_EVERY_S = 5.0
 _DIGITS = 6
@@ -91,7 +91,7 @@ class JudgedLog:
                 measures = known["arms"].setdefault(arm, {})
                 for measure, values in _measured(episodes).items():
                     measures[measure] = [*measures.get(measure, [])[:first], *values]
-        for channel, curve in chunk.followed.items():
+        for channel, curve in chunk.open_loop_errors.items():
             known["followed"][channel] = [_sound(value) for value in curve.double().nanmean(0).tolist()]
         if time.monotonic() - self._saved > SAVED_EVERY_S:
             self.save()
@@ -149,7 +149,7 @@ class JudgedLog:
         }
 
 
-def _measured(episodes: list[Episode]) -> dict[str, list[Any]]:
+def _measured(episodes: list[PlayedEpisode]) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {RETURN: [episode.reward for episode in episodes]}
     found["steps"] = [episode.steps for episode in episodes]
     if episodes[0].success is not None:

@@ -18,7 +18,7 @@ from ..data import Dataset
 from ..data.recording import LONGEST
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
-from ..measure import CLIPS, Exam, ExamConfig, verdict, within
+from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .named import Controls, Environment
 from .plan import RECORDING, SCORING, TRAINING, Plan, folder_for
 from .practising import practise as rounds_of_practice
@@ -217,7 +217,7 @@ def _score(plan: Plan, name: str, controls: Controls, environment: Environment, 
         return {"verdict": [f"{plan.folder.name} is not scored: {error}"]}
     report(0, 1, "measuring how fast the world is")
     if "clips" not in plan.facts:
-        plan.note("clips", within(exam, plan.left_s(SCORING), SIZES))
+        plan.note("clips", most_clips_within(exam, plan.left_s(SCORING), SIZES))
     card, files = carded(run, exam.of(plan.facts["clips"]), identity, plan.folder / "score", report)
     return {"verdict": verdict(card), "card": str(files[1])}
 

@@ -16,28 +16,28 @@ from PIL import Image
 from tyro.conf import Positional
 
 from .. import library, progress
-from ..act.named import policy_of, proposing
 from ..act.planning import (
     NEAR_M,
     Cost,
     Destination,
-    Episode,
-    Judge,
+    FullyObserved,
     Planner,
-    Played,
-    Revealed,
+    PlayedEpisode,
+    PlayResult,
     SearchConfig,
+    SuccessCriterion,
     distance,
     distance_to,
     negative_reward,
     play,
 )
+from ..act.policies_by_name import policy_of, proposal_policy
 from ..core.errors import PlanningError, TerrellaError
 from ..core.files import write_json
 from ..core.policy import Policy, Random
 from ..core.spec import Spec
 from ..core.world import World, make_rng
-from ..measure.acted import compute_chart, film, film_strip, plan_page
+from ..measure.plan_page import compute_chart, film, film_strip, plan_page
 from ..measure.statistics import Figure, mean_interval, wilson
 from ..serve.picture import uncertainty_levels
 from .beside import STEPS, check_alike, compared, open_copied, open_real, sound
@@ -58,7 +58,7 @@ class _Case:
     world: World
     real: World
     goal: Mapping[str, torch.Tensor]
-    judge: Judge
+    judge: SuccessCriterion
     searching: Searching
     episodes: int
     steps: int
@@ -87,14 +87,14 @@ class _Case:
         ):
             trust = levels[1]
         name = self.searching.proposal
-        proposal = None if name is None else proposing(name, self.world)
+        proposal = None if name is None else proposal_policy(name, self.world)
         return Planner(self.world, self.cost(), replace(config, trust=trust), proposal)
 
     def walker(self, config: SearchConfig, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
         return goal.walker(Planner(self.world, goal.cost(self.world), config))
 
-    def planned(self, config: SearchConfig, what: str, keep: tuple[str, ...] = ()) -> Played:
+    def planned(self, config: SearchConfig, what: str, keep: tuple[str, ...] = ()) -> PlayResult:
         """Episodes of the planner."""
         if agent := self.searching.agent:
             policy = policy_of(agent, self.real.spec, self.world, self.cost())
@@ -102,12 +102,12 @@ class _Case:
             policy = partial(self.walker, config) if self.walks else self.planner(config)
         return self._played(policy, what, _seen_by(self), keep)
 
-    def floor(self) -> Played:
+    def floor(self) -> PlayResult:
         """Episodes of acting at random, from the same starts."""
         policy = Random(self.real.spec)
         return self._played((lambda goal: policy) if self.walks else policy, "acting at random", ())
 
-    def _played(self, policy, what: str, sees: tuple[str, ...], keep: tuple[str, ...] = ()) -> Played:
+    def _played(self, policy, what: str, sees: tuple[str, ...], keep: tuple[str, ...] = ()) -> PlayResult:
         with progress.shown(what) as report:
             if self.walks:
                 return self.walks.played(self.real, policy, self.episodes, self.steps, self.seed, sees, keep, report)
@@ -186,7 +186,7 @@ def plan(
 
 
 def _report(
-    case: _Case, mine: Played, floor: Played, points: list, facts: Mapping[str, object], folder: Path
+    case: _Case, mine: PlayResult, floor: PlayResult, points: list, facts: Mapping[str, object], folder: Path
 ) -> tuple[list[str], dict[str, Any]]:
     """Writes the page and the film; what came of it in words, and all of it."""
     arms = {"planner": _figures(mine, case.seed), "random": _figures(floor, case.seed)}
@@ -222,7 +222,7 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
             "--episodes and --steps are whole numbers from 1 up, --within is above 0, and --apart is 0 or more."
         )
     truth = library.is_truth(name)
-    world = Revealed(open_copied(name, environment)) if truth else load_named(name, device_of(device))
+    world = FullyObserved(open_copied(name, environment)) if truth else load_named(name, device_of(device))
     if not world.spec.observes:
         raise PlanningError(f"{name} observes nothing, so nobody can tell it where the episode stands.")
     acted = world if real in (None, name) else open_real(real, environment, world.spec)
@@ -240,7 +240,7 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
         if len(views) > 1 and apart_m <= walks.within_m:
             raise TerrellaError(f"--apart is more than the {walks.within_m:g} m within which a view is reached.")
         limit = steps or acted.spec.max_episode_steps or round(WALK_S / acted.spec.dt_s)
-        case = _Case(world, acted, wanted, Judge(), settled, episodes, limit, seed, walks)
+        case = _Case(world, acted, wanted, SuccessCriterion(), settled, episodes, limit, seed, walks)
         case.walker(settled.search, Destination(views[0]))
         return case
     judge = _judge(aim, wanted, acted.spec)
@@ -252,14 +252,14 @@ def _opened(name, environment, searching, aim, real, episodes, steps, device, se
     return case
 
 
-def _judge(aim: Aim, wanted: Mapping[str, torch.Tensor], real: Spec) -> Judge:
+def _judge(aim: Aim, wanted: Mapping[str, torch.Tensor], real: Spec) -> SuccessCriterion:
     judged = {} if aim.success or any(at not in real.channels for at in wanted) else wanted
     if wanted and not judged and not aim.success:
         raise PlanningError(
             f"{real.name} does not show {', '.join(wanted)}, so nobody can tell whether the goal is reached: name a "
             "channel that can with --success."
         )
-    return Judge({at: value[None] for at, value in judged.items()}, aim.within or WITHIN, aim.success or "")
+    return SuccessCriterion({at: value[None] for at, value in judged.items()}, aim.within or WITHIN, aim.success or "")
 
 
 def _seen_by(case: _Case) -> tuple[str, ...]:
@@ -270,7 +270,7 @@ def _pictured(case: _Case) -> tuple[str, ...]:
     return ("rgb",) if "rgb" in case.real.spec.channels else ()
 
 
-def _figures(played: Played, seed: int) -> dict[str, Figure]:
+def _figures(played: PlayResult, seed: int) -> dict[str, Figure]:
     episodes = played.episodes
     count = len(episodes)
     ms, imagined = ([value for one in episodes for value in getattr(one, name)] for name in ("ms", "imagined"))
@@ -292,7 +292,7 @@ def _middle(values: list) -> Figure:
     return Figure(middle, low, high, len(values))
 
 
-def _curve(case: _Case, mine: Played) -> list[Point]:
+def _curve(case: _Case, mine: PlayResult) -> list[Point]:
     """The same starts with less and less compute, up to what was asked; nothing where a search imagines nothing."""
     points = []
     asked = case.searching.search
@@ -306,7 +306,7 @@ def _curve(case: _Case, mine: Played) -> list[Point]:
 
 
 def _lines(
-    case: _Case, mine: Played, arms: Mapping[str, Mapping[str, Figure]], points: list[Point], what: str
+    case: _Case, mine: PlayResult, arms: Mapping[str, Mapping[str, Figure]], points: list[Point], what: str
 ) -> list[str]:
     """What came of it, for people."""
     count, planner, floor = len(mine.episodes), arms["planner"], arms["random"]
@@ -349,13 +349,15 @@ def _plain(figures: Mapping[str, Figure]) -> dict[str, object]:
     return {name: asdict(figure) for name, figure in figures.items()}
 
 
-def _told(episode: Episode) -> dict[str, object]:
+def _told(episode: PlayedEpisode) -> dict[str, object]:
     told: dict[str, Any] = {"steps": episode.steps, "return": episode.reward, "success": episode.success}
     return {**told, "nearest": episode.nearest, "ended": episode.ended, "best_cost": episode.best_cost}
 
 
 @torch.no_grad()
-def _filmed(case: _Case, episode: Episode, folder: Path) -> tuple[dict[str, list[float]], Image.Image | None, str]:
+def _filmed(
+    case: _Case, episode: PlayedEpisode, folder: Path
+) -> tuple[dict[str, list[float]], Image.Image | None, str]:
     """The dream of an episode, from its first observation under its actions: the divergence in each channel, a strip of both,
     and the film's file, "" where there are no pictures."""
     seen, names = episode.seen, compared(case.world.spec, case.real.spec)

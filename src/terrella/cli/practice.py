@@ -12,11 +12,10 @@ from tyro.conf import arg
 
 from .. import library, progress
 from ..act.actor import Actor
-from ..act.belief import actor_of
-from ..act.named import seen_by
+from ..act.belief import load_learned_policy
 from ..act.planning.episodes import play
 from ..core.errors import TerrellaError
-from ..core.policy import Policy, Random
+from ..core.policy import Policy, Random, observed_channels
 from ..core.world import World, make_rng
 from ..learn.growth import Scaled
 from ..learn.recipes.policy import Practice, train_policy
@@ -93,8 +92,8 @@ def tried_out(out: Path, inside: World, outside: World, episodes: int, seed: int
             played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
         return torch.tensor([one.reward for one in played.episodes])
 
-    actor = actor_of(out, outside.spec, inside)
-    sees = [name for name in seen_by(actor, outside.spec) if name in outside.spec.channels]
+    actor = load_learned_policy(out, outside.spec, inside)
+    sees = [name for name in observed_channels(actor, outside.spec) if name in outside.spec.channels]
     mine = returns(outside, actor, "acting", sees)
     floor = returns(outside, Random(outside.spec), "acting at random")
     found = {"return": mine, "at random": floor, "better by": mine - floor}

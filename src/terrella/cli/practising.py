@@ -19,8 +19,8 @@ import torch
 
 from .. import library, progress
 from ..act.actor import Actor
-from ..act.belief import BeliefPolicy, actor_of
-from ..act.named import Slipping
+from ..act.belief import BeliefPolicy, load_learned_policy
+from ..act.policies_by_name import NoisyPolicy
 from ..core.errors import TerrellaError
 from ..core.files import write_json
 from ..core.policy import Policy
@@ -171,9 +171,9 @@ def _collect(rounds: Rounds, number: int, real: World, upto: int, seed: int, rep
     if number == 0:
         explore(real, rounds.recording, upto, seed, told, stored_as(real.spec), enough=enough)
         return
-    policy = actor_of(rounds.policy(number - 1), real.spec, library.load(rounds.world(number - 1)))
+    policy = load_learned_policy(rounds.policy(number - 1), real.spec, library.load(rounds.world(number - 1)))
     record(
-        real, Slipping(drawing(policy), SLIPS, real.spec), rounds.recording, upto, make_rng(seed), told,
+        real, NoisyPolicy(drawing(policy), SLIPS, real.spec), rounds.recording, upto, make_rng(seed), told,
         pictures=stored_as(real.spec), enough=enough,
     )  # fmt: skip
 

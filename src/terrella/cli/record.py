@@ -123,7 +123,7 @@ def record_world(
 
 def _opened(name: str, controls: Controls, environment: Environment, rgb: bool, policy: str):
     """A world and what makes a policy of it: for a worker, too."""
-    from ..act.named import policy_of
+    from ..act.policies_by_name import policy_of
 
     world = controls.of(environment.open(name, rgb=rgb))
     return world, lambda: policy_of(policy, world.spec, world)

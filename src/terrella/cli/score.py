@@ -28,12 +28,12 @@ from ..measure import (
     as_dict,
     check_recording,
     clips_from_cache,
+    clips_with_endings,
     examine,
     in_box,
     out_of_sight,
-    passages,
+    place_label,
     verdict,
-    words_of,
     write_report,
 )
 from ..worlds.splat import SplatWorld
@@ -166,9 +166,9 @@ def exam_of(
             if drift:
                 raise
             say(
-                f"No drift curve of {words_of(place)}: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
+                f"No drift curve of {place_label(place)}: no clip of 256 steps fits there; --drift STEPS asks for shorter ones."
             )
-        drawn = passages(
+        drawn = clips_with_endings(
             source, world.spec, *asked[1:], max(config.horizons), min(clips, ENDING_CLIPS), make_rng(seed + 2), where
         )
         sets[ENDINGS][place], going[place] = drawn
@@ -220,5 +220,5 @@ def _lines(card: Scorecard) -> list[str]:
         baselines = "".join(f"; {name} {figure.value:.3g}" for name, figure in row.baselines.items())
         about = " ".join(part for part in (row.channel, row.what) if part)
         figure = f"{row.figure.value:.3g} {row.unit}".rstrip() + sure + baselines
-        lines.append(f"{row.probe:>12}  {about}, {words_of(row.place)}, {row.horizon} steps: {figure}")
+        lines.append(f"{row.probe:>12}  {about}, {place_label(row.place)}, {row.horizon} steps: {figure}")
     return [*lines, *(f"not applicable: {one.probe} {one.why}" for one in card.missing if one.arm == arm)]

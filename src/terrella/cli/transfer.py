@@ -17,8 +17,8 @@ import torch
 from .. import library
 from ..core.errors import TerrellaError
 from ..core.files import write_json
-from ..measure.transferred import Played, as_dict, camera_table, table, transferred, verdict
-from ..measure.transferred_page import transferred_page
+from ..measure.transfer_page import transfer_page
+from ..measure.transfer_scores import Successes, as_dict, camera_table, compare_transfer_arms, table, verdict
 from .beside import check_alike, sound
 from .evaluate import table_lines
 from .say import Json, Seed, result, say
@@ -260,7 +260,7 @@ def _different(before: Mapping[str, Any], mine: Mapping[str, Any]) -> list[str]:
 
 
 def _report(folder: Path, asked: Experiment, found: Mapping[int, Mapping[str, Any]], json: bool) -> None:
-    def played(place: str) -> Played:
+    def played(place: str) -> Successes:
         arms = list(dict.fromkeys(arm for one in found.values() for arm in one[place]))
         return {
             arm: {seed: torch.tensor(one[place][arm]) for seed, one in found.items() if arm in one[place]}
@@ -279,11 +279,11 @@ def _report(folder: Path, asked: Experiment, found: Mapping[int, Mapping[str, An
         arm: {seed: torch.tensor(one["arms"][arm]) for seed, one in looked if arm in one["arms"]} for arm in named
     }
     errors = {name: [one["errors"][name] for _, one in looked] for name in (looked[0][1]["errors"] if looked else ())}
-    whole = transferred(played("real"), dial if asked.gap else {}, inside, camera, errors)
+    whole = compare_transfer_arms(played("real"), dial if asked.gap else {}, inside, camera, errors)
     identified = [one["identified"] for one in found.values() if one.get("identified")]
     facts: dict[str, Any] = {**asdict(asked), "seeds": list(found), "identified": identified}
     page = folder / "transfer.html"
-    page.write_text(transferred_page(f"{asked.sim}, carried over to {asked.real}", whole, facts), encoding="utf-8")
+    page.write_text(transfer_page(f"{asked.sim}, carried over to {asked.real}", whole, facts), encoding="utf-8")
     write_json(folder / "transfer.json", sound({**facts, **as_dict(whole)}))
     lines = [
         *verdict(whole),

@@ -12,8 +12,8 @@ import torch
 
 from .. import library
 from ..act.actor import Actor
-from ..act.named import Slipping
-from ..act.planning.episodes import Judge, play
+from ..act.planning.episodes import SuccessCriterion, play
+from ..act.policies_by_name import NoisyPolicy
 from ..core.files import write_json
 from ..core.policy import Idle, Policy, Random
 from ..core.world import World
@@ -21,7 +21,7 @@ from ..learn.feeds import Drawn
 from ..learn.objectives.regression import Regression, drawn_rows
 from ..learn.recipes.policy import Practice, train_policy
 from ..learn.trainer import Run, Trainer
-from ..measure.transferred import FLOORS, IDLE, RANDOM
+from ..measure.transfer_scores import FLOORS, IDLE, RANDOM
 from ..sim.corrected import Corrected, Residual, residuals
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld
@@ -57,7 +57,7 @@ class _Seed:
         self.sim: World = library.load(asked.sim, cameras=(), threads=1)
         self.real: World = opened_real(asked.real, asked.gap, asked.dial)
         self._models: dict[int, tuple[World, Path]] = {}
-        self.judge = Judge(channel=asked.success)
+        self.judge = SuccessCriterion(channel=asked.success)
         self.steps = self.real.spec.max_episode_steps or 200
         places = ("real", "the simulator", "the model", *(f"dial {gap}" for gap in map(str, DIAL)))
         self.found: dict[str, Any] = {"practised": [], **{place: {} for place in places}}
@@ -159,7 +159,7 @@ class _Seed:
         """Real episodes to learn from, of a policy of which some actions slip, in round `number`. Those of fewer are among those of
         more."""
         actor = Actor.load(policy, self.sim.spec, greedy=False)
-        slipping, seed = Slipping(actor, SLIPS, self.sim.spec), GATHERED + self.seed + 1000 * number
+        slipping, seed = NoisyPolicy(actor, SLIPS, self.sim.spec), GATHERED + self.seed + 1000 * number
         blocks = (collect(self.real, slipping, GATHER, seed + 1_000_000 * at) for at in range(-(-count // GATHER)))
         return reduce(Trials.and_then, blocks)[:count]
 

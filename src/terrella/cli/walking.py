@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..act.planning import STRIDE_S, Destination, Episode, Judge, Played, play
+from ..act.planning import STRIDE_S, Destination, PlayedEpisode, PlayResult, SuccessCriterion, play
 from ..act.planning.routes import NoRoute
 from ..core.errors import ObservationError, PlanningError
 from ..core.policy import Policy
@@ -45,9 +45,9 @@ class Walks:
         sees: Sequence[str],
         keep: Sequence[str],
         report: Callable[[float, float], None],
-    ) -> Played:
+    ) -> PlayResult:
         """As planning.play plays them. An episode in which no way is known has failed; of a lone place that is raised."""
-        found, skipped, filmed = list[Episode](), 0, False
+        found, skipped, filmed = list[PlayedEpisode](), 0, False
         for number in range(episodes):
             own = seed + 1009 * number
             goal = self._goal(real, number, own)
@@ -59,9 +59,9 @@ class Walks:
                 if len(self.views) == 1:
                     raise
                 seen = real.render(real.start(1, make_rng(own)), judge.channels)
-                found.append(Episode(success=False, nearest=float(judge.away(real, seen)[0])))
+                found.append(PlayedEpisode(success=False, nearest=float(judge.away(real, seen)[0])))
             report(number + 1, episodes)
-        return Played(found, skipped)
+        return PlayResult(found, skipped)
 
     def _goal(self, real: World, number: int, seed: int) -> Destination:
         if len(self.views) == 1:
@@ -77,13 +77,13 @@ class Walks:
         )
 
 
-def judge_of(goal: Destination) -> Judge:
+def judge_of(goal: Destination) -> SuccessCriterion:
     """Reached is near the place, and facing as the view does."""
 
     def apart(spec: Spec, wanted: Observation, seen: Observation) -> torch.Tensor:
         return goal.away(seen["pose"])
 
-    return Judge({"pose": goal.pose[None]}, goal.near_m, apart=apart)
+    return SuccessCriterion({"pose": goal.pose[None]}, goal.near_m, apart=apart)
 
 
 def search_of(world: Spec) -> dict[str, int]:

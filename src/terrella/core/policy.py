@@ -45,6 +45,13 @@ def act(
     return action, memory
 
 
+def observed_channels(policy: Policy, spec: Spec) -> tuple[str, ...]:
+    """The channels of a world that a policy is shown: its own `sees`, or all that a recording would hold. Channels that the world
+    lacks are left out where it lists them in `may_observe`."""
+    named = tuple(getattr(policy, "sees", spec.recorded))
+    return tuple(name for name in named if name in spec.channels or name not in spec.may_observe)
+
+
 def _batch_of(memory: Any) -> int | None:
     if isinstance(memory, State):
         return memory.batch

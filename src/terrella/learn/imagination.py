@@ -179,7 +179,7 @@ class Imagination:
         channels = tuple(dict.fromkeys((*sees, *told)))
         seen, drawn, brought = [dict(world.render(state, channels))], [], []
         for _ in range(self.steps):
-            drawn.append(self.network(seen[-1]).draw(now.noise))
+            drawn.append(self.network(seen[-1]).sample(now.noise))
             state = world.imagine(state, config.actions(drawn[-1], spec).to(state.device), now.noise)
             seen.append(dict(world.render(state, channels)))
             brought.append(self._brought(seen[-1], now.device))

@@ -19,7 +19,7 @@ LEARNERS = ("observation", "reward", "done")  # what a learner is shown at each 
 
 
 @dataclass(frozen=True)
-class Pace:
+class Throughput:
     """Of one batch size: imagined seconds a wall second, of all streams together, and joules an imagined second."""
 
     batch: int
@@ -31,7 +31,7 @@ class Pace:
         return self.aggregate / self.batch
 
 
-class Meter:
+class EnergyMeter:
     """Joules since it was made: of RAPL where the machine tells, else processor seconds at an assumed power."""
 
     def __init__(self) -> None:
@@ -56,20 +56,20 @@ class Meter:
 
 
 @torch.inference_mode()
-def pace(world: World, batch: int, seconds: float, seed: int = 0) -> Pace:
+def measure_throughput(world: World, batch: int, seconds: float, seed: int = 0) -> Throughput:
     """Steps `batch` streams for about `seconds` of wall time, each step with fresh uniform actions, showing what a learner sees."""
     rng, spec = make_rng(seed), world.spec
     shown = [name for name in LEARNERS if name in spec.channels]
     low, high = (torch.as_tensor(limit).float() for limit in spec.action_limits)
     state = _stepped(world, world.start(batch, rng), low, high, shown, rng)  # the first may compile
-    fresh, steps, meter, began = state, 0, Meter(), time.perf_counter()
+    fresh, steps, meter, began = state, 0, EnergyMeter(), time.perf_counter()
     while (took := time.perf_counter() - began) < seconds or steps < 3:
         state = _stepped(world, state, low, high, shown, rng)
         steps += 1
         if steps % 50 == 0:
             state = fresh  # so that none stands still after its end
     imagined = batch * steps * spec.dt_s
-    return Pace(batch, imagined / took, meter.joules() / imagined)
+    return Throughput(batch, imagined / took, meter.joules() / imagined)
 
 
 def _stepped(
@@ -82,7 +82,7 @@ def _stepped(
 
 
 @torch.inference_mode()
-def horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int = 0) -> Figure:
+def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int = 0) -> Figure:
     """The steps for which the world, begun where episodes of the real one do and given the same random actions, foretells its
     numbers better than standing still does; in the channels that it observes."""
     rng, names = make_rng(seed), list(world.spec.observes)

@@ -54,18 +54,18 @@ class Album:
             found.append(torch.where(least.isfinite(), row, -1))
         return torch.cat(found)
 
-    def looks(self, rows: torch.Tensor) -> torch.Tensor:
+    def appearances(self, rows: torch.Tensor) -> torch.Tensor:
         """Looks of the frames of rows [M]: float64 [M, 7]; zeros for -1."""
         out = torch.zeros(len(rows), 7, dtype=torch.float64)
         for number, row in enumerate(rows.tolist()):
             if row >= 0:
                 piece = int(torch.searchsorted(self.first, row, right=True)) - 1
                 frame = np.array(self._rgb[piece][row - int(self.first[piece])])
-                out[number] = look(torch.from_numpy(frame)[None])[0]
+                out[number] = appearance(torch.from_numpy(frame)[None])[0]
         return out
 
 
-def look(frames: torch.Tensor) -> torch.Tensor:
+def appearance(frames: torch.Tensor) -> torch.Tensor:
     """Gradient energy, then mean and standard deviation of the channels: uint8 [B, H, W, 3] -> float64 [B, 7]."""
     mean, deviation = colour_statistics(frames)
     return torch.cat([gradient_energy(frames)[:, None], mean, deviation], 1)

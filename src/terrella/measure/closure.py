@@ -14,13 +14,13 @@ from ..core.errors import ObservationError
 from ..core.policy import Replay
 from ..core.world import World
 from .clips import Clip
-from .exam import Exam, Found, Probe, batches
+from .exam import Exam, ExamResults, Probe, batches
 from .fidelity import psnr
-from .roll import Results, Tick, fold_context, poses_at
-from .scorecard import PREDICTED, TRUE, Picture, Report, Row, words_of
+from .rollouts import Results, Tick, fold_context, poses_at
+from .scorecard import PREDICTED, TRUE, Picture, ProbeReport, Row, place_label
 from .statistics import mean_interval
-from .turning import scrolls, turns
-from .work import UNSEEN, Unit
+from .turning import scrolling_actions, turning_actions
+from .work_units import UNSEEN, Unit
 
 STATIC_DB = 20.0  # a far view this like the first one means that the picture hardly changed at all
 WALKED_M = 1.0  # who goes less far does not leave
@@ -32,7 +32,7 @@ LEAD = (
 
 
 @dataclass(frozen=True)
-class Way:
+class RoundTrip:
     """There and back. `steps(clips, pose)`: 2n poses [B, 7] to be observed, that lead away from the first poses (None for a
     world that shows none) and to them again; or, where `acted`, 2n actions [A]."""
 
@@ -42,15 +42,15 @@ class Way:
     acted: bool = False
 
 
-def yaw_way(far_deg: float, step_deg: float = 3.0) -> Way:
+def yaw_round_trip(far_deg: float, step_deg: float = 3.0) -> RoundTrip:
     """Turns on the spot to `far_deg` and back, in steps of `step_deg` or a little less."""
     half = math.ceil(far_deg / step_deg)
     turns = [far_deg * step / half for step in (*range(1, half + 1), *range(half - 1, -1, -1))]
-    steps = lambda clips, pose: [turned(pose, math.radians(turn)) for turn in turns]  # noqa: E731
-    return Way(f"yaw 0-{far_deg:g}-0", steps, far_deg)
+    steps = lambda clips, pose: [yawed(pose, math.radians(turn)) for turn in turns]  # noqa: E731
+    return RoundTrip(f"yaw 0-{far_deg:g}-0", steps, far_deg)
 
 
-def walk_way(steps: int = 100) -> Way:
+def walk_round_trip(steps: int = 100) -> RoundTrip:
     """Walks as the recording did for half of the steps, and backwards the same way."""
     half = steps // 2
 
@@ -58,16 +58,18 @@ def walk_way(steps: int = 100) -> Way:
         first = clips[0].context - 1
         return [poses_at(clips, first + step) for step in (*range(1, half + 1), *range(half - 1, -1, -1))]
 
-    return Way(f"walk of {2 * half} steps", path)
+    return RoundTrip(f"walk of {2 * half} steps", path)
 
 
-def turn_way(there: torch.Tensor, back: torch.Tensor, name: str, steps: int, far_deg: float = 0.0) -> Way:
+def turn_round_trip(there: torch.Tensor, back: torch.Tensor, name: str, steps: int, far_deg: float = 0.0) -> RoundTrip:
     """Holds the action `there` for half of the steps, then `back`: for worlds that take no poses."""
     half = steps // 2
-    return Way(name, lambda clips, pose: [*[there] * half, *[back] * half], far_deg, True)
+    return RoundTrip(name, lambda clips, pose: [*[there] * half, *[back] * half], far_deg, True)
 
 
-def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick: Tick = lambda done: None) -> Results:
+def run_round_trip(
+    world: World, clips: Sequence[Clip], way: RoundTrip, rng: torch.Generator, tick: Tick = lambda done: None
+) -> Results:
     """Goes the way from each clip's context on, there and back, and there again.
 
     closed, far, again, alike [B] dB: back against the first frame, the far view against it, the far view seen again against
@@ -104,35 +106,43 @@ def go(world: World, clips: Sequence[Clip], way: Way, rng: torch.Generator, tick
     return {**found, "went": went, "frames": torch.stack(frames, 1), "steps": torch.full((len(clips),), count)}
 
 
-def ways_of(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[Way, Sequence[Clip]]]:
+def round_trips_of(exam: Exam, world: World, clips: Sequence[Clip]) -> list[tuple[RoundTrip, Sequence[Clip]]]:
     """Along poses where the world takes them, else by actions that undo each other: that turn, or scroll."""
     config, clips = exam.config, clips[: exam.config.closure_clips]
     if exam.follows_poses(world):
-        ways = [(yaw_way(far, config.closure_step_deg), clips) for far in config.closure_deg]
-        afoot = walkers(clips, config.closure_walk) if config.closure_walk else []
-        return ways + ([(walk_way(config.closure_walk), afoot)] if afoot else [])
+        ways = [(yaw_round_trip(far, config.closure_step_deg), clips) for far in config.closure_deg]
+        afoot = clips_that_walk(clips, config.closure_walk) if config.closure_walk else []
+        return ways + ([(walk_round_trip(config.closure_walk), afoot)] if afoot else [])
     found = _turns(exam, world)
     if found is None:
         aside = _scrolls(exam, world)
         if aside is None:
             return []
         one, other, name, _ = aside
-        return [(turn_way(one, other, f"scrolling by {name}, {config.closure_walk} steps", config.closure_walk), clips)]
+        return [
+            (
+                turn_round_trip(one, other, f"scrolling by {name}, {config.closure_walk} steps", config.closure_walk),
+                clips,
+            )
+        ]
     left, right, name, speed = found
     halves = {far: min(100, max(5, round(math.radians(far) / speed))) for far in config.closure_deg}
     return [
-        (turn_way(left, right, f"turning by {name}, {2 * half} steps", 2 * half, math.degrees(half * speed)), clips)
+        (
+            turn_round_trip(left, right, f"turning by {name}, {2 * half} steps", 2 * half, math.degrees(half * speed)),
+            clips,
+        )
         for half in dict.fromkeys(halves.values())
     ]
 
 
-def _asked(exam: Exam) -> list[tuple[str, World, str, int, Way, Sequence[Clip]]]:
+def _asked(exam: Exam) -> list[tuple[str, World, str, int, RoundTrip, Sequence[Clip]]]:
     return [
         (arm, world, place, number, way, some)
         for arm, world in {**exam.arms, **exam.closing}.items()
         if not _missing(exam, world)
         for place, clips in exam.places.items()
-        for number, (way, some) in enumerate(ways_of(exam, world, clips))
+        for number, (way, some) in enumerate(round_trips_of(exam, world, clips))
     ]
 
 
@@ -145,17 +155,17 @@ def _units(exam: Exam) -> list[Unit]:
             calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * (steps + steps // 2)}
             run = partial(_go, exam, world, some, way, first)
             units.append(
-                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {words_of(place)}: {way.name}", calls, run)
+                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {place_label(place)}: {way.name}", calls, run)
             )
     return units
 
 
-def _go(exam: Exam, world: World, clips: Sequence[Clip], way: Way, first: int, tick: Tick) -> Results:
-    found = go(world, clips, way, exam.rng(3000 + first), tick)
+def _go(exam: Exam, world: World, clips: Sequence[Clip], way: RoundTrip, first: int, tick: Tick) -> Results:
+    found = run_round_trip(world, clips, way, exam.rng(3000 + first), tick)
     return {**found, "frames": found["frames"][: 1 if first == 0 else 0]}  # one is looked at
 
 
-def rows_of(where: tuple, way: Way, gone: Results, rng: Callable[[], torch.Generator]) -> list[Row]:
+def rows_of(where: tuple, way: RoundTrip, gone: Results, rng: Callable[[], torch.Generator]) -> list[Row]:
     """closed and again, with the far view against the first, and whether they prove anything."""
     back, far, again = (mean_interval(gone[name], rng()) for name in ("closed", "far", "again"))
     away = float(gone["went"].double().mean())
@@ -171,13 +181,13 @@ def rows_of(where: tuple, way: Way, gone: Results, rng: Callable[[], torch.Gener
     ]
 
 
-def _report(exam: Exam, found: Found) -> Report:
-    whole, strips = Report(), {}
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
+    whole, strips = ProbeReport(), {}
     for arm, _, place, which, way, _ in _asked(exam):
         if gone := found.of("memory", arm, place, str(which)):
             rows = rows_of((place, arm), way, gone, exam.rng)
             whole.rows += rows
-            strips.setdefault(f"{way.name}, {words_of(place)}", {})[_words(arm, rows)] = gone["frames"][0].numpy()
+            strips.setdefault(f"{way.name}, {place_label(place)}", {})[_words(arm, rows)] = gone["frames"][0].numpy()
     columns = ["first", "on the way", "far", "on the way back", "back", "far again"]
     whole.pictures = [Picture("memory", title, columns, rows) for title, rows in strips.items()]
     return whole
@@ -197,14 +207,14 @@ def _scrolls(exam: Exam, world: World):
     if "mosaic" not in world.spec.channels or not exam.config.closure_walk:
         return None
     clips = next(iter(exam.places.values()))[: exam.config.closure_clips]
-    return exam.once(f"scrolls {id(world)}", lambda: scrolls(world, clips, exam.rng(2)))
+    return exam.once(f"scrolls {id(world)}", lambda: scrolling_actions(world, clips, exam.rng(2)))
 
 
 def _turns(exam: Exam, world: World):
     if not exam.config.closure_deg:
         return None
     clips = next(iter(exam.places.values()))
-    return exam.once(f"turns {id(world)}", lambda: turns(world, clips, exam.rng(2)))
+    return exam.once(f"turns {id(world)}", lambda: turning_actions(world, clips, exam.rng(2)))
 
 
 def _missing(exam: Exam, world: World) -> str:
@@ -217,14 +227,14 @@ def _missing(exam: Exam, world: World) -> str:
     return "needs actions that turn a camera whose pose is shown or recorded, or that scroll the picture and undo each other"
 
 
-def walkers(clips: Sequence[Clip], steps: int) -> list[Clip]:
+def clips_that_walk(clips: Sequence[Clip], steps: int) -> list[Clip]:
     """Those of the clips that walk at least a metre in half of the steps: others would close without having left."""
     half = steps // 2
     able = [clip for clip in clips if clip.pose is not None and clip.horizon >= half]
     return [clip for clip in able if clip.walked_m()[half - 1] >= WALKED_M]
 
 
-def turned(pose: torch.Tensor, angle_rad: float) -> torch.Tensor:
+def yawed(pose: torch.Tensor, angle_rad: float) -> torch.Tensor:
     """Poses [B, 7] turned about the world's vertical by `angle_rad`, counter-clockwise from above; the place stays."""
     c, s = math.cos(angle_rad / 2), math.sin(angle_rad / 2)
     w, x, y, z = pose[:, 3:].unbind(-1)

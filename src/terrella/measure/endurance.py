@@ -14,13 +14,13 @@ import torch
 from ..core.policy import Idle, Policy, Replay
 from ..core.spec import can_idle
 from ..core.world import World
-from .album import Album, look
+from .album import Album, appearance
 from .clips import Clip
-from .exam import Exam, Found, Probe
-from .roll import Results, Tick, fold_context, rows_at
-from .scorecard import COPY_LAST, IDLE, PREDICTED, Curve, Picture, Report, Row
+from .exam import Exam, ExamResults, Probe
+from .rollouts import Results, Tick, fold_context, rows_at
+from .scorecard import COPY_LAST, IDLE, PREDICTED, Curve, Picture, ProbeReport, Row
 from .statistics import Band, Figure, ratio_band, ratio_interval
-from .work import UNSEEN, Unit
+from .work_units import UNSEEN, Unit
 
 STRIDE = 5  # every fifth frame is looked at
 NAMES = ("sharpness", *(f"{what} of {colour}" for what in ("mean", "spread") for colour in ("red", "green", "blue")))
@@ -86,12 +86,12 @@ def long_rollout(
         if step == 1 or step % STRIDE == 0:
             seen = {name: tensor.cpu() for name, tensor in world.render(state, ("rgb", "pose")[: 1 + posed]).items()}
             if step % STRIDE == 0:
-                looks.append(look(seen["rgb"]))
+                looks.append(appearance(seen["rgb"]))
                 poses += [seen["pose"]] if posed else []
             if step == 1 or step % max(STRIDE, steps // 10 // STRIDE * STRIDE) == 0:
                 frames.append(seen["rgb"][0])
         tick(size)
-    found = {"looks": torch.stack(looks), "first": look(last), "frames": torch.stack(frames)}
+    found = {"looks": torch.stack(looks), "first": appearance(last), "frames": torch.stack(frames)}
     return found | ({"poses": torch.stack(poses)} if posed else {})
 
 
@@ -120,7 +120,7 @@ def recorded_actions(world: World, clips: Sequence[Clip], batch: int, steps: int
 
 def rows_of(
     gone: Results, clips: Sequence[Clip], album: Album | None, arm: str, place: str, rng: torch.Generator
-) -> Report:
+) -> ProbeReport:
     """By stretches of a tenth: ratios of sharpness, and of the mean and the spread of each colour; the worst of each as a
     row, all as curves."""
     mine, steps = gone["looks"], len(gone["looks"]) * STRIDE
@@ -136,7 +136,7 @@ def rows_of(
     starts = range(0, len(mine), span)
     buckets = [_bucket(dreamt, first, span, rng) for first in starts]
     low, high = _spread(real, mine.shape[1], rng)
-    found, matched = Report(), float(dreamt.known.double().mean())
+    found, matched = ProbeReport(), float(dreamt.known.double().mean())
     x = [min(first + span, len(mine)) * STRIDE for first in starts]
     for k, name in enumerate(NAMES):
         figures = [bucket[k] for bucket in buckets]
@@ -154,9 +154,9 @@ def rows_of(
     return found
 
 
-def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> Report:
+def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> ProbeReport:
     """By tenths of a rollout in which nobody acted: sharpness and the mean of each colour, against the last true frame."""
-    found, span, lanes = Report(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
+    found, span, lanes = ProbeReport(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
     looks, first = _at_rest(gone)
     parts = torch.stack([part.mean(0) for part in looks.split(span)], -1).clamp_min(LEAST)  # [lanes, 7, tenths]
     first = first.clamp_min(LEAST)[..., None].expand_as(parts)
@@ -205,8 +205,8 @@ def _units(kind: str, exam: Exam) -> list[Unit]:
     return units
 
 
-def _report(kind: str, exam: Exam, found: Found) -> Report:
-    whole = Report()
+def _report(kind: str, exam: Exam, found: ExamResults) -> ProbeReport:
+    whole = ProbeReport()
     place, clips = next(iter(exam.places.items()))
     for arm in exam.arms:
         if gone := found.of(kind, arm):
@@ -242,7 +242,7 @@ STILLNESS = _probe("stillness", "Does it fade while nobody plays?", STILL_LEAD, 
 
 def _matched(mine: torch.Tensor, poses: torch.Tensor, album: Album, not_episode: torch.Tensor | None = None) -> _Looks:
     rows = album.nearest(poses.flatten(0, 1), not_episode)
-    return _Looks(mine, album.looks(rows).view_as(mine), (rows >= 0).view(mine.shape[:2]))
+    return _Looks(mine, album.appearances(rows).view_as(mine), (rows >= 0).view(mine.shape[:2]))
 
 
 def _real_stretches(clips: Sequence[Clip], album: Album | None, span: int) -> _Looks:
@@ -250,7 +250,7 @@ def _real_stretches(clips: Sequence[Clip], album: Album | None, span: int) -> _L
     clips = clips[:64]
     rows = range(0, min(len(clips[0].action), span * STRIDE), STRIDE)
     mine = torch.stack(
-        [look(torch.from_numpy(np.stack([np.asarray(c.channels["rgb"][row]) for c in clips]))) for row in rows]
+        [appearance(torch.from_numpy(np.stack([np.asarray(c.channels["rgb"][row]) for c in clips]))) for row in rows]
     )
     if album is None:
         return _Looks(mine, mine.mean((0, 1)).expand_as(mine), torch.ones(mine.shape[:2], dtype=torch.bool))

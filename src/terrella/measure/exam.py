@@ -17,9 +17,9 @@ from ..core.spec import can_idle
 from ..core.world import World, make_rng
 from .album import Album
 from .clips import Clip
-from .roll import Results, Watch, dream, fold_context, poses_at
-from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, Report, words_of
-from .work import Unit
+from .rollouts import Results, StepMetric, dream, fold_context, poses_at
+from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, ProbeReport, place_label
+from .work_units import Unit
 
 CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: of figures, of drift, those that may run into an end
 KEPT = 2  # the form in which results are kept; those of another form are measured again
@@ -137,7 +137,7 @@ class Exam:
 
 
 @dataclass(frozen=True)
-class Found:
+class ExamResults:
     """Results of units by kind, batches of clips as one."""
 
     results: Mapping[str, Results]
@@ -170,8 +170,8 @@ class Probe:
     question: str
     lead: str
     missing: Callable[[Exam, World], str]
-    report: Callable[[Exam, Found], Report]
-    watch: Callable[[Exam, World, str, int], list[Watch]] = lambda exam, world, of, first: []
+    report: Callable[[Exam, ExamResults], ProbeReport]
+    watch: Callable[[Exam, World, str, int], list[StepMetric]] = lambda exam, world, of, first: []
     units: Callable[[Exam], list[Unit]] = lambda exam: []
     any_world: bool = False
 
@@ -217,7 +217,9 @@ def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Cl
     order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
     turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
     units, verb = [], "pose" if motion == TRUE else "imagine"
-    words = f"{arm}, {words_of(place)}, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
+    words = (
+        f"{arm}, {place_label(place)}, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
+    )
     for number, (first, some) in enumerate(batches(exam, world, clips)):
         watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
         others = [clips[turn[first + at]] for at in range(len(some))]

@@ -11,8 +11,8 @@ import torch
 from .clips import Clip, check_clips
 from .closure import MEMORY
 from .endurance import ENDURANCE, STILLNESS
-from .exam import CLIPS, LONG, Exam, Found, Probe, dreams
-from .likeness import drift_probe
+from .error_series import drift_probe
+from .exam import CLIPS, LONG, Exam, ExamResults, Probe, dreams
 from .outcomes import OUTCOMES
 from .page import page
 from .pixels import PIXELS
@@ -20,12 +20,12 @@ from .pixels import series as pixel_series
 from .poses import POSES
 from .poses import series as pose_series
 from .risk import CALIBRATION
-from .scorecard import Missing, Place, Scorecard
+from .scorecard import Missing, PlaceSummary, Scorecard
 from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
 from .verdict import to_json
-from .work import Calls, Clock, Forecast, Progress, Store, prices_of, run_all, writing
+from .work_units import Calls, Clock, Forecast, Progress, Store, prices_of, run_all, writing
 
 DRIFT = drift_probe((pixel_series, state_series, pose_series))
 PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, STILLNESS, ENDURANCE, SPEED)
@@ -54,7 +54,7 @@ def examine(
     progress(0.0, "measuring how fast the worlds are", 0.0)
     prices = _prices(exam, clock)
     units = dreams(exam, probes) + [unit for probe in probes for unit in probe.units(exam)]
-    found = Found(run_all(units, store, prices, clock, progress))
+    found = ExamResults(run_all(units, store, prices, clock, progress))
     card = Scorecard({arm: world.spec.name for arm, world in exam.arms.items()}, first.spec.dt_s, _places(exam))
     for probe in probes:
         for arm, world in exam.arms.items():
@@ -69,7 +69,7 @@ def examine(
 
 
 @torch.inference_mode()
-def within(
+def most_clips_within(
     exam: Exam, seconds: float, sizes: Sequence[int], clock: Clock = time.monotonic, probes: Sequence[Probe] = PROBES
 ) -> int:
     """The most clips, of `sizes`, on which the exam takes no more than so many seconds, as far as a trial of the worlds tells;
@@ -102,9 +102,9 @@ def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path,
     return data, shown
 
 
-def _places(exam: Exam) -> list[Place]:
-    def described(name: str, clips: Sequence[Clip]) -> Place:
+def _places(exam: Exam) -> list[PlaceSummary]:
+    def described(name: str, clips: Sequence[Clip]) -> PlaceSummary:
         moving = sum(clip.moves() for clip in clips) / len(clips)
-        return Place(name, len(clips), moving, clips[0].context, clips[0].horizon)
+        return PlaceSummary(name, len(clips), moving, clips[0].context, clips[0].horizon)
 
     return [described(name, clips) for name, clips in exam.sets[CLIPS].items()]

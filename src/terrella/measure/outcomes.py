@@ -12,9 +12,9 @@ from ..core.errors import DatasetError
 from ..core.spec import Spec, neutral_action
 from ..core.world import World
 from .clips import Clip, Where, recorded_channels, runs
-from .exam import ENDINGS, Exam, Found, Probe
-from .roll import Results, Watch
-from .scorecard import COPY_LAST, PREDICTED, Report, Row
+from .exam import ENDINGS, Exam, ExamResults, Probe
+from .rollouts import Results, StepMetric
+from .scorecard import COPY_LAST, PREDICTED, ProbeReport, Row
 from .statistics import Figure, mean_interval
 
 LEAD = (
@@ -26,7 +26,7 @@ LEAD = (
 USUAL = "the usual reward"
 
 
-def passages(
+def clips_with_endings(
     cache,
     spec: Spec,
     episodes: Sequence[int],
@@ -57,7 +57,7 @@ def passages(
     return [clip for clip, _ in found], [real for _, real in found]
 
 
-def outcomes(
+def outcome_rows(
     exam: Exam, place: str, arm: str, shown: Sequence[Clip], going: torch.Tensor, dreamt: Results
 ) -> list[Row]:
     """Figures of reward, of single numbers, and of the end, of clips that a world dreamt on from their context; going: bool
@@ -130,17 +130,17 @@ def _compared(exam: Exam, world: World) -> list[str]:
     return [name for name in single if not name.startswith("uncertainty")]
 
 
-def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     names = _compared(exam, world) if of == ENDINGS else []
     flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
-    return [Watch(tuple(names), flat)] if names else []
+    return [StepMetric(tuple(names), flat)] if names else []
 
 
-def _report(exam: Exam, found: Found) -> Report:
-    whole = Report()
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
+    whole = ProbeReport()
     for place, clips, arm, _, dreamt in found.dreams(exam, ENDINGS, (PREDICTED,)):
         going = torch.from_numpy(np.stack(exam.going[place]))
-        whole.rows += outcomes(exam, place, arm, clips, going, dreamt)
+        whole.rows += outcome_rows(exam, place, arm, clips, going, dreamt)
     return whole
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .page_parts import charts_of, figure_table, number, picture_of, section, steps_words, table_of
-from .scorecard import COPY_LAST, Row, Scorecard, words_of
-from .verdict import BETTER, WORSE, compared, judged, verdict
+from .scorecard import COPY_LAST, Row, Scorecard, place_label
+from .verdict import BETTER, WORSE, compared, gain_verdict, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
@@ -27,7 +27,7 @@ def page(card: Scorecard, title: str, probes: Sequence[Probe]) -> str:
         _method(card),
     ]
     places = " &middot; ".join(
-        f"{place.clips} {escape(words_of(place.name))} ({place.moving_share:.0%} moving)" for place in card.places
+        f"{place.clips} {escape(place_label(place.name))} ({place.moving_share:.0%} moving)" for place in card.places
     )
     worlds = " &middot; ".join(f"{escape(arm)}: {escape(name)}" for arm, name in card.worlds.items())
     return (
@@ -45,7 +45,7 @@ def _verdict(card: Scorecard) -> str:
     for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
         mine = {row.horizon: row for row in rows if (row.channel, row.what, row.unit, row.place) == kind}
         unit = f", {kind[2]}" if kind[2] else ""
-        about = f"{escape(f'{kind[0]} {kind[1]}{unit}')}<small>{escape(words_of(kind[3]))}</small>"
+        about = f"{escape(f'{kind[0]} {kind[1]}{unit}')}<small>{escape(place_label(kind[3]))}</small>"
         lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
     inside = (
         table_of(["gain over copying the last frame", *(steps_words(step) for step in steps)], lines) if lines else ""
@@ -54,7 +54,7 @@ def _verdict(card: Scorecard) -> str:
 
 
 def _gain(row: Row) -> str:
-    said = judged(row.gain)
+    said = gain_verdict(row.gain)
     kind = {BETTER: "met", WORSE: "missed"}.get(said, "void")
     words = number(abs(row.gain.value)) if row.gain else ""
     sign = "" if row.gain is None else "\u2212" if row.gain.value < 0 else "+"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from .plot import Line, line_chart, y_span
-from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard, words_of
+from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard, place_label
 from .statistics import Figure
 from .strip import join_row, jpeg
 
@@ -99,11 +99,11 @@ def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
             words = f"{escape(f'{what}, {unit}' if unit else what)}<small>{escape(', '.join(about))}</small>"
             lines.append([words, *(_cell(found[step]) if step in found else "" for step in steps)])
         heads = [
-            escape(words_of(place)),
+            escape(place_label(place)),
             *(f"{steps_words(step)}<small>{step * dt_s:.2f} s</small>" for step in steps),
         ]
         inside = table_of(heads, lines)
-        folded = f"<details><summary>All figures, {escape(words_of(place))}</summary>{inside}</details>"
+        folded = f"<details><summary>All figures, {escape(place_label(place))}</summary>{inside}</details>"
         tables += inside if open_ else folded
     return tables
 
@@ -129,7 +129,7 @@ def charts_of(card: Scorecard, probe: str) -> str:
             lines = [_line(card, curve) for curve in sorted(mine, key=lambda curve: curve.arm == COPY_LAST)]
             x_label, log = ("% kept, the surest first", False) if probe == "calibration" else ("steps", True)
             svg = line_chart(lines, _ticks(mine, log), x_label, f"{what}, {unit}" if unit else what, log, span, guides)
-            title = f"{words_of(place)}, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
+            title = f"{place_label(place)}, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
             boxes += _box(title, svg, lines)
         charts.append(boxes)
     alone = len({curve.place for curve in curves}) == 1  # then all share one grid

@@ -11,14 +11,14 @@ import torch
 from ..core.world import World
 from .clips import Clip
 from .encoder import MIN_SIDE, frame_features
-from .exam import CLIPS, ENDINGS, LONG, Exam, Found, Probe, batches
+from .error_series import Series, report
+from .exam import CLIPS, ENDINGS, LONG, Exam, ExamResults, Probe, batches
 from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_error, ssim
 from .frechet import frechet_interval
-from .likeness import Series, report
-from .roll import Results, Tick, Watch, rows_at
-from .scorecard import CHANGE, COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, Report, Row, words_of
+from .rollouts import Results, StepMetric, Tick, rows_at
+from .scorecard import CHANGE, COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, ProbeReport, Row, place_label
 from .statistics import Figure, mean_interval, ratio_band, ratio_interval
-from .work import Unit
+from .work_units import Unit
 
 LEAD = (
     "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
@@ -33,7 +33,7 @@ _LEAST_SSIM = 11  # pixels: the size of its window
 _RECENT = 8  # steps over which what changes is counted
 
 
-def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+def series(exam: Exam, found: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
     """PSNR of every camera that was dreamt: the mean of the frames', and that of the pooled errors."""
     truth = found.of("truth", of, place)
     made = []
@@ -55,12 +55,14 @@ def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip],
     return made
 
 
-def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     if of == ENDINGS:
         return []
     horizons = exam.config.horizons if of == CLIPS else ()
     before: dict[str, torch.Tensor] = {}
-    return [Watch((name,), partial(_see, exam, name, horizons, first, before)) for name in exam.shared(world, "rgb")]
+    return [
+        StepMetric((name,), partial(_see, exam, name, horizons, first, before)) for name in exam.shared(world, "rgb")
+    ]
 
 
 def _see(
@@ -97,7 +99,7 @@ def _units(exam: Exam) -> list[Unit]:
                 steps = clips[0].horizon if of == LONG else max(exam.config.horizons)
                 run = partial(_truth, exam, names, some, steps, exam.config.horizons if of == CLIPS else ())
                 calls = {("recording", "compare"): float(steps * len(some))}
-                units.append(Unit(f"truth|{of}|{place}|{number}", f"recordings, {words_of(place)}", calls, run))
+                units.append(Unit(f"truth|{of}|{place}|{number}", f"recordings, {place_label(place)}", calls, run))
     return units
 
 
@@ -131,7 +133,7 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
     return {key: torch.stack(values, 1) for key, values in kept.items()}
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
     whole = report(exam, found, "pixels", series)
     for place, clips in exam.places.items():
         truth, strips = found.of("truth", CLIPS, place), [{} for _ in clips[: exam.config.strips]]
@@ -151,7 +153,7 @@ def _report(exam: Exam, found: Found) -> Report:
                             strip[f"{arm}, {motion} motion, {name}"] = np.concatenate([now, frames.numpy()])
         columns = ["now", *(f"{step} step{'s'[: step > 1]}, {step * exam.dt_s:.2f} s" for step in exam.config.horizons)]
         whole.pictures += [
-            Picture("pixels", f"{words_of(place)}, clip {number + 1}", columns, strip)
+            Picture("pixels", f"{place_label(place)}, clip {number + 1}", columns, strip)
             for number, strip in enumerate(strips)
             if strip
         ]

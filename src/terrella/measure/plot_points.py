@@ -15,7 +15,7 @@ _ROW, _WORDS, _WIDE = 26, 190, 860
 
 
 @dataclass(frozen=True)
-class Point:
+class ScatterPoint:
     """A point with intervals both ways."""
 
     label: str
@@ -24,7 +24,7 @@ class Point:
     colour: str
 
 
-def scatter(points: Sequence[Point], x_label: str, y_label: str) -> str:
+def scatter(points: Sequence[ScatterPoint], x_label: str, y_label: str) -> str:
     """An <svg> with one scale both ways, and the diagonal on which both agree."""
     low, high = y_span([end for point in points for each in (point.x, point.y) for end in _ends(each)])
     across, up = _SIDE - _LEFT - _RIGHT, _SIDE - _TOP - _BOTTOM
@@ -58,7 +58,7 @@ def scatter(points: Sequence[Point], x_label: str, y_label: str) -> str:
     return "".join(parts)
 
 
-def listed(
+def dot_plot(
     rows: Sequence[tuple[str, Sequence[tuple[Figure, str]]]], x_label: str, guides: Sequence[tuple[float, str]] = ()
 ) -> str:
     """An <svg>: a line for each name with its figures, (figure, colour) from above to below, on one scale; guides: (value, colour),

@@ -9,10 +9,10 @@ import torch
 
 from ..core.world import World
 from .clips import Clip
-from .exam import CLIPS, ENDINGS, Exam, Found, Probe
-from .likeness import Series, report
-from .roll import Results, Watch, rows_at
-from .scorecard import COPY_LAST, PREDICTED, Report, Row
+from .error_series import Series, report
+from .exam import CLIPS, ENDINGS, Exam, ExamResults, Probe
+from .rollouts import Results, StepMetric, rows_at
+from .scorecard import COPY_LAST, PREDICTED, ProbeReport, Row
 from .statistics import mean_interval, median_interval
 
 LEAD = (
@@ -23,7 +23,7 @@ LEAD = (
 WALKED_M = 0.5  # clips that went less far have no share of it
 
 
-def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+def series(exam: Exam, found: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
     """Distance and turn between the predicted and the true pose."""
     made, context = [], clips[0].context
     for name in [key.removesuffix("/where") for key in dreamt if key.endswith("/where")]:
@@ -38,14 +38,14 @@ def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip],
     return made
 
 
-def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     names = exam.shared(world, "pose")
     if of == ENDINGS or not names:
         return []
-    return [Watch(tuple(names), lambda seen, *_: {f"{name}/where": seen[name] for name in names})]
+    return [StepMetric(tuple(names), lambda seen, *_: {f"{name}/where": seen[name] for name in names})]
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
     whole = report(exam, found, "pose", series)
     for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS, (PREDICTED,)):
         for made in series(exam, found, CLIPS, place, clips, dreamt):

@@ -13,9 +13,9 @@ import torch
 
 from ..core.world import World
 from .clips import Clip
-from .exam import CLIPS, Exam, Found, Probe
-from .roll import Results, Watch, rows_at
-from .scorecard import PREDICTED, TRUE, Curve, Report, Row
+from .exam import CLIPS, Exam, ExamResults, Probe
+from .rollouts import Results, StepMetric, rows_at
+from .scorecard import PREDICTED, TRUE, Curve, ProbeReport, Row
 from .statistics import Band, figure_of
 
 RESAMPLES = 400
@@ -29,9 +29,9 @@ LEAD = (
 _ORDERS = ("by its own order", "by an oracle", "by chance")
 
 
-def risk(
+def risk_coverage_report(
     place: str, arm: str, motion: str, error: torch.Tensor, uncertainty: torch.Tensor, rng: torch.Generator
-) -> Report:
+) -> ProbeReport:
     """Of errors (mean absolute, intensities 0 to 1) and uncertainties [n, T] of the frames of n clips; in %, intervals over
     clips. `order worth`: how much of the way from chance to the oracle its order goes."""
     clips, steps = error.shape
@@ -48,7 +48,7 @@ def risk(
     off = torch.zeros(len(weights), dtype=torch.float64)
     for part in orders[0].tensor_split(BINS):
         off += (shares[:, clip[part]] @ (wrong[part] - expected[part])).abs()
-    where, found = ("calibration", "rgb"), Report()
+    where, found = ("calibration", "rgb"), ProbeReport()
     reference = {
         "by chance": figure_of(chance[0], chance[1:], clips),
         "by an oracle": figure_of(least[0], least[1:], clips),
@@ -76,14 +76,14 @@ def _see(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
     return {"error": away, "uncertainty": seen["uncertainty"]}
 
 
-def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     asked = of == CLIPS and not _missing(exam, world)
-    return [Watch(("rgb", "uncertainty"), _see)] if asked else []
+    return [StepMetric(("rgb", "uncertainty"), _see)] if asked else []
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
     """Each place by itself, and all together: can it tell the known from the invented?"""
-    whole = Report()
+    whole = ProbeReport()
     for arm in exam.arms:
         for motion in (PREDICTED, TRUE):
             parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
@@ -92,7 +92,7 @@ def _report(exam: Exam, found: Found) -> Report:
                 error, uncertainty = zip(*known.values())
                 known["all"] = torch.cat(error), torch.cat(uncertainty)
             for place, (error, uncertainty) in known.items():
-                one = risk(place, arm, motion, error, uncertainty, exam.rng())
+                one = risk_coverage_report(place, arm, motion, error, uncertainty, exam.rng())
                 whole.rows += one.rows
                 whole.curves += one.curves if motion == PREDICTED else []
     return whole

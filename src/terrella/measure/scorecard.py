@@ -80,7 +80,7 @@ class Missing:
 
 
 @dataclass(frozen=True)
-class Place:
+class PlaceSummary:
     """What was shown: how many clips, the share of them in which anything moves, their lengths in steps."""
 
     name: str
@@ -91,7 +91,7 @@ class Place:
 
 
 @dataclass
-class Report:
+class ProbeReport:
     """What one probe found."""
 
     rows: list[Row] = field(default_factory=list)
@@ -105,7 +105,7 @@ class Scorecard:
 
     worlds: dict[str, str]
     dt_s: float
-    places: list[Place]
+    places: list[PlaceSummary]
     rows: list[Row] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     missing: list[Missing] = field(default_factory=list)
@@ -120,6 +120,6 @@ class Scorecard:
         ]
 
 
-def words_of(place: str) -> str:
+def place_label(place: str) -> str:
     """As people are told of it: "recorded clips", "new places"."""
     return f"{place} {'places' if place == 'new' else 'clips'}"

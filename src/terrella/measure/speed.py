@@ -14,11 +14,11 @@ from ..core.spec import kind_of
 from ..core.world import World
 from .clips import Clip
 from .endurance import recorded_actions
-from .exam import Exam, Found, Probe
-from .roll import Results, Tick, fold_context
-from .scorecard import PREDICTED, Report, Row
+from .exam import Exam, ExamResults, Probe
+from .rollouts import Results, Tick, fold_context
+from .scorecard import PREDICTED, ProbeReport, Row
 from .statistics import Figure
-from .work import Unit
+from .work_units import Unit
 
 LEAD = (
     "One imagined and drawn step of one rollout, in milliseconds. It depends on the machine and on what else it does."
@@ -69,10 +69,10 @@ def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
     ]
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
     place = next(iter(exam.places))
     timed = {arm: found.of("speed", arm) for arm in exam.arms}
-    return Report([row for arm, one in timed.items() if one for row in rows_of(one, arm, place)])
+    return ProbeReport([row for arm, one in timed.items() if one for row in rows_of(one, arm, place)])
 
 
 SPEED = Probe("speed", "Speed", LEAD, lambda exam, world: "", _report, units=_units, any_world=True)

@@ -11,10 +11,10 @@ import torch
 from ..core.spec import kind_of
 from ..core.world import World
 from .clips import Clip
-from .exam import CLIPS, ENDINGS, Exam, Found, Probe
-from .likeness import Series, report
-from .roll import Results, Watch
-from .scorecard import Report, Row
+from .error_series import Series, report
+from .exam import CLIPS, ENDINGS, Exam, ExamResults, Probe
+from .rollouts import Results, StepMetric
+from .scorecard import ProbeReport, Row
 from .statistics import Figure, last_step_above, ratio_interval
 
 LEAD = (
@@ -64,7 +64,7 @@ class _Vector:
         return self.values[:, self.context - 1 : self.context] - self.values[:, self.context : self.context + steps]
 
 
-def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
+def series(exam: Exam, found: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
     """Normalised RMSE of every vector that was dreamt."""
     made = []
     for name in [key.removesuffix("/vector") for key in dreamt if key.endswith("/vector")]:
@@ -75,14 +75,16 @@ def series(exam: Exam, found: Found, of: str, place: str, clips: Sequence[Clip],
     return made
 
 
-def _watch(exam: Exam, world: World, of: str, first: int) -> list[Watch]:
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     if of == ENDINGS:
         return []
     names = vectors(exam, world)
-    return [Watch(tuple(names), lambda seen, *_: {f"{name}/vector": seen[name] for name in names})] if names else []
+    return (
+        [StepMetric(tuple(names), lambda seen, *_: {f"{name}/vector": seen[name] for name in names})] if names else []
+    )
 
 
-def _report(exam: Exam, found: Found) -> Report:
+def _report(exam: Exam, found: ExamResults) -> ProbeReport:
     whole = report(exam, found, "state", series)
     for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS):
         for made in series(exam, found, CLIPS, place, clips, dreamt):

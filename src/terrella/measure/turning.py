@@ -15,13 +15,13 @@ from ..core.world import World
 from ..space.camera import yaw
 from ..space.matching import scrolled
 from .clips import Clip
-from .roll import fold_context
+from .rollouts import fold_context
 
 TRIED, TURNS_RAD = 4, math.radians(0.2)  # steps that an action is tried for; what turns less in a step does not turn
 REACH, SCROLLS = 8, 0.5  # pixels that a picture may go in a step, either way; what goes less does not scroll
 
 
-def turns(
+def turning_actions(
     world: World, clips: Sequence[Clip], rng: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor, str, float] | None:
     """Two actions that turn the camera one way and the other, their name, and radians a step; None where nothing does.
@@ -45,7 +45,7 @@ def turns(
     return candidates[left][1], candidates[right][1], f"{candidates[left][0]} and {candidates[right][0]}", speed
 
 
-def scrolls(
+def scrolling_actions(
     world: World, clips: Sequence[Clip], rng: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor, str, float] | None:
     """Two actions that scroll the picture one way and back, their name, and pixels a step; None where no two do. Each is tried in

@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from .endurance import COLOUR_WITHIN, SHARP_WITHIN
-from .scorecard import CHANGE, COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, words_of
+from .scorecard import CHANGE, COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, place_label
 from .statistics import Figure
 
 BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
@@ -52,7 +52,7 @@ def compared(card: Scorecard) -> list[Row]:
     return [row for row in mine if COPY_LAST in row.baselines]
 
 
-def judged(gain: Figure | None) -> str:
+def gain_verdict(gain: Figure | None) -> str:
     """Better or worse where the whole interval of a gain says so; one clip alone cannot say."""
     if gain is None or not math.isfinite(gain.low):
         return UNCLEAR
@@ -64,16 +64,16 @@ def _copying(curves: Sequence[Curve], rows: Sequence[Row]) -> str:
     mean of the frames' PSNR says worse and their pooled errors do not."""
     lead, last = curves[0], "frame" if curves[0].unit == "dB" else "observation"
     than = {
-        curve.place: _spans(curve.x, [judged(curve.band.at(at)) for at in range(len(curve.x))])
+        curve.place: _spans(curve.x, [gain_verdict(curve.band.at(at)) for at in range(len(curve.x))])
         for curve in curves
         if (curve.channel, curve.what) == (lead.channel, lead.what)
     }
     (first, told), *others = than.items()
     means = [row for row in rows if (row.channel, row.what, row.place) == (lead.channel, "PSNR", first)]
-    worse = [row.horizon for row in means if judged(row.gain) == WORSE and "worse" not in told]
+    worse = [row.horizon for row in means if gain_verdict(row.gain) == WORSE and "worse" not in told]
     told += f", though by mean PSNR worse after {_steps(worse)}" if worse else ""
     told = told.replace("THAN", f"than copying the last {last}", 1)
-    parts = [told, *(f"in {words_of(place)} {words}" for place, words in others if words != than[first])]
+    parts = [told, *(f"in {place_label(place)} {words}" for place, words in others if words != than[first])]
     return "; ".join(parts).replace(" THAN", "")
 
 
@@ -171,7 +171,7 @@ def _stands(row: Row) -> tuple[int, str]:
 def _by_place(told: Iterable[tuple[str, str]]) -> str:
     """What is said of the first place, then of each of which something else is."""
     (_, first), *others = told
-    return ", ".join([first, *(f"{words} in {words_of(place)}" for place, words in others if words != first)])
+    return ", ".join([first, *(f"{words} in {place_label(place)}" for place, words in others if words != first)])
 
 
 def _line(rows: Sequence[Row]) -> str:
@@ -179,8 +179,8 @@ def _line(rows: Sequence[Row]) -> str:
         " / ".join(f"{figure.value:.3g}" for figure in figures)
         for figures in ([row.figure for row in rows], [row.baselines[COPY_LAST] for row in rows])
     )
-    said = [judged(row.gain) for row in rows]
-    about = f"{rows[0].channel} {rows[0].what}, {words_of(rows[0].place)}: {mine} {rows[0].unit}".rstrip()
+    said = [gain_verdict(row.gain) for row in rows]
+    about = f"{rows[0].channel} {rows[0].what}, {place_label(rows[0].place)}: {mine} {rows[0].unit}".rstrip()
     unanimous = said[0] if len(set(said)) == 1 else ", ".join(said)
     return f"{about} after {_steps([row.horizon for row in rows])}; copy-last {copied} ({unanimous})"
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..act.planning import Revealed
+from ..act.planning import FullyObserved
 from ..core.errors import ActionError, PlanningError
 from ..core.spec import Spec, kind_of
 from ..core.world import World
@@ -30,7 +30,7 @@ def open_real(real: str, environment: EnvironmentConfig, spec: Spec) -> World:
     if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
         environment = replace(environment, size=(shape[0], shape[1]))
     takes_snapshots = any(kind_of(channel) == "snapshot" for channel in spec.observes)
-    return Revealed(open_copied(real, environment)) if takes_snapshots else environment.open(real)
+    return FullyObserved(open_copied(real, environment)) if takes_snapshots else environment.open(real)
 
 
 def open_copied(name: str, environment: EnvironmentConfig) -> World:

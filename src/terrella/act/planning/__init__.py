@@ -1,28 +1,19 @@
-"""Planners over any World: what futures cost, how good ones are searched, and the policy that acts on what it finds."""
+"""Planners over any World: the cost of futures, searches for cheap plans, and the policy that acts on the best one."""
 
-from .budget import search_within, tells_apart
+from .budget import cost_discriminates, search_config_within
 from .costs import Cost, distance, distance_to, negative_reward
-from .episodes import Episode, Judge, Played, play, play_from
+from .episodes import PlayedEpisode, PlayResult, SuccessCriterion, play, play_from
 from .exported import ActionModel, CostModel
-from .futures import Imagined, imagined
-from .planner import Decision, Planner, Thought
-from .reaching import Reaching
-from .revealed import Revealed
+from .fully_observed import FullyObserved
+from .goal_belief import GoalBeliefPolicy
+from .imagined_futures import ImaginedFuture, imagined_futures
+from .planner import Decision, Planner, PlannerMemory
+from .problem import PlanningProblem
 from .routes import NEAR_M, STRIDE_S, Destination, Navigator
-from .searches import Found, Hints, SearchConfig, search
-from .task import Task
+from .searches import SearchConfig, SearchResult, WarmStart, search
 
-__all__ = ["Cost", "Decision", "Episode", "Found", "Hints", "Judge", "Planner", "Played", "Revealed", "SearchConfig"]
-__all__ += [
-    "Task",
-    "Thought",
-    "distance",
-    "distance_to",
-    "negative_reward",
-    "search_within",
-    "play",
-    "play_from",
-    "search",
-]
-__all__ += ["NEAR_M", "STRIDE_S", "Destination", "Imagined", "Navigator", "imagined", "tells_apart"]
-__all__ += ["ActionModel", "CostModel", "Reaching"]
+__all__ = ["NEAR_M", "STRIDE_S", "ActionModel", "Cost", "CostModel", "Decision", "Destination", "FullyObserved"]
+__all__ += ["GoalBeliefPolicy", "ImaginedFuture", "Navigator", "Planner", "PlannerMemory", "PlanningProblem"]
+__all__ += ["PlayResult", "PlayedEpisode", "SearchConfig", "SearchResult", "SuccessCriterion", "WarmStart"]
+__all__ += ["cost_discriminates", "distance", "distance_to", "imagined_futures", "negative_reward", "play"]
+__all__ += ["play_from", "search", "search_config_within"]

@@ -11,8 +11,8 @@ from ...core.state import State
 from ...core.world import World, make_rng
 from .costs import Cost
 from .moves import moves_of
+from .problem import PlanningProblem
 from .searches import SearchConfig
-from .task import Task
 
 _FEWEST_MOVES, _MOST_MOVES = 4, 16
 _FEWEST_SAMPLES = 8
@@ -23,7 +23,7 @@ _HOLD_S, _AHEAD_S = (
 
 
 @torch.no_grad()
-def search_within(
+def search_config_within(
     world: World, cost: Cost, state: State, budget_ms: float, block: int = 1, samples: int = 32
 ) -> tuple[SearchConfig, bool]:
     """An iCEM search from states like `state` [1] of which a round takes about `budget_ms` here and now, and whether it does: a
@@ -51,7 +51,7 @@ def _step_ms(world: World, cost: Cost, state: State, samples: int) -> float:
 
 
 @torch.no_grad()
-def tells_apart(world: World, cost: Cost, state: State, limit_s: float = 1.0, plans: int = 16) -> bool:
+def cost_discriminates(world: World, cost: Cost, state: State, limit_s: float = 1.0, plans: int = 16) -> bool:
     """Whether random plans from `state` [1] cost different sums, or ends, in the next seconds: where all are worth the same,
     there is nothing to plan for. Gives up, and says no, after `limit_s`."""
     dt_s = world.spec.dt_s
@@ -59,7 +59,7 @@ def tells_apart(world: World, cost: Cost, state: State, limit_s: float = 1.0, pl
     moves = max(2, round(_AHEAD_S / dt_s / block))
     end, rng = time.perf_counter() + limit_s, make_rng(0)
     coded = moves_of(world.spec)
-    task = Task(world, coded, cost, state, cost.goal_of(0, 1), [0], moves, block)
+    task = PlanningProblem(world, coded, cost, state, cost.goal_of(0, 1), [0], moves, block)
     codes = coded.uniform(torch.randn(1, plans, moves, coded.size, generator=rng))
     ahead, alive, total = state.fork(plans), None, None
     for move in range(moves):

@@ -15,15 +15,15 @@ from ...core.spec import Spec
 from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import distance
-from .planner import Decision, Thought
-from .routes import Walk
+from .planner import Decision, PlannerMemory
+from .routes import NavigatorMemory
 
 _STREAMS = 1 << 40, 2 << 40, 3 << 40  # of the seed: what the world, the policy's actions and its beginning draw
 MOST_SKIPPED = 20  # starts that are already solved, for each episode that is asked for
 
 
 @dataclass(frozen=True)
-class Judge:
+class SuccessCriterion:
     """When an episode has succeeded: where `channel` is above 0, or else within `within` of the goal (costs.distance).
 
     goal: channel -> [1, ...]. With neither a goal nor a channel nothing is judged, and an episode has its return alone.
@@ -61,7 +61,7 @@ class Judge:
 
 
 @dataclass
-class Episode:
+class PlayedEpisode:
     """One episode. reward: the sum; success: None where nothing is judged; nearest: the least distance to the goal; ended: the
     environment said so; actions: [*action.shape] a step; ms and imagined: of each decision; best_cost: of any plan; seen: what
     was kept, a frame a step from the start on."""
@@ -80,8 +80,8 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Played:
-    episodes: list[Episode]
+class PlayResult:
+    episodes: list[PlayedEpisode]
     skipped: int  # starts that were already solved
 
 
@@ -91,21 +91,21 @@ def play(
     episodes: int,
     steps: int,
     seed: int,
-    judge: Judge | None = None,
+    judge: SuccessCriterion | None = None,
     sees: Sequence[str] = (),
     keep: Sequence[str] = (),
     kept: int = 0,
     report: Callable[[float, float], None] | None = None,
-) -> Played:
+) -> PlayResult:
     """`episodes` unsolved starts of `world`, each until it succeeds, ends or has had `steps`.
 
     The same seed gives the same starts whatever the policy, so that two policies can be compared in pairs. sees: channels that
     the policy is shown. keep: channels that are kept of the first `kept` episodes. Where states are values all episodes are
     played at once, else one after the other. PlanningError where nearly every start is already solved.
     """
-    judge = judge or Judge()
+    judge = judge or SuccessCriterion()
     spec, starts = world.spec, make_rng(seed)
-    found, skipped = list[Episode](), 0
+    found, skipped = list[PlayedEpisode](), 0
     while len(found) < episodes:
         batch = min(episodes - len(found), spec.max_batch or episodes) if spec.forkable else 1
         state = world.start(batch, starts)
@@ -124,7 +124,7 @@ def play(
         found += play_from(world, state, policy, steps, own, judge, sees, keep, left)
         if report:
             report(len(found), episodes)
-    return Played(found, skipped)
+    return PlayResult(found, skipped)
 
 
 def play_from(
@@ -133,14 +133,14 @@ def play_from(
     policy: Policy,
     steps: int,
     seed: int,
-    judge: Judge | None = None,
+    judge: SuccessCriterion | None = None,
     sees: Sequence[str] = (),
     keep: Sequence[str] = (),
     kept: int = 0,
-) -> list[Episode]:
+) -> list[PlayedEpisode]:
     """The episodes that begin in `state`, as `play` plays them. What the policy draws by chance is the same in any world, as long
     as none of the episodes ends."""
-    judge = judge or Judge()
+    judge = judge or SuccessCriterion()
     told = [name for name in ("reward", "done") if name in world.spec.channels]
     world.spec.check_channels((*judge.channels, *sees, *keep))
     channels = tuple(dict.fromkeys((*sees, *judge.channels, *told)))
@@ -154,7 +154,7 @@ class _Group:
 
     world: World
     policy: Policy
-    judge: Judge
+    judge: SuccessCriterion
     channels: tuple[str, ...]
     keep: tuple[str, ...]
     kept: int
@@ -163,9 +163,9 @@ class _Group:
     @torch.no_grad()
     def play(
         self, state: State, moves: torch.Generator, chance: torch.Generator, begins: torch.Generator
-    ) -> list[Episode]:
+    ) -> list[PlayedEpisode]:
         """moves: of the world alone; chance: of the policy's actions; begins: of its memory."""
-        episodes = [Episode(success=False if self.judge.judges else None) for _ in range(state.batch)]
+        episodes = [PlayedEpisode(success=False if self.judge.judges else None) for _ in range(state.batch)]
         memory, going = self.policy.begin(state.batch, begins), list(range(state.batch))
         seen = self.world.render(state, self.channels)
         for episode, away in zip(episodes, self.judge.away(self.world, seen).tolist() if self.judge.goal else []):
@@ -191,7 +191,7 @@ class _Group:
         self._note(episodes, going, state)
         return episodes
 
-    def _judged(self, episodes: list[Episode], going: list[int], seen: Observation) -> torch.Tensor:
+    def _judged(self, episodes: list[PlayedEpisode], going: list[int], seen: Observation) -> torch.Tensor:
         """Writes down what a step brought; bool [B]: which episodes are over."""
         none = torch.zeros(len(going))
         paid = seen["reward"].cpu().tolist() if "reward" in seen else none.tolist()
@@ -208,7 +208,7 @@ class _Group:
                 episode.nearest = min(episode.nearest, away[entry])
         return ended | solved
 
-    def _note(self, episodes: list[Episode], going: list[int], state: State) -> None:
+    def _note(self, episodes: list[PlayedEpisode], going: list[int], state: State) -> None:
         """Keeps what is seen of the episodes that are to be kept."""
         for entry, number in enumerate(going):
             if 0 <= number < self.kept and self.keep:
@@ -216,12 +216,12 @@ class _Group:
                 episodes[number].seen.append({name: value[0].cpu() for name, value in shown.items()})
 
 
-def _decided(episode: Episode, action: torch.Tensor, ms: float, memory: Any, entry: int) -> None:
+def _decided(episode: PlayedEpisode, action: torch.Tensor, ms: float, memory: Any, entry: int) -> None:
     """Writes down an action, and the decision behind it if that is a new one."""
     episode.actions.append(action.cpu())
     thought = memory[entry] if isinstance(memory, list) else None
-    thought = thought.thought if isinstance(thought, Walk) else thought
-    if not isinstance(thought, Thought) or thought.decision is None:
+    thought = thought.thought if isinstance(thought, NavigatorMemory) else thought
+    if not isinstance(thought, PlannerMemory) or thought.decision is None:
         episode.ms.append(ms)
     elif thought.decision is not episode.decision:
         episode.decision = thought.decision

@@ -13,7 +13,7 @@ from ...core.rollouts import advanced
 from ...core.world import World, make_rng
 from ..goal_network import GOAL, LATENT, GoalActor
 from .costs import distance
-from .moves import Axes, moves_of
+from .moves import ContinuousMoves, moves_of
 
 
 @final
@@ -27,7 +27,7 @@ class CostModel(nn.Module):
     def __init__(self, world: World):
         super().__init__()
         spec = world.spec
-        if spec.observes != ("rgb",) or LATENT not in spec.channels or not isinstance(moves_of(spec), Axes):
+        if spec.observes != ("rgb",) or LATENT not in spec.channels or not isinstance(moves_of(spec), ContinuousMoves):
             raise PlanningError(f"{spec.name} sees no pictures alone, or has no latent or no axes to be planned with.")
         self.world, self.moves = world, moves_of(spec)
         self.whose_dtype = nn.Parameter(torch.zeros(()), requires_grad=False)  # solvers ask for the dtype of parameters

@@ -20,7 +20,7 @@ _FLOOR = 0.02  # least deviation, and least share of probability that is spread 
 _MOST_MOVES = 256  # of which a tree tries each
 
 
-class Axes:
+class ContinuousMoves:
     """Actions of a Box. Axes without a limit reach from -1 to 1."""
 
     def __init__(self, spec: Spec):
@@ -69,7 +69,7 @@ class Axes:
         raise PlanningError("a tree search tries each choice in turn, and axes have no end of them: use icem or mppi.")
 
 
-class Choices:
+class DiscreteMoves:
     """Actions of one choice or several, and buttons."""
 
     def __init__(self, spec: Spec):
@@ -120,14 +120,14 @@ class Choices:
         return torch.cartesian_prod(*every).reshape(total, self.size).float()
 
 
-Moves = Axes | Choices
+Moves = ContinuousMoves | DiscreteMoves
 
 
 def moves_of(spec: Spec) -> Moves:
     """How the actions of a world are coded. ActionError for spaces that no world has."""
     if dtype_of(spec.action).kind == "f" and isinstance(spec.action, spaces.Box):
-        return Axes(spec)
-    return Choices(spec)
+        return ContinuousMoves(spec)
+    return DiscreteMoves(spec)
 
 
 def coloured(seeds: torch.Tensor, candidates: int, horizon: int, size: int, colour: float, stream: int) -> torch.Tensor:

@@ -16,8 +16,8 @@ from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import Cost
 from .moves import moves_of, shifted
-from .searches import Found, Hints, SearchConfig, search
-from .task import Task, by_episode, later
+from .problem import PlanningProblem, by_episode, later
+from .searches import SearchConfig, SearchResult, WarmStart, search
 
 _OBSERVE, _PRIOR, _SEARCH, _PROPOSE = range(4)  # what an episode's seed is spent on, at each step
 
@@ -38,7 +38,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Thought:
+class PlannerMemory:
     """The planner's memory of one episode: its seed and step, the state [1] expected now, what is still to be done [n, D] of the
     plan, the belief [H, D, K] and plan [H, D] to begin with next, the goal [1, ...], and the last decision."""
 
@@ -60,7 +60,7 @@ class Planner:
               that it sees are `sees`, by default its own or all that a recording of the world would hold; the goal is among
               them, as `goal.` and its channel.
 
-    Its memory is a list with a Thought for each episode. The same seed gives the same actions, and a batch those of its episodes
+    The memory is a list of one PlannerMemory an episode. The same seed gives the same actions; a batch gives those of its episodes
     alone, but for what the world's own arithmetic rounds (and unless a budget in milliseconds is set).
     Raises PlanningError, ObservationError or ChannelError; it never acts by chance.
     """
@@ -97,14 +97,14 @@ class Planner:
         """What it is to be shown: the evidence that its world takes."""
         return (*self.world.spec.observes, *self.world.spec.may_observe)
 
-    def begin(self, batch: int, rng: torch.Generator) -> list[Thought]:
+    def begin(self, batch: int, rng: torch.Generator) -> list[PlannerMemory]:
         seeds = chance.seeds(batch, rng, "cpu").bitwise_and(2**63 - 1).tolist()
-        return [Thought(seed, self.cost.goal_of(entry, batch)) for entry, seed in enumerate(seeds)]
+        return [PlannerMemory(seed, self.cost.goal_of(entry, batch)) for entry, seed in enumerate(seeds)]
 
     @torch.no_grad()
     def act(
-        self, observation: Observation, memory: list[Thought], rng: torch.Generator
-    ) -> tuple[torch.Tensor, list[Thought]]:
+        self, observation: Observation, memory: list[PlannerMemory], rng: torch.Generator
+    ) -> tuple[torch.Tensor, list[PlannerMemory]]:
         """The first actions of the best plans. `rng` is not used: each episode has a seed of its own since it began."""
         state, memory = self._observed(observation, memory), list(memory)
         new = [entry for entry, thought in enumerate(memory) if thought.queue is None]
@@ -121,7 +121,7 @@ class Planner:
             for entry, thought in enumerate(memory)
         ]
 
-    def _observed(self, observation: Observation, memory: Sequence[Thought]) -> State:
+    def _observed(self, observation: Observation, memory: Sequence[PlannerMemory]) -> State:
         """What is seen, folded into what was expected; where nothing was yet, into nothing."""
         spec = self.world.spec
         missing = [name for name in spec.observes if name not in observation]
@@ -143,7 +143,7 @@ class Planner:
         ]
         return State.stack(parts).at([(new + old).index(entry) for entry in range(len(memory))])
 
-    def _folded(self, shown: Observation, thoughts: Sequence[Thought]) -> State:
+    def _folded(self, shown: Observation, thoughts: Sequence[PlannerMemory]) -> State:
         """For episodes that all expect something, or all expect nothing yet."""
         priors = [thought.prior for thought in thoughts if thought.prior is not None]
         prior = State.stack(priors) if priors else None
@@ -154,18 +154,22 @@ class Planner:
 
         return by_episode(fold, [later(thought.seed, 4 * thought.step + _OBSERVE) for thought in thoughts])
 
-    def _planned(self, state: State, thoughts: list[Thought]) -> list[Thought]:
+    def _planned(self, state: State, thoughts: list[PlannerMemory]) -> list[PlannerMemory]:
         began, config = time.perf_counter(), self.config
         names = thoughts[0].goal
         goal = {name: torch.cat([thought.goal[name] for thought in thoughts]) for name in names}
         seeds = [later(thought.seed, 4 * thought.step + _SEARCH) for thought in thoughts]
-        task = Task(self.world, self.moves, self.cost, state, goal, seeds, config.horizon, config.block, config.trust)
+        task = PlanningProblem(
+            self.world, self.moves, self.cost, state, goal, seeds, config.horizon, config.block, config.trust
+        )
         proposed = None if self._proposal is None else self._proposals_of(state, thoughts)
-        found = search(task, config, Hints(_stacked(thoughts, "belief"), _stacked(thoughts, "plan"), proposed))
+        found = search(task, config, WarmStart(_stacked(thoughts, "belief"), _stacked(thoughts, "plan"), proposed))
         ms = 1e3 * (time.perf_counter() - began) / len(thoughts)
         return [self._thought(thought, task, found, entry, ms) for entry, thought in enumerate(thoughts)]
 
-    def _thought(self, thought: Thought, task: Task, found: Found, entry: int, ms: float) -> Thought:
+    def _thought(
+        self, thought: PlannerMemory, task: PlanningProblem, found: SearchResult, entry: int, ms: float
+    ) -> PlannerMemory:
         plan, known = found.plan[entry], int(task.known[entry])
         done = min(self.config.replan, known)
         fresh = self.moves.first(1, self.config.horizon, self.config.spread)[0]
@@ -181,7 +185,7 @@ class Planner:
             decision=decision,
         )
 
-    def _proposals_of(self, state: State, thoughts: Sequence[Thought]) -> torch.Tensor:
+    def _proposals_of(self, state: State, thoughts: Sequence[PlannerMemory]) -> torch.Tensor:
         """The policy's plans [B, M, H, D]: its action at the beginning of each move, held for a block as all moves are."""
         found = []
         for entry, thought in enumerate(thoughts):
@@ -210,7 +214,7 @@ def _rest(queue: torch.Tensor | None) -> torch.Tensor | None:
     return None if queue is None else queue[1:]
 
 
-def _stacked(thoughts: Sequence[Thought], name: str) -> torch.Tensor | None:
+def _stacked(thoughts: Sequence[PlannerMemory], name: str) -> torch.Tensor | None:
     """What all these episodes begin with; None where they have nothing yet."""
     found = [getattr(thought, name) for thought in thoughts]
     return None if found[0] is None else torch.stack(found)

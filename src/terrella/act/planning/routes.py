@@ -15,7 +15,7 @@ from ...core.spec import WALKABLE
 from ...core.world import Observation, World
 from ...space.camera import yaw
 from .costs import Cost, distance_to
-from .planner import Planner, Thought
+from .planner import Planner, PlannerMemory
 
 
 class NoRoute(PlanningError):
@@ -65,10 +65,10 @@ class Routes:
 
 
 @dataclass(frozen=True)
-class Walk:
+class NavigatorMemory:
     """The memory of one episode: the planner's, the ways, the place walked to next, and where the walker was some steps ago."""
 
-    thought: Thought
+    thought: PlannerMemory
     routes: Routes | None = None
     next: tuple[float, float] | None = None
     step: int = 0
@@ -120,17 +120,17 @@ class Navigator:
             raise PlanningError("who walks to a place plans for a goal in 'pose'.")
         self.planner, self.place, self.heading = planner, np.asarray(place, np.float64), heading
 
-    def begin(self, batch: int, rng: torch.Generator) -> list[Walk]:
-        return [Walk(thought) for thought in self.planner.begin(batch, rng)]
+    def begin(self, batch: int, rng: torch.Generator) -> list[NavigatorMemory]:
+        return [NavigatorMemory(thought) for thought in self.planner.begin(batch, rng)]
 
     def act(
-        self, observation: Observation, memory: list[Walk], rng: torch.Generator
-    ) -> tuple[torch.Tensor, list[Walk]]:
+        self, observation: Observation, memory: list[NavigatorMemory], rng: torch.Generator
+    ) -> tuple[torch.Tensor, list[NavigatorMemory]]:
         walks = [self._led(walk, observation, entry) for entry, walk in enumerate(memory)]
         actions, thoughts = self.planner.act(observation, [walk.thought for walk in walks], rng)
         return actions, [replace(walk, thought=thought) for walk, thought in zip(walks, thoughts)]
 
-    def _led(self, walk: Walk, observation: Observation, entry: int) -> Walk:
+    def _led(self, walk: NavigatorMemory, observation: Observation, entry: int) -> NavigatorMemory:
         """The walk with the next place as its planner's goal."""
         here = observation["pose"][entry, :2].double().cpu().numpy()
         walk = self._noted(walk, here)
@@ -148,7 +148,7 @@ class Navigator:
         thought = replace(walk.thought, goal={**walk.thought.goal, "pose": pose})
         return replace(walk, thought=thought, next=(float(target[0]), float(target[1])), step=walk.step + 1)
 
-    def _known(self, observation: Observation, walk: Walk, entry: int) -> np.ndarray:
+    def _known(self, observation: Observation, walk: NavigatorMemory, entry: int) -> np.ndarray:
         """The places [N, 4] that are known, as they are seen, or as the planner's world remembers them."""
         if "places" in observation:
             held = observation["places"][entry]
@@ -158,7 +158,7 @@ class Navigator:
             return np.zeros((0, 4))
         return held[held[:, 3] > 0].double().cpu().numpy()
 
-    def _noted(self, walk: Walk, here: np.ndarray) -> Walk:
+    def _noted(self, walk: NavigatorMemory, here: np.ndarray) -> NavigatorMemory:
         """Notices who does not get on: the place walked to is then avoided."""
         if math.dist(here, walk.before) > _STUCK_M:
             return replace(walk, before=(float(here[0]), float(here[1])), noted=walk.step)

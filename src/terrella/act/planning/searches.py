@@ -12,8 +12,8 @@ import torch
 from ...core import chance
 from ...core.errors import PlanningError
 from ...core.state import State
-from .moves import Axes, coloured
-from .task import Task, check_some
+from .moves import ContinuousMoves, coloured
+from .problem import PlanningProblem, check_some
 
 _MOST_ROUNDS = 10_000  # of a search by the clock
 _RATE = 0.1  # of Adam, in codes
@@ -87,7 +87,7 @@ class SearchConfig:
 
 
 @dataclass(frozen=True)
-class Hints:
+class WarmStart:
     """What a search may begin with: the belief [B, H, D, K] and the best plan [B, H, D] of the decision before, moved on, and
     plans [B, M, H, D] that a policy proposes. None for none."""
 
@@ -97,7 +97,7 @@ class Hints:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """plan [B, H, D] and its cost [B]; the belief that the next decision may begin with, and plans of the last round
     [B, M, H, D] for people to see: its best, its median and its worst, as far as there are so many."""
 
@@ -107,9 +107,9 @@ class Found:
     considered: torch.Tensor
 
 
-def search(task: Task, config: SearchConfig, hints: Hints | None = None) -> Found:
+def search(task: PlanningProblem, config: SearchConfig, hints: WarmStart | None = None) -> SearchResult:
     """The best plan found. PlanningError where no candidate of an episode has a finite cost, or the search does not suit."""
-    return _SEARCHES[config.search](task, config.filled(), hints or Hints())
+    return _SEARCHES[config.search](task, config.filled(), hints or WarmStart())
 
 
 def _rounds(config: SearchConfig) -> Iterator[int]:
@@ -123,7 +123,7 @@ def _rounds(config: SearchConfig) -> Iterator[int]:
         yield number
 
 
-def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
+def _sampled(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
     """CEM, iCEM and MPPI. The plan is iCEM's best of all, and of the others the last mean, if that has a cost."""
     moves, seeds, icem = task.moves, torch.tensor(task.seeds), config.search == "icem"
     prior = moves.first(task.batch, task.horizon, config.spread)
@@ -150,10 +150,10 @@ def _sampled(task: Task, config: SearchConfig, hints: Hints) -> Found:
         mean = moves.best_of(belief)
         cost = task.evaluate(mean[:, None], settled=True)[:, 0]
         best = _Best(*best.where(torch.isfinite(cost), mean, cost))
-    return Found(best.codes, best.costs, belief, _some(codes))
+    return SearchResult(best.codes, best.costs, belief, _some(codes))
 
 
-def _random(task: Task, config: SearchConfig, hints: Hints) -> Found:
+def _random(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
     """The best of evenly drawn plans, and of those that were given."""
     moves, seeds, best = task.moves, torch.tensor(task.seeds), _Best()
     first = [each for each in (_single(hints.plan), hints.proposed) if each is not None]
@@ -166,13 +166,13 @@ def _random(task: Task, config: SearchConfig, hints: Hints) -> Found:
         codes = _picked(codes, order)
         best.look(codes[:, 0], costs.gather(1, order)[:, 0], task.shortened)
     check_some(best.costs[:, None], task)
-    return Found(best.codes, best.costs, _prior(task, config), _some(codes))
+    return SearchResult(best.codes, best.costs, _prior(task, config), _some(codes))
 
 
-def _gradient(task: Task, config: SearchConfig, hints: Hints) -> Found:
+def _gradient(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
     """Adam (Kingma & Ba 2015) on all candidates at once, kept within the limits; the best that was ever evaluated."""
     moves, spec, best = task.moves, task.world.spec, _Best()
-    if not isinstance(moves, Axes):
+    if not isinstance(moves, ContinuousMoves):
         raise PlanningError(f"the actions of {spec.name} are choices, which have no gradient; use icem, cem or tree.")
     if not spec.differentiable:
         raise PlanningError(f"no gradients flow through {spec.name} (Spec.differentiable); use icem, cem or mppi.")
@@ -196,10 +196,10 @@ def _gradient(task: Task, config: SearchConfig, hints: Hints) -> Found:
             descent = first / (1 - 0.9**taken) / ((second / (1 - 0.999**taken)).sqrt() + 1e-8)
             codes = (codes.detach() - _RATE * descent).clamp(-1, 1).requires_grad_()
     order = costs.detach().argsort(dim=1, stable=True)
-    return Found(best.codes, best.costs, _prior(task, config), _some(_picked(codes.detach(), order)))
+    return SearchResult(best.codes, best.costs, _prior(task, config), _some(_picked(codes.detach(), order)))
 
 
-def _tree(task: Task, config: SearchConfig, hints: Hints) -> Found:
+def _tree(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
     """A beam: each depth tries every move from the cheapest states so far, equals counted once, ties broken by the seed."""
     every = task.moves.all()
     width = max(1, config.samples * config.iterations // len(every))
@@ -240,7 +240,9 @@ def _tree(task: Task, config: SearchConfig, hints: Hints) -> Found:
         before.look(result.codes, result.costs)
         result = before
     whole = paths.shape[2] == task.horizon
-    return Found(result.codes, result.costs, _prior(task, config), _some(paths) if whole else result.codes[:, None])
+    return SearchResult(
+        result.codes, result.costs, _prior(task, config), _some(paths) if whole else result.codes[:, None]
+    )
 
 
 def _order(state: State, costs: torch.Tensor, tie: torch.Tensor, width: int) -> torch.Tensor:
@@ -305,7 +307,7 @@ def _single(plan: torch.Tensor | None) -> torch.Tensor | None:
     return None if plan is None else plan[:, None]
 
 
-def _prior(task: Task, config: SearchConfig) -> torch.Tensor:
+def _prior(task: PlanningProblem, config: SearchConfig) -> torch.Tensor:
     return task.moves.first(task.batch, task.horizon, config.spread)
 
 
@@ -321,7 +323,7 @@ def _plain(state: State) -> State:
     return State({name: tensor.clone() for name, tensor in state.items()}, state.arenas)
 
 
-_SEARCHES: dict[str, Callable[[Task, SearchConfig, Hints], Found]] = {
+_SEARCHES: dict[str, Callable[[PlanningProblem, SearchConfig, WarmStart], SearchResult]] = {
     "cem": _sampled,
     "icem": _sampled,
     "mppi": _sampled,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from ...act.actor_network import ActorConfig, ActorNetwork, Eyes, perceptron, symexp
+from ...act.actor_network import ActorConfig, ActorNetwork, ObservationEncoder, mlp, symexp
 from ..imagination import Imagined
 from ..trainer import Average, Loss, Now, adamw, warmed
 from .outcome import two_hot
@@ -62,8 +62,8 @@ class Critic(nn.Module):
 
     def __init__(self, config: ActorConfig):
         super().__init__()
-        self.eyes = Eyes(config)
-        self.think = perceptron(self.eyes.width, config.hidden, config.layers, BINS, gain=0.0)
+        self.eyes = ObservationEncoder(config)
+        self.think = mlp(self.eyes.width, config.hidden, config.layers, BINS, gain=0.0)
         self.register_buffer("bins", symexp(torch.linspace(-REACH, REACH, BINS)), persistent=False)
 
     def forward(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:

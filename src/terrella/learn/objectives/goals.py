@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ...act.distributions import Axes
+from ...act.distributions import SquashedGaussian
 from ...act.goal_network import GoalNetwork
 from ..trainer import Loss, Now, adamw, warmed
 
@@ -67,8 +67,8 @@ class GoalReaching:
 
 def action_error(found, action: torch.Tensor, counts: tuple[int, ...]) -> torch.Tensor:
     """How far the likeliest is from actions [N, A] as networks have them: of axes the square, of the rest in nats."""
-    if isinstance(found, Axes):
-        return (torch.tanh(found.likeliest()) - action).square().mean()
+    if isinstance(found, SquashedGaussian):
+        return (torch.tanh(found.mode()) - action).square().mean()
     if action.shape[1] != len(counts):  # one-hot
         action = torch.stack([part.argmax(1) for part in action.split(list(counts), 1)], 1).float()
     return -found.log_prob(action).mean()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ...act.actor import RUN
-from ...act.distributions import Axes
+from ...act.distributions import SquashedGaussian
 from ...act.goal_network import GoalActor, GoalConfig, GoalNetwork
 from ...core.errors import TrainingError
 from ...core.world import World, make_rng
@@ -120,7 +120,7 @@ def _explained(network: GoalNetwork, held: Trajectories) -> dict[str, float]:
         told = network(batch.latent, batch.goal, batch.steps)
         error = float(action_error(told, batch.action, network.config.actor.counts))
         usual = batch.action.mean(0)
-        if isinstance(told, Axes):
+        if isinstance(told, SquashedGaussian):
             blind = float((batch.action - usual).square().mean())
         else:
             blind = float(torch.special.entr(usual).sum())

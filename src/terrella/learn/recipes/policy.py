@@ -127,7 +127,7 @@ def train_policy(
     gradients = not ppo and config.gradients and spec.differentiable and spec.action_mode not in (BUTTONS, CHOICE)
     usual = starts.usual(sees)
     for network in (actor, critic):
-        network.to(run.device).eyes.settle(usual)
+        network.to(run.device).eyes.fit_normalization(usual)
     kept = {**starts.modules, **({} if growth is None else {"growth": growth})}
     wanted = Wanted(config.discount, config.td_lambda, config.entropy, config.cautious)
     objective: Objective = (

@@ -25,7 +25,7 @@ Scores = Mapping[str, Mapping[str, torch.Tensor]]  # arm -> measure -> [N]
 
 
 @dataclass(frozen=True)
-class Judged:
+class PolicyEvaluation:
     """what: the measure that policies are ranked by. policies: those that are ranked; rows: of each, and of acting at random, its
     figures by name. dream, control, itself: how reality's scores agree with the dream's, with the control's, and with its own
     from other starts. worst: two policies between which the dream errs most. curves: channel -> its error by step."""
@@ -41,12 +41,12 @@ class Judged:
     expected: float = math.nan  # the rank correlation of the dream's uncertainty with its error
 
 
-def judge(
+def evaluate_policies(
     scores: Mapping[str, Scores],
     followed: Mapping[str, Mapping[str, Sequence[float]]],
     ranked: Sequence[str],
     seed: int,
-) -> Judged:
+) -> PolicyEvaluation:
     """Figures of policies from their episodes, n of all arms and policies having begun alike.
 
     scores: policy -> arm -> measure -> [N]; RANDOM is the floor. followed: policy -> channel -> error by step, NaN where unknown.
@@ -55,7 +55,7 @@ def judge(
     rng = torch.Generator().manual_seed(seed)
     what = SUCCESS if SUCCESS in scores[ranked[0]][DREAM] else RETURN
     rows = {name: _row(arms, scores.get(RANDOM), what, seed) for name, arms in scores.items()}
-    found = Judged(what, list(ranked), rows)
+    found = PolicyEvaluation(what, list(ranked), rows)
     arms = {
         arm: [scores[name][arm][what].double() for name in ranked if arm in scores[name]]
         for arm in (REAL, DREAM, CONTROL)
@@ -142,13 +142,13 @@ def _expected(followed: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
 # -- in words ---------------------------------------------------------------------------------------------------------
 
 
-def told(figure: Figure) -> str:
+def with_interval(figure: Figure) -> str:
     """A figure and its interval, three digits as people write them."""
     words = [_number(value) for value in (figure.value, figure.low, figure.high)]
     return f"{words[0]} [{words[1]}, {words[2]}]" if math.isfinite(figure.low) else words[0]
 
 
-def share(figure: Figure) -> str:
+def percent(figure: Figure) -> str:
     return f"{figure.value:.0%} [{figure.low:.0%}, {figure.high:.0%}]"
 
 
@@ -159,9 +159,9 @@ def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:.1f}" if abs(value) >= 9.995 else f"{value:.2f}"
 
 
-def verdict(judged: Judged) -> list[str]:
+def verdict(judged: PolicyEvaluation) -> list[str]:
     """Sentences, the answer first."""
-    say = share if judged.what == SUCCESS else told
+    say = percent if judged.what == SUCCESS else with_interval
     rows, count = judged.rows, len(judged.policies)
     if judged.dream is None:
         best = max(judged.policies, key=lambda name: rows[name][DREAM].value)
@@ -180,7 +180,7 @@ def verdict(judged: Judged) -> list[str]:
     return [*lines, *_wrong(judged), *_errors(judged)]
 
 
-def _ranking(judged: Judged) -> str:
+def _ranking(judged: PolicyEvaluation) -> str:
     count, said = len(judged.policies), judged.dream
     assert said is not None
     if count < LEAST:
@@ -192,7 +192,7 @@ def _ranking(judged: Judged) -> str:
             return f"Reality itself gives all {count} policies the same {judged.what}: there is nothing to rank."
         return f"The dream cannot tell these {count} policies apart: it gives all the same {judged.what}."
     low, value = said.spearman.low, said.spearman.value
-    figure = f"Spearman {told(said.spearman)}"
+    figure = f"Spearman {with_interval(said.spearman)}"
     if value >= ALIKE and said.chance > UNLIKELY:
         return (
             f"These {count} policies are too few to say whether the dream ranks them as reality does: {figure}, which chance gives "
@@ -208,22 +208,25 @@ def _ranking(judged: Judged) -> str:
     return f"The dream ranks these {count} policies {alike}: {figure}."
 
 
-def _no_better(judged: Judged) -> bool:
+def _no_better(judged: PolicyEvaluation) -> bool:
     """Whether a dream that hears the actions of another episode ranks the policies nearly as well."""
     dream, control = judged.dream, judged.control
     return dream is not None and control is not None and control.spearman.value >= ALIKE * dream.spearman.value
 
 
 def _ranked(agreed: Agreement) -> str:
-    return f"Spearman {told(agreed.spearman)}, Pearson {told(agreed.pearson)}"
+    return f"Spearman {with_interval(agreed.spearman)}, Pearson {with_interval(agreed.pearson)}"
 
 
-def _figures(arm: str, agreed: Agreement, judged: Judged) -> str:
+def _figures(arm: str, agreed: Agreement, judged: PolicyEvaluation) -> str:
     unit = "of all episodes" if judged.what == SUCCESS else "of what the policies differ by"
-    return f"{arm} and reality: Pearson {told(agreed.pearson)}, Spearman {told(agreed.spearman)}, MMRV {told(agreed.mmrv)} {unit}"
+    mmrv = f"MMRV {with_interval(agreed.mmrv)} {unit}"
+    return (
+        f"{arm} and reality: Pearson {with_interval(agreed.pearson)}, Spearman {with_interval(agreed.spearman)}, {mmrv}"
+    )
 
 
-def _control(judged: Judged) -> str:
+def _control(judged: PolicyEvaluation) -> str:
     agreed = judged.control
     assert agreed is not None
     if not math.isfinite(agreed.spearman.value):
@@ -234,9 +237,9 @@ def _control(judged: Judged) -> str:
     return words
 
 
-def _wrong(judged: Judged) -> list[str]:
+def _wrong(judged: PolicyEvaluation) -> list[str]:
     """Where dream and reality are apart."""
-    rows, say = judged.rows, share if judged.what == SUCCESS else told
+    rows, say = judged.rows, percent if judged.what == SUCCESS else with_interval
     gaps = {name: rows[name]["gap"] for name in judged.policies}
     lines, mean = [], sum(gap.value for gap in gaps.values()) / len(gaps)
     far = max(gaps, key=lambda name: abs(gaps[name].value))
@@ -255,7 +258,7 @@ def _wrong(judged: Judged) -> list[str]:
     return lines
 
 
-def _errors(judged: Judged) -> list[str]:
+def _errors(judged: PolicyEvaluation) -> list[str]:
     lines = []
     for channel, band in judged.curves.items():
         if channel == UNCERTAINTY or channel.endswith(HELD):
@@ -272,9 +275,9 @@ def _errors(judged: Judged) -> list[str]:
     return lines
 
 
-def table(judged: Judged) -> tuple[list[str], list[list[str]]]:
+def table(judged: PolicyEvaluation) -> tuple[list[str], list[list[str]]]:
     """Heads and lines, the best first: of each policy its scores, and of acting at random."""
-    say = share if judged.what == SUCCESS else told
+    say = percent if judged.what == SUCCESS else with_interval
     first = REAL if judged.dream is not None else DREAM
     heads = [name for name in (REAL, DREAM, "gap", CONTROL) if any(name in row for row in judged.rows.values())]
     names = sorted(judged.rows, key=lambda name: -judged.rows[name][first].value)
@@ -285,12 +288,12 @@ def table(judged: Judged) -> tuple[list[str], list[list[str]]]:
     lines = []
     for name in names:
         row = judged.rows[name]
-        cells = [(told if head == "gap" else say)(row[head]) if head in row else "" for head in heads]
-        lines.append([floor[name], *cells, *(told(row[head]) if head in row else "" for head in more)])
+        cells = [(with_interval if head == "gap" else say)(row[head]) if head in row else "" for head in heads]
+        lines.append([floor[name], *cells, *(with_interval(row[head]) if head in row else "" for head in more)])
     return ["policy", *heads, *more], lines
 
 
-def as_dict(judged: Judged) -> dict[str, Any]:
+def as_dict(judged: PolicyEvaluation) -> dict[str, Any]:
     """Plain data for JSON, the verdict first."""
     plain = dataclasses.asdict(judged)
     return {"verdict": verdict(judged), **plain}

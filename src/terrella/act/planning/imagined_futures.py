@@ -10,19 +10,19 @@ import torch
 
 from ...core.world import World, make_rng
 from .costs import Cost
-from .planner import Thought
+from .planner import PlannerMemory
 
 
-class Imagined(NamedTuple):
+class ImaginedFuture(NamedTuple):
     """What a plan would lead to: its cost, and pictures uint8 [T, H, W, 3] of it, evenly spread from now to its end."""
 
     cost: float
     pictures: torch.Tensor
 
 
-def imagined(
-    world: World, cost: Cost, thought: Thought, block: int = 1, count: int = 6, channel: str = "rgb"
-) -> Iterator[list[Imagined] | None]:
+def imagined_futures(
+    world: World, cost: Cost, thought: PlannerMemory, block: int = 1, count: int = 6, channel: str = "rgb"
+) -> Iterator[list[ImaginedFuture] | None]:
     """The futures of the plans that the last decision considered, the best first, after None for each step on the way: a step is
     imagined when the next is asked for, so that whoever shows them can do something else between. Nothing without a decision."""
     decision = thought.decision
@@ -51,4 +51,4 @@ def imagined(
         yield None
     assert total is not None
     shown = torch.stack(pictures, 1)
-    yield [Imagined(float(price), frames) for price, frames in zip(total[0], shown)]
+    yield [ImaginedFuture(float(price), frames) for price, frames in zip(total[0], shown)]

@@ -5,16 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 
-from .judged import CONTROL, DREAM, HELD, RANDOM, REAL, SUCCESS, UNCERTAINTY, Judged, table, verdict
 from .page_parts import COLOURS, QUIET, document, keys_of, section, table_of, words_and_interval
 from .plot import Line, line_chart, y_span
-from .plot_points import Point, listed, scatter
+from .plot_points import ScatterPoint, dot_plot, scatter
+from .policy_evaluation import (
+    CONTROL,
+    DREAM,
+    HELD,
+    RANDOM,
+    REAL,
+    SUCCESS,
+    UNCERTAINTY,
+    PolicyEvaluation,
+    table,
+    verdict,
+)
 from .statistics import Band
 
 _REAL, _DREAM = COLOURS[1], COLOURS[0]
 
 
-def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
+def policy_evaluation_page(title: str, judged: PolicyEvaluation, facts: Mapping[str, object]) -> str:
     """HTML that needs nothing from outside."""
     lines = [line[:1].upper() + line[1:] for line in verdict(judged)]
     heads, cells = table(judged)
@@ -37,26 +48,28 @@ def judged_page(title: str, judged: Judged, facts: Mapping[str, object]) -> str:
     return document(title, parts)
 
 
-def _lead(judged: Judged) -> str:
+def _lead(judged: PolicyEvaluation) -> str:
     return (
         f"A point is a policy: its {judged.what} in reality and in the dream, with 95% intervals. On the dotted line both are the "
         "same; a ranking needs no more than that the points rise."
     )
 
 
-def _scatter(judged: Judged) -> str:
+def _scatter(judged: PolicyEvaluation) -> str:
     if judged.dream is None:
         return ""
     boxes = ""
     for arm, title in ((DREAM, "The dream"), (CONTROL, "The control: the dream hears other actions")):
         rows = {name: judged.rows[name] for name in judged.policies}
-        points = [Point(name, row[REAL], row[arm], _DREAM if arm == DREAM else QUIET) for name, row in rows.items()]
+        points = [
+            ScatterPoint(name, row[REAL], row[arm], _DREAM if arm == DREAM else QUIET) for name, row in rows.items()
+        ]
         svg = scatter(points, f"{judged.what} in reality", f"{judged.what} in the dream")
         boxes += f"<figure><h3>{escape(title)}</h3>{svg}</figure>"
     return f"<div class=charts>{boxes}</div>"
 
 
-def _listed(judged: Judged) -> str:
+def _listed(judged: PolicyEvaluation) -> str:
     real = judged.dream is not None
     names = sorted(judged.policies, key=lambda name: -judged.rows[name][REAL if real else DREAM].value)
     shown = {REAL: _REAL, DREAM: _DREAM} if real else {DREAM: _DREAM}
@@ -66,10 +79,10 @@ def _listed(judged: Judged) -> str:
     keys = {{REAL: "in reality", DREAM: "in the dream"}[arm]: colour for arm, colour in shown.items()}
     keys |= {"acting at random" + (" in reality" if real else ""): QUIET} if floor else {}
     label = "share of successes" if judged.what == SUCCESS else judged.what
-    return f'<div class=scroll><div style="min-width:560px">{listed(rows, label, guides)}</div></div>{keys_of(keys)}'
+    return f'<div class=scroll><div style="min-width:560px">{dot_plot(rows, label, guides)}</div></div>{keys_of(keys)}'
 
 
-def _errors(judged: Judged) -> str:
+def _errors(judged: PolicyEvaluation) -> str:
     boxes = ""
     for channel, band in sorted(judged.curves.items(), key=lambda curve: curve[0] == UNCERTAINTY):
         if channel.endswith(HELD) or len(band.value) < 2:
@@ -79,9 +92,11 @@ def _errors(judged: Judged) -> str:
         span = y_span([0.0, *(v for line in lines for v in (*line.y, *line.low, *line.high))])
         last = len(band.value) - 1
         ticks = [(float(2**k), str(2**k)) for k in range(12) if 2**k <= last]
-        told = channel == UNCERTAINTY
-        title = "The uncertainty that the dream tells" if told else f"Error in {channel}"
-        svg = line_chart(lines, ticks, "steps", "expected error" if told else "distance to reality", True, span)
+        is_uncertainty = channel == UNCERTAINTY
+        title = "The uncertainty that the dream tells" if is_uncertainty else f"Error in {channel}"
+        svg = line_chart(
+            lines, ticks, "steps", "expected error" if is_uncertainty else "distance to reality", True, span
+        )
         keys = keys_of({line.label: line.colour for line in lines})
         boxes += f"<figure><h3>{escape(title)}</h3>{svg}{keys}</figure>"
     return f"<div class=charts>{boxes}</div>" if boxes else ""
@@ -92,7 +107,7 @@ def _line(label: str, band: Band, colour: str, dash: str = "") -> Line:
     return Line(label, steps, band.value[1:], band.low[1:], band.high[1:], colour, dash)
 
 
-def _method(judged: Judged) -> str:
+def _method(judged: PolicyEvaluation) -> str:
     lines = ["Intervals of single scores: " + ("Wilson's." if judged.what == SUCCESS else "a bootstrap over episodes.")]
     if judged.dream is not None:
         scale = "" if judged.what == SUCCESS else ", here in shares of the range of the real scores"

@@ -9,10 +9,9 @@ from tests.act.tiny_worlds import Grid, Point
 import terrella
 from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork
-from terrella.act.named import seen_by
 from terrella.act.planning import Planner
 from terrella.core.errors import TerrellaError
-from terrella.core.policy import Reactive, act
+from terrella.core.policy import Reactive, act, observed_channels
 from terrella.core.world import make_rng
 
 CONTROLLERS = """
@@ -87,8 +86,8 @@ def test_a_learned_policy_is_opened_by_its_folder(tmp_path):
 def test_what_need_not_be_seen_may_be_missing():
     world = Point(may_observe=("health",))
     planner = terrella.load_policy("plan", world.spec, world)
-    assert planner.sees == ("observation", "health") and seen_by(planner, world.spec) == ("observation",)
-    assert seen_by(terrella.load_policy("explorer", world.spec), world.spec) == tuple(world.spec.channels)
+    assert planner.sees == ("observation", "health") and observed_channels(planner, world.spec) == ("observation",)
+    assert observed_channels(terrella.load_policy("explorer", world.spec), world.spec) == tuple(world.spec.channels)
 
 
 def test_a_policy_slips_as_often_as_it_is_told():

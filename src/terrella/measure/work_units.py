@@ -18,7 +18,7 @@ from ..core.files import replacing
 from ..core.state import State
 from ..core.world import World, make_rng
 from .clips import Clip, evidence
-from .roll import Results, Tick, actions_at, fold_context, poses_at
+from .rollouts import Results, Tick, actions_at, fold_context, poses_at
 
 Clock = Callable[[], float]
 Progress = Callable[[float, str, float], None]  # share done in 0..1, what is being done, seconds left

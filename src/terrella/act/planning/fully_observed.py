@@ -17,7 +17,7 @@ from ...core.world import Observation, World, make_rng
 _KIND = "snapshot"
 
 
-class Revealed:
+class FullyObserved:
     """A World around a World whose states are values: each tensor of the state is a channel `snapshot.NAME`, and to observe those
     is to be in that state. So a Planner over a simulator is a Policy like any other: it sees what it needs to copy it.
 

@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from tests.act.tiny_worlds import Point
 
-from terrella.act.judging import HELD, UNCERTAINTY, Bench, Echo, check_finite
-from terrella.act.named import Slipping, policy_of
-from terrella.act.planning import Episode, Judge
+from terrella.act.paired_evaluation import PERSISTENCE, UNCERTAINTY, LoopedActions, PairedEvaluation, check_finite
+from terrella.act.planning import PlayedEpisode, SuccessCriterion
+from terrella.act.policies_by_name import NoisyPolicy, policy_of
 from terrella.core.errors import PlanningError, TerrellaError
 from terrella.core.policy import Reactive
 from terrella.core.spec import REWARD, Spec
@@ -57,16 +57,20 @@ def homing(seen, rng):
 
 
 def test_all_begin_where_reality_did_and_the_same_again():
-    bench, spec = Bench(Off(), Point(), Judge(), 6, 3, ("observation",)), Point().spec
+    bench, spec = PairedEvaluation(Off(), Point(), SuccessCriterion(), 6, 3, ("observation",)), Point().spec
     starts = bench.starts(1, 5)
     real = torch.cat([state["at"] for state in bench._real_states(starts)])
     dream = torch.cat([state["at"] for state in bench._dream_states(starts)])
     assert torch.equal(real, dream) and len(real.unique(dim=0)) == 5
-    assert torch.equal(real, Bench(Off(), Point(), Judge(), 9, 3).starts(1, 5).seen["observation"])
+    assert torch.equal(
+        real, PairedEvaluation(Off(), Point(), SuccessCriterion(), 9, 3).starts(1, 5).seen["observation"]
+    )
     one, other = (
         bench.play(lambda name=name: policy_of(name, spec), spec, 1, 5) for name in ("constant:1,1", "random")
     )
-    again = Bench(Off(), Point(), Judge(), 6, 3).play(lambda: policy_of("random", spec), spec, 1, 5)
+    again = PairedEvaluation(Off(), Point(), SuccessCriterion(), 6, 3).play(
+        lambda: policy_of("random", spec), spec, 1, 5
+    )
     for arm in ("real", "dream", "control"):
         assert [one.reward for one in getattr(other, arm)] == [one.reward for one in getattr(again, arm)]
     assert one.real[0].reward != one.dream[0].reward
@@ -76,30 +80,32 @@ def test_all_begin_where_reality_did_and_the_same_again():
 
 def test_the_error_grows_as_it_must_and_uncertainty_is_told():
     spec = Point().spec
-    bench = Bench(Off(), Point(), Judge(), 4, 0, ("observation",))
-    found = bench.play(lambda: policy_of("constant:0.5,0.5", spec), spec, 0, 3).followed
+    bench = PairedEvaluation(Off(), Point(), SuccessCriterion(), 4, 0, ("observation",))
+    found = bench.play(lambda: policy_of("constant:0.5,0.5", spec), spec, 0, 3).open_loop_errors
     expected = torch.arange(5) * 0.05 / 20  # in shares of the range
     assert torch.allclose(found["observation"], expected.expand(3, 5), atol=1e-5)
     held = torch.arange(5) * 0.5 / 20
-    assert torch.allclose(found["observation" + HELD], held.expand(3, 5), atol=1e-5)
+    assert torch.allclose(found["observation" + PERSISTENCE], held.expand(3, 5), atol=1e-5)
     assert found[UNCERTAINTY].shape == (3, 5)
 
 
 def test_a_world_alone_and_starts_that_are_not_solved():
-    judge = Judge({"observation": torch.zeros(1, 2)}, within=0.1)
-    bench = Bench(Point(), None, judge, 12, 0)
+    judge = SuccessCriterion({"observation": torch.zeros(1, 2)}, within=0.1)
+    bench = PairedEvaluation(Point(), None, judge, 12, 0)
     found = bench.play(lambda: Reactive(homing), Point().spec, 0, 30)
     assert not found.real and found.skipped > 0 and all(one.success for one in found.dream)
     assert min(one.steps for one in found.dream) > 0
     with pytest.raises(PlanningError, match="already solved"):
-        Bench(Point(), None, Judge(judge.goal, within=5), 12, 0).starts(0, 1)
+        PairedEvaluation(Point(), None, SuccessCriterion(judge.goal, within=5), 12, 0).starts(0, 1)
 
 
 def test_the_control_knows_habits_and_nothing_else():
     spec, means = Guess().spec, []
     right = Reactive(lambda seen, rng: seen["observation"][:, 0].long())
     for share in (0.0, 0.4, 0.8):
-        chunk = Bench(Guess(), Guess(), Judge(), 100, 0).play(lambda p=share: Slipping(right, p, spec), spec, 0, 20)
+        chunk = PairedEvaluation(Guess(), Guess(), SuccessCriterion(), 100, 0).play(
+            lambda p=share: NoisyPolicy(right, p, spec), spec, 0, 20
+        )
         arms = chunk.real, chunk.dream, chunk.control
         means.append([sum(one.reward for one in arm) / 2000 for arm in arms])
     real, dream, control = zip(*means)
@@ -109,7 +115,7 @@ def test_the_control_knows_habits_and_nothing_else():
 
 
 def test_an_echo_begins_again_where_it_ends():
-    echo, rng = Echo([torch.tensor([1, 2]), torch.tensor([3])]), make_rng(0)
+    echo, rng = LoopedActions([torch.tensor([1, 2]), torch.tensor([3])]), make_rng(0)
     memory, heard = echo.begin(2, rng), []
     for _ in range(3):
         action, memory = echo.act({}, memory, rng)
@@ -120,12 +126,12 @@ def test_an_echo_begins_again_where_it_ends():
 
 def test_a_return_that_is_no_number_is_said():
     with pytest.raises(TerrellaError, match="of mine in the dream is no finite number in 1 of 2"):
-        check_finite("mine", "the dream", [Episode(reward=1.0), Episode(reward=math.nan)])
+        check_finite("mine", "the dream", [PlayedEpisode(reward=1.0), PlayedEpisode(reward=math.nan)])
 
 
 def test_a_dream_of_few_at_once_follows_as_many():
     dream = Off()
     dream.spec = dataclasses.replace(dream.spec, max_batch=4)
-    bench, spec = Bench(dream, Point(), Judge(), 6, 3, ("observation",)), Point().spec
+    bench, spec = PairedEvaluation(dream, Point(), SuccessCriterion(), 6, 3, ("observation",)), Point().spec
     chunk = bench.play(lambda: policy_of("random", spec), spec, 0, 10)
     assert len(chunk.dream) == len(chunk.real) == 10

@@ -16,7 +16,7 @@ _GOAL, _MEMORY = "reaching.goal", "reaching.memory"
 
 
 @final
-class Reaching:
+class GoalBeliefPolicy:
     """The world folds what is seen into its latent, the policy acts from that towards the goal of `cost`, which is a latent (see
     `distance_to`). Its memory is the world's state, with the goal. PlanningError for other goals."""
 

@@ -35,7 +35,7 @@ def later(seed: int, count: int) -> int:
 
 
 @dataclass
-class Task:
+class PlanningProblem:
     """B episodes that stand in `state` (batch B), from where plans of `horizon` moves are sought, each held for `block` steps.
 
     goal:  channel -> [B, ...]; seeds: one an episode. trust: the world's channel `uncertainty` up to which a step counts.
@@ -134,7 +134,7 @@ class Task:
         return by_episode(step, seeds)
 
 
-def check_some(cost: torch.Tensor, task: Task) -> None:
+def check_some(cost: torch.Tensor, task: PlanningProblem) -> None:
     """PlanningError where an episode's candidates [B, N] have no finite cost between them: nothing is chosen by chance."""
     if not bool(torch.isfinite(cost).any(1).all()):
         raise PlanningError(

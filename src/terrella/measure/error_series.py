@@ -10,9 +10,9 @@ import torch
 
 from ..core.spec import kind_of
 from .clips import Clip
-from .exam import CLIPS, LONG, Exam, Found, Probe
-from .roll import Results
-from .scorecard import COPY_LAST, GAIN, IDLE, OTHERS, PREDICTED, TRUE, Curve, Report, Row
+from .exam import CLIPS, LONG, Exam, ExamResults, Probe
+from .rollouts import Results
+from .scorecard import COPY_LAST, GAIN, IDLE, OTHERS, PREDICTED, TRUE, Curve, ProbeReport, Row
 from .statistics import Band, last_step_above, mean_band, mean_interval, ratio_band
 
 FALL_DB = 10 * math.log10(2)  # twice the squared error
@@ -51,13 +51,13 @@ class Series:
 
 Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
 SeriesOf = Callable[
-    [Exam, Found, str, str, Sequence[Clip], Results], list[Series]
+    [Exam, ExamResults, str, str, Sequence[Clip], Results], list[Series]
 ]  # exam, found, set, place, clips, dreamt
 
 
-def report(exam: Exam, found: Found, probe: str, series_of: SeriesOf) -> Report:
+def report(exam: Exam, found: ExamResults, probe: str, series_of: SeriesOf) -> ProbeReport:
     """Rows at the horizons, curves at every step, of all arms and places; then those of the long clips."""
-    whole = Report()
+    whole = ProbeReport()
     for place, clips in exam.places.items():
         copied: set[str] = set()
         for arm in exam.arms:
@@ -82,13 +82,13 @@ def report(exam: Exam, found: Found, probe: str, series_of: SeriesOf) -> Report:
     return whole
 
 
-def drift(exam: Exam, found: Found, series_of: SeriesOf) -> Report:
+def drift(exam: Exam, found: ExamResults, series_of: SeriesOf) -> ProbeReport:
     """The long clips' curves, and how far each can be used.
 
     A dream's PSNR can be used up to the last step before it has fallen by 3.01 dB (twice the squared error) from its own
     first, and from copy-last's first, one yardstick for all; whatever else, as long as it is better than copy-last.
     """
-    whole, still = Report(), dict[Where, Series]()
+    whole, still = ProbeReport(), dict[Where, Series]()
     for place, clips, arm, motion, dreamt in found.dreams(exam, LONG):
         for series in _asked(motion, series_of(exam, found, LONG, place, clips, dreamt)):
             where = "drift", series.channel, series.what, series.unit, place
@@ -149,7 +149,7 @@ def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) ->
 
 
 def _add_usable(
-    exam: Exam, whole: Report, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series
+    exam: Exam, whole: ProbeReport, where: Where, arm: str, motion: str, values: torch.Tensor, series: Series
 ) -> None:
     steps, mark = values.shape[1], None
     if series.unit == "dB":
@@ -177,9 +177,11 @@ def _long_missing(exam: Exam, world) -> str:
 def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
     """Of every series that the other probes have."""
 
-    def found(exam: Exam, results: Found) -> Report:
+    def found(exam: Exam, results: ExamResults) -> ProbeReport:
         parts = [drift(exam, results, some) for some in series_of]
-        return Report([row for part in parts for row in part.rows], [curve for part in parts for curve in part.curves])
+        return ProbeReport(
+            [row for part in parts for row in part.rows], [curve for part in parts for curve in part.curves]
+        )
 
     lead = (
         "The same at every step of longer clips. A dot marks the last step up to which the squared error stays within twice "

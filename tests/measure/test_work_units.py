@@ -10,7 +10,7 @@ from panorama import SHORT, Panorama, exam_of, some_clips
 
 from terrella.core.errors import TerrellaError
 from terrella.measure import LONG, ExamConfig, examine
-from terrella.measure.work import Store
+from terrella.measure.work_units import Store
 
 
 class Clocked(Panorama):

@@ -20,7 +20,7 @@ Results = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Watch:
+class StepMetric:
     """What is kept of a rollout. channels: what must be rendered; see(observation, clips, row, step) -> name -> [B, ...]."""
 
     channels: tuple[str, ...]
@@ -61,7 +61,7 @@ def dream(
     motion: str,
     steps: int,
     rng: torch.Generator,
-    watches: Sequence[Watch],
+    watches: Sequence[StepMetric],
     others: Sequence[Clip] | None = None,
     tick: Tick = lambda done: None,
 ) -> Results:

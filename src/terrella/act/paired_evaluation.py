@@ -8,27 +8,26 @@ from dataclasses import dataclass, field
 import torch
 
 from ..core.errors import PlanningError, TerrellaError
-from ..core.policy import Policy
+from ..core.policy import Policy, observed_channels
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
-from .named import seen_by
-from .planning import Episode, Judge, distance, play_from
-from .planning.task import later
+from .planning import PlayedEpisode, SuccessCriterion, distance, play_from
+from .planning.problem import later
 
 CHUNK = 100  # episodes that are played, and saved, together
-FOLLOWED, FOLLOWED_PICTURES = (
+OPEN_LOOP_EPISODES, OPEN_LOOP_WITH_PICTURES = (
     16,
     4,
 )  # episodes of a policy whose actions are followed in the dream; with pictures to compare
 _ATTEMPTS = 64  # starts that are tried for an episode, until one is not solved already
 _ACTIONS, _DREAM = 1, 2  # what seeds are spent on
-HELD = " of the start"  # the error of what holds the first observation
+PERSISTENCE = " of the start"  # the error of what holds the first observation
 UNCERTAINTY = "uncertainty"
 
 
 @dataclass(frozen=True)
-class Starts:
+class EpisodeStarts:
     """Where some episodes begin: the seed of each, what is seen there ([B, ...]), and how many were left out as solved."""
 
     seeds: list[int]
@@ -38,20 +37,20 @@ class Starts:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some episodes of a policy: in reality (none without one), in the dream from the same starts, and of the control.
+    """Some episodes of a policy: real (none without an environment), dreamt from the same starts, and those of the control.
 
-    followed: channel -> [F, T + 1], how far the dream is from reality when it is given the actions of real episodes, NaN where
-    an episode is over; with HELD behind the channel, how far its first observation is; UNCERTAINTY, what the dream expects.
+    open_loop_errors: channel -> [F, T + 1], the distance of the dream to F real episodes under the real actions, NaN after an
+    episode's end; channel + PERSISTENCE: that of the first observation, held; UNCERTAINTY: the error that the dream expects.
     """
 
-    real: list[Episode]
-    dream: list[Episode]
-    control: list[Episode]
+    real: list[PlayedEpisode]
+    dream: list[PlayedEpisode]
+    control: list[PlayedEpisode]
     skipped: int
-    followed: Mapping[str, torch.Tensor]
+    open_loop_errors: Mapping[str, torch.Tensor]
 
 
-class Echo:
+class LoopedActions:
     """Does given actions, a sequence [T, *action.shape] an episode, again and again, whatever it sees."""
 
     sees = ()
@@ -70,7 +69,7 @@ class Echo:
 
 
 @dataclass
-class Bench:
+class PairedEvaluation:
     """A dream, and where there is one the reality that it is held against; `compared`: the channels of both that are.
 
     Episode n begins alike whoever plays it: with the seed n of `seed`, in the dream with what is seen of reality there. A dream
@@ -79,16 +78,16 @@ class Bench:
 
     dream: World
     real: World | None
-    judge: Judge
+    judge: SuccessCriterion
     steps: int
     seed: int
     compared: tuple[str, ...] = ()
-    _starts: dict[tuple[int, int], Starts] = field(default_factory=dict)
+    _starts: dict[tuple[int, int], EpisodeStarts] = field(default_factory=dict)
 
     def play(self, load: Callable[[], Policy], spec: Spec, number: int, count: int) -> Chunk:
         """Chunk `number`, of `count` episodes, of the policy that `load` makes anew for dream and reality, so that nothing that it
         learns in one helps it in the other. `spec`: of the channels that it may be shown."""
-        starts, real, seed = self.starts(number, count), list[Episode](), later(self.seed, number) ^ _ACTIONS
+        starts, real, seed = self.starts(number, count), list[PlayedEpisode](), later(self.seed, number) ^ _ACTIONS
         followed: Mapping[str, torch.Tensor] = {}
         if self.real is not None:
             policy, kept = load(), self._kept if number == 0 else 0
@@ -97,13 +96,13 @@ class Bench:
         dream = self._played(self.dream, self._dream_states(starts), load(), seed, spec)
         return Chunk(real, dream, self._control(starts, dream, seed), starts.skipped, followed)
 
-    def starts(self, number: int, count: int) -> Starts:
+    def starts(self, number: int, count: int) -> EpisodeStarts:
         if (number, count) not in self._starts:
             self._starts[number, count] = self._sought(number, count)
         return self._starts[number, count]
 
     @torch.no_grad()
-    def _sought(self, number: int, count: int) -> Starts:
+    def _sought(self, number: int, count: int) -> EpisodeStarts:
         world = self.dream if self.real is None else self.real
         shown = [*self.dream.spec.observes, *self.dream.spec.may_observe] if self._paired else []
         wanted = tuple(dict.fromkeys((*(name for name in shown if name in world.spec.channels), *self.judge.channels)))
@@ -122,7 +121,7 @@ class Bench:
                 )
             seeds.append(seed)
             views.append(seen)
-        return Starts(seeds, {name: torch.cat([seen[name] for seen in views]) for name in wanted}, skipped)
+        return EpisodeStarts(seeds, {name: torch.cat([seen[name] for seen in views]) for name in wanted}, skipped)
 
     @property
     def _paired(self) -> bool:
@@ -133,14 +132,18 @@ class Bench:
     def _kept(self) -> int:
         assert self.real is not None
         pictures = any(len(self.real.spec.channels[name].shape or ()) > 1 for name in self.compared)
-        kept = (FOLLOWED_PICTURES if pictures else FOLLOWED) if self.compared and self.dream.spec.forkable else 0
+        kept = (
+            (OPEN_LOOP_WITH_PICTURES if pictures else OPEN_LOOP_EPISODES)
+            if self.compared and self.dream.spec.forkable
+            else 0
+        )
         return min(kept, self.dream.spec.max_batch or kept)
 
-    def _real_states(self, starts: Starts) -> Iterator[State]:
+    def _real_states(self, starts: EpisodeStarts) -> Iterator[State]:
         assert self.real is not None
         return _started(self.real, starts.seeds)
 
-    def _dream_states(self, starts: Starts) -> Iterator[State]:
+    def _dream_states(self, starts: EpisodeStarts) -> Iterator[State]:
         if not self._paired:
             yield from _started(self.dream, starts.seeds)
             return
@@ -159,27 +162,35 @@ class Bench:
         spec: Spec,
         keep: tuple[str, ...] = (),
         kept: int = 0,
-    ) -> list[Episode]:
-        found: list[Episode] = []
+    ) -> list[PlayedEpisode]:
+        found: list[PlayedEpisode] = []
         for state in states:
             left = max(0, kept - len(found))
-            told = (policy, self.steps, later(seed, len(found)), self.judge, seen_by(policy, spec), keep, left)
+            told = (
+                policy,
+                self.steps,
+                later(seed, len(found)),
+                self.judge,
+                observed_channels(policy, spec),
+                keep,
+                left,
+            )
             found += play_from(world, state, *told)
         return found
 
-    def _control(self, starts: Starts, dream: Sequence[Episode], seed: int) -> list[Episode]:
+    def _control(self, starts: EpisodeStarts, dream: Sequence[PlayedEpisode], seed: int) -> list[PlayedEpisode]:
         """The matched control: the same policy, starts and dream, but the dream hears the actions of another episode, which answer
         to something else; of a lone one those from its middle on."""
         done = [torch.stack(episode.actions) for episode in dream]
         heard = [*done[1:], done[0]] if len(done) > 1 else [done[0].roll(len(done[0]) // 2, 0)]
-        found: list[Episode] = []
+        found: list[PlayedEpisode] = []
         for state in self._dream_states(starts):
-            echo = Echo(heard[len(found) : len(found) + state.batch])
+            echo = LoopedActions(heard[len(found) : len(found) + state.batch])
             found += play_from(self.dream, state, echo, self.steps, later(seed, len(found)), self.judge)
         return found
 
     @torch.no_grad()
-    def _followed(self, starts: Starts, episodes: Sequence[Episode]) -> dict[str, torch.Tensor]:
+    def _followed(self, starts: EpisodeStarts, episodes: Sequence[PlayedEpisode]) -> dict[str, torch.Tensor]:
         assert self.real is not None
         state, rng = next(self._dream_states(starts)).at(list(range(len(episodes)))), make_rng(self.seed)
         told = [UNCERTAINTY] if UNCERTAINTY in self.dream.spec.channels else []
@@ -193,7 +204,7 @@ class Bench:
                 truth = torch.stack([episode.seen[min(step, episode.steps)][name] for episode in episodes])
                 first = torch.stack([episode.seen[0][name] for episode in episodes])
                 found[name] = distance(self.real.spec, {name: truth}, {name: shown[name].cpu()})
-                found[name + HELD] = distance(self.real.spec, {name: truth}, {name: first})
+                found[name + PERSISTENCE] = distance(self.real.spec, {name: truth}, {name: first})
             for name, values in found.items():
                 curves.setdefault(name, []).append(torch.where(over, torch.nan, values))
             if step < length:
@@ -213,7 +224,7 @@ def _started(world: World, seeds: Sequence[int]) -> Iterator[State]:
         yield State.stack([world.start(1, make_rng(seed)) for seed in seeds[part]])
 
 
-def check_finite(name: str, place: str, episodes: Sequence[Episode]) -> None:
+def check_finite(name: str, place: str, episodes: Sequence[PlayedEpisode]) -> None:
     """TerrellaError where a return is no number."""
     broken = [at for at, episode in enumerate(episodes) if not abs(episode.reward) < float("inf")]
     if broken:

@@ -8,9 +8,9 @@ from html import escape
 
 from .page_parts import COLOURS, QUIET, document, keys_of, section, table_of, words_and_interval
 from .plot import Line, line_chart
-from .plot_points import listed
+from .plot_points import dot_plot
 from .statistics import Figure
-from .transferred import FLOORS, NOMINAL, ORACLE, RECOVERS, SUCCEEDS, Transferred, camera_table, table, verdict
+from .transfer_scores import FLOORS, NOMINAL, ORACLE, RECOVERS, SUCCEEDS, TransferScores, camera_table, table, verdict
 
 METHOD = (
     "Intervals are Clopper and Pearson's, of all episodes of all seeds as one sample: they tell the chance of episodes, the column "
@@ -31,7 +31,7 @@ METHOD = (
 )
 
 
-def transferred_page(title: str, found: Transferred, facts: Mapping[str, object]) -> str:
+def transfer_page(title: str, found: TransferScores, facts: Mapping[str, object]) -> str:
     """HTML that needs nothing from outside."""
     lines = [line[:1].upper() + line[1:] for line in verdict(found)]
     words = "".join(f"<li>{escape(line)}</li>" for line in lines[1:])
@@ -41,7 +41,7 @@ def transferred_page(title: str, found: Transferred, facts: Mapping[str, object]
         arm: QUIET if arm in (*FLOORS, ORACLE) else COLOURS[1] if arm == NOMINAL else COLOURS[0] for arm in found.arms
     }
     rows = [(arm, [(figure, colours[arm])]) for arm, figure in found.arms.items()]
-    svg = listed(rows, "share of successes in the real one", [(SUCCEEDS, QUIET)])
+    svg = dot_plot(rows, "share of successes in the real one", [(SUCCEEDS, QUIET)])
     settings = "".join(
         f"<li>{escape(name.replace('_', ' '))}: {escape(str(value))}</li>"
         for name, value in facts.items()
@@ -65,7 +65,7 @@ def _wide(svg: str) -> str:
     return f'<div class=scroll><div style="min-width:560px">{svg}</div></div>'
 
 
-def _few(found: Transferred) -> str:
+def _few(found: TransferScores) -> str:
     kinds: dict[str, list[tuple[int, Figure]]] = {}
     for arm, figure in found.arms.items():
         said = re.fullmatch(r"(\w+) (\d+)", arm)
@@ -85,16 +85,16 @@ def _few(found: Transferred) -> str:
     return f"<div class=charts><figure>{svg}{keys_of({line.label: line.colour for line in lines})}</figure></div>{note}"
 
 
-def _camera(found: Transferred) -> str:
+def _camera(found: TransferScores) -> str:
     if not found.camera:
         return ""
     heads, cells = camera_table(found)
     rows = [(arm, [(figure, QUIET if "oracle" in arm else COLOURS[0])]) for arm, figure in found.camera.items()]
     figures = table_of(list(map(escape, heads)), [[words_and_interval(cell) for cell in line] for line in cells])
-    return _wide(listed(rows, "share of successes in the real one", [(SUCCEEDS, QUIET)])) + figures
+    return _wide(dot_plot(rows, "share of successes in the real one", [(SUCCEEDS, QUIET)])) + figures
 
 
-def _dialled(found: Transferred) -> str:
+def _dialled(found: TransferScores) -> str:
     lines = [
         _line(arm, sorted(gaps.items()), COLOURS[at % len(COLOURS)])
         for at, (arm, gaps) in enumerate(found.dial.items())

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 from ..core.errors import ActionError, TerrellaError
-from ..core.policy import Constant, Idle, Policy, Random, Reactive
+from ..core.policy import Constant, Idle, Policy, Random, Reactive, observed_channels
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from ..similar import did_you_mean
 from .actor import policy_folder, read_policy
-from .belief import actor_of
+from .belief import load_learned_policy
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
@@ -37,13 +37,13 @@ _SETTINGS = {
 }
 
 
-class Slipping:
+class NoisyPolicy:
     """Another policy whose actions are replaced by random ones, each with a probability; it is not told. So one policy becomes
     many of different worth."""
 
     def __init__(self, policy: Policy, probability: float, spec: Spec):
         self.policy, self.probability, self.spec = policy, probability, spec
-        self.sees = seen_by(policy, spec)
+        self.sees = observed_channels(policy, spec)
 
     def begin(self, batch: int, rng: torch.Generator) -> Any:
         return self.policy.begin(batch, rng)
@@ -54,13 +54,6 @@ class Slipping:
         meant = torch.as_tensor(meant).to(other)
         slips = torch.rand(len(meant), generator=rng) < self.probability
         return torch.where(slips.view(-1, *[1] * (meant.ndim - 1)), other, meant), memory
-
-
-def seen_by(policy: Policy, spec: Spec) -> tuple[str, ...]:
-    """The channels that a policy is to be shown: those that it names as its `sees`, or all that a recording would hold; what a
-    world need not observe may be missing."""
-    named = tuple(getattr(policy, "sees", spec.recorded))
-    return tuple(name for name in named if name in spec.channels or name not in spec.may_observe)
 
 
 def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
@@ -75,10 +68,10 @@ def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | No
         probability = -1.0
     if not 0 <= probability <= 1:
         raise TerrellaError(f"'{name}' slips with a probability of 0 to 1 after the @, as in {text or 'idle'}@0.3.")
-    return Slipping(_plain(text, spec, world, cost), probability, spec)
+    return NoisyPolicy(_plain(text, spec, world, cost), probability, spec)
 
 
-def proposing(name: str, world: World) -> Policy:
+def proposal_policy(name: str, world: World) -> Policy:
     """A policy whose plans a search in `world` tries as well, by its name; one for goals is told the search's own."""
     if Path(name).is_dir() and read_policy(policy_folder(name)).get("kind") == KIND:
         return GoalActor.load(name, world.spec, varied=True)
@@ -99,7 +92,7 @@ def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Pol
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
-        return actor_of(name, spec, world, cost)
+        return load_learned_policy(name, spec, world, cost)
     likest = did_you_mean(name, [*simple, "constant", "plan"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{likest} There are: {KNOWN}.")
 
