@@ -140,7 +140,8 @@ def test_a_dream_pays_costs_lives_and_ends(learned):
     state = world.observe({"rgb": before, "lives": torch.tensor([1.0, 3.0])}, None, rng)
     numbers = world.controls.encode(torch.tensor([1, 2]))
     drawn = world.observe({"rgb": after, "lives": torch.tensor([1.0, 3.0])}, state, rng)  # as if it had been dreamt
-    then = world.outcome.followed(state, drawn, world.scene.frame, numbers, torch.zeros(2, dtype=torch.int64))
+    nobody, seeds = torch.zeros(2, dtype=torch.bool), torch.zeros(2, dtype=torch.int64)
+    then = drawn.replace(**world.outcome.step(state, drawn, nobody, numbers, seeds))
     assert then["vitals"][:, 0].tolist() == [0.0, 3.0] and then["done"].tolist() == [True, False]
     assert then["reward"][1] > 1.5 and then["reward"][0] < 0.5
     still = world.imagine(then, torch.tensor([2, 2]), rng)

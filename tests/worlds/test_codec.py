@@ -79,7 +79,7 @@ def test_what_lies_over_what_scrolls_is_no_part_of_the_mosaic_but_of_the_map():
     made.scene.over[:4] = True
     before = made.start(2, rng)
     state = made.imagine(before, torch.zeros(2, 2, dtype=torch.int8), rng)
-    given = made.conditioning(state, before)
+    given = made.look(state, before)
     assert given.over is not None and given.mosaic is not None
     assert torch.equal(given.over, made.scene.over.expand(2, -1, -1))
     known = recalled(given.mosaic, SIZE, torch.zeros(2, 2, dtype=torch.int64))[:, 3] > 0

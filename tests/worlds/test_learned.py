@@ -76,10 +76,10 @@ def test_on_unknown_ground_the_walls_of_the_dream_count():
     """The rule of docs/decisions/0008: without recordings an episode has nothing but its own keyframes."""
     world = place(KINDS["buttons"])
     state = walk(world, look=False)
-    known = world.scene.walls(state)
+    _, known = world.scene.walls(state)
     assert state.deferred is not None, "among recorded keyframes nobody needs the dreamt ones"
     alone = world.without_memory()
-    walls = alone.scene.walls(state)
+    _, walls = alone.scene.walls(state)
     assert state.deferred is None and len(walls.shared) == 0 and walls.own.shape[1] >= known.own.shape[1]
 
 

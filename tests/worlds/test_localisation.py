@@ -26,7 +26,7 @@ def test_two_pictures_arrive_each_in_its_own_place():
     noise = torch.randint(0, 256, known.shape, generator=make_rng(0), dtype=torch.uint8)
     small = thumbnails(memory.rgb)
     seen = arrive(torch.cat([known, noise]), estimator, memory, small, memory.at(slice(0, 4)), CAMERA, 6)
-    assert seen.found.tolist() == [True, False] and seen.pose.shape == (2, 7) and seen.depth.shape == (2, *SIZE)
+    assert seen.recognised.tolist() == [True, False] and seen.pose.shape == (2, 7) and seen.depth.shape == (2, *SIZE)
     assert float((seen.pose[0, :2] - here[0, :2]).norm()) < 0.25
     truth = room_depth(here)[0]
     assert float(((seen.depth[0] - truth).abs() / truth).mean()) < 0.1
@@ -34,4 +34,4 @@ def test_two_pictures_arrive_each_in_its_own_place():
     assert float(seen.pose[1, 0]) > float(pose[:, 0].max()) + AWAY_M - 10
     none = memory.at(slice(0, 0))
     lost = arrive(known, estimator, none, thumbnails(none.rgb), memory.at(slice(0, 4)), CAMERA, 6)
-    assert lost.found.tolist() == [False]
+    assert lost.recognised.tolist() == [False]

@@ -66,7 +66,7 @@ def billboards(objects: Billboards, *places: tuple[float, float, float]) -> torc
 
 
 def step(objects: Billboards, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
-    return objects.step(before, torch.tensor([seen]), viewer(), torch.zeros(1, 2, 3), chance.seeds(1, make_rng(0)))
+    return objects.act(before, torch.tensor([seen]), viewer(), torch.zeros(1, 2, 3), chance.seeds(1, make_rng(0)))
 
 
 def test_a_billboard_does_what_is_told_of_it_and_its_ages_go_on():
@@ -91,11 +91,9 @@ def test_by_chance_as_often_as_told():
     objects.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
     many, rng = billboards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
     seen = torch.ones(800, 4, dtype=torch.bool)
-    looks = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[
-        :, 0, LOOK
-    ]
+    looks = objects.act(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[:, 0, LOOK]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = objects.step(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[
+    again = objects.act(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[
         :, 0, LOOK
     ]
     assert torch.equal(looks, again)
@@ -104,7 +102,7 @@ def test_by_chance_as_often_as_told():
 def shown(objects: Billboards, there: torch.Tensor):
     """What evidence tells of a frame with these billboards: its cut, and number and place of each."""
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    rgb, depth, instances = objects.paint(there, *behind, viewer(), CAMERA)
+    rgb, depth, instances = objects.painted(there, *behind, viewer(), CAMERA)
     listed = there[..., :4]
     return cut_out((rgb * 255).to(torch.uint8), instances, depth, listed[..., PLACE], viewer(), CAMERA), listed
 
@@ -160,7 +158,7 @@ def test_evidence_of_a_batch_is_taken_as_each_alone():
     now[..., :3, 1] = torch.tensor([3.0, 4.0, 5.0])
     behind = torch.full((6, 3, *SIZE), 0.3), torch.full((6, *SIZE), 9.0)
     pose = viewer().expand(6, 7)
-    rgb, depth, instances = objects.paint(now, *behind, pose, CAMERA)
+    rgb, depth, instances = objects.painted(now, *behind, pose, CAMERA)
     listed = now[..., :4]
     cut = cut_out((rgb * 255).to(torch.uint8), instances, depth, listed[..., PLACE], pose, CAMERA)
     whole = objects.recognised(cut, listed, before)
@@ -177,7 +175,7 @@ def test_what_is_lit_more_than_its_picture_does_not_turn_dark():
     objects = two_looks()
     there = billboards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LIGHT] = 4.0
-    rgb, _, seen = objects.paint(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), viewer(), CAMERA)
+    rgb, _, seen = objects.painted(there, torch.zeros(1, 3, *SIZE), torch.full((1, *SIZE), 9.0), viewer(), CAMERA)
     assert seen.any() and rgb.max() == 1.0
 
 
@@ -192,7 +190,7 @@ def test_a_look_that_is_not_known_is_not_painted():
     there = billboards(objects, (4.0, 0.0, 0.0))
     there[0, 0, LOOK] = NONE
     behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
-    assert not objects.paint(there, *behind, viewer(), CAMERA)[2].any()
+    assert not objects.painted(there, *behind, viewer(), CAMERA)[2].any()
     assert torch.isfinite(step(objects, there)).all()
 
 

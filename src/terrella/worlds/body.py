@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from typing import final
 
 import torch
@@ -14,9 +13,9 @@ from ..core.state import State
 from ..space.camera import planar_pose, yaw
 from ..space.floorplan import slide
 from .config import MotionConfig
-from .parts import Absent, Channels, Walls
+from .parts import Absent, Channels, Evidence, Tensors, Walls
 
-FASTEST_M = 1.0  # a step; what evidence moves by more has been put there, and has no speed
+FASTEST_M = 1.0  # a step; a viewer that evidence moves further was put there, and has no speed
 
 
 class Motion(nn.Module):
@@ -60,11 +59,7 @@ class MotionBody:
 
     def __init__(self, motion: Motion, config: MotionConfig | None = None):
         self.motion, self.config = motion.eval().requires_grad_(False), config or motion.config
-
-    @property
-    def history(self) -> int:
-        """Actions before the present one that it needs."""
-        return self.config.history
+        self.history, self.half_m = self.config.history, self.config.body_m
 
     def to(self, device) -> MotionBody:
         return MotionBody(copy.deepcopy(self.motion).to(device), self.config)
@@ -72,26 +67,23 @@ class MotionBody:
     def channels(self) -> Channels:
         return Channels({"pose": POSE}, {"pose": POSE_UNIT}, ("pose",))
 
-    def blank(self, batch: int, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        """A body that stands still at `pose` [B, 7]."""
+    def observe(self, prior: State | None, evidence: Evidence) -> Tensors:
+        """The body at the pose of the evidence, as fast as it was imagined plus the error of that; without a prior it stands."""
+        pose = evidence.pose
         assert pose is not None
-        still = pose.new_zeros(batch, 2), torch.zeros(batch, dtype=torch.bool, device=pose.device)
-        return {"pose": pose, "speed": still[0], "dreamt": still[1]}
-
-    def observed(self, prior: State, pose: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        """The body at `pose` [B, 7], where evidence says that it is: as fast as it was dreamt, and as that was wrong."""
-        assert pose is not None
+        still = torch.zeros(len(pose), dtype=torch.bool, device=pose.device)
+        if prior is None:
+            return {"pose": pose, "speed": pose.new_zeros(len(pose), 2), "dreamt": still}
         speed = pose[:, :2] - prior["pose"][:, :2] + torch.where(prior["dreamt"][:, None], prior["speed"], 0.0)
         speed = torch.where((speed.norm(dim=-1) < FASTEST_M)[:, None], speed, 0.0)
-        return {"pose": pose, "speed": speed, "dreamt": torch.zeros_like(prior["dreamt"])}
+        return {"pose": pose, "speed": speed, "dreamt": still}
 
-    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The body one step on: actions [B, history + 1, A], the newest last; `levels` [K, 3], recorded places, whose height it
-        follows where there are stairs."""
+    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> Tensors:
+        """The body one step on; parameters as in parts.Body."""
         pose = state["pose"]
         heading, wish = self.motion(yaw(pose), state["speed"], actions)
-        moved, speed = slide(walls.shared, pose[:, :2], wish, self.config.body_m, self.config.short, walls.own)
-        place, height = pose[:, :2] + moved, pose[:, 2]
+        shift, speed = slide(walls.shared, pose[:, :2], wish, self.config.body_m, self.config.short, walls.own)
+        place, height = pose[:, :2] + shift, pose[:, 2]
         if self.config.stairs and len(levels):
             height = climbed(levels, pose[:, :2], place, height)
         return {
@@ -100,19 +92,25 @@ class MotionBody:
             "dreamt": torch.ones_like(state["dreamt"]),
         }
 
-    def ends(self, after: Mapping[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
+    def ends(self, after: State, action: torch.Tensor) -> torch.Tensor:
         """Whether an episode ends where a step led, bool [B]."""
         return self.motion.ends(after["pose"][:, :2], action) > 0
 
 
 @final
 class NoBody(Absent):
-    """Of a frames-only world: nobody knows where its pictures were taken."""
+    """Of a frames-only world: where its pictures were taken is unknown."""
 
-    history = 0
-    blank = observed = step = Absent.nothing
+    history: int = 0
+    half_m: float = 0.0
 
-    def ends(self, after: Mapping[str, torch.Tensor], action: torch.Tensor) -> torch.Tensor:
+    def observe(self, prior: State | None, evidence: Evidence) -> Tensors:
+        return {}
+
+    def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> Tensors:
+        return {}
+
+    def ends(self, after: State, action: torch.Tensor) -> torch.Tensor:
         return torch.zeros(len(action), dtype=torch.bool, device=action.device)
 
 

@@ -7,7 +7,7 @@ pointer-generator mixture (See et al. 2017) over the block moves of the recordin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
 import torch
@@ -139,12 +139,14 @@ class Codec(nn.Module):
         drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features).float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
-    def scroll(self, conditioning: Conditioning) -> torch.Tensor:
-        """By which of the moves most of the picture goes on: int64 [B]."""
+    def prepare(self, conditioning: Conditioning) -> Conditioning:
+        """With `scroll`, by which of the moves most of the picture goes on, where there is a mosaic."""
+        if conditioning.mosaic is None:
+            return conditioning
         frames, context = _frames(conditioning), conditioning.context
         went = [explains(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
         logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
-        return least_off(logits, self.moves)
+        return replace(conditioning, scroll=least_off(logits, self.moves))
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:
         """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over: bool

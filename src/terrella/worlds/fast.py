@@ -91,7 +91,8 @@ def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioni
     rng = make_rng(0)
     state = world.start(1, rng)
     numbers = world.controls.encode(world.spec.sample_action(1, rng)).to(world.device)
-    conditioning = world.conditioning(world.asked(state, numbers), state)
+    state, after = world.move(state, numbers)
+    conditioning = world.look(after, state)
     noise = chance.normal(chance.seeds(1, rng, world.device), (4, *world.size))
     return noise, torch.zeros(1, device=world.device), conditioning
 

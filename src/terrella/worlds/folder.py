@@ -298,9 +298,9 @@ KINDS: dict[str, dict[str, tuple[type, Make]]] = {
 NETWORKS: dict[str, tuple[type, Callable[[Any], LatentNetwork]]] = {LatentNetwork.kind: (LatentConfig, LatentNetwork)}
 
 
-def _remembered(scene: KeyframeScene | FrameHistory, quality: int) -> dict[str, torch.Tensor]:
+def _remembered(scene: Any, quality: int) -> dict[str, torch.Tensor]:
     """What a scene remembers, packed."""
-    if scene.posed:
+    if isinstance(scene, KeyframeScene):
         parts = {"memory": scene.recorded, "starts": scene.starts}
         return {f"{name}.{key}": value for name, keys in parts.items() for key, value in _pack(keys, quality).items()}
     starts: Any = scene.starts

@@ -6,7 +6,7 @@ them into a view. Where pictures scroll, a mosaic remembers what left the pictur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -17,12 +17,13 @@ from gymnasium import spaces
 from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
+from ..space.camera import Intrinsics
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.matching import scrolled
 from ..space.mosaic import PICTURES, blank, held_in, remembered
 from .config import HistoryConfig
-from .generator import Conditioning, context_thumbnail, pixels
-from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
+from .generator import Conditioning, DrawnFrame, context_thumbnail
+from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
 TRUST = 0.03  # in a frame, against the one after it: what is merged from all of them is nearly the newest alone
 
@@ -47,16 +48,19 @@ class StartClips:
 
 @final
 class FrameHistory:
-    """`starts`: where episodes begin; `over` bool [H, W]: the pixels that stay while the picture scrolls, such as a status line or
-    the walker in the middle, which are no part of the mosaic. Default: none."""
+    """`starts`: where episodes begin. `over` bool [H, W], default none: pixels that stay while the picture scrolls, such as a
+    status line or the player in the middle; they are no part of the mosaic."""
 
-    kind, posed, camera = "history", False, None
+    kind = "history"
+    camera: Intrinsics | None = None
+    earlier_names: tuple[str, ...] = ()
 
     def __init__(self, config: HistoryConfig, starts: StartClips, over: torch.Tensor | None = None):
         self.config, self.starts = config, starts
+        self.device, self.history = starts.frames.device, config.slots
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
-        self.moves = torch.tensor(config.moves, dtype=torch.int64, device=starts.frames.device).view(-1, 2)
-        self.drawn_names = ("frames", "mosaic", "scroll") if config.moves else ("frames",)
+        self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
+        self.drawn_names: tuple[str, ...] = ("frames", "mosaic", "scroll") if config.moves else ("frames",)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
@@ -64,35 +68,26 @@ class FrameHistory:
         starts = StartClips(*(part.to(device) for part in vars(self.starts).values()))
         return FrameHistory(self.config, starts, self.over.to(device))
 
-    def with_memory(self, *given) -> FrameHistory:
-        """It has no use for keyframes."""
+    def with_memory(self, recorded: Keyframes | None = None, budget_mb: float | None = None) -> FrameHistory:
+        """The same: it has no keyframes."""
         return self
-
-    with_memory_of = with_memory
-
-    @property
-    def device(self) -> torch.device:
-        return self.starts.frames.device
-
-    @property
-    def history(self) -> int:
-        """Actions that its conditioning needs."""
-        return self.config.slots
 
     def channels(self) -> Channels:
         shows: dict[str, spaces.Space] = {"rgb": spaces.Box(0, 255, (*self.config.size, 3), np.uint8)}
-        if len(set(self.config.moves)) > 1:  # else nothing ever scrolls, and what was seen is what is seen
+        if len(set(self.config.moves)) > 1:  # with one move nothing ever scrolls, and the mosaic is the frame
             height, width = (times * length for times, length in zip(PICTURES, self.config.size))
             shows["mosaic"] = spaces.Box(0, 255, (height, width, 4), np.uint8)
         return Channels(shows, observes=("rgb",))
 
-    def begin(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
-        """Pieces of recordings, by chance; which of the starts they are [B]."""
+    # -- evidence -----------------------------------------------------------------------------------------------------
+
+    def start(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
+        """Clips of recordings, drawn by chance; which of the starts they are [B]."""
         pick = (chance.uniform(seeds, (), stream=STARTS) * len(self.starts.frames)).long()
-        found = StartClips(*(part[pick] for part in vars(self.starts).values()))
-        seen = {"frames": found.frames, "actions": found.actions.flip(1), "vitals": found.vitals}
+        clips = StartClips(*(part[pick] for part in vars(self.starts).values()))
+        seen = {"frames": clips.frames, "actions": clips.actions.flip(1), "vitals": clips.vitals}
         if self.config.moves:
-            seen["mosaic"] = held_in(blank(len(pick), self.config.size, self.device), found.known)
+            seen["mosaic"] = held_in(blank(len(pick), self.config.size, self.device), clips.known)
         return Evidence(len(pick), self.device, None, seen), pick
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
@@ -105,57 +100,45 @@ class FrameHistory:
         check_prior(prior.batch, len(frame))
         return Evidence(len(frame), self.device, None, {"frames": torch.cat([frame, prior["frames"][:, 1:]], 1)})
 
-    def adopted(self, state: State, *given) -> State:
-        """`state`, which points at nothing; nothing in it waits for a body, is kept beside it or grows old."""
+    def observe(self, prior: State | None, evidence: Evidence) -> State:
+        """With the frames of the evidence, the mosaic as of the frame before, and how the newest scrolled."""
+        frames = evidence.seen["frames"]
+        seen = {"frames": frames}
+        if self.config.moves:
+            if "mosaic" in evidence.seen:
+                seen["mosaic"] = evidence.seen["mosaic"]
+            elif prior is None:
+                seen["mosaic"] = blank(evidence.batch, self.config.size, self.device)
+            seen["scroll"] = scrolled(frames[:, 1], frames[:, 0], self.moves)
+        return State(seen) if prior is None else prior.replace(**seen)
+
+    # -- a step -------------------------------------------------------------------------------------------------------
+
+    def adopt(self, state: State) -> State:
+        """The same: its states point at nothing."""
         return state
 
-    settled = kept = aged = adopted
-
-    def blank(self, evidence: Evidence) -> State:
-        """A state in which nothing was seen yet."""
-        flat = {}
-        if self.config.moves:
-            flat = {"mosaic": blank(evidence.batch, self.config.size, self.device)}
-            flat["scroll"] = torch.zeros(evidence.batch, dtype=torch.int64, device=self.device)
-        return State({"frames": evidence.seen["frames"], **flat})
-
-    def pictured(self, state: State, evidence: Evidence) -> State:
-        """`state` with the frames of the evidence, the actions that led to them, the mosaic as of the frame before, and how the
-        newest scrolled."""
-        names = ("frames", "actions", "mosaic")
-        found = {name: evidence.seen[name] for name in names if name in evidence.seen}
-        if self.config.moves:
-            found["scroll"] = scrolled(found["frames"][:, 1], found["frames"][:, 0], self.moves)
-        return state.replace(**found)
-
-    def frame(self, state: State) -> torch.Tensor:
-        """The newest frame, uint8 [B, 3, H, W]."""
-        return state["frames"][:, 0]
-
-    def walls(self, state: State) -> Walls:
+    def walls(self, state: State) -> tuple[State, Walls]:
+        """No walls, and the same state."""
         nothing = torch.zeros(state.batch, 0, 4, device=self.device)
-        return Walls(nothing[0], nothing)
+        return state, Walls(nothing[0], nothing)
 
-    def familiar(self, state: State) -> torch.Tensor:
-        """Nothing of it lies anywhere: [B, 2] of zeros (see KeyframeScene)."""
-        return torch.zeros(state.batch, 2, device=self.device)
-
-    def conditioning(self, state: State, before: State) -> Conditioning:
-        """What the generator gets to draw the frame that follows `state`'s newest action."""
+    def look(self, state: State, before: State) -> Conditioning:
+        """The last frames in the place of what a memory knows. Nothing of it lies in a place: `familiar` is 0."""
         frames, actions = state["frames"], state["actions"].flip(1)
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
+        familiar = torch.zeros(state.batch, 2, device=self.device)
         if not self.config.moves:
-            return Conditioning(past(frames), last, context)
-        return Conditioning(past(frames), last, context, self._joined(state), self.over.expand(len(frames), -1, -1))
+            return Conditioning(past(frames), last, context, familiar)
+        over = self.over.expand(len(frames), -1, -1)
+        return Conditioning(past(frames), last, context, familiar, self._joined(state), over)
 
-    def drawn(
-        self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
-    ) -> State:
-        """`state` with the frame `clean` [B, 4, H, W] as its newest, how it was made to scroll, and the last in its mosaic."""
+    def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
+        """With the frame as its newest, how it was made to scroll, and the last frame in its mosaic."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
-        return state.replace(frames=torch.cat([pixels(clean)[:, None], state["frames"][:, :-1]], 1), **flat)
+        return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:
         """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it.
@@ -168,11 +151,13 @@ class FrameHistory:
         joined, none = self._joined(state), torch.zeros_like(self.over)
         return torch.where(joined[:, 3:] > 0, joined, remembered(state["mosaic"], frame, move, none))
 
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        return {
-            "rgb": lambda: state["frames"][:, 0].permute(0, 2, 3, 1).contiguous(),
-            "mosaic": lambda: _shown(self._whole(state)),
-        }
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
+        shown = {}
+        if "rgb" in channels:
+            shown["rgb"] = newest_frame(state).permute(0, 2, 3, 1).contiguous()
+        if "mosaic" in channels:
+            shown["mosaic"] = _shown(self._whole(state))
+        return shown
 
 
 def _shown(mosaic: torch.Tensor) -> torch.Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar, final
 
 import torch
@@ -21,27 +22,46 @@ LASTING = 5.0  # by how much (a logit) the last frame is the likelier source whe
 
 @dataclass(frozen=True)
 class Conditioning:
-    """What a frame is drawn from: what the scene knows of the view; `last` [B, 4, H, W], the last frame's colour in [0, 1]
-    carried into the view and its trust (where things move [B, 4 + PLANES, H, W], see carried_frames.py); `context` [B, n],
-    the last frame's thumbnail and, in some worlds, the last actions; of a flat world its `mosaic` (space/mosaic.py), what
-    lies `over` it (bool [B, H, W]), and `scroll` [B], by which of its moves most of the picture goes on."""
+    """What a frame is drawn from.
+
+    glimpse: what the scene knows of the view. last [B, 4, H, W]: the last frame carried into the view, colour in [0, 1] and
+    trust; where things move [B, 4 + PLANES, H, W] (carried_frames.py). context [B, n]: thumbnail of the last frame, in some
+    worlds also the last actions. familiar [B, 2]: how well the place is known, for the uncertainty (keyframe_scene.py).
+    Of a flat world: mosaic uint8 [B, 4, H', W'] (space/mosaic.py); over bool [B, H, W], what lies over it; scroll int64 [B], by
+    which of the codec's moves most of the picture goes on.
+    """
 
     glimpse: Glimpse
     last: torch.Tensor
     context: torch.Tensor
+    familiar: torch.Tensor | None = None
     mosaic: torch.Tensor | None = None
     over: torch.Tensor | None = None
     scroll: torch.Tensor | None = None
 
     def to(self, device) -> Conditioning:
-        flat = (None if part is None else part.to(device) for part in (self.mosaic, self.over, self.scroll))
-        return Conditioning(self.glimpse.to(device), self.last.to(device), self.context.to(device), *flat)
+        return self._each(lambda part: part.to(device))
 
     def at(self, rows: slice) -> Conditioning:
         """The entries `rows` of the batch."""
-        glimpse = Glimpse(*(part[rows] for part in vars(self.glimpse).values()))
-        flat = (None if part is None else part[rows] for part in (self.mosaic, self.over, self.scroll))
-        return Conditioning(glimpse, self.last[rows], self.context[rows], *flat)
+        return self._each(lambda part: part[rows])
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Conditioning:
+        glimpse = Glimpse(*map(change, vars(self.glimpse).values()))
+        parts = {name: part for name, part in vars(self).items() if isinstance(part, torch.Tensor)}
+        return replace(self, glimpse=glimpse, **{name: change(part) for name, part in parts.items()})
+
+
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A frame as it was drawn. rgb uint8 [B, 3, H, W]; depth [B, H, W] in metres, None in a world without poses; things
+    [B, H, W] in 0..1, where something may move, None where nothing does; instances uint8 [B, H, W], the number of the
+    billboard at a pixel (0: none), None without billboards."""
+
+    rgb: torch.Tensor
+    depth: torch.Tensor | None = None
+    things: torch.Tensor | None = None
+    instances: torch.Tensor | None = None
 
 
 class Block(nn.Module):
@@ -104,6 +124,10 @@ class UNet(nn.Module):
         bias[0] = 0.0 if config.residual else 3.0  # at first, trust the merged colours
         self.residual = config.residual
         self.output.bias.data = bias.repeat_interleave(4)
+
+    def prepare(self, conditioning: Conditioning) -> Conditioning:
+        """It derives nothing: the same."""
+        return conditioning
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]. Returns the clean frame in the code of `noisy`; where
@@ -169,6 +193,12 @@ def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
 def pixels(clean: torch.Tensor) -> torch.Tensor:
     """The colours of a drawn frame [B, 4 or more, H, W] as uint8 [B, 3, H, W]."""
     return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+
+
+def decode(clean: torch.Tensor, posed: bool) -> DrawnFrame:
+    """The frame that a generator's `clean` [B, 4 or 5, H, W] stands for; without depth unless the world is `posed`."""
+    depth = decode_depth(clean[:, 3]) if posed else None
+    return DrawnFrame(pixels(clean), depth, clean[:, 4].sigmoid() if clean.shape[1] > 4 else None)
 
 
 def generate(generator: nn.Module, noise: torch.Tensor, conditioning: Conditioning, steps: int) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, final
@@ -19,17 +19,17 @@ from ..core.state import State
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import floor_plan
 from ..space.keyframes import Keyframes
-from ..space.memory import RECORDED, ROWS, Memory, keyframe_table
+from ..space.memory import RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
 from .carried_frames import Frame, carry_frames, covering, still
 from .config import KeyframesConfig
-from .generator import Conditioning, context_thumbnail, decode_depth, pixels
+from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .localisation import AWAY_M, arrive
-from .parts import STARTS, Channels, Evidence, Walls, check_prior, picture_of
+from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
-SEEN = "rgb", "depth", "things", "pose", "instances"  # of a frame, needed still two steps later, where things move
+SEEN: tuple[str, ...] = "rgb", "depth", "things", "pose", "instances"  # state entries of a frame
 NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
 CELL_M = 0.25  # side of the cells of the map in which that is looked up
 BLIND = " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
@@ -40,30 +40,26 @@ EXACTLY = "donot_use_mm_for_euclid_dist"
 class KeyframeScene:
     """`recorded`: the recordings' keyframes (may be empty); `starts`: those that an episode may begin from."""
 
-    kind, posed, history = "keyframes", True, 0  # actions that its conditioning needs beside the body's
+    kind, history = "keyframes", 0
 
     def __init__(self, config: KeyframesConfig, recorded: Keyframes, starts: Keyframes):
         self.config, self.recorded, self.starts = config, recorded, starts
+        self.camera: Intrinsics | None = config.camera
+        self.device = starts.pose.device
         self.own = own_memory(config, str(recorded.pose.device))
+        # where things move, how a frame looked is still needed two steps later
+        self.earlier_names: tuple[str, ...] = SEEN if config.moving else ()
+        moving = ("things", "instances", *(f"earlier_{name}" for name in SEEN)) if config.moving else ()
+        self.drawn_names: tuple[str, ...] = "rgb", "depth", "known", *moving, *self.own.empty(1)
 
     def to(self, device) -> KeyframeScene:
-        moved = KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
-        vars(moved).update({name: getattr(self, name).to(device) for name in ("_plan", "_cells", "_table", "_small")})
-        return moved
+        scene = KeyframeScene(self.config, self.recorded.to(device), self.starts.to(device))
+        vars(scene).update({name: getattr(self, name).to(device) for name in ("_plan", "_cells", "_table", "_small")})
+        return scene
 
-    def with_memory(self, recorded: Keyframes) -> KeyframeScene:
-        return KeyframeScene(self.config, recorded, self.starts)
-
-    def with_memory_of(self, budget_mb: float) -> KeyframeScene:
-        return KeyframeScene(replace(self.config, memory_mb=budget_mb), self.recorded, self.starts)
-
-    @property
-    def device(self) -> torch.device:
-        return self.starts.pose.device
-
-    @property
-    def camera(self) -> Intrinsics:
-        return self.config.camera
+    def with_memory(self, recorded: Keyframes | None = None, budget_mb: float | None = None) -> KeyframeScene:
+        config = self.config if budget_mb is None else replace(self.config, memory_mb=budget_mb)
+        return KeyframeScene(config, self.recorded if recorded is None else recorded, self.starts)
 
     @cached_property
     def _table(self) -> torch.Tensor:
@@ -107,7 +103,7 @@ class KeyframeScene:
 
     # -- evidence -----------------------------------------------------------------------------------------------------
 
-    def begin(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
+    def start(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
         """Evidence of places where recordings were, by chance; which of the starts they are [B]."""
         pick = (chance.uniform(seeds, (), stream=STARTS) * len(self.starts)).long()
         keys = self.starts.at(pick)
@@ -173,66 +169,43 @@ class KeyframeScene:
             return {**observation, "pose": prior["pose"], "depth": estimator.depth(rgb)}, lone
         config = self.config
         seen = arrive(rgb, estimator, self.recorded, self._small, self.starts, config.camera, config.sources)
-        return {**observation, "pose": seen.pose, "depth": seen.depth}, ~seen.found
+        return {**observation, "pose": seen.pose, "depth": seen.depth}, ~seen.recognised
 
-    # -- the state ----------------------------------------------------------------------------------------------------
+    def observe(self, prior: State | None, evidence: Evidence) -> State:
+        """With the picture of the evidence, which memory always keeps."""
+        state = self._blank(evidence) if prior is None else prior
+        known = torch.full_like(state["known"], 255)
+        state = state.replace(**{**evidence.seen, "pose": evidence.pose}, known=known)
+        state = state.replace(**self.own.observed(state, state["rgb"], self._lasting(state), state["pose"]))
+        return state.replace(observed_walls=self.own.walls(state, dreamt=False))
 
-    @property
-    def drawn_names(self) -> tuple[str, ...]:
-        """The tensors of a state that follow from drawing its frame."""
-        moving = ("things", "instances", *(f"earlier_{part}" for part in SEEN)) if self.config.moving else ()
-        return "rgb", "depth", "known", *moving, *self.own.empty(1)
-
-    def adopted(self, state: State) -> State:
-        """`state` with its keyframes in this scene's arena; ContractError where its memory is of another layout."""
-        return self.own.adopted(state)
-
-    def blank(self, evidence: Evidence) -> State:
-        """A state in which nothing was seen yet."""
-        batch, there, (height, width) = evidence.batch, self.device, self.config.size
-        plane = torch.zeros(batch, height, width, device=there)
+    def _blank(self, evidence: Evidence) -> State:
+        """A state that has seen nothing yet."""
+        batch, (height, width) = evidence.batch, self.config.size
+        plane = torch.zeros(batch, height, width, device=self.device)
         mask = plane.to(torch.uint8)
         tensors = {"rgb": mask[:, None].expand(-1, 3, -1, -1), "depth": plane + 1, "known": mask, "pose": evidence.pose}
         if self.config.moving:
             tensors |= {"things": plane, "instances": mask}
             tensors |= {f"earlier_{part}": tensors[part] for part in SEEN}
-        state = State({**tensors, **self.own.empty(batch)}, self.own.arenas)
-        return state.replace(observed_walls=self.own.walls(state, dreamt=False))
+        return State({**tensors, **self.own.empty(batch)}, self.own.arenas)
 
-    def pictured(self, state: State, evidence: Evidence) -> State:
-        """`state` with the picture of the evidence."""
-        return state.replace(**evidence.seen, known=torch.full_like(state["known"], 255))
+    # -- a step -------------------------------------------------------------------------------------------------------
 
-    def kept(self, state: State, begins: bool) -> State:
-        """`state`, whose memory keeps the picture that was observed; an episode that begins has stood still."""
-        kept = self.own.observed(state, state["rgb"], self._lasting(state), state["pose"])
-        state = state.replace(**kept)
-        state = state.replace(observed_walls=self.own.walls(state, dreamt=False))
-        return self.aged(state, state) if begins else state
+    def adopt(self, state: State) -> State:
+        """The state with its keyframes in this scene's arena; ContractError where its memory is of another layout."""
+        return self.own.adopted(state)
 
-    def aged(self, state: State, before: State) -> State:
-        """`state`, in which the frame of `before` is the one before the last, where things move."""
-        return state.replace(**{f"earlier_{part}": before[part] for part in SEEN}) if self.config.moving else state
-
-    def frame(self, state: State) -> torch.Tensor:
-        """The newest frame, uint8 [B, 3, H, W]."""
-        return state["rgb"]
-
-    def walls(self, state: State) -> Walls:
-        """The walls that recordings and evidence show; and those of dreamt frames, of episodes where no recording ever was."""
-        own, away = state["observed_walls"], self._away(state)
+    def walls(self, state: State) -> tuple[State, Walls]:
+        """The walls that recordings and evidence show. In episodes off known ground also those of dreamt frames, which are
+        drawn for that; the frames of the others may wait."""
+        away, own = self._away(state), state["observed_walls"]
         if len(away):
-            own = own.index_copy(0, away, self.own.walls(state if len(away) == len(own) else state.narrowed(away)))
-        return Walls(self._plan, own)
-
-    def settled(self, state: State) -> State:
-        """`state`, of which the episodes off known ground are drawn, since `walls` reads what they dreamt; the others may wait."""
-        away = self._away(state)
-        if state.deferred is None or not len(away):
-            return state
-        drawn = state if len(away) == state.batch else state.narrowed(away)
-        drawn[ROWS]
-        return state if drawn is state else state.put(away, drawn)
+            drawn = state if len(away) == state.batch else state.narrowed(away)
+            own = own.index_copy(0, away, self.own.walls(drawn))
+            if drawn is not state and state.deferred is not None:
+                state = state.put(away, drawn)
+        return state, Walls(self._plan, own)
 
     def _away(self, state: State) -> torch.Tensor:
         """The entries of the batch [n] that are in no cell of the map that recorded keyframes are near."""
@@ -241,9 +214,25 @@ class KeyframeScene:
             return torch.zeros(state.batch, dtype=torch.int64, device=codes.device)
         return (cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] != codes).nonzero()[:, 0]
 
-    def familiar(self, state: State) -> torch.Tensor:
-        """How far the next recorded keyframe is, a radian counting two metres, and how much of its own memory is in use; as
-        logarithm and share: [B, 2]."""
+    def look(self, state: State, before: State) -> Conditioning:
+        """What is known of the view from the state's pose; `before` has the last frame."""
+        config, pose = self.config, state["pose"]
+        glimpse = self.own.look(state, pose, config.sources, config.slots, self.recorded)
+        context, familiar = context_thumbnail(before["rgb"]), self._familiar(state)
+        if not config.moving:
+            frame = before["rgb"], before["depth"], before["pose"]
+            last = carry_unknown(*frame, glimpse.known, glimpse.depth, pose, config.camera)
+            return Conditioning(glimpse, last, context, familiar)
+        frames = []
+        for age in ("", "earlier_"):
+            rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
+            frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
+        context = torch.cat([context, state["actions"].flatten(1)], 1)
+        return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context, familiar)
+
+    def _familiar(self, state: State) -> torch.Tensor:
+        """How well the place is known [B, 2]: distance to the nearest recorded keyframe, log(1 + metres), a radian counting as
+        two metres; and the share of its own memory that is in use."""
         pose, kept = state["pose"], self.recorded.pose
         angle = (yaw(kept) - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
         apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY) + 2 * angle.abs()
@@ -251,41 +240,29 @@ class KeyframeScene:
         own = self.own.count(state).float() / max(1, self.own.capacity)
         return torch.stack([nearest.clamp_max(20).log1p(), own], 1)
 
-    def conditioning(self, state: State, before: State) -> Conditioning:
-        """What the generator gets to draw the frame at `state`'s pose, `before` being the last."""
-        config, pose = self.config, state["pose"]
-        glimpse = self.own.look(state, pose, config.sources, config.slots, self.recorded)
-        context = context_thumbnail(before["rgb"])
-        if not config.moving:
-            frame = before["rgb"], before["depth"], before["pose"]
-            last = carry_unknown(*frame, glimpse.known, glimpse.depth, pose, config.camera)
-            return Conditioning(glimpse, last, context)
-        frames = []
-        for age in ("", "earlier_"):
-            rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
-            frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
-        context = torch.cat([context, state["actions"].flatten(1)], 1)
-        return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context)
-
-    def drawn(
-        self, state: State, conditioning: Conditioning, clean: torch.Tensor, paint: Callable[[State], State]
-    ) -> State:
-        """`state` with the frame `clean` [B, 4 or 5, H, W] that was drawn of it, what `paint` adds to it, remembered if new."""
-        known = conditioning.glimpse.known
-        state = state.replace(rgb=pixels(clean), depth=decode_depth(clean[:, 3]))
+    def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
+        """With the frame; memory keeps it if it shows a new view of which little was known."""
+        known, drawn = (
+            conditioning.glimpse.known,
+            {name: part for name, part in vars(frame).items() if part is not None},
+        )
+        state = state.replace(**drawn)
         if self.config.moving:
-            state = paint(state.replace(things=clean[:, 4].sigmoid()))
             known = known * (state["things"] < 0.5)
         kept = self.own.dreamt(state, state["rgb"], self._lasting(state), state["pose"], known)
         return state.replace(**kept, known=(known * 255).round().to(torch.uint8))
 
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        return {
-            "rgb": lambda: state["rgb"].permute(0, 2, 3, 1).contiguous(),
-            "known": lambda: state["known"].float() / 255,
-            "things": lambda: state["things"] > 0.5,
-            "places": lambda: torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1),
-        }
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
+        shown = {}
+        if "rgb" in channels:
+            shown["rgb"] = newest_frame(state).permute(0, 2, 3, 1).contiguous()
+        if "known" in channels:
+            shown["known"] = state["known"].float() / 255
+        if "things" in channels:
+            shown["things"] = state["things"] > 0.5
+        if "places" in channels:
+            shown["places"] = torch.cat([self._table.expand(state.batch, -1, -1), self.own.table(state)], 1)
+        return shown
 
     def _lasting(self, state: State) -> torch.Tensor:
         """What a keyframe may keep of the frame's depth."""

@@ -1,9 +1,9 @@
 """LearnedWorld: the world that is learned from recordings, made of parts.
 
-A body moves the viewer, a scene knows what is seen from there, a generator draws it, objects stand in it, an outcome says what
-it brings, an uncertainty how wrong the frame may be, and an estimator sees depth in lone pictures. Each part owns its channels,
-its tensors of the State and its settings; one that a world lacks is a null object. A frame is drawn when somebody looks: a
-rollout that asks for what the body alone decides never draws.
+A body moves the viewer, a scene knows the view, a generator draws it, objects are painted over it, an outcome gives reward,
+end and vitals, an uncertainty the error to expect, and an estimator sees depth in pictures that come alone (parts.py). Each
+part owns its channels, its entries of the State and its settings. A frame is drawn when it is first read: a rollout that asks
+only for what the body decides never draws.
 """
 
 from __future__ import annotations
@@ -24,25 +24,23 @@ from ..core.spec import Camera, Spec
 from ..core.state import State
 from ..space.estimator import Estimator
 from ..space.keyframes import Keyframes
-from .body import MotionBody, NoBody
+from .body import NoBody
 from .config import VideoConfig
 from .controls import Controls
-from .frame_history import FrameHistory, StartClips
-from .generator import Conditioning, channels_last, generate
-from .keyframe_scene import KeyframeScene
+from .frame_history import StartClips
+from .generator import Conditioning, channels_last, decode, generate
 from .localisation import NoEstimator
-from .objects import Billboards, NoObjects
-from .outcome import ConstantConfig, ConstantOutcome, FrameOutcome
-from .parts import NOISE, Evidence
-from .uncertainty import GONE, NoUncertainty, UncertaintyNetwork, UncertaintyProbe, gone_on
+from .objects import NoObjects
+from .outcome import ConstantConfig, ConstantOutcome
+from .parts import NOISE, Body, Evidence, Generator, Objects, Outcome, Scene, Uncertainty, newest_frame
+from .uncertainty import GONE, NoUncertainty, gone_on
 
-PATIENCE = 4096  # steps after which a frame is drawn though nobody looks: what waits is kept in memory
+PATIENCE = 4096  # steps after which a frame is drawn though nobody reads it: what it waits for is kept in memory
 
 
 @dataclass(frozen=True)
 class About:
-    """What a world is called and how it is played: the fields of Spec of these names; ignored: channels of the recording that
-    were not learned."""
+    """What a world is called and how it is played: fields of Spec."""
 
     name: str
     controls: Controls
@@ -50,35 +48,35 @@ class About:
     action_names: tuple[str, ...] = ()
     keys: Mapping[str, list[float]] = field(default_factory=dict)
     card: Mapping[str, object] = field(default_factory=dict)
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # channels of the recording that were not learned
     idle: tuple[float, ...] = ()
     max_episode_steps: int | None = None
 
 
 @final
 class LearnedWorld:
-    """Its parts are read, never changed: `replaced` gives another world. They are put into evaluation mode, without gradients
-    to their weights: whoever trains on hands in copies."""
+    """Its parts never change: `replaced` gives another world. They are put into evaluation mode, without gradients to their
+    weights: hand in copies of those that go on training."""
 
     def __init__(
         self,
         about: About,
         *,
-        scene: KeyframeScene | FrameHistory,
-        generator: nn.Module,
-        body: MotionBody | NoBody | None = None,
-        objects: Billboards | NoObjects | None = None,
-        outcome: FrameOutcome | ConstantOutcome | None = None,
-        uncertainty: UncertaintyNetwork | UncertaintyProbe | NoUncertainty | None = None,
+        scene: Scene,
+        generator: Generator,
+        body: Body | None = None,
+        objects: Objects | None = None,
+        outcome: Outcome | None = None,
+        uncertainty: Uncertainty | None = None,
         estimator: Estimator | NoEstimator | None = None,
     ):
         self.about, self.controls, self.scene = about, about.controls, scene
-        self.generator = channels_last(_finished(generator))
-        self.body = body or NoBody()
-        self.objects = _finished(objects or NoObjects())
-        self.outcome = _finished(outcome or ConstantOutcome(ConstantConfig()))
-        self.uncertainty = _finished(uncertainty or NoUncertainty())
-        self.estimator = _finished(estimator or NoEstimator())
+        self.generator: Any = channels_last(_finished(generator))
+        self.body: Body = body or NoBody()
+        self.objects: Objects = _finished(objects or NoObjects())
+        self.outcome: Outcome = _finished(outcome or ConstantOutcome(ConstantConfig()))
+        self.uncertainty: Uncertainty = _finished(uncertainty or NoUncertainty())
+        self.estimator: Any = _finished(estimator or NoEstimator())
         self.history = max(self.body.history, scene.history)
         self.size = scene.config.size
         self._drawn_names = (*scene.drawn_names, "uncertainty")
@@ -88,7 +86,7 @@ class LearnedWorld:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """By name, as they are saved."""
+        """By their names in world.json."""
         names = ("body", "scene", "generator", "objects", "outcome", "uncertainty", "estimator")
         return {name: getattr(self, name) for name in names}
 
@@ -109,7 +107,7 @@ class LearnedWorld:
     @cached_property
     def config(self) -> VideoConfig:
         """The settings of all parts in one."""
-        drawn, posed = self.generator.config, self.scene.posed
+        drawn, posed = self.generator.config, self.scene.camera is not None
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
         settings.pop("moves", None)  # those of a codec, found in its recording
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
@@ -122,8 +120,8 @@ class LearnedWorld:
     def replaced(
         self, *, steps: int | None = None, card: Mapping[str, object] | None = None, **parts: Any
     ) -> LearnedWorld:
-        """The same world with other parts; a part that is None is taken out. steps: in which it draws a frame; card: facts that
-        are added to its card, or with None taken from it."""
+        """The same world with other parts; None takes a part out. steps: flow-matching steps a frame; card: facts to add to its
+        card, or with None to take from it."""
         facts = {**self.about.card, **(card or {})}
         about = replace(self.about, card={name: fact for name, fact in facts.items() if fact is not None})
         if unknown := set(parts) - set(self.parts):
@@ -138,26 +136,27 @@ class LearnedWorld:
 
     def to(self, device: torch.device | str) -> LearnedWorld:
         """The same world on another device: its networks, its memory and its geometry."""
-        moved: dict[str, Any] = {
-            name: copy.deepcopy(part) if isinstance(part, nn.Module) else part for name, part in self.parts.items()
+        parts: dict[str, Any] = {
+            name: (copy.deepcopy(part) if isinstance(part, nn.Module) else part).to(device)
+            for name, part in self.parts.items()
         }
-        return LearnedWorld(self.about, **{name: part.to(device) for name, part in moved.items()})
+        return LearnedWorld(self.about, **parts)
 
     def with_memory(self, memory: Keyframes) -> LearnedWorld:
         """The same world with other keyframes of recordings."""
-        return self.replaced(scene=self.scene.with_memory(memory))
+        return self.replaced(scene=self.scene.with_memory(recorded=memory))
 
     def without_memory(self) -> LearnedWorld:
-        """The same world, with nothing of its recordings but where they began."""
+        """The same world without keyframes of recordings; where episodes begin stays."""
         return self.with_memory(self.memory.at(slice(0, 0)))
 
     def with_memory_of(self, budget_mb: float) -> LearnedWorld:
-        """The same world with another budget for an episode's own memory; with 0 it holds the last frame alone."""
-        return self.replaced(scene=self.scene.with_memory_of(budget_mb))
+        """The same world with another budget in MiB for an episode's own memory; with 0 it holds the last frame alone."""
+        return self.replaced(scene=self.scene.with_memory(budget_mb=budget_mb))
 
     def _spec(self) -> Spec:
         about, scene = self.about, self.scene
-        said = [
+        parts = [
             scene.channels(), self.body.channels(), self.objects.channels(self.size), self.outcome.channels(),
             self.uncertainty.channels(),
         ]  # fmt: skip
@@ -167,10 +166,10 @@ class LearnedWorld:
         return Spec(
             name=about.name,
             action=about.controls.space(),
-            channels={name: space for part in said for name, space in part.shows.items()},
-            observes=tuple(name for part in said for name in part.observes),
+            channels={name: space for part in parts for name, space in part.shows.items()},
+            observes=tuple(name for part in parts for name in part.observes),
             dt_s=about.dt_s,
-            units={name: unit for part in said for name, unit in part.units.items()},
+            units={name: unit for part in parts for name, unit in part.units.items()},
             action_names=tuple(about.action_names),
             keys=about.keys,
             idle=about.idle,
@@ -180,7 +179,7 @@ class LearnedWorld:
             action_mode=about.controls.mode,
             action_frame=about.controls.frame,
             card=card,
-            may_observe=tuple(name for part in said for name in part.may_observe),
+            may_observe=tuple(name for part in parts for name in part.may_observe),
         )
 
     # -- the verbs ----------------------------------------------------------------------------------------------------
@@ -190,118 +189,115 @@ class LearnedWorld:
         if batch < 1:
             raise ContractError(f"start needs a batch of 1 or more; got {batch}.")
         seeds = chance.seeds(batch, rng, self.device)
-        evidence, pick = self.scene.begin(seeds)
+        evidence, pick = self.scene.start(seeds)
         state = self._observed(evidence, {}, None)
-
-        def draw(bare: State) -> State:
-            bare = self.scene.aged(bare, bare)
-            drawn = self._draw(bare, bare, seeds, torch.zeros_like(bare["done"]))
-            return self.scene.aged(drawn, drawn)
-
-        return self.objects.begin(state, pick, draw)
+        objects = self.objects.start(pick, state)
+        if not objects:
+            return state
+        state = state.replace(**objects)  # they are no part of the recorded picture, which is drawn again
+        state = self._earlier(state, state)
+        state = self._draw(state, state, seeds, torch.zeros_like(state["done"]))
+        return self._earlier(state, state)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """Evidence into state, as the scene takes it (keyframe_scene.py, frame_history.py); of a pose alone the frame is dreamt."""
-        prior = None if prior is None else self.scene.adopted(prior)
+        """Evidence into state, as the scene takes it (keyframe_scene.py, frame_history.py); of a pose alone the frame is drawn."""
+        prior = None if prior is None else self.scene.adopt(prior)
         evidence = self.scene.evidence(observation, prior, self.estimator)
         seeds = chance.seeds(evidence.batch, rng, self.device)
         state = self._observed(evidence, observation, prior)
         if not evidence.seen:
             assert prior is not None
-            state = state.replace(**self.objects.moved(prior, state, seeds), gone=gone_on(prior, state, led=True))
+            state = state.replace(**self.objects.step(prior, state, seeds), gone=gone_on(prior, state, led=True))
             return self._draw(state, prior, seeds, torch.zeros_like(state["done"]))
         return state if evidence.lone is None else self._judged(state, evidence.lone, seeds)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One step: move, then draw what is seen from there, now or when somebody looks. What is over stands still."""
+        """One step: move, then draw what is seen from there, now or when it is first read. Episodes that are over stand still."""
         numbers = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
-        state, seeds = self.scene.settled(self.scene.adopted(state)), chance.seeds(state.batch, rng, self.device)
-        still = state["done"]
-        asked = self.asked(state, numbers)
-        asked = asked.replace(**self.outcome.placed(state, self.body.ends(asked, numbers)))
-        asked = asked.replace(**self.objects.moved(state, asked, seeds), gone=gone_on(state, asked, led=False))
-        drawn = self._draw(asked, state, seeds, still)
-        after = self.outcome.followed(state, drawn, self.scene.frame, numbers, seeds)
+        seeds = chance.seeds(state.batch, rng, self.device)
+        state, after = self.move(self.scene.adopt(state), numbers)
+        still, ends = state["done"], self.body.ends(after, numbers)
+        after = after.replace(**self.objects.step(state, after, seeds), gone=gone_on(state, after, led=False))
+        after = self._draw(after, state, seeds, still)
+        after = after.replace(**self.outcome.step(state, after, ends, numbers, seeds))
         at_hand = [name for name in after if name not in self._drawn_names and after[name] is not state[name]]
         kept = {name: _where(still, state[name], after[name]) for name in at_hand}
         return after.replace(**{**kept, "reward": torch.where(still, 0.0, after["reward"])})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
-        state = self.scene.adopted(state)
-        show = {**self.scene.show(state), **self.objects.show(state), **self.outcome.show(state)}
-        return {name: show[name]() if name in show else state[name] for name in channels}
+        state = self.scene.adopt(state)
+        shown = self.scene.render(state, channels)
+        shown |= self.objects.render(state, channels) | self.outcome.render(state, channels)
+        return {name: shown[name] if name in shown else state[name] for name in channels}
 
     # -- a step in pieces, as training takes it -----------------------------------------------------------------------
 
-    def asked(self, state: State, numbers: torch.Tensor, pose: torch.Tensor | None = None) -> State:
-        """The state one step on, its frame not yet drawn: after an action [B, A] as `controls.encode` gives it, where the body
-        goes by itself, or at `pose` [B, 7]."""
+    def move(self, state: State, numbers: torch.Tensor, pose: torch.Tensor | None = None) -> tuple[State, State]:
+        """The state, and the state one step on, whose frame is not yet drawn: after an action [B, A] of `controls.encode`, or at
+        `pose` [B, 7]. In the first those frames are drawn that the walls of the step are read from."""
         acts = torch.cat([state["actions"], numbers[:, None]], 1)
-        asked = state.replace(actions=acts[:, 1:])
+        after = {"actions": acts[:, 1:]}
         if pose is not None:
-            return asked.replace(pose=pose)
-        scene, body = self.scene, self.body
-        if not body:
-            return asked
-        walls = self.objects.among(scene.walls(state), state, body.config.body_m)
-        return asked.replace(**body.step(state, acts, walls, scene.recorded.pose[:, :3]))
+            return state, state.replace(**after, pose=pose)
+        state, walls = self.scene.walls(state)
+        walls = self.objects.add_walls(walls, state, self.body.half_m)
+        after |= self.body.step(state, acts, walls, self.scene.recorded.pose[:, :3])
+        return state, state.replace(**after)
 
-    def conditioning(self, asked: State, before: State) -> Conditioning:
-        """What the generator gets to draw the frame of `asked`, `before` being the last."""
-        found = self.scene.conditioning(asked, before)
-        return found if found.mosaic is None else replace(found, scroll=self.generator.scroll(found))
+    def look(self, after: State, before: State) -> Conditioning:
+        """What the generator draws the frame of `after` from, `before` having the last frame."""
+        return self.generator.prepare(self.scene.look(after, before))
 
-    def drawn(self, asked: State, before: State, conditioning: Conditioning, clean: torch.Tensor) -> State:
-        """`asked` with the frame `clean` [B, 4 or 5, H, W] that was drawn of it, remembered if new."""
-
-        def paint(state: State) -> State:
-            return self.objects.painted(state, self.scene.camera)
-
-        return self.scene.drawn(self.scene.aged(asked, before), conditioning, clean, paint)
+    def take(self, after: State, before: State, conditioning: Conditioning, clean: torch.Tensor) -> State:
+        """`after` with the frame `clean` [B, 4 or 5, H, W] that was drawn from the conditioning, remembered if new."""
+        camera = self.scene.camera
+        frame = self.objects.paint(after, decode(clean, posed=camera is not None), camera)
+        return self.scene.take(self._earlier(after, before), conditioning, frame)
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _observed(self, evidence: Evidence, observation: Mapping[str, torch.Tensor], prior: State | None) -> State:
-        begins = prior is None
-        prior = self._blank(evidence) if prior is None else prior
-        body, outcome = self.body.observed(prior, evidence.pose), self.outcome.observed(prior, evidence, observation)
-        state = prior.replace(
-            **body, **outcome, gone=torch.zeros_like(prior["gone"]) if evidence.seen else prior["gone"]
-        )
+        """The state that follows from evidence, of new episodes where there is no prior."""
+        known = self.body.observe(prior, evidence) | self.outcome.observe(prior, evidence, observation)
         if not evidence.seen:
-            return state
-        state = self.scene.pictured(state, evidence)
-        state = state.replace(**self.objects.observed(state, observation, self.scene.camera))
-        state = state.replace(uncertainty=torch.zeros_like(state["reward"]))
-        return self.scene.kept(state, begins)
+            assert prior is not None
+            return prior.replace(**known)
+        batch, device = evidence.batch, self.device
+        known |= self.objects.observe(prior, evidence, observation, self.scene.camera)
+        known |= {
+            "gone": torch.zeros(batch, len(GONE), device=device),
+            "uncertainty": torch.zeros(batch, device=device),
+        }
+        if "actions" in evidence.seen:
+            known["actions"] = evidence.seen["actions"]
+        elif prior is None:
+            known["actions"] = torch.zeros(batch, self.history, self.controls.numbers, device=device)
+        state = self.scene.observe(prior, evidence).replace(**known)
+        return self._earlier(state, state) if prior is None else state
 
-    def _blank(self, evidence: Evidence) -> State:
-        batch, there = evidence.batch, self.device
-        state = self.scene.blank(evidence)
-        return state.replace(
-            **self.body.blank(batch, evidence.pose), **self.outcome.blank(batch, there), **self.objects.blank(batch),
-            actions=torch.zeros(batch, self.history, self.controls.numbers, device=there),
-            gone=torch.zeros(batch, len(GONE), device=there), uncertainty=torch.zeros(batch, device=there),
-        )  # fmt: skip
+    def _earlier(self, state: State, before: State) -> State:
+        """The state with what its scene has to know of the frame of `before`."""
+        names = self.scene.earlier_names
+        return state.replace(**{f"earlier_{name}": before[name] for name in names}) if names else state
 
-    def _draw(self, asked: State, before: State, seeds: torch.Tensor, still: torch.Tensor) -> State:
-        """`asked` with its frame, which is drawn when it is first read; entries that are `still` [B] keep that of `before`."""
-        now = {name: asked[name] for name in asked if name not in self._drawn_names}
+    def _draw(self, after: State, before: State, seeds: torch.Tensor, still: torch.Tensor) -> State:
+        """`after` with its frame, which is drawn when it is first read; entries that are `still` [B] keep that of `before`."""
+        now = {name: after[name] for name in after if name not in self._drawn_names}
         frame = Step(self._frame, before, {**now, "seeds": seeds, "still": still})
         drawn = Deferred(self._drawn_names, frame)
         if drawn.length > PATIENCE:
             drawn.values()
-        return State(now, asked.arenas, drawn)
+        return State(now, after.arenas, drawn)
 
     def _frame(self, before: State, now: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The tensors that follow from drawing the frame of the state that `before` and `now` make."""
-        asked = before.replace(**{name: tensor for name, tensor in now.items() if name not in ("seeds", "still")})
-        conditioning = self.conditioning(asked, before)
+        """The state entries that follow from drawing the frame of the state that `before` and `now` make."""
+        after = before.replace(**{name: tensor for name, tensor in now.items() if name not in ("seeds", "still")})
+        conditioning = self.look(after, before)
         clean = self._generated(conditioning, now["seeds"])
-        expected = self._expected(asked, conditioning, clean)
-        after = self.drawn(asked, before, conditioning, clean).replace(uncertainty=expected)
-        return {name: _where(now["still"], before[name], after[name]) for name in self._drawn_names}
+        expected = self._expected(after, conditioning, clean)
+        drawn = self.take(after, before, conditioning, clean).replace(uncertainty=expected)
+        return {name: _where(now["still"], before[name], drawn[name]) for name in self._drawn_names}
 
     def _generated(self, conditioning: Conditioning, seeds: torch.Tensor) -> torch.Tensor:
         noise = chance.normal(seeds, (4, *self.size), stream=NOISE)
@@ -309,17 +305,18 @@ class LearnedWorld:
 
     def _expected(self, state: State, conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
         """The error [B] to expect of a frame `clean` that was drawn for `state`."""
-        gone = state["gone"]
-        situation = torch.cat([gone[:, :4].clamp_max(128).log1p(), self.scene.familiar(state)], 1)
+        gone, familiar = state["gone"], conditioning.familiar
+        assert familiar is not None
+        situation = torch.cat([gone[:, :4].clamp_max(128).log1p(), familiar], 1)
         return self.uncertainty.expected(conditioning, clean, situation, gone[:, 4])
 
     def _judged(self, state: State, lone: torch.Tensor, seeds: torch.Tensor) -> State:
-        """`state`, of lone pictures, with the error to expect: what the world itself would draw of them says it. Those that are
-        `lone` [B] are of elsewhere."""
-        strange = (10 * (self.estimator.strangeness(self.scene.frame(state)) - 0.95)).clamp(0, 1) * lone
+        """`state`, of pictures that came alone, with the error to expect, judged by what the world would draw there; `lone` [B]:
+        those of a place outside the recordings."""
+        strange = (10 * (self.estimator.strangeness(newest_frame(state)) - 0.95)).clamp(0, 1) * lone
         nothing = torch.zeros(state.batch, 3, device=self.device)
         state = state.replace(gone=torch.cat([nothing, lone[:, None].float(), strange[:, None]], 1))
-        conditioning = self.conditioning(state, state)
+        conditioning = self.look(state, state)
         return state.replace(uncertainty=self._expected(state, conditioning, self._generated(conditioning, seeds)))
 
 

@@ -24,11 +24,11 @@ class NoEstimator(Absent):
 
 @dataclass(frozen=True)
 class Arrival:
-    """pose [B, 7]; depth [B, H, W] metres; found [B]: the picture is of a place that memory holds."""
+    """pose [B, 7]; depth [B, H, W] metres; recognised bool [B]: the picture is of a place that memory holds."""
 
     pose: torch.Tensor
     depth: torch.Tensor
-    found: torch.Tensor
+    recognised: torch.Tensor
 
 
 def arrive(
@@ -43,7 +43,7 @@ def arrive(
     """Pictures, uint8 [B, 3, H, W], in the place among `memory` (its `thumbnails` are `small`) where they were taken, or
     else in an empty corner of the world at the height of the `starts`; depth is memory's where it knows it, else the
     estimator's."""
-    depth, found, poses = estimator.depth(rgb), [], []
+    depth, recognised, poses = estimator.depth(rgb), [], []
     corner = starts.pose[:1].clone()
     corner[0, 0] = starts.pose[:, 0].max() + AWAY_M
     corner[0, 2] = starts.pose[:, 2].median()
@@ -51,11 +51,11 @@ def arrive(
     for view, picture in enumerate(rgb):
         place = recognise(picture, memory, small, camera, sources)
         known = place is not None and place.likeness > ALIKE and place.edges > ALIKE_EDGES and place.known > KNOWN
-        found.append(known)
+        recognised.append(known)
         poses.append(place.pose if place is not None and known else corner[0])
         if known:
             size = (rgb.shape[-2], rgb.shape[-1])
             picks = retrieve(memory, poses[-1][None], camera, size, sources)
             seen = look(memory, picks, poses[-1][None], camera, size, 1)
             depth[view] = torch.where(seen.known[0] > 0, seen.depth[0], depth[view])
-    return Arrival(torch.stack(poses), depth, torch.tensor(found, device=rgb.device))
+    return Arrival(torch.stack(poses), depth, torch.tensor(recognised, device=rgb.device))

@@ -6,7 +6,7 @@ is drawn by chance from the logits of a small network: a figure is never the mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
@@ -22,7 +22,8 @@ from ..core.state import State
 from ..space.billboards import PICTURE, Cutout, cut_out, painted
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import NOWHERE
-from .parts import GOES, LOOKS, MOVES, Absent, Channels, Walls
+from .generator import DrawnFrame
+from .parts import GOES, LOOKS, MOVES, Absent, Channels, Evidence, Tensors, Walls
 
 # A billboard: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its
 # last move (x, y), steps since that, and its light, of its look's own.
@@ -105,23 +106,22 @@ class Billboards(nn.Module):
         shows["objects"] = spaces.Box(-np.inf, np.inf, (rows, 4), np.float32)
         return Channels(shows, may_observe=tuple(shows))
 
-    def blank(self, batch: int) -> dict[str, torch.Tensor]:
-        return {"billboards": self.empty(batch), "billboards_before": self.empty(batch)}
+    def start(self, pick: torch.Tensor, state: State) -> Tensors:
+        """The billboards of the starts `pick` [B], in place of the things in their pictures, which would never move."""
+        billboards = self.begun[pick]
+        shown = state["things"].to(torch.uint8)
+        return {"billboards": billboards, "billboards_before": billboards, "instances": shown}
 
-    def begin(self, state: State, pick: torch.Tensor, draw: Callable[[State], State]) -> State:
-        """A state in which an episode begins at the start `pick` [B], with the billboards of then, in place of the things that
-        its picture shows, which would stand there for ever; `draw` draws the picture again."""
-        billboards, shown = self.begun[pick], state["things"].to(torch.uint8)
-        return draw(state.replace(billboards=billboards, billboards_before=billboards, instances=shown))
-
-    def observed(self, seen: State, observation: Mapping, camera: Intrinsics | None) -> dict[str, torch.Tensor]:
-        """The billboards of the frame of `seen` and their pixels, where the evidence tells things apart; else what is seen is no
-        billboard, and those that there were are gone from sight."""
-        depth, batch = seen["depth"], seen.batch
+    def observe(
+        self, prior: State | None, evidence: Evidence, observation: Mapping, camera: Intrinsics | None
+    ) -> Tensors:
+        """The billboards of the evidence and their pixels, where it tells things apart; else there is no billboard."""
+        depth, batch = evidence.seen["depth"], evidence.batch
+        none = self.empty(batch)
         if not {"objects", "instances"} <= set(observation):
-            none, nothing = self.empty(batch), torch.zeros_like(depth, dtype=torch.uint8)
+            nothing = torch.zeros_like(depth, dtype=torch.uint8)
             return {"billboards": none, "billboards_before": none, "instances": nothing}
-        assert camera is not None
+        assert camera is not None and evidence.pose is not None
         listed = torch.as_tensor(observation["objects"]).float().to(depth.device)
         instances = torch.as_tensor(observation["instances"]).to(depth.device)
         fits = listed.shape == (batch, self.config.rows, 4) and instances.ndim == 3 and len(instances) == batch
@@ -130,34 +130,36 @@ class Billboards(nn.Module):
                 f"objects is finite float [B, {self.config.rows}, 4] and instances uint8 [B, h, w]; got "
                 f"{tuple(listed.shape)} and {instances.dtype} {tuple(instances.shape)}."
             )
-        # a pixel of nobody is nobody's
+        # pixels with the number of no listed object belong to none
         named = F.pad((listed[..., 0] > 0).to(torch.uint8), (1, 255 - self.config.rows))
         instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
-        cut = cut_out(seen["rgb"], instances, depth, listed[..., 1:], seen["pose"], camera)
-        billboards = self.recognised(cut, listed, seen["billboards_before"])
+        cut = cut_out(evidence.seen["rgb"], instances, depth, listed[..., 1:], evidence.pose, camera)
+        billboards = self.recognised(cut, listed, none if prior is None else prior["billboards_before"])
         return {"billboards": billboards, "billboards_before": billboards, "instances": instances}
 
-    def moved(self, before: State, after: State, seeds: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The billboards of `after`, a step after `before`: those that were in sight have done something."""
-        billboards = self.step(before["billboards"], in_sight(before), after["pose"], after["actions"], seeds)
+    def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
+        """The billboards of `after`, a step after `before`: those that were in sight have acted."""
+        billboards = self.act(before["billboards"], in_sight(before), after["pose"], after["actions"], seeds)
         return {"billboards": billboards, "billboards_before": before["billboards"]}
 
-    def among(self, walls: Walls, state: State, half_m: float) -> Walls:
-        """`walls` and the sides of those billboards that stop a body of half width `half_m`."""
+    def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:
+        """The walls, and the sides of those billboards that stop a body of half width `half_m`."""
         return walls._replace(own=torch.cat([walls.own, self.bodies(state, half_m)], 1))
 
-    def painted(self, state: State, camera: Intrinsics | None) -> State:
-        """`state` with its billboards in its frame."""
-        assert camera is not None
-        parts = state["rgb"].float() / 255, state["depth"], state["pose"], camera
-        rgb, depth, instances = self.paint(state["billboards"], *parts)
-        things = torch.maximum(state["things"], (instances > 0).float())
-        rgb = (rgb * 255).round().to(torch.uint8)
-        return state.replace(rgb=rgb, depth=depth, things=things, instances=instances)
+    def paint(self, state: State, frame: DrawnFrame, camera: Intrinsics | None) -> DrawnFrame:
+        """The frame with the state's billboards in it."""
+        assert camera is not None and frame.depth is not None and frame.things is not None
+        rgb, depth, instances = self.painted(
+            state["billboards"], frame.rgb.float() / 255, frame.depth, state["pose"], camera
+        )
+        things = torch.maximum(frame.things, (instances > 0).float())
+        return DrawnFrame((rgb * 255).round().to(torch.uint8), depth, things, instances)
 
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        return {"objects": lambda: state["billboards"][..., :4] * in_sight(state)[..., None]}
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
+        if "objects" not in channels:
+            return {}
+        return {"objects": state["billboards"][..., :4] * in_sight(state)[..., None]}
 
     # -- what happens -------------------------------------------------------------------------------------------------
 
@@ -181,7 +183,7 @@ class Billboards(nn.Module):
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
         return BillboardLogits(next_look, self.next_move(known), self.goes(known)[:, 0])
 
-    def step(
+    def act(
         self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor
     ) -> torch.Tensor:
         """The billboards [B, K, COLUMNS] one step later, by chance; seen [B, K] bool: the others wait; pose [B, 7] and acts
@@ -200,7 +202,7 @@ class Billboards(nn.Module):
         after = torch.where(gone[..., None], 0.0, after)
         return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
 
-    def paint(
+    def painted(
         self, billboards: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Frames with billboards [B, K, COLUMNS] in them: see space/billboards.painted."""
@@ -261,17 +263,27 @@ class Billboards(nn.Module):
 
 @final
 class NoObjects(Absent):
-    """Of a world whose things, if it has any, are drawn as the rest."""
+    """Of a world whose things, if it has any, are drawn like the rest."""
 
-    blank = observed = moved = show = Absent.nothing
+    def start(self, pick: torch.Tensor, state: State) -> Tensors:
+        return {}
 
-    def begin(self, state: State, *given) -> State:
-        return state
+    def observe(
+        self, prior: State | None, evidence: Evidence, observation: Mapping, camera: Intrinsics | None
+    ) -> Tensors:
+        return {}
 
-    def among(self, walls: Walls, *given) -> Walls:
+    def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
+        return {}
+
+    def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:
         return walls
 
-    painted = begin
+    def paint(self, state: State, frame: DrawnFrame, camera: Intrinsics | None) -> DrawnFrame:
+        return frame
+
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
+        return {}
 
 
 def in_sight(state: State) -> torch.Tensor:

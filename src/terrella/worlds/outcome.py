@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
@@ -16,7 +16,7 @@ from ..core import chance
 from ..core.errors import ObservationError
 from ..core.spec import DONE, REWARD
 from ..core.state import State
-from .parts import CHANGES, Channels, Evidence
+from .parts import CHANGES, Channels, Evidence, Tensors, newest_frame
 
 VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -33,7 +33,8 @@ class ConstantConfig:
 class ConstantOutcome:
     """The same reward for every step, and another for the last: where an episode ends is the body's to say."""
 
-    kind, begins = "constant", ()
+    kind = "constant"
+    begins: tuple[float, ...] = ()
 
     def __init__(self, config: ConstantConfig):
         self.config = config
@@ -44,22 +45,16 @@ class ConstantOutcome:
     def channels(self) -> Channels:
         return Channels({"reward": REWARD, "done": DONE})
 
-    def blank(self, batch: int, device) -> dict[str, torch.Tensor]:
-        return _going(batch, device)
+    def observe(self, prior: State | None, evidence: Evidence, observation: Mapping) -> Tensors:
+        return _going(evidence)
 
-    def observed(self, prior: State, evidence: Evidence, observation: Mapping) -> dict[str, torch.Tensor]:
-        return _going(evidence.batch, evidence.device)
-
-    def placed(self, before: State, ends: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Reward and end of a step that `ends` [B] or does not."""
+    def step(
+        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
+    ) -> Tensors:
+        """Reward and end of a step that `ends` [B] or does not; no frame is read."""
         return {"done": before["done"] | ends, "reward": self.config.usual + self.config.ending * ends.float()}
 
-    def followed(
-        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
-    ) -> State:
-        return after
-
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
         return {}
 
 
@@ -113,7 +108,7 @@ class FrameOutcome(nn.Module):
 
     def __init__(self, config: OutcomeConfig):
         super().__init__()
-        self.config = config
+        self.config, self.begins = config, config.begins or (0.0,) * len(config.vitals)
         widths = (24, 32, 48, 64)
         self.look = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(widths, widths[1:]))
         self.sum_up = nn.Linear(widths[-1] * 16, 128)
@@ -125,11 +120,6 @@ class FrameOutcome(nn.Module):
         self.changed = nn.ModuleList(nn.Linear(inner, len(levels)) for levels in config.changes)
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
-    @property
-    def begins(self) -> tuple[float, ...]:
-        """The vitals with which an episode begins."""
-        return self.config.begins or (0.0,) * len(self.config.vitals)
-
     def begin(self, batch: int) -> torch.Tensor:
         """The hidden state in which an episode begins: [batch, hidden]."""
         return self.rewards.new_zeros(batch, self.config.hidden)
@@ -140,34 +130,34 @@ class FrameOutcome(nn.Module):
         vitals = self.config.vitals
         return Channels({"reward": REWARD, "done": DONE, **dict.fromkeys(vitals, VITAL)}, may_observe=vitals)
 
-    def blank(self, batch: int, device) -> dict[str, torch.Tensor]:
-        vitals = torch.tensor(self.begins, device=device).expand(batch, -1)
-        return {**_going(batch, device), "vitals": vitals, "hidden": self.begin(batch)}
-
-    def observed(self, prior: State, evidence: Evidence, observation: Mapping) -> dict[str, torch.Tensor]:
-        """An episode that goes on, with the vitals [B, V] that evidence gives, and those of `prior` where it is silent."""
-        vitals = evidence.seen.get("vitals", prior["vitals"]).clone()
+    def observe(self, prior: State | None, evidence: Evidence, observation: Mapping) -> Tensors:
+        """An episode that goes on, with the vitals that evidence gives, else those of `prior`, else those of a new episode."""
+        batch, device = evidence.batch, evidence.device
+        if prior is None:
+            begun = {"hidden": self.begin(batch)}
+            known = torch.tensor(self.begins, device=device).expand(batch, -1)
+        else:
+            begun, known = {}, prior["vitals"]
+        vitals = evidence.seen.get("vitals", known).clone()
         for column, name in enumerate(self.config.vitals):
             if name in observation:
                 given = torch.as_tensor(observation[name]).float()
                 if given.shape != (len(vitals),) or not torch.isfinite(given).all():
                     raise ObservationError(f"{name} is finite float [B]; got {tuple(given.shape)}.")
                 vitals[:, column] = given
-        return {**_going(evidence.batch, evidence.device), "vitals": vitals}
+        return {**_going(evidence), **begun, "vitals": vitals}
 
-    def placed(self, before: State, ends: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {}
+    def step(
+        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
+    ) -> Tensors:
+        """Reward, end and vitals as they are read off the frames before and after the step; where the body ends is ignored."""
+        frames = newest_frame(before), newest_frame(after)
+        outcome = self(*frames, action, before["vitals"], before["hidden"], seeds)
+        return {**outcome._asdict(), "done": outcome.done > 0}
 
-    def followed(
-        self, before: State, after: State, frame: Callable, action: torch.Tensor, seeds: torch.Tensor
-    ) -> State:
-        """`after`, the step from `before`, with the reward, end and vitals that are read off the two frames."""
-        found = self(frame(before), frame(after), action, before["vitals"], before["hidden"], seeds)
-        return after.replace(vitals=found.vitals, hidden=found.hidden, reward=found.reward, done=found.done > 0)
-
-    def show(self, state: State) -> dict[str, Callable[[], torch.Tensor]]:
-        names = enumerate(self.config.vitals)
-        return {name: lambda column=column: state["vitals"][:, column].clone() for column, name in names}
+    def render(self, state: State, channels: Sequence[str]) -> Tensors:
+        columns = {name: column for column, name in enumerate(self.config.vitals) if name in channels}
+        return {name: state["vitals"][:, column].clone() for name, column in columns.items()}
 
     # -- the network --------------------------------------------------------------------------------------------------
 
@@ -216,9 +206,10 @@ class FrameOutcome(nn.Module):
         return OutcomePrediction(reward, self.ends(found.known, left).float(), left, found.hidden.float())
 
 
-def _going(batch: int, device) -> dict[str, torch.Tensor]:
-    """An episode that is not over, and of which nothing was paid yet."""
-    return {"reward": torch.zeros(batch, device=device), "done": torch.zeros(batch, dtype=torch.bool, device=device)}
+def _going(evidence: Evidence) -> Tensors:
+    """An episode that is not over, without reward yet."""
+    reward = torch.zeros(evidence.batch, device=evidence.device)
+    return {"reward": reward, "done": torch.zeros_like(reward, dtype=torch.bool)}
 
 
 def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:

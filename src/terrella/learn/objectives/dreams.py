@@ -17,6 +17,7 @@ import torch
 from ...core.errors import DatasetError
 from ...worlds.generator import encode_depth
 from ...worlds.learned import LearnedWorld
+from ...worlds.parts import newest_frame
 from ..batches import Batch, as_drawn, coded
 from ..history_batches import changing
 from ..recording import Recording
@@ -51,13 +52,13 @@ class Rollouts:
         found, weight = recording.rgb(self.row), None
         numbers = recording.action(self.row - 1).to(there)
         pose = recording.pose(self.row).to(there) if self.config.geometry else None
-        self.asked = world.asked(self.state, numbers, pose)
-        self.shown = world.conditioning(self.asked, self.state)
+        self.state, self.after = world.move(self.state, numbers, pose)
+        self.shown = world.look(self.after, self.state)
         if self.config.geometry:
             depth = recording.depth(self.row)
         else:
             depth = self.shown.glimpse.depth.cpu()
-            newest = world.scene.frame(self.state).cpu()
+            newest = newest_frame(self.state).cpu()
             weight = changing(found, torch.stack([newest, recording.rgb(self.row - 1)], 1))
         truth = torch.cat([coded(found), encode_depth(depth)[:, None]], 1)
         if self.config.moving:
@@ -69,7 +70,7 @@ class Rollouts:
     @torch.no_grad()
     def go_on(self, clean: torch.Tensor) -> None:
         """The dream continues from the frame that was drawn."""
-        self.state = self.world.drawn(self.asked, self.state, self.shown, clean.detach())
+        self.state = self.world.take(self.after, self.state, self.shown, clean.detach())
 
 
 def beginnings(recording: Recording, horizon: int) -> np.ndarray:
