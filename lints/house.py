@@ -126,24 +126,32 @@ def circles(modules: dict[str, ast.Module]) -> list[str]:
 
 def hidden_imports(modules: dict[str, ast.Module]) -> list[str]:
     """First-party imports inside a function, but for the rooms that start lazily."""
-    known, wrong = set(modules), []
+    known, optional, wrong = set(modules), optional_modules(modules), []
     for m, tree in modules.items():
         if tree.path.startswith(LAZY):
             continue
         for function in ast.walk(tree):
             if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
                 for node in ast.walk(function):
-                    names = [n for n in imported(m, tree, node, known) if not is_optional_leaf(modules[n])]
+                    names = [n for n in imported(m, tree, node, known) if n not in optional]
                     if names:
                         wrong.append(f"{tree.path}:{node.lineno} imports {', '.join(names)} inside {function.name}")
     return wrong
 
 
-def is_optional_leaf(tree: ast.Module) -> bool:
-    """Whether a module imports an optional package at its top."""
-    names = {a.name for node in tree.body if isinstance(node, ast.Import) for a in node.names}
-    names |= {node.module or "" for node in tree.body if isinstance(node, ast.ImportFrom) and not node.level}
-    return any(name.split(".")[0] in OPTIONAL for name in names)
+def optional_modules(modules: dict[str, ast.Module]) -> set[str]:
+    """The modules that cannot be imported without an optional package, directly or through another module."""
+    known, optional, grew = set(modules), set(), True
+    while grew:
+        before = len(optional)
+        for m, tree in modules.items():
+            for node in [n for top in tree.body for n in (top.body if isinstance(top, ast.Try) else [top])]:
+                names = {a.name for a in node.names} if isinstance(node, ast.Import) else set()
+                names |= {node.module or ""} if isinstance(node, ast.ImportFrom) and not node.level else set()
+                if any(n.split(".")[0] in OPTIONAL for n in names) or optional & set(imported(m, tree, node, known)):
+                    optional.add(m)
+        grew = len(optional) > before
+    return optional
 
 
 def private_names(modules: dict[str, ast.Module]) -> list[str]:

@@ -212,10 +212,10 @@ def test_language_that_changes_on_the_way_is_kept(tmp_path):
 
 
 def test_what_is_nothing_known_is_said(tmp_path):
-    with pytest.raises(DatasetError, match="there is nothing at"):
+    with pytest.raises(DatasetError, match="does not exist"):
         open_source(tmp_path / "nowhere")
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(DatasetError, match="of no format"):
+    with pytest.raises(DatasetError, match="of no known format"):
         open_source(tmp_path / "notes.txt")
     with pytest.raises(DatasetError, match="holds no recording"):
         open_source(tmp_path)

@@ -18,7 +18,7 @@ from terrella.data.source import Readings, Sensor, Source, Take
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'terrella[hdf5]'")
 
-from terrella.exchange.formats import counter_strike, hdf5, robomimic, rows  # noqa: E402
+from terrella.exchange.formats import counter_strike, hdf5, hdf5_file, robomimic, rows  # noqa: E402
 from terrella.exchange.formats.arrays import Array  # noqa: E402
 
 
@@ -95,7 +95,7 @@ def everything(file) -> dict:
     found = {}
 
     def see(name, item):
-        attrs = {key: value for key, value in item.attrs.items() if key != hdf5.OURS}
+        attrs = {key: value for key, value in item.attrs.items() if key != hdf5_file.OURS}
         values = (item[()].tolist(), str(item.dtype), item.shape) if isinstance(item, h5py.Dataset) else None
         found[name] = (values, str(attrs))
 
@@ -162,13 +162,13 @@ def test_write_read_write_is_the_identity(tmp_path_factory, state, action, pictu
 
 def test_pictures_are_read_when_looked_at(tmp_path, monkeypatch):
     source = hdf5.read(robomimic_file(tmp_path / "a.hdf5"))
-    reads, original = [], hdf5.array
+    reads, original = [], hdf5_file.concatenated
 
     def counted(*given) -> Array:
         array = original(*given)
         return replace(array, read=lambda *at: (reads.append((len(array.shape), *at)), array.read(*at))[1])
 
-    monkeypatch.setattr(hdf5, "array", counted)
+    monkeypatch.setattr(hdf5_file, "concatenated", counted)
     take = next(iter(source.takes()))
     assert reads and all(dimensions < 4 for dimensions, *_ in reads)
     reads.clear()
@@ -422,9 +422,9 @@ def test_flipped_bytes_are_an_error_or_the_right_shape(tmp_path):
 
 def test_without_h5py_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    monkeypatch.delitem(sys.modules, "terrella.exchange.formats.hdf5")
+    monkeypatch.delitem(sys.modules, "terrella.exchange.formats.hdf5_file")
     with pytest.raises(DatasetError, match=r"pip install 'terrella\[hdf5\]'"):
-        importlib.import_module("terrella.exchange.formats.hdf5")
+        importlib.import_module("terrella.exchange.formats.hdf5_file")
 
 
 def test_a_reward_that_is_one_number_is_robomimics_flat_array(tmp_path):

@@ -44,9 +44,9 @@ def _talking(notes: tuple[str, ...] = ()) -> Source:
 LOST = {  # format -> what must be named
     "lerobot": ["weather"],
     "mcap": [SAID],
-    "minari": [SAID, "course of the instruction", "weather"],
-    "robomimic": [SAID, "course of the instruction", "weather", "wall-clock time"],
-    "rollouts": [SAID, "course of the instruction", "weather"],
+    "minari": [SAID, "changes of the instruction", "weather"],
+    "robomimic": [SAID, "changes of the instruction", "weather", "wall-clock time"],
+    "rollouts": [SAID, "changes of the instruction", "weather"],
     "videos": [SAID, "'action'", "the instruction", "wall-clock time", f"calibration of '{CAMERA}'", "weather"],
     "images": [SAID, "'action'", "the instruction", "wall-clock time", f"calibration of '{CAMERA}'", "weather"],
 }

@@ -187,7 +187,7 @@ def test_logging_never_waits_for_a_slow_disk(tmp_path, monkeypatch):
         add(*args)
 
     monkeypatch.setattr(mcap_write.McapRecording, "add", slow)
-    monkeypatch.setattr("terrella.exchange.live._WAITING_COUNT", 8)
+    monkeypatch.setattr("terrella.exchange.live._MAX_QUEUED", 8)
     with Live(tmp_path / "slow.mcap", SENSORS, "run") as live:
         begun = time.perf_counter()
         for i in range(200):
@@ -199,7 +199,7 @@ def test_logging_never_waits_for_a_slow_disk(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("target", ["", "port", "live.txt", "-1", "99999", "٣"])
 def test_targets_that_cannot_be_are_refused(target):
-    with pytest.raises(DatasetError, match="neither a port nor a file|Port 99999"):
+    with pytest.raises(DatasetError, match="neither a port nor an .mcap file|Port 99999"):
         Live(target, SENSORS, "run")
 
 

@@ -342,7 +342,7 @@ def test_broken_datasets_are_named(store, kind):
     with pytest.raises(DatasetError):
         list(ours.read(data).takes())
     (data / "metadata.json").unlink()
-    with pytest.raises(DatasetError, match="no Minari dataset"):
+    with pytest.raises(DatasetError, match="not a Minari dataset"):
         ours.read(data)
 
 

@@ -105,7 +105,7 @@ def test_a_registered_environment_gives_the_same_takes_at_each_call_and_others_w
 
 
 def test_a_long_episode_is_cut(monkeypatch):
-    monkeypatch.setattr(environments, "_MOST_STEPS", 4)
+    monkeypatch.setattr(environments, "_MAX_STEPS", 4)
     (take,) = environments.from_env("CartPole-v1", episodes=1, fps=10).takes()
     assert take.readings["next.truncated"].values.ravel().tolist() == [False] * 3 + [True]
     np.testing.assert_array_equal(take.readings["observation.state"].time_s, np.arange(5) / 10)
@@ -127,13 +127,13 @@ def test_takes_are_collected_one_by_one():
 def test_what_is_no_environment_is_said():
     with pytest.raises(DatasetError, match="NoSuchThing-v0"):
         environments.from_env("NoSuchThing-v0")
-    with pytest.raises(DatasetError, match="no Gymnasium environment"):
+    with pytest.raises(DatasetError, match="not a Gymnasium environment"):
         environments.from_env(lambda: 3)
     with pytest.raises(DatasetError, match="0 episodes"):
         environments.from_env(Arm, episodes=0)
     env = Arm()
     env.observation_space = spaces.Sequence(spaces.Discrete(2))
-    with pytest.raises(DatasetError, match="no place in a recording"):
+    with pytest.raises(DatasetError, match="cannot be recorded"):
         environments.from_env(lambda: env)
     env = Arm()
     env.observation_space = spaces.Box(-1, 1, (7,))

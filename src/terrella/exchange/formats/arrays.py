@@ -1,22 +1,26 @@
-"""Episodes of named arrays, as HDF5, Minari and .npz keep them: a table says which array is which sensor.
+"""Episodes of named arrays, as HDF5, Minari and .npz store them: a table says which array is which sensor.
 
-A format finds the arrays of an episode (`Array`, at their places) and names what the first keys of places mean (`names`).
-`columns` makes sensors of that, `readings` the readings of a take, and `source` the whole.
+A format lists the arrays of an episode (`Array`, by place) and says what the first key of a place means (`names`).
+`columns` makes sensors of them, `readings` the readings of a take, and `source` the whole source.
 """
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from PIL import Image
 
 from ...core.errors import DatasetError
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import rows
 
 Place = tuple[str | int, ...]  # ("obs", "front"): keys of groups or Dicts, indices of Tuples
-GYMNASIUM = {  # what the arrays of a rollout mean, as Gymnasium and Minari name them
+Shapes = Mapping[Place, tuple[int, ...]]  # the shape of one row, as the spaces declare it
+GYMNASIUM = {  # the arrays of a rollout, as Gymnasium and Minari name them
     "observations": rows.OBSERVATION,
     "actions": rows.ACTION,
     "rewards": rows.REWARD,
@@ -26,32 +30,56 @@ GYMNASIUM = {  # what the arrays of a rollout mean, as Gymnasium and Minari name
 Guess = Callable[[Place, tuple[int, ...], np.dtype], Sensor | None]
 
 
-def _unread(start: int, stop: int) -> np.ndarray:
-    raise DatasetError("of this array nothing but the header is known.")
+def _unreadable(start: int, stop: int) -> np.ndarray:
+    raise DatasetError("only the header of this array is known.")
 
 
 @dataclass(frozen=True)
 class Array:
-    """An array of an episode as it is stored, shape (rows, ...); `read(start, stop)` gives rows of it."""
+    """A stored array of an episode, shape (rows, ...); `read(start, stop)` returns some of its rows."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    read: Callable[[int, int], np.ndarray] = _unread
+    read: Callable[[int, int], np.ndarray] = _unreadable
 
     @property
-    def is_numbers(self) -> bool:
+    def is_numeric(self) -> bool:
         return self.dtype.kind in "biuf" and self.dtype.itemsize <= 8 and len(self.shape) > 0
 
 
+def jpeg_rows(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes], where: str) -> Array:
+    """An array with one JPEG file per row; reading a damaged one, or one of another size, is a DatasetError."""
+
+    def decode(i: int) -> np.ndarray:
+        try:
+            with Image.open(io.BytesIO(packed(i)), formats=("JPEG",)) as picture:
+                size = (picture.height, picture.width, len(picture.getbands()))
+                if size != (*shape[:2], math.prod(shape[2:])):
+                    raise DatasetError(f"{where} has a picture of {list(size)} where the space says {list(shape)}.")
+                return np.asarray(picture, np.uint8).reshape(shape)
+        except rows.PICTURE_ERRORS as error:
+            raise DatasetError(f"{where}, row {i}, is a damaged JPEG ({error}); restore it from a copy.") from error
+
+    def read(start: int, stop: int) -> np.ndarray:
+        return np.stack([decode(i) for i in range(start, stop)])
+
+    return Array((count, *shape), np.dtype(np.uint8), read)
+
+
 def joined(place: Place) -> str:
-    """A place as a part of a sensor's name."""
+    """A place as part of a sensor's name: ("agent", 0) -> "agent.0"."""
     return ".".join(rows.clean(part) for key in place for part in str(key).split("."))
 
 
-def named(names: Mapping[str, str], place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
-    """The sensor of rows of that shape, by the meaning of the place's first key; None where the table does not have it.
+def spelled(place: Place) -> str:
+    """A place as a path: ("agent", 0) -> "agent/0"."""
+    return "/".join(map(str, place))
 
-    names: first key -> "observation", "action", "info" (further keys are the sensor's name), or a whole name.
+
+def sensor_at(names: Mapping[str, str], place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
+    """The sensor of an array with rows of that shape, by the first key of its place; None for a key not in the table.
+
+    names: first key -> "observation", "action" or "info" (further keys become the sensor's name), or a whole name.
     """
     name = names.get(str(place[0]))
     if name is None:
@@ -66,40 +94,40 @@ def named(names: Mapping[str, str], place: Place, shape: tuple[int, ...], dtype:
 def columns(
     arrays: Mapping[Place, Array], guess: Guess, what: str, described: Mapping[Place, Sensor] | None = None
 ) -> tuple[dict[Place, Sensor], list[str]]:
-    """Place -> its sensor, for each array that `guess` knows; and sentences on those that are left out.
+    """Place -> sensor for each array that `guess` recognises, and a note on each array that is left out.
 
-    described: what we wrote there, taken instead of a guess where it fits.
+    described: the sensors of our own description; each replaces the guess if it fits the array.
     """
-    found: dict[Place, Sensor] = {}
+    sensors: dict[Place, Sensor] = {}
     notes, taken = [], set()
     for place, array in arrays.items():
-        sensor = guess(place, array.shape[1:], array.dtype) if array.is_numbers else None
+        sensor = guess(place, array.shape[1:], array.dtype) if array.is_numeric else None
         if sensor is None:
-            notes.append(f"{what} '{spelled(place)}' is left out: it is not an array of numbers that is known there.")
+            notes.append(f"{what} '{spelled(place)}' is left out: it is not a known array of numbers.")
             continue
-        mine = (described or {}).get(place)
-        if mine is not None and mine.dtype == sensor.dtype:
-            mine = rows.stored_as(mine, array.shape[1:])
-            sensor = mine if rows.stored_shape(mine) == array.shape[1:] else sensor
-        found[place] = replace(sensor, name=rows.unique(sensor.name, taken))
-        taken.add(found[place].name)
-    return found, notes
+        own = (described or {}).get(place)
+        if own is not None and own.dtype == sensor.dtype:
+            own = rows.stored_as(own, array.shape[1:])
+            sensor = own if rows.stored_shape(own) == array.shape[1:] else sensor
+        sensors[place] = replace(sensor, name=rows.unique(sensor.name, taken))
+        taken.add(sensors[place].name)
+    return sensors, notes
 
 
 def readings(
     arrays: Mapping[Place, Array], sensors: Mapping[Place, Sensor], time_s: np.ndarray, where: str
 ) -> dict[str, Readings]:
-    """The readings of one take, row i at time_s[i]; pictures are read when they are looked at.
+    """The readings of one take, row i at time_s[i]. Pictures are read lazily.
 
-    DatasetError where an array is missing, of another shape than its sensor, or longer than there are times.
+    DatasetError where an array is missing, has another shape than its sensor, or more rows than there are times.
     """
-    found = {}
+    result = {}
     for place, sensor in sensors.items():
         what, want = f"'{spelled(place)}' in {where}", rows.stored_shape(sensor)
         if place not in arrays:
             raise DatasetError(f"{where} lacks '{spelled(place)}', an array of numbers; mend it, or drop it.")
         array = arrays[place]
-        if not array.is_numbers:
+        if not array.is_numeric:
             raise DatasetError(f"{what} is not an array of numbers with a row for each step; restore it from a copy.")
         if array.shape[1:] != want:
             shape = list(array.shape[1:])
@@ -111,12 +139,12 @@ def readings(
         def value(start: int, stop: int, array=array, sensor=sensor, what=what) -> np.ndarray:
             stored = array.read(start, stop)
             if stored.shape != (stop - start, *array.shape[1:]):
-                raise DatasetError(f"{what} changed while it was read; read it anew.")
+                raise DatasetError(f"{what} changed while it was read; read it again.")
             return rows.from_stored(stored.astype(sensor.dtype, copy=False), sensor)
 
         one = Lazy(count, lambda i, value=value: value(i, i + 1)[0])
-        found[sensor.name] = Readings(time_s[:count], value(0, count) if sensor.kind == "vector" else one)
-    return found
+        result[sensor.name] = Readings(time_s[:count], value(0, count) if sensor.kind == "vector" else one)
+    return result
 
 
 def source(
@@ -127,13 +155,13 @@ def source(
     *,
     fps: float | None,
     about: Mapping | None = None,
-    robot: str = "",
     notes: Iterable[str] = (),
     facts: Mapping[str, object] | None = None,
 ) -> Source:
-    """A source of such takes; `takes(fps)` gives them.
+    """The source of the takes that `takes(fps)` yields.
 
-    fps: rows a second as the caller says, else as `about` does (our own description of the recording), else a guess.
+    fps:   rows per second given by the caller; else `about`'s, else a default with a note.
+    about: our own description of the recording (fps, name, robot, facts), where there is one.
     """
     about = about or {}
     rate, more = rows.rate_of(fps, about.get("fps"), what)
@@ -143,11 +171,7 @@ def source(
         sensors={sensor.name: sensor for sensor in sensors.values()},
         takes=lambda: takes(rate),
         fps=rate,
-        robot=str(about.get("robot") or robot),
+        robot=str(about.get("robot") or ""),
         notes=(*notes, *more),
         facts={**(kept if isinstance(kept, Mapping) else {}), **(facts or {})},
     )
-
-
-def spelled(place: Place) -> str:
-    return "/".join(map(str, place))

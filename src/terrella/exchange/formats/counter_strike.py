@@ -1,4 +1,4 @@
-"""The Counter-Strike deathmatch recordings that DIAMOND learned from (Pearce and Zhu, arXiv:2104.04258), read."""
+"""Reads the Counter-Strike deathmatch recordings that DIAMOND was trained on (Pearce and Zhu, arXiv:2104.04258)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Sensor, Source, Take
-from . import arrays, hdf5, rows
+from . import arrays, hdf5_file, rows
 
-# what is at each place of frame_i_y (ACTION) and of frame_i_xaux (AUX: the last three actions and what they met)
+# ACTION names the numbers of frame_i_y, AUX those of frame_i_xaux (the last three actions and their effects).
 FPS = 16.0
 KEYS = ("w", "a", "s", "d", "space", "ctrl", "shift", "1", "2", "3", "r")
 CLICKS = ("mouse_left", "mouse_right")
@@ -39,57 +39,57 @@ _PARTS = {  # frame_i_PART -> its sensor, and the names of its numbers
 
 
 def read(path: Path, files: list[Path], fps: float | None) -> Source:
-    """Files of frame_i_x (picture), frame_i_y (action), frame_i_xaux, frame_i_helperarr: each one take, 16 rows a second.
+    """Files of frame_i_x (picture), frame_i_y (action), frame_i_xaux and frame_i_helperarr; each file is one take at 16 Hz.
 
-    Pictures are stored blue first and given red first. An action has 51 numbers, 0 or 1: 11 keys, 2 mouse buttons, one of
-    23 horizontal and one of 15 vertical mouse steps (ACTION names them). "observation.events" says whether the player
-    scored a kill, and whether it died, since the last row.
+    Pictures are stored as BGR and returned as RGB. An action has 51 numbers, 0 or 1: 11 keys, 2 mouse buttons, one of 23
+    horizontal and one of 15 vertical mouse steps (see ACTION). "observation.events" is 1 where the player scored a kill, and
+    where it died, since the last row.
     """
     sensors: dict[arrays.Place, Sensor] = {}
-    with hdf5.opened(files[0]) as file:
+    with hdf5_file.open_file(files[0]) as file:
         for part, (name, names) in _PARTS.items():
             if f"frame_0_{part}" in file:
-                found = hdf5.numbers(file, f"frame_0_{part}")
+                data = hdf5_file.numeric(file, f"frame_0_{part}")
                 kind = "image" if part == "x" else "vector"
-                good = found.ndim == 1 if kind == "vector" else found.shape[2:] == (3,) and found.dtype == np.uint8
-                if not good:
-                    raise DatasetError(f"{files[0]}/frame_0_{part} is {found.dtype} {list(found.shape)}, not a {kind}.")
+                valid = data.ndim == 1 if kind == "vector" else data.shape[2:] == (3,) and data.dtype == np.uint8
+                if not valid:
+                    raise DatasetError(f"{files[0]}/frame_0_{part} is {data.dtype} {list(data.shape)}, not a {kind}.")
                 if kind == "image":
-                    rows.check_size(found.shape[0], found.shape[1], f"{files[0]}/frame_0_x")
-                names = names if len(names) == len(found) else ()
-                sensors[part,] = Sensor(name, kind, found.shape, found.dtype.name, names, rate_hz=fps or FPS)
+                    rows.check_size(data.shape[0], data.shape[1], f"{files[0]}/frame_0_x")
+                names = names if len(names) == len(data) else ()
+                sensors[part,] = Sensor(name, kind, data.shape, data.dtype.name, names, rate_hz=fps or FPS)
     base = path if path.is_dir() else path.parent
 
     def takes(rate: float) -> Iterator[Take]:
         for file in files:
-            there = _episode(file, sensors)
-            found = arrays.readings(there, sensors, np.arange(there["x",].shape[0]) / rate, str(file))
-            yield Take(found, facts={"file": file.relative_to(base).as_posix()})
+            stored = _episode(file, sensors)
+            readings = arrays.readings(stored, sensors, np.arange(stored["x",].shape[0]) / rate, str(file))
+            yield Take(readings, facts={"file": file.relative_to(base).as_posix()})
 
     name = path.name if path.is_dir() else path.stem
     facts = {"layout": "counter-strike"}
-    return arrays.source(name, name, sensors, takes, fps=fps or FPS, robot="counter-strike", facts=facts)
+    return arrays.source(name, name, sensors, takes, fps=fps or FPS, about={"robot": "counter-strike"}, facts=facts)
 
 
 def _episode(path: Path, sensors: dict[arrays.Place, Sensor]) -> dict[arrays.Place, arrays.Array]:
-    with hdf5.opened(path) as file:
-        names = set(hdf5.members(file))
+    with hdf5_file.open_file(path) as file:
+        names = set(hdf5_file.names_in(file))
     frames = sum(bool(re.fullmatch(r"frame_\d+_x", key)) for key in names)
     needed = [f"frame_{i}_{part}" for i in range(max(frames, 1)) for (part,) in sensors]
     if missing := [key for key in needed if key not in names]:
-        raise DatasetError(f"{path} lacks {missing[0]}; it is truncated, or no Counter-Strike recording.")
+        raise DatasetError(f"{path} lacks {missing[0]}; it is truncated, or not a Counter-Strike recording.")
 
     def one(part: str, sensor: Sensor) -> arrays.Array:
         def read(start: int, stop: int) -> np.ndarray:
-            found = np.empty((stop - start, *sensor.shape), sensor.dtype)
-            with hdf5.opened(path) as file:
+            values = np.empty((stop - start, *sensor.shape), sensor.dtype)
+            with hdf5_file.open_file(path) as file:
                 for i in range(start, stop):
-                    frame = hdf5.numbers(file, f"frame_{i}_{part}")
+                    frame = hdf5_file.numeric(file, f"frame_{i}_{part}")
                     if frame.shape != sensor.shape:
                         shape, want = list(frame.shape), list(sensor.shape)
                         raise DatasetError(f"{path}{frame.name} is {shape} where the first frame has {want}.")
-                    found[i - start] = frame[()]
-            return found[..., ::-1] if part == "x" else found  # stored blue, green, red
+                    values[i - start] = frame[()]
+            return values[..., ::-1] if part == "x" else values  # BGR to RGB
 
         return arrays.Array((frames, *sensor.shape), np.dtype(sensor.dtype), read)
 

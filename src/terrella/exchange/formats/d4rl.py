@@ -1,4 +1,4 @@
-"""D4RL's flat HDF5 arrays (observations, actions, rewards, terminals, timeouts), cut into episodes when read."""
+"""D4RL's flat HDF5 arrays (observations, actions, rewards, terminals, timeouts), split into episodes when read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Sensor, Source, Take
-from . import arrays, hdf5, rows
+from . import arrays, hdf5_file, rows
 
 _NAMES = {
     "observations": rows.OBSERVATION,
@@ -23,27 +23,27 @@ _NEXT = ("next_observations",)
 
 
 def read(path: Path, fps: float | None) -> Source:
-    """A file of flat arrays, cut into takes after each terminal and each timeout; what follows the last is a take too.
+    """A file of flat arrays, split into takes after each terminal and each timeout; rows after the last one are a take too.
 
-    With next_observations a take has one observation more than actions, else as many. Other arrays with a row for each
-    step are "info.*"; metadata/* and the attributes are kept in facts["d4rl"].
+    With next_observations a take has one more observation than actions, else as many. Other arrays with a row per step
+    become "info.*"; metadata/* and the attributes are kept in facts["d4rl"].
     """
-    with hdf5.opened(path) as file:
-        count = len(hdf5.numbers(file, "actions"))
-        found = dict(hdf5.walked(file))
-        has_next = _NEXT in found
-        metadata = {place[1]: rows.json_or_none(it[()]) for place, it in found.items() if _is_metadata(place, it)}
-        flat = hdf5.headers(item for item in found.items() if item[0][0] not in ("metadata", *_NEXT))
+    with hdf5_file.open_file(path) as file:
+        count = len(hdf5_file.numeric(file, "actions"))
+        stored = dict(hdf5_file.all_datasets(file))
+        has_next = _NEXT in stored
+        metadata = {place[1]: rows.json_or_none(it[()]) for place, it in stored.items() if _is_metadata(place, it)}
+        flat = hdf5_file.headers(item for item in stored.items() if item[0][0] not in ("metadata", *_NEXT))
         for place in flat:
             if place[0] in _NAMES and place[0] != "infos":
-                hdf5.numbers(hdf5.inside(file, *place[:-1]), place[-1], count)  # says what is wrong
+                hdf5_file.numeric(hdf5_file.subgroup(file, *place[:-1]), place[-1], count)  # raises where it is not
         flat = {place: it if it.shape[:1] == (count,) else arrays.Array((), it.dtype) for place, it in flat.items()}
         sensors, notes = arrays.columns(flat, _guess, "D4RL's")
         ends = np.zeros(count, bool)
         for name in ("terminals", "timeouts"):
-            if (name,) in found:
-                ends |= found[name,][()].reshape(-1).astype(bool)
-        facts = {"attributes": hdf5.attributes(file)}
+            if (name,) in stored:
+                ends |= stored[name,][()].reshape(-1).astype(bool)
+        facts = {"attributes": hdf5_file.attributes(file)}
         facts |= {"metadata": {name: it for name, it in metadata.items() if it is not None}} if metadata else {}
     stops = sorted({*(np.flatnonzero(ends) + 1).tolist(), count} - {0})
     if not stops:
@@ -51,20 +51,20 @@ def read(path: Path, fps: float | None) -> Source:
 
     def takes(rate: float) -> Iterator[Take]:
         for start, stop in zip([0, *stops[:-1]], stops):
-            with hdf5.opened(path) as file:
-                there = {}
+            with hdf5_file.open_file(path) as file:
+                parts = {}
                 for place in sensors:
                     after = [(_NEXT, stop - 1, stop)] if has_next and place == ("observations",) else []
-                    there[place] = hdf5.array(file, count, (place, start, stop), *after)
+                    parts[place] = hdf5_file.concatenated(file, count, (place, start, stop), *after)
                 time_s = np.arange(stop - start + has_next) / rate
-                yield Take(arrays.readings(there, sensors, time_s, str(path)), facts={"rows": [start, stop]})
+                yield Take(arrays.readings(parts, sensors, time_s, str(path)), facts={"rows": [start, stop]})
 
     return arrays.source("D4RL's layout", path.stem, sensors, takes, fps=fps, notes=notes, facts={"d4rl": facts})
 
 
 def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
-    return arrays.named(_NAMES, place if place[0] in _NAMES else ("infos", *place), shape, dtype)
+    return arrays.sensor_at(_NAMES, place if place[0] in _NAMES else ("infos", *place), shape, dtype)
 
 
-def _is_metadata(place: tuple[str, ...], item: hdf5.Dataset) -> bool:
+def _is_metadata(place: tuple[str, ...], item: hdf5_file.Dataset) -> bool:
     return place[0] == "metadata" and len(place) == 2 and item.ndim == 0

@@ -1,4 +1,4 @@
-"""Rollouts of a Gymnasium environment under random actions, drawn when they are asked for."""
+"""Rollouts of a Gymnasium environment under random actions, made when they are read."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from . import arrays, rows, spaces
 from .arrays import Array, Place
 
 _FOLLOW = [("rewards",), ("terminations",), ("truncations",)]
-_MOST_STEPS = 1000
+_MAX_STEPS = 1000
 
 
 def from_env(
     env: str | Callable[[], gymnasium.Env], episodes: int = 10, seed: int = 0, fps: float | None = None
 ) -> Source:
-    """Rollouts of an environment, its id or a function that makes one; the same at each call of `takes`.
+    """Rollouts of an environment, given by its id or a function that makes one; the same at each call of `takes`.
 
-    fps: rows a second; by default from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
+    fps: rows per second. Default: from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
 
-    An episode is cut (truncated) after 1000 steps. Observations are one more than actions: the one after the last step is
-    kept. Spaces are flattened as in minari.read.
-    DatasetError for unknown ids, and spaces that are not arrays.
+    An episode is truncated after 1000 steps. There is one more observation than actions: the last one is kept. Spaces are
+    flattened as in minari.read. DatasetError for unknown ids, and spaces that are not arrays.
     """
     if episodes < 1:
-        raise DatasetError(f"{episodes} episodes are no recording; ask for 1 or more.")
+        raise DatasetError(f"{episodes} episodes make no recording; ask for 1 or more.")
     rows.check_fps(fps, "the rollout")
     made, name = _make(env)
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
@@ -43,7 +42,7 @@ def from_env(
     known = {place: leaf for place, leaf in leaves.items() if leaf} | dict.fromkeys(
         _FOLLOW, Array((0,), np.dtype(float))
     )
-    sensors, _ = arrays.columns(known, partial(arrays.named, arrays.GYMNASIUM), name)
+    sensors, _ = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
 
     def takes(rate: float) -> Iterator[Take]:
         made, _ = _make(env)
@@ -64,12 +63,12 @@ def _make(env: str | Callable[[], gymnasium.Env]) -> tuple[gymnasium.Env, str]:
     except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
         raise DatasetError(f"the environment '{env}' cannot be made: {str(error).splitlines()[0]}.") from error
     if not isinstance(made, gymnasium.Env):
-        raise DatasetError(f"{made!r} is no Gymnasium environment; give an id, or a function that makes one.")
+        raise DatasetError(f"{made!r} is not a Gymnasium environment; give an id, or a function that makes one.")
     return made, env if isinstance(env, str) else type(made.unwrapped).__name__
 
 
 def _rate(env: gymnasium.Env) -> float | None:
-    """The environment's own word on how many of its steps make a second."""
+    """Steps per second, as the environment declares it."""
     for name in ("dt", "tau"):
         dt_s = getattr(env.unwrapped, name, None)
         if isinstance(dt_s, int | float) and dt_s > 0:
@@ -81,31 +80,31 @@ def _rate(env: gymnasium.Env) -> float | None:
 def _rollout(env: gymnasium.Env, draw: np.ndarray) -> dict[str, list]:
     seen, _ = env.reset(seed=int(draw[0]))
     env.action_space.seed(int(draw[1]))
-    found: dict[str, list] = {name: [] for name in arrays.GYMNASIUM}
-    found["observations"].append(seen)
+    episode: dict[str, list] = {name: [] for name in arrays.GYMNASIUM}
+    episode["observations"].append(seen)
     done = cut = False
     while not (done or cut):
         action = env.action_space.sample()
         seen, reward, terminated, truncated, _ = env.step(action)
-        done, steps = bool(terminated), len(found["actions"]) + 1
-        cut = bool(truncated) or (steps == _MOST_STEPS and not done)
+        done, steps = bool(terminated), len(episode["actions"]) + 1
+        cut = bool(truncated) or (steps == _MAX_STEPS and not done)
         for name, value in zip(arrays.GYMNASIUM, (seen, action, float(reward), done, cut)):
-            found[name].append(value)
-    return found
+            episode[name].append(value)
+    return episode
 
 
 def _take(
-    found: Mapping[str, list],
+    episode: Mapping[str, list],
     leaves: Mapping[Place, Array | None],
     sensors: Mapping[Place, Sensor],
     fps: float,
     name: str,
     seed: int,
 ) -> Take:
-    there: dict[Place, Array] = {}
+    stored: dict[Place, Array] = {}
     texts: dict[Place, list[str]] = {}
     for place in {**leaves, **sensors}:
-        values = found[str(place[0])]
+        values = episode[str(place[0])]
         for key in place[1:]:
             values = [value[key] for value in values]
         if place not in sensors:
@@ -113,10 +112,10 @@ def _take(
             continue
         sensor = sensors[place]
         try:
-            stored = np.stack([np.asarray(it, sensor.dtype).reshape(rows.stored_shape(sensor)) for it in values])
+            values = np.stack([np.asarray(it, sensor.dtype).reshape(rows.stored_shape(sensor)) for it in values])
         except (TypeError, ValueError) as error:
             raise DatasetError(f"{name} gave {sensor.name} of another shape than its space says: {error}.") from error
-        there[place] = Array(stored.shape, stored.dtype, lambda start, stop, stored=stored: stored[start:stop])
-    task, kept = spaces.said(texts)
-    readings = arrays.readings(there, sensors, np.arange(len(found["observations"])) / fps, name)
+        stored[place] = Array(values.shape, values.dtype, lambda start, stop, values=values: values[start:stop])
+    task, kept = spaces.split_texts(texts)
+    readings = arrays.readings(stored, sensors, np.arange(len(episode["observations"])) / fps, name)
     return Take(readings, task, facts={"seed": seed, **({"texts": kept} if kept else {})})

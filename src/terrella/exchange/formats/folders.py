@@ -1,4 +1,4 @@
-"""Folders of films or pictures: which take and camera each file is of, and what a writer names them."""
+"""Folders of videos or images: which take and camera each file belongs to, and the names that writers use."""
 
 from __future__ import annotations
 
@@ -18,48 +18,48 @@ CAMERA = f"{rows.IMAGES}{rows.CAMERA}"
 
 
 def takes_of(path: Path, suffixes: frozenset[str], what: str, deep: bool) -> dict[str, dict[str, list[Path]]]:
-    """Take -> camera -> its files, by the rule of `videos.read` (or, `deep`, of `images.read`)."""
+    """Take -> camera -> its files, as `videos.read` describes (or, if `deep`, `images.read`)."""
     if not path.is_dir():
         raise DatasetError(f"{path} is not a folder; name a folder of {what}.")
     here, folders = _listed(path, suffixes)
     inside = {folder.name: _listed(folder, suffixes) for folder in folders}
     if deep:
-        found = {}
+        takes = {}
         if here:
-            found[path.name] = {rows.CAMERA: here}
+            takes[path.name] = {rows.CAMERA: here}
         for name, (files, below) in inside.items():
             cameras = {clean(sub.name): _listed(sub, suffixes)[0] for sub in below}
             cameras = {camera: images for camera, images in cameras.items() if images}
             if files and cameras:
                 raise DatasetError(f"{path / name} has images and folders of images; keep the one or the other in it.")
             if files or cameras:
-                found[name] = cameras or {rows.CAMERA: files}
+                takes[name] = cameras or {rows.CAMERA: files}
     else:
-        found = {file.stem: {rows.CAMERA: [file]} for file in here}
-        if len(found) < len(here):
-            found = {file.name: {rows.CAMERA: [file]} for file in here}
+        takes = {file.stem: {rows.CAMERA: [file]} for file in here}
+        if len(takes) < len(here):
+            takes = {file.name: {rows.CAMERA: [file]} for file in here}
         for name, (files, _) in inside.items():
             cameras = {clean(file.stem): [file] for file in files}
             if len(cameras) < len(files):
                 raise DatasetError(f"{path / name} has two videos of the same name; a camera has one in each take.")
             if files:
-                found[name] = cameras
-    if here and any(files or below for files, below in inside.values()) and len(found) > (1 if deep else len(here)):
+                takes[name] = cameras
+    if here and any(files or below for files, below in inside.values()) and len(takes) > (1 if deep else len(here)):
         raise DatasetError(f"{path} has {what} next to folders of {what}; keep the one or the other in it.")
-    if not found:
+    if not takes:
         raise DatasetError(f"{path} has no {what} ({', '.join(sorted(suffixes))}); name a folder that has.")
-    return found
+    return takes
 
 
 def _listed(folder: Path, suffixes: frozenset[str]) -> tuple[list[Path], list[Path]]:
-    """Files with one of the suffixes, and folders, in their natural order; hidden ones are ignored."""
+    """Files with one of the suffixes, and folders, in natural order, without hidden ones."""
     every = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: rows.natural(p.name))
     return [p for p in every if p.suffix.lower() in suffixes and p.is_file()], [p for p in every if p.is_dir()]
 
 
 def cameras(source: Source, kinds: tuple[str, ...], what: str) -> tuple[dict[str, str], list[str]]:
-    """Sensor -> the name of its file or folder, and sentences on the sensors that have none."""
-    found: dict[str, str] = {}
+    """Sensor -> the name of its file or folder, and a note on each sensor that has none."""
+    names: dict[str, str] = {}
     for name, sensor in source.sensors.items():
         if sensor.kind in kinds:
             if sensor.kind == "depth":
@@ -68,12 +68,12 @@ def cameras(source: Source, kinds: tuple[str, ...], what: str) -> tuple[dict[str
             else:
                 camera = name.removeprefix(rows.IMAGES).removeprefix("observation.")
             camera = clean(camera)
-            if camera in found.values():
+            if camera in names.values():
                 raise DatasetError(f"two sensors would both be called '{camera}'; rename '{name}'.")
-            found[name] = camera
-    if not found:
+            names[name] = camera
+    if not names:
         raise DatasetError(f"{source.name or 'the source'} has no pictures; write it in another format.")
-    return found, [f"'{name}' has no place in {what} and was left out." for name in source.sensors if name not in found]
+    return names, [f"'{name}' has no place in {what} and was left out." for name in source.sensors if name not in names]
 
 
 def clean(camera: str) -> str:
@@ -81,11 +81,11 @@ def clean(camera: str) -> str:
 
 
 def numbered(source: Source, cameras: Mapping[str, str], progress) -> Iterator[tuple[int, Take]]:
-    """Takes with pictures, checked; DatasetError where there are none."""
+    """Takes reduced to their pictures, with checked clocks; DatasetError for a take without pictures."""
     for number, take in rows.numbered(source, progress):
-        seen = [name for name in cameras if name in take.readings and len(take.readings[name].values)]
-        if not seen:
+        shown = [name for name in cameras if name in take.readings and len(take.readings[name].values)]
+        if not shown:
             raise DatasetError(f"take {number} has no pictures; leave it out.")
-        for name in seen:
+        for name in shown:
             clock_of(take.readings[name], f"'{name}' in take {number}")
-        yield number, Take({name: take.readings[name] for name in seen}, take.task)
+        yield number, Take({name: take.readings[name] for name in shown}, take.task)

@@ -1,4 +1,4 @@
-"""Folders of images, without actions: read, and written as PNG."""
+"""Folders of images without actions, read, and written as PNG."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from . import folders, rows
 from .folders import IMAGES
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
-_ORIENTATION = 0x0112  # in EXIF; from 5 on the picture lies on its side
+_ORIENTATION = 0x0112  # the EXIF tag; values from 5 on swap width and height
 _MM = 1000.0
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
-    """A folder of images as a Source of pictures alone, `fps` a second (None: 10).
+    """A folder of images as a Source of pictures, `fps` per second (default: 10).
 
-    Images in the folder itself are one take of the camera "observation.images.rgb". Or each sub-folder is one take: with
-    images in it, or with a folder of images for each camera ("take_0/front/1.png": "observation.images.front"). Takes and
-    images are in natural order (2 before 10). EXIF orientation is applied, transparency and further frames are dropped.
+    Either the images in the folder are one take of the camera "observation.images.rgb"; or each subfolder is one take, with
+    images in it or with a folder of images per camera ("take_0/front/1.png": "observation.images.front"). Takes and images
+    are in natural order (2 before 10). EXIF orientation is applied; transparency and further frames are dropped.
 
-    Images of 16 bits are depth in millimetres, 0 where nothing was seen (inf): "observation.depth", or
-    "observation.depth.NAME" for the folder NAME or NAME_depth. DatasetError where there are no images, one is damaged, of
-    absurd size, or not of its camera's size and kind.
+    16-bit images are depth in millimetres, 0 for no measurement (inf): "observation.depth", or "observation.depth.NAME" for
+    the folder NAME or NAME_depth. DatasetError where there are no images, or one is damaged, too large, or of another size
+    or kind than its camera's first.
     """
     path, fps = Path(path), rows.FPS_UNKNOWN if fps is None else fps
     rows.check_fps(fps, "a folder of images")
@@ -71,13 +71,13 @@ def _images(files: list[Path], sensor: Sensor, fps: float) -> Readings:
         kind, shape = _look(file)
         if (kind, shape) != (sensor.kind, sensor.shape):
             raise DatasetError(
-                f"{file} is {_said(kind, shape)} where the first of its camera is {_said(sensor.kind, sensor.shape)}; "
+                f"{file} is {_described(kind, shape)} where the first of its camera is {_described(sensor.kind, sensor.shape)}; "
                 "scale it to the same size, or keep it in a folder of its own."
             )
     return Readings(np.arange(len(files)) / fps, Lazy(len(files), lambda i: _load(files[i], sensor)))
 
 
-def _said(kind: str, shape: tuple[int, ...]) -> str:
+def _described(kind: str, shape: tuple[int, ...]) -> str:
     return f"{'depth' if kind == 'depth' else 'a picture'} of {shape[1]} x {shape[0]}"
 
 
@@ -96,20 +96,20 @@ def _load(path: Path, sensor: Sensor) -> np.ndarray:
     with _image(path) as picture:
         upright = ImageOps.exif_transpose(picture)
         if sensor.kind == "depth":
-            found = rows.metres(np.asarray(upright))
+            value = rows.metres(np.asarray(upright))
         else:
-            found = np.asarray(upright.convert("RGB"))
-    if found.shape != sensor.shape:
-        raise DatasetError(f"{path} changed while it was read; read the folder anew.")
-    return np.array(found)
+            value = np.asarray(upright.convert("RGB"))
+    if value.shape != sensor.shape:
+        raise DatasetError(f"{path} changed while it was read; read the folder again.")
+    return np.array(value)
 
 
 def _orientation(picture: Image.Image) -> int:
     exif = picture.getexif() if picture.format != "PNG" else Image.Exif()
-    if picture.format == "PNG":  # Pillow would decode the whole image to look behind it
+    if picture.format == "PNG":  # Pillow's getexif would decode the whole image
         exif.load(picture.info.get("exif", b""))
-    found = exif.get(_ORIENTATION, 1)
-    return found if isinstance(found, int) else 1
+    value = exif.get(_ORIENTATION, 1)
+    return value if isinstance(value, int) else 1
 
 
 @contextmanager
@@ -118,15 +118,15 @@ def _image(path: Path) -> Iterator[Image.Image]:
         with Image.open(path, formats=_FORMATS) as picture:
             rows.check_size(picture.height, picture.width, f"the image {path}")
             yield picture
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+    except rows.PICTURE_ERRORS as error:
         raise DatasetError(f"the image {path} is damaged or of an unknown kind ({error}); restore it.") from error
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source's pictures and depth as PNG files, as `read` reads them; returns what had no place in it.
+    """Writes a source's pictures and depth as PNG files, as `read` reads them; returns a note on everything left out.
 
-    take_0/000000.png, … where the only sensor is "observation.images.rgb", else take_0/CAMERA/000000.png. Pictures are
-    exact; depth is rounded to millimetres, and 0 where it is not a number or beyond 65.535 m. Times are not kept.
+    Files are take_0/000000.png, … if the only camera is "observation.images.rgb", else take_0/CAMERA/000000.png. Pictures
+    are exact; depth is rounded to millimetres, and 0 where it is NaN or beyond 65.535 m. Times are not kept.
     `progress(takes, 0)` is called after each take. DatasetError where there are no pictures, or `path` exists.
     """
     cameras, left_out = folders.cameras(source, ("image", "depth"), "images")
@@ -138,7 +138,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
                 folder = staged / f"take_{number}"
                 folder = folder if list(cameras) == [folders.CAMERA] else folder / cameras[name]
                 folder.mkdir(parents=True)
-                if not rows.even(readings.time_s, source.fps):
+                if not rows.is_even(readings.time_s, source.fps):
                     notes[f"images keep no times: those of '{name}' were left out."] = None
                 row = 0
                 for part in rows.batches(readings.values, source.sensors[name], f"take {number}", size=8):

@@ -1,4 +1,4 @@
-"""Writes MCAP with the messages that Foxglove knows, a whole source or as readings come in."""
+"""Writes MCAP with Foxglove's message types: a whole source, or readings as they arrive."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ try:
 except ImportError as error:
     raise DatasetError("MCAP needs packages that are not installed: pip install 'terrella[mcap]'.") from error
 
-CALIBRATION_TOPIC = "/calibration"  # beneath the topic of its camera
+CALIBRATION_TOPIC = "/calibration"  # under the topic of its camera
 _CHUNK = 2**20
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source as `path`: a file if it ends in .mcap (one take), else a folder of take-000000.mcap and so on.
+    """Writes a source at `path`: one file if it ends in .mcap (one take), else a folder of take-000000.mcap, ….
 
-    Values are exact. `progress(messages, of_this_take)` is called as it goes. Nothing stands at `path` until all of it does.
-    DatasetError where the path is taken, the disk is full, or a reading is not what its sensor declares.
+    Values are exact. `progress(messages, messages_of_this_take)` is called on the way. `path` appears only when it is
+    complete. DatasetError where the path exists, the disk is full, or a reading differs from its sensor's declaration.
     """
     path = Path(path)
     with creating(path) as staged:
@@ -75,16 +75,17 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
 def _nanoseconds(name: str, readings: Readings) -> np.ndarray:
     time_s = clock_of(readings, name)
     if (np.abs(time_s) > 2**62 / 1e9).any():
-        raise DatasetError(f"'{name}' has times that are none; mend them.")
+        raise DatasetError(f"'{name}' has impossible times; mend them.")
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
 class McapRecording:
-    """An MCAP file in the making: every sensor is declared first, then readings come in any order of sensors.
+    """An open MCAP file: all sensors are declared first, then readings are added in any order of sensors.
 
-    What was added before a `flush` is found by `read` even if nothing is written after it. The file must be new.
-    zero_ns: the log time of the take's second 0, nanoseconds. Of `take` its start_ns, task and facts are kept, and of
-    `source` all but its sensors. jpeg: whether pictures are written as JPEG, else as PNG (exact).
+    Everything added before a `flush` can be read even if the file ends there. The file must be new.
+    source:  its name, fps, robot, notes and facts are stored; likewise `take`'s start_ns, task and facts.
+    zero_ns: the log time of the take's second 0, in nanoseconds.
+    jpeg:    write pictures as JPEG instead of PNG (exact).
     """
 
     def __init__(
@@ -122,19 +123,19 @@ class McapRecording:
         self.close() if kind is None else self.abandon()
 
     def add(self, name: str, log_ns: int, value: np.ndarray) -> None:
-        """One reading at a log time; DatasetError where it is not what its sensor declares, OSError from the disk."""
-        if name in self._calibrations:  # once, with the first picture
+        """Adds a reading; DatasetError where it differs from its sensor's declaration, OSError from the disk."""
+        if name in self._calibrations:  # written once, before the first picture
             data = message_encoder.calibration(self._sensors[name], log_ns) or b""
             self._writer.add_message(self._calibrations.pop(name), log_ns, data, log_ns)
         data = self._encoders[name](value, log_ns)
         self._writer.add_message(self._channels[name], log_ns, data, log_ns)
 
     def flush(self) -> None:
-        """Ends the chunk and hands all bytes to the system."""
+        """Ends the chunk and passes all bytes to the operating system."""
         self._writer.flush()
 
     def close(self) -> None:
-        """Writes the index and ends the file; OSError from the disk."""
+        """Writes the index and closes the file; OSError from the disk."""
         try:
             self._writer.finish()
             self._file.close()
@@ -142,7 +143,7 @@ class McapRecording:
             self.abandon()
 
     def abandon(self) -> None:
-        """Lets go of the file as it stands: nothing is written after a chunk that may not be whole."""
+        """Closes the file as it is, without an index: the last chunk may be incomplete."""
         try:
             self._file.close()
         except OSError:
@@ -158,4 +159,4 @@ class McapRecording:
             self._writer.add_metadata(name, {key: json.dumps(value) for key, value in values.items()})
         except (TypeError, ValueError) as error:
             self._file.close()
-            raise DatasetError(f"The facts of a source, take or sensor are no JSON ({error}); drop them.") from error
+            raise DatasetError(f"The facts of a source, take or sensor are not JSON ({error}); drop them.") from error

@@ -199,7 +199,7 @@ def _compressed_image(fields: Mapping[str, Any]) -> Reading:
             if picture.mode.startswith("I"):
                 return Reading("depth", rows.metres(np.asarray(picture)), frame=frame)
             return Reading("image", np.asarray(picture.convert("RGB")), frame=frame)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+    except rows.PICTURE_ERRORS as error:
         raise DatasetError(f"its picture is no whole JPEG, PNG or WebP ({error})") from error
 
 

@@ -1,7 +1,7 @@
-"""Minari datasets (0.5): read from and written to the files of the `minari` package, which is not needed for it.
+"""Reads and writes Minari datasets (0.5) without the `minari` package.
 
-The package itself decodes whole episodes at once and makes the environment that a stranger's metadata names; its files are
-few and documented, so they are read here one value at a time, and nothing in them is run.
+The package decodes whole episodes at once and makes the environment that the metadata names. Its files are few and documented,
+so they are read here one value at a time, and no code that they name is run.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _KEPT_ELSEWHERE = ("observation_space", "action_space", "total_episodes", "total
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
-    """A Minari dataset folder (or its `data` folder), kept as HDF5, Arrow or Parquet.
+    """A Minari dataset folder (or its `data` folder), stored as HDF5, Arrow or Parquet.
 
-    Dict and Tuple spaces become one sensor a leaf: "observation.agent.pos", "action.0"; a space of one array becomes
-    "observation.state" or "action"; pictures are "observation.images.NAME". Discrete and other ints stay ints. A leaf
-    that is a text named mission (or task, instruction, …) is the take's task; other texts are kept in its facts. Infos
-    with a row for each step, as the first episode has them, are "info.NAME". next.done is Minari's termination,
-    next.truncated its truncation. The spaces and metadata are kept as facts. A take has one observation more than actions.
+    Each leaf of a Dict or Tuple space becomes a sensor: "observation.agent.pos", "action.0". A space of one array becomes
+    "observation.state" or "action"; pictures become "observation.images.NAME". Integers stay integers. A Text leaf named
+    mission (or task, instruction, …) is the take's task; other texts are kept in its facts. Infos with a row per step in the
+    first episode become "info.NAME". next.done is Minari's termination, next.truncated its truncation. Spaces and metadata
+    are kept as facts. A take has one more observation than actions.
 
-    fps: rows a second; Minari keeps none, so without it (and where the dataset is not ours) rows.FPS_UNKNOWN is taken.
-    DatasetError where files are missing or damaged, or spaces are of unknown types.
+    fps: rows per second. Default: as `write` stored it, else rows.FPS_UNKNOWN, because Minari stores none.
+    DatasetError where files are missing or damaged, or a space has an unknown type.
     """
     rows.check_fps(fps, str(path))
     data, meta, count = _opened(Path(path))
@@ -59,11 +59,11 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     for place, array in sorted(episode(0).arrays(shapes).items(), key=str):
         if place[0] in _FOLLOW or place[0] == "infos":
             known |= {place: array}
-    ours = meta["terrella"] if isinstance(meta.get("terrella"), dict) else {}
-    described = rows.sensors_described(ours, str(data)) if ours else {}
+    own = meta["terrella"] if isinstance(meta.get("terrella"), dict) else {}
+    described = rows.sensors_described(own, str(data)) if own else {}
     places = _places(Source("", described, tuple, facts=spaces_facts))[1] if described else {}
-    mine = {place: described[name] for place, name in places.items() if name}
-    sensors, notes = arrays.columns(known, partial(arrays.named, _NAMES), "Minari's", mine)
+    ours = {place: described[name] for place, name in places.items() if name}
+    sensors, notes = arrays.columns(known, partial(arrays.sensor_at, _NAMES), "Minari's", ours)
 
     def takes(rate: float) -> Iterator[Take]:
         texts = [place for place, leaf in leaves.items() if leaf is None]
@@ -71,14 +71,14 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
     facts = {**spaces_facts, "minari": {key: value for key, value in meta.items() if key not in _KEPT_ELSEWHERE}}
     name = str(meta.get("dataset_id") or Path(path).name)
-    return arrays.source("Minari", name, sensors, takes, fps=fps, about=ours, notes=notes, facts=facts)
+    return arrays.source("Minari", name, sensors, takes, fps=fps, about=own, notes=notes, facts=facts)
 
 
 def _opened(path: Path) -> tuple[Path, dict, int]:
-    """The folder that has the data, its metadata, and how many episodes it claims."""
+    """The data folder, its metadata, and its number of episodes."""
     data = path / "data" if (path / "data").is_dir() else path
     if not (data / "metadata.json").is_file():
-        raise DatasetError(f"{path} is no Minari dataset: {data / 'metadata.json'} is missing; name another folder.")
+        raise DatasetError(f"{path} is not a Minari dataset: {data / 'metadata.json'} is missing; name another folder.")
     meta = rows.read_json(data / "metadata.json")
     count = meta.get("total_episodes")
     if not isinstance(count, int) or not 0 < count <= 1 << 32:
@@ -89,25 +89,27 @@ def _opened(path: Path) -> tuple[Path, dict, int]:
 def _space(meta: dict, key: str, data: Path) -> dict:
     text = meta.get(key)
     try:
-        found = json.loads(text) if isinstance(text, str) else text
+        space = json.loads(text) if isinstance(text, str) else text
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{key} in {data / 'metadata.json'} is damaged ({error}); restore it.") from error
-    if not isinstance(found, dict):
-        raise DatasetError(f"{data / 'metadata.json'} has no {key}; open it once with minari, which writes that.")
-    return found
+    if not isinstance(space, dict):
+        raise DatasetError(f"{data / 'metadata.json'} has no {key}; open it once with minari, which adds it.")
+    return space
 
 
 def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, texts: list[Place], fps: float) -> Take:
-    there = episode.arrays(shapes)
-    steps = there["rewards",].shape[0] if ("rewards",) in there else 0
+    stored = episode.arrays(shapes)
+    steps = stored["rewards",].shape[0] if ("rewards",) in stored else 0
     if not steps:
         raise DatasetError(f"{where} has no steps (rewards); remove it from the dataset.")
-    mine = {place: it for place, it in sensors.items() if place[0] != "infos" or _fits(there.get(place), it)}
-    readings = arrays.readings(there, mine, np.arange(steps + 1) / fps, where)
+    own = {place: it for place, it in sensors.items() if place[0] != "infos" or _fits(stored.get(place), it)}
+    readings = arrays.readings(stored, own, np.arange(steps + 1) / fps, where)
     rows.rows_of(Take(readings), where)
     facts = episode.facts()
     task, start_ns = facts.pop("task", ""), facts.pop("start_ns", None)
-    task, kept = spaces.said({place: episode.texts(place) for place in texts}, task if isinstance(task, str) else "")
+    task, kept = spaces.split_texts(
+        {place: episode.texts(place) for place in texts}, task if isinstance(task, str) else ""
+    )
     return Take(
         readings,
         task=task,
@@ -117,20 +119,20 @@ def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, 
 
 
 def _fits(array: arrays.Array | None, sensor: Sensor) -> bool:
-    return array is not None and array.is_numbers and array.shape[1:] == rows.stored_shape(sensor)
+    return array is not None and array.is_numeric and array.shape[1:] == rows.stored_shape(sensor)
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source as a Minari dataset (HDF5, pictures lossless); returns sentences on what had no place in it.
+    """Writes a source as a Minari dataset (HDF5, lossless pictures); returns a note on everything that was left out.
 
-    With MINARI_DATASETS_PATH set to the folder that holds `path`, `minari.load_dataset(path.name)` opens it. The name must
-    end in -v0, -v1, ….
-    Spaces are the source's own where its sensors still are the leaves of facts["observation_space"], else a Dict of one
-    Box for each sensor. Minari needs an observation after the last action: where a take has none, its last action is
-    left out. Missing rewards are 0, missing ends a truncation at the last step; names, units, frames and fps are kept in
-    the metadata. `progress(takes, 0)` is called after each take. DatasetError where takes do not fit or `path` exists.
+    With MINARI_DATASETS_PATH set to the parent of `path`, `minari.load_dataset(path.name)` opens it. The name must end in
+    -v0, -v1, …. Spaces are facts["observation_space"] and facts["action_space"] if their leaves match the sensors, else a
+    Dict with a Box per sensor. Minari needs an observation after the last action: where a take has none, its last action is
+    left out. Missing rewards become 0; a missing end becomes a truncation at the last step. Names, units, frames and fps are
+    kept in the metadata. `progress(takes, 0)` is called after each take. DatasetError where a take does not fit or `path`
+    exists.
     """
-    from . import hdf5
+    from . import hdf5_file
 
     path = Path(path)
     if not _ID.fullmatch(path.name):
@@ -144,7 +146,7 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
         data = staged / "data"
         data.mkdir(parents=True)
         steps, number = 0, 0
-        with hdf5.File(data / "main_data.hdf5", "w", track_order=True) as file:
+        with hdf5_file.File(data / "main_data.hdf5", "w", track_order=True) as file:
             for number, take in rows.numbered(source, progress):
                 group = file.create_group(f"episode_{number}")
                 steps += _write_take(group, number, source, take, places, notes)
@@ -156,12 +158,12 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
 
 
 def _places(source: Source) -> tuple[dict[str, dict], dict[Place, str | None]]:
-    """The spaces of observations and actions; and what lies at each place: the name of a sensor, None for a text."""
+    """The spaces of observations and actions; and the sensor's name at each place, None for a text."""
     given: dict[str, dict] = {}
     places: dict[Place, str | None] = {}
     for root, role in _ROLES.items():
-        given[root], found = _structure(source, root, role)
-        places |= {(root, *place): name for place, name in found.items()}
+        given[root], leaves = _structure(source, root, role)
+        places |= {(root, *place): name for place, name in leaves.items()}
     for name in source.sensors:
         flat = any(other != name and f"{name}.".startswith(f"{other}.") for other in source.sensors)
         if name in _ROOTS:
@@ -173,25 +175,25 @@ def _places(source: Source) -> tuple[dict[str, dict], dict[Place, str | None]]:
 
 
 def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, str | None]]:
-    """The space of a role, and what lies at each of its leaves."""
-    mine = {n: s for n, s in source.sensors.items() if rows.role_of(n) == role and s.kind != "points"}
-    if not mine:
+    """The space of a role, and the sensor's name at each of its leaves."""
+    own = {n: s for n, s in source.sensors.items() if rows.role_of(n) == role and s.kind != "points"}
+    if not own:
         raise DatasetError(f"{source.name or 'the source'} has no {root}, which Minari needs; choose another format.")
-    own = source.facts.get(f"{role}_space")
+    space = source.facts.get(f"{role}_space")
     try:
-        leaves = spaces.leaves(own, role, "the source") if isinstance(own, dict) else {}
+        leaves = spaces.leaves(space, role, "the source") if isinstance(space, dict) else {}
         known = {(root, *place): leaf for place, leaf in leaves.items() if leaf}
-        found, _ = arrays.columns(known, partial(arrays.named, _NAMES), "")
+        sensors, _ = arrays.columns(known, partial(arrays.sensor_at, _NAMES), "")
     except DatasetError:
-        leaves, found = {}, {}
-    names = {place[1:]: sensor.name for place, sensor in found.items()}
-    if isinstance(own, dict) and _forms(found.values()) == _forms(mine.values()):
-        return own, {place: names.get(place) for place in leaves}
-    if len(mine) == 1:
-        (sensor,) = mine.values()
+        leaves, sensors = {}, {}
+    names = {place[1:]: sensor.name for place, sensor in sensors.items()}
+    if isinstance(space, dict) and _forms(sensors.values()) == _forms(own.values()):
+        return space, {place: names.get(place) for place in leaves}
+    if len(own) == 1:
+        (sensor,) = own.values()
         return spaces.box(sensor), {(): sensor.name}
-    keys = {name: name.removeprefix(f"{role}.") for name in mine}
-    parts = {keys[name]: spaces.box(sensor) for name, sensor in mine.items()}
+    keys = {name: name.removeprefix(f"{role}.") for name in own}
+    parts = {keys[name]: spaces.box(sensor) for name, sensor in own.items()}
     return {"type": "Dict", "subspaces": parts}, {(key,): name for name, key in keys.items()}
 
 
@@ -202,8 +204,8 @@ def _forms(sensors: Iterable[Sensor]) -> dict[str, tuple]:
 def _metadata(source: Source, given: dict, dataset_id: str) -> dict:
     own = source.facts.get("minari")
     own = {key: value for key, value in own.items() if key not in _KEPT_ELSEWHERE} if isinstance(own, Mapping) else {}
-    gone = ("minari", "observation_space", "action_space")
-    kept = {key: value for key, value in source.facts.items() if key not in gone}
+    elsewhere = ("minari", "observation_space", "action_space")
+    kept = {key: value for key, value in source.facts.items() if key not in elsewhere}
     return {
         **own,
         "data_format": "hdf5",
@@ -217,22 +219,22 @@ def _metadata(source: Source, given: dict, dataset_id: str) -> dict:
 
 
 def _write_take(group, number: int, source: Source, take: Take, places: Mapping, notes: dict[str, None]) -> int:
-    from . import hdf5
+    from . import hdf5_file
 
     where = f"take {number}"
     missing = [name for place, name in places.items() if place[0] in _ROLES and name not in (None, *take.readings)]
     if missing:
         raise DatasetError(f"{where} lacks '{missing[0]}', which Minari needs in every episode; leave it out.")
     named = [name for place, name in places.items() if name is not None and place[0] != "infos"]
-    found = rows.rows_of(replace(take, readings={n: take.readings[n] for n in named if n in take.readings}), where)
-    steps = min(found.steps, found.observations - 1)
+    counts = rows.rows_of(replace(take, readings={n: take.readings[n] for n in named if n in take.readings}), where)
+    steps = min(counts.steps, counts.observations - 1)
     if steps < 1:
-        raise DatasetError(f"{where} has {found.observations} observations; Minari needs 2 or more: leave it out.")
-    if steps < found.steps:
+        raise DatasetError(f"{where} has {counts.observations} observations; Minari needs 2 or more: leave it out.")
+    if steps < counts.steps:
         notes[
             "Minari needs an observation after the last action: where there was none, the last action was left out."
         ] = None
-    if not rows.even(found.time_s, source.fps):
+    if not rows.is_even(counts.time_s, source.fps):
         notes["Minari keeps no times: the true times of the rows were left out."] = None
     for place, name in places.items():
         keys = "/".join(f"_index_{part}" if isinstance(part, int) else part for part in place)
@@ -241,7 +243,7 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
             texts = take.facts.get("texts")
             given = texts.get(arrays.spelled(place)) if isinstance(texts, Mapping) else None
             texts = given if isinstance(given, list) and len(given) == count else [take.task] * count
-            group.create_dataset(keys, data=texts, dtype=hdf5.TEXT)
+            group.create_dataset(keys, data=texts, dtype=hdf5_file.TEXT)
         elif name in take.readings:
             sensor, readings = source.sensors[name], take.readings[name]
             if len(readings.values) < steps:
@@ -254,7 +256,7 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
                 shape = ()
             count = min(len(readings.values), steps + 1) if place[0] == "infos" else count
             flag = place[0] in ("terminations", "truncations")
-            hdf5.store(group, {keys: 0}, (count, *shape), sensor, readings, where, "bool" if flag else "")
+            hdf5_file.store_readings(group, {keys: 0}, (count, *shape), sensor, readings, where, "bool" if flag else "")
     if "rewards" not in group:
         notes["there were no rewards: Minari's are 0."] = None
         group["rewards"] = np.zeros(steps)
@@ -262,8 +264,7 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
         group["terminations"] = np.zeros(steps, bool)
     if "truncations" not in group:
         group["truncations"] = (np.arange(steps) == steps - 1) & ~group["terminations"][-1]
-    own = take.facts.get("minari")
-    hdf5.set_attributes(group, own)
-    told = {"task": take.task or None, "start_ns": take.start_ns, "id": number, "total_steps": steps}
-    hdf5.set_attributes(group, told)
+    hdf5_file.set_attributes(group, take.facts.get("minari"))
+    numbered = {"task": take.task or None, "start_ns": take.start_ns, "id": number, "total_steps": steps}
+    hdf5_file.set_attributes(group, numbered)
     return steps

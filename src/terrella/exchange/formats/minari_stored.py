@@ -1,8 +1,7 @@
-"""How Minari keeps one episode on the disk: as a group of main_data.hdf5, or as a folder with an Arrow or Parquet table."""
+"""How Minari stores an episode: as a group of main_data.hdf5, or as a folder with an Arrow or Parquet table."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -11,36 +10,34 @@ from typing import Protocol
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from PIL import Image
 
 from ...core.errors import DatasetError
 from . import rows
-from .arrays import Array, Place, spelled
+from .arrays import Array, Place, Shapes, jpeg_rows, spelled
 
-_DEEPEST = 16
-Shapes = Mapping[Place, tuple[int, ...]]  # of one row of what the spaces name, which the storage may have packed
+_MAX_DEPTH = 16
 
 
 class StoredEpisode(Protocol):
-    """One episode as it is stored."""
+    """One stored episode."""
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
-        """All that has rows; pictures that are JPEG are decoded when they are read."""
+        """Every array with rows; JPEG pictures are decoded when they are read."""
         ...
 
     def texts(self, place: Place) -> list[str]:
-        """The texts of a Text space."""
+        """The strings of a Text space, one per row."""
         ...
 
     def facts(self) -> dict[str, object]:
-        """What is known of the episode: its seed, sums of its rewards, …"""
+        """The metadata of the episode: its seed, sum of rewards, …"""
         ...
 
 
 def open_storage(data: Path, kind: object, count: int) -> Callable[[int], StoredEpisode]:
-    """Opener of episode i of `count`; DatasetError where the storage is missing or of an unknown kind."""
+    """A function that opens episode i of `count`; DatasetError where the storage is missing or of an unknown kind."""
     if kind == "hdf5":
-        from .minari_hdf5 import Hdf5Episode  # only who has such a dataset needs its package
+        from .minari_hdf5 import Hdf5Episode  # h5py is needed for this storage alone
 
         if not (data / "main_data.hdf5").is_file():
             raise DatasetError(f"{data / 'main_data.hdf5'} is missing; restore it from a copy.")
@@ -50,33 +47,8 @@ def open_storage(data: Path, kind: object, count: int) -> Callable[[int], Stored
     raise DatasetError(f"{data} keeps its data as '{kind}'; only hdf5, arrow and parquet are known.")
 
 
-def jpegs(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes], where: str) -> Array:
-    """Rows that are JPEG files each; DatasetError where one is damaged or of another size."""
-
-    def decode(i: int) -> np.ndarray:
-        try:
-            with Image.open(io.BytesIO(packed(i)), formats=("JPEG",)) as picture:
-                size = (picture.height, picture.width, len(picture.getbands()))
-                if size != (*shape[:2], math.prod(shape[2:])):
-                    raise DatasetError(f"{where} has a picture of {list(size)} where the space says {list(shape)}.")
-                return np.asarray(picture, np.uint8).reshape(shape)
-        except (
-            OSError,
-            ValueError,
-            SyntaxError,
-            Image.DecompressionBombError,
-            Image.DecompressionBombWarning,
-        ) as error:
-            raise DatasetError(f"{where}, row {i}, is a damaged JPEG ({error}); restore it from a copy.") from error
-
-    def read(start: int, stop: int) -> np.ndarray:
-        return np.stack([decode(i) for i in range(start, stop)])
-
-    return Array((count, *shape), np.dtype(np.uint8), read)
-
-
 class TableEpisode:
-    """A folder with part-0.arrow (or .parquet): one row an observation, the last row's action is padding; and metadata.json."""
+    """A folder with metadata.json and part-0.arrow (or .parquet): one row per observation; the last row's action is padding."""
 
     def __init__(self, folder: Path, kind: str):
         self._folder = folder
@@ -94,21 +66,21 @@ class TableEpisode:
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
         known = {tuple(map(str, place)): place for place in shapes}
-        found = {}
+        arrays = {}
         for names, (array, stated) in self._leaves.items():
             place: Place = known.get(names) or names
             count = len(array) - (names[0] not in ("observations", "infos"))
-            found[place] = self._array(array.slice(0, max(count, 0)), shapes.get(place, stated), spelled(names))
-        return found
+            arrays[place] = self._array(array.slice(0, max(count, 0)), shapes.get(place, stated), spelled(names))
+        return arrays
 
     def _array(self, array: pa.Array, shape: tuple[int, ...] | None, what: str) -> Array:
         count, where = len(array), f"{self._folder}, {what}"
         if array.null_count:
             raise DatasetError(f"{where} has empty rows; restore the episode from a copy.")
         if shape and (pa.types.is_binary(array.type) or pa.types.is_large_binary(array.type)):
-            return jpegs(count, shape, lambda i: array[i].as_py(), where)
+            return jpeg_rows(count, shape, lambda i: array[i].as_py(), where)
         flat = array.flatten() if pa.types.is_fixed_size_list(array.type) else array
-        if not _is_numbers(flat.type):
+        if not _is_numeric(flat.type):
             return Array((count,), np.dtype(object))
         if flat.null_count:
             raise DatasetError(f"{where} has empty numbers; restore the episode from a copy.")
@@ -128,8 +100,8 @@ class TableEpisode:
 
 
 def _leaves(array: pa.Array, place: tuple[str, ...], metadata: Mapping | None = None) -> Iterator[tuple]:
-    """(place, (array, shape of a row as its metadata states it)) of all that is no struct: "2,3", "" for one number."""
-    if pa.types.is_struct(array.type) and len(place) < _DEEPEST:
+    """(place, (array, shape of a row in its metadata)) of every field that is not a struct: "2,3", or "" for one number."""
+    if pa.types.is_struct(array.type) and len(place) < _MAX_DEPTH:
         for i in range(array.type.num_fields):
             part = array.type.field(i)
             yield from _leaves(array.field(i), (*place, part.name), part.metadata)
@@ -139,7 +111,7 @@ def _leaves(array: pa.Array, place: tuple[str, ...], metadata: Mapping | None = 
         yield place, (array, shape)
 
 
-def _is_numbers(kind: pa.DataType) -> bool:
+def _is_numeric(kind: pa.DataType) -> bool:
     return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
 
 
@@ -150,13 +122,13 @@ def _arrow(path: Path) -> pa.Table:
 def _parquet(path: Path) -> pa.Table:
     with pq.ParquetFile(path) as file:
         width = sum(_width(field.type) for field in file.schema_arrow)
-        if file.metadata.num_rows * width > rows.MOST_BYTES:
+        if file.metadata.num_rows * width > rows.MAX_BYTES:
             raise DatasetError(f"{path} claims {file.metadata.num_rows} rows; restore it from a copy.")
         return file.read()
 
 
 def _width(kind: pa.DataType) -> int:
-    """Bytes of a row at least."""
+    """The fewest bytes that a row takes."""
     if pa.types.is_struct(kind):
         return sum(_width(kind.field(i).type) for i in range(kind.num_fields))
     if pa.types.is_fixed_size_list(kind):

@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from . import arrays, hdf5, rows
+from . import arrays, hdf5_file, rows
 
 _NAMES = {
     "obs": rows.OBSERVATION,
@@ -28,31 +28,32 @@ _FLAGS = ("dones", "truncated")
 
 
 def read(path: Path, fps: float | None) -> Source:
-    """A robomimic file.
+    """A robomimic file as a Source.
 
-    A demo with next_obs gives one observation more than actions. The simulator's states are "info.states". Filter keys
-    (facts["robomimic"]["mask"]), env_args and the attributes of data and of each demo are kept as facts; an instruction
-    (ep_meta's lang, LIBERO's problem_info) is the take's task.
+    A demo with next_obs has one more observation than actions. The simulator's states become "info.states". Filter keys
+    (facts["robomimic"]["mask"]), env_args and attributes are kept as facts. An instruction (ep_meta's lang, LIBERO's
+    problem_info) becomes the take's task.
     """
-    with hdf5.opened(path) as file:
-        data = hdf5.inside(file, "data")
-        demos = sorted((name for name in hdf5.members(data) if re.fullmatch(r"demo_\d+", name)), key=rows.natural)
-        ours = hdf5.json_attribute(data, hdf5.OURS)
-        env_args = hdf5.json_attribute(data, "env_args")
-        attributes = hdf5.attributes(data, ("total", "env_args", hdf5.OURS))
+    with hdf5_file.open_file(path) as file:
+        data = hdf5_file.subgroup(file, "data")
+        demos = sorted((name for name in hdf5_file.names_in(data) if re.fullmatch(r"demo_\d+", name)), key=rows.natural)
+        own = hdf5_file.json_attribute(data, hdf5_file.OURS)
+        env_args = hdf5_file.json_attribute(data, "env_args")
+        attributes = hdf5_file.attributes(data, ("total", "env_args", hdf5_file.OURS))
         facts = {"env_args": env_args, "mask": _mask(file), "attributes": attributes}
-        first = hdf5.headers(hdf5.walked(hdf5.inside(data, demos[0])))
-        task = hdf5.json_attribute(data, "problem_info").get("language_instruction")  # LIBERO's instruction
+        first = hdf5_file.headers(hdf5_file.all_datasets(hdf5_file.subgroup(data, demos[0])))
+        task = hdf5_file.json_attribute(data, "problem_info").get("language_instruction")  # LIBERO's instruction
     if ("actions",) not in first:
         raise DatasetError(f"{path}/data has demos without actions; restore the file from a copy.")
-    unread = [place for place, it in first.items() if place[0] == "next_obs" or (place[0] != "obs" and 0 in it.shape)]
-    for place in unread:  # robomimic leaves `states` empty where there is no simulator
+    unused = [place for place, it in first.items() if place[0] == "next_obs" or (place[0] != "obs" and 0 in it.shape)]
+    for place in unused:  # robomimic leaves `states` empty where there is no simulator
         del first[place]
-    described = rows.sensors_described(ours, str(path)).values() if ours else ()
+    described = rows.sensors_described(own, str(path)).values() if own else ()
     sensors, notes = arrays.columns(first, _guess, "robomimic's", {_place(it) or (): it for it in described})
     kwargs = env_args.get("env_kwargs")
     kwargs = kwargs if isinstance(kwargs, dict) else {}
     robots = kwargs.get("robots", "")
+    robot = ", ".join(map(str, robots)) if isinstance(robots, list) else str(robots)
 
     def takes(rate: float) -> Iterator[Take]:
         return (_demo(path, name, sensors, rate, task if isinstance(task, str) else "") for name in demos)
@@ -63,25 +64,26 @@ def read(path: Path, fps: float | None) -> Source:
         sensors,
         takes,
         fps=fps,
-        about={**ours, "fps": ours.get("fps") or kwargs.get("control_freq")},
-        robot=", ".join(map(str, robots)) if isinstance(robots, list) else str(robots),
+        about={**own, "fps": own.get("fps") or kwargs.get("control_freq"), "robot": own.get("robot") or robot},
         notes=notes,
         facts={"robomimic": facts},
     )
 
 
-def _mask(file: hdf5.File) -> dict[str, list[str]]:
+def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
     """Filter keys: name -> demos."""
     if "mask" not in file:
         return {}
-    parts = dict(hdf5.walked(hdf5.inside(file, "mask")))
-    return {arrays.spelled(place): hdf5.texts(part) for place, part in parts.items() if part.dtype.kind in "OS"}
+    parts = dict(hdf5_file.all_datasets(hdf5_file.subgroup(file, "mask")))
+    return {
+        arrays.spelled(place): hdf5_file.read_strings(part) for place, part in parts.items() if part.dtype.kind in "OS"
+    }
 
 
 def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     key = str(place[-1])
     if place[0] != "obs" or len(place) < 2:
-        return arrays.named(_NAMES, place, shape, dtype) if len(place) == 1 else None
+        return arrays.sensor_at(_NAMES, place, shape, dtype) if len(place) == 1 else None
     if key.endswith("_depth") and dtype == np.float32 and len(shape) in (2, 3) and shape[2:] in ((), (1,)):
         rows.check_size(shape[0], shape[1], f"'{key}'")
         name = f"{rows.DEPTH}.{rows.clean(key.removesuffix('_depth'))}"
@@ -93,64 +95,64 @@ def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sens
 
 def _demo(path: Path, name: str, sensors: Mapping[arrays.Place, Sensor], fps: float, task: str) -> Take:
     where = f"{path}/data/{name}"
-    with hdf5.opened(path) as file:
-        demo = hdf5.inside(file, "data", name)
-        steps = len(hdf5.numbers(demo, "actions"))
-        facts = hdf5.attributes(demo)
+    with hdf5_file.open_file(path) as file:
+        demo = hdf5_file.subgroup(file, "data", name)
+        steps = len(hdf5_file.numeric(demo, "actions"))
+        facts = hdf5_file.attributes(demo)
         claimed = facts.pop("num_samples", steps)
         if claimed != steps or not steps:
             raise DatasetError(f"{where} has {steps} actions where num_samples says {claimed}; restore or drop it.")
-        seen = [place for place in sensors if place[0] == "obs"]
-        # every sensor must have been seen after the last action, or none
-        after = "next_obs" in demo and all(f"next_obs/{arrays.spelled(place[1:])}" in demo for place in seen)
-        there = {}
+        observed = [place for place in sensors if place[0] == "obs"]
+        # a last observation after the last action needs every sensor
+        after = "next_obs" in demo and all(f"next_obs/{arrays.spelled(place[1:])}" in demo for place in observed)
+        parts = {}
         for place in sensors:
             if arrays.spelled(place) in demo:
                 pieces = [(("data", name, *place), 0, steps)]
-                if after and place in seen:
+                if after and place in observed:
                     pieces.append((("data", name, "next_obs", *place[1:]), steps - 1, steps))
-                there[place] = hdf5.array(file, steps, *pieces)
-        mine = {place: sensor for place, sensor in sensors.items() if place in there}
-        found = arrays.readings(there, mine, np.arange(steps + after) / fps, where)
-    lang = hdf5.json_object(facts.get("ep_meta")).get("lang")  # robocasa's, and ours
+                parts[place] = hdf5_file.concatenated(file, steps, *pieces)
+        own = {place: sensor for place, sensor in sensors.items() if place in parts}
+        readings = arrays.readings(parts, own, np.arange(steps + after) / fps, where)
+    lang = hdf5_file.json_object(facts.get("ep_meta")).get("lang")  # as robocasa and `write` store it
     attributes = {"demo": name, "attributes": facts}
-    return Take(found, task=lang if isinstance(lang, str) else task, facts={"robomimic": attributes})
+    return Take(readings, task=lang if isinstance(lang, str) else task, facts={"robomimic": attributes})
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source as one robomimic file; returns sentences on what had no place in it.
+    """Writes a source as one robomimic file, values exact; returns a note on everything that was left out.
 
-    Every take must have "action" (one vector) and one rate throughout; where it has one observation more than actions it
-    gets next_obs. What robomimic does not ask for (names, units, frames, fps) is kept in an attribute of `data`. Values
-    are exact. `progress(takes, 0)` is called after each take. DatasetError where the takes do not fit, or `path` exists.
+    Every take needs "action" (one vector) and one rate for all sensors. A take with one more observation than actions gets
+    next_obs. Names, units, frames and fps, which robomimic has no keys for, are kept in an attribute of `data`.
+    `progress(takes, 0)` is called after each take. DatasetError where a take does not fit, or `path` exists.
     """
     notes: dict[str, None] = {}
     known = _facts(source)
-    with creating(path) as staged, hdf5.File(staged, "w") as file:
+    with creating(path) as staged, hdf5_file.File(staged, "w") as file:
         data, total = file.create_group("data"), 0
         for number, take in rows.numbered(source, progress):
             demo = data.create_group(_demo_name(take, data))
             total += _write_demo(demo, source, take, f"take {number}", notes)
-        hdf5.set_attributes(data, known.get("attributes"))
+        hdf5_file.set_attributes(data, known.get("attributes"))
         gym = {"env_name": source.name, "env_type": 2, "env_kwargs": {}}  # 2 is robomimic's number for Gym environments
         written = {name: sensor for name, sensor in source.sensors.items() if _place(sensor) is not None}
         kept = {key: value for key, value in source.facts.items() if key != "robomimic"}
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps(known.get("env_args") or gym)
-        data.attrs[hdf5.OURS] = json.dumps(rows.describe(replace(source, sensors=written, facts=kept)))
+        data.attrs[hdf5_file.OURS] = json.dumps(rows.describe(replace(source, sensors=written, facts=kept)))
         mask = known.get("mask")
         for key, demos in mask.items() if isinstance(mask, Mapping) else ():
-            there = [demo.encode() for demo in demos if demo in data]
-            file.create_dataset(f"mask/{rows.clean(key)}", data=np.array(there, dtype="S"))
+            members = [demo.encode() for demo in demos if demo in data]
+            file.create_dataset(f"mask/{rows.clean(key)}", data=np.array(members, dtype="S"))
     return list(notes)
 
 
 def _facts(item: Source | Take) -> Mapping:
-    found = item.facts.get("robomimic")
-    return found if isinstance(found, Mapping) else {}
+    facts = item.facts.get("robomimic")
+    return facts if isinstance(facts, Mapping) else {}
 
 
-def _demo_name(take: Take, data: hdf5.Group) -> str:
+def _demo_name(take: Take, data: hdf5_file.Group) -> str:
     name = _facts(take).get("demo")
     if isinstance(name, str) and re.fullmatch(r"demo_\d+", name) and name not in data:
         return name
@@ -161,7 +163,7 @@ def _demo_name(take: Take, data: hdf5.Group) -> str:
 
 
 def _place(sensor: Sensor) -> tuple[str, ...] | None:
-    """Where a sensor lies in a demo, None where robomimic has no place for it."""
+    """The keys of a sensor in a demo; None where robomimic has no place for it."""
     if sensor.name in _PLACES:
         return _PLACES[sensor.name]
     if rows.role_of(sensor.name) != rows.OBSERVATION or sensor.kind == "points":
@@ -174,7 +176,7 @@ def _place(sensor: Sensor) -> tuple[str, ...] | None:
     return ("obs", name)
 
 
-def _write_demo(demo: hdf5.Group, source: Source, take: Take, where: str, notes: dict[str, None]) -> int:
+def _write_demo(demo: hdf5_file.Group, source: Source, take: Take, where: str, notes: dict[str, None]) -> int:
     if rows.ACTION not in take.readings:
         raise DatasetError(f"{where} has no 'action', which robomimic needs; write it in another format.")
     placed: dict[tuple[str, ...], str] = {}
@@ -187,25 +189,27 @@ def _write_demo(demo: hdf5.Group, source: Source, take: Take, where: str, notes:
             raise DatasetError(f"{both} would both be robomimic's {'/'.join(place)}; rename one of them.")
         else:
             placed[place] = name
-    found = rows.rows_of(replace(take, readings={name: take.readings[name] for name in placed.values()}), where)
-    if not found.steps:
+    counts = rows.rows_of(replace(take, readings={name: take.readings[name] for name in placed.values()}), where)
+    if not counts.steps:
         raise DatasetError(f"{where} has no actions; leave it out.")
-    if not rows.even(found.time_s, source.fps):
+    if not rows.is_even(counts.time_s, source.fps):
         notes["robomimic keeps no times: the true times of the rows were left out."] = None
     for place, name in placed.items():
         sensor, readings = source.sensors[name], take.readings[name]
-        if len(readings.values) < found.steps:
+        if len(readings.values) < counts.steps:
             raise DatasetError(f"'{name}' in {where} has fewer readings than there are actions; resample it first.")
         targets = {"/".join(place): 0}
-        if place[0] == "obs" and found.observations > found.steps:
+        if place[0] == "obs" and counts.observations > counts.steps:
             targets[f"next_obs/{place[1]}"] = 1
         flags = place[0] in _FLAGS
         shape = () if (flags or place[0] == "rewards") and sensor.shape == (1,) else rows.stored_shape(sensor)
-        hdf5.store(demo, targets, (found.steps, *shape), sensor, readings, where, "int64" if flags else "")
+        hdf5_file.store_readings(
+            demo, targets, (counts.steps, *shape), sensor, readings, where, "int64" if flags else ""
+        )
     attributes = _facts(take).get("attributes")
-    hdf5.set_attributes(demo, attributes)
+    hdf5_file.set_attributes(demo, attributes)
     if take.task:
-        meta = hdf5.json_object(attributes.get("ep_meta")) if isinstance(attributes, Mapping) else {}
+        meta = hdf5_file.json_object(attributes.get("ep_meta")) if isinstance(attributes, Mapping) else {}
         demo.attrs["ep_meta"] = json.dumps({**meta, "lang": take.task})
-    demo.attrs["num_samples"] = found.steps
-    return found.steps
+    demo.attrs["num_samples"] = counts.steps
+    return counts.steps

@@ -18,9 +18,9 @@ from ...data.source import Sensor, Source, Take
 from . import arrays, rows
 from .arrays import Array, Place
 
-ABOUT = "terrella.json"  # names, units and frames of what we wrote, in the folder of the episodes
+ABOUT = "terrella.json"  # our description, in the folder of the episodes: names, units and frames
 TIME, TASK, START = "time_s", "task", "start_ns"
-_SPELLINGS = {  # the first is what `write` writes
+_SPELLINGS = {  # `write` uses the first
     rows.OBSERVATION: ("observations", "observation", "obs"),
     rows.ACTION: ("actions", "action"),
     rows.REWARD: ("rewards", "reward"),
@@ -32,14 +32,14 @@ _NAMES = {spelling: role for role, spellings in _SPELLINGS.items() for spelling 
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
-    """A folder of .npz files, each one episode, in the natural order of their names (or one such file).
+    """A folder of .npz files, one episode each, in the natural order of their names (or one such file).
 
-    Keys: observations (obs), actions, rewards, terminations (terminated, dones), truncations (truncated), infos; parts of
-    a Dict are "observations/NAME" or "obs.NAME". Observations may be as many as actions or one more. What `write` wrote
-    comes back with its names, units, times and tasks. Pickled arrays are refused. The sensors are those of the first file.
+    Keys: observations (obs), actions, rewards, terminations (terminated, dones), truncations (truncated), infos; entries of
+    a Dict are "observations/NAME" or "obs.NAME". There are as many observations as actions, or one more. The first file
+    determines the sensors. Files of `write` keep their names, units, times and tasks. Pickled arrays are refused.
 
-    fps: rows a second, where the folder does not say; without either rows.FPS_UNKNOWN with a note.
-    DatasetError where there are no such files, or one is damaged or of other shapes than the first.
+    fps: rows per second. Default: the folder's own, else rows.FPS_UNKNOWN with a note.
+    DatasetError where there are no such files, or one is damaged or differs in shape from the first.
     """
     path = Path(path)
     rows.check_fps(fps, str(path))
@@ -48,10 +48,10 @@ def read(path: str | Path, fps: float | None = None) -> Source:
         raise DatasetError(f"{path} has no .npz files; name a folder of episodes, one .npz each.")
     about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
-    mine = {_place(key): described[name] for name, key in _keys(described).items()}
+    own = {_place(key): described[name] for name, key in _keys(described).items()}
     first = _arrays(files[0])
-    unknown = {place: array for place, array in first.items() if place not in ((TIME,), (TASK,), (START,))}
-    sensors, notes = arrays.columns(unknown, partial(arrays.named, _NAMES), "the key", mine)
+    candidates = {place: array for place, array in first.items() if place not in ((TIME,), (TASK,), (START,))}
+    sensors, notes = arrays.columns(candidates, partial(arrays.sensor_at, _NAMES), "the key", own)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
         keys = ", ".join(map(arrays.spelled, first)) or "nothing"
         raise DatasetError(f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME.")
@@ -63,7 +63,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
 
 def _place(key: str) -> Place:
-    """ "obs.front" -> ("obs", "front"); a key that is none of a rollout is a place of its own."""
+    """The place of a key: "obs.front" -> ("obs", "front"); an unknown key is a place of its own."""
     for mark in ("/", "."):
         head, _, rest = key.partition(mark)
         if head in _NAMES and rest:
@@ -72,8 +72,8 @@ def _place(key: str) -> Place:
 
 
 def _arrays(path: Path) -> dict[Place, Array]:
-    """What arrays a file holds; none of their values is read yet."""
-    found: dict[Place, Array] = {}
+    """The arrays of a file, without their values."""
+    stored: dict[Place, Array] = {}
     try:
         with zipfile.ZipFile(path) as file:
             for info in file.infolist():
@@ -89,18 +89,18 @@ def _arrays(path: Path) -> dict[Place, Array]:
                     shape, _, dtype = header(member)
                 key = info.filename.removesuffix(".npy")
                 size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
-                if dtype.hasobject or size > min(rows.MOST_BYTES, info.file_size):
+                if dtype.hasobject or size > min(rows.MAX_BYTES, info.file_size):
                     raise DatasetError(f"'{key}' in {path} is {dtype} {list(shape)}: pickled, too large or cut off.")
-                found[_place(key)] = Array(tuple(shape), dtype, _reader(path, key))
+                stored[_place(key)] = Array(tuple(shape), dtype, _reader(path, key))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} does not exist; name a folder of .npz files.") from error
     except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise DatasetError(f"{path} is truncated or no .npz file ({error}); restore or remove it.") from error
-    return found
+    return stored
 
 
 def _reader(path: Path, key: str) -> Callable[[int, int], np.ndarray]:
-    """Reads rows of an array; all of it at the first look, for a .npz gives an array whole or not at all."""
+    """Reads rows of an array; the first call loads it whole, for a .npz cannot be read in part."""
     kept: list[np.ndarray] = []
 
     def read(start: int, stop: int) -> np.ndarray:
@@ -115,35 +115,35 @@ def _load(path: Path, key: str) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as file:
             return file[key]
-    except Exception as error:  # zlib.error, and what else a damaged stream raises in the decompressor
+    except Exception as error:  # zlib.error, and other errors of the decompressor
         raise DatasetError(f"'{key}' in {path} cannot be read ({error}); restore it from a copy.") from error
 
 
 def _take(path: Path, sensors: Mapping[Place, Sensor], fps: float) -> Take:
-    there = _arrays(path)
-    marching = [place for place, it in sensors.items() if place in there and rows.role_of(it.name) != rows.INFO]
-    count = max((there[place].shape for place in marching), default=(0,))[0]
+    stored = _arrays(path)
+    rowwise = [place for place, it in sensors.items() if place in stored and rows.role_of(it.name) != rows.INFO]
+    count = max((stored[place].shape for place in rowwise), default=(0,))[0]
     time_s = np.arange(count) / fps
-    if (TIME,) in there:
+    if (TIME,) in stored:
         time_s = _load(path, TIME)
         if time_s.shape != (count,) or time_s.dtype.kind != "f":
             raise DatasetError(
                 f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have as many."
             )
-    single = {key: _load(path, key) for key in (TASK, START) if (key,) in there and there[key,].shape == ()}
+    single = {key: _load(path, key) for key in (TASK, START) if (key,) in stored and stored[key,].shape == ()}
     start_ns = int(single[START]) if START in single else None
-    readings = arrays.readings(there, sensors, time_s.astype(np.float64), str(path))
+    readings = arrays.readings(stored, sensors, time_s.astype(np.float64), str(path))
     take = Take(readings, str(single.get(TASK, "")), start_ns, {"file": path.name})
     rows.rows_of(take, str(path))
     return take
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source as a folder of episode_0.npz, episode_1.npz, …; returns sentences on what had no place in it.
+    """Writes a source as a folder of episode_0.npz, episode_1.npz, …; returns a note on everything that was left out.
 
-    Keys as `read` knows them, one sensor of a role alone without a name ("observations"), several with ("observations/
-    images.front"). Values and times are exact; a take's sensors must march in step. `progress(takes, 0)` is called
-    after each take. DatasetError where they do not, or `path` exists.
+    Keys are those of `read`: a single sensor of a role has no name ("observations"), several have one
+    ("observations/images.front"). Values and times are exact; a take's sensors must share one clock.
+    `progress(takes, 0)` is called after each take. DatasetError where a take does not fit, or `path` exists.
     """
     notes: dict[str, None] = {}
     keys = _keys(source.sensors)
@@ -161,24 +161,24 @@ def write(source: Source, path: str | Path, progress: Callable[[int, int], None]
 
 
 def _keys(sensors: Mapping[str, Sensor]) -> dict[str, str]:
-    """Sensor -> its key, for all that have a place in rollouts."""
+    """Sensor -> its key, for every sensor that rollouts can store."""
     roles = {name: rows.role_of(name) for name, sensor in sensors.items() if sensor.kind != "points"}
     several = Counter(roles.values())
-    found: dict[str, str] = {}
+    keys: dict[str, str] = {}
     for name, role in roles.items():
         if role:
             key, rest = _SPELLINGS[role][0], name.removeprefix(role).removeprefix(".")
-            found[name] = f"{key}/{rest}" if rest and several[role] > 1 else key
-    return found
+            keys[name] = f"{key}/{rest}" if rest and several[role] > 1 else key
+    return keys
 
 
 def _write_take(path: Path, source: Source, take: Take, keys: Mapping[str, str], where: str) -> None:
     if missing := [name for name in keys if name not in take.readings]:
         raise DatasetError(f"{where} lacks '{missing[0]}', which other takes have; leave out the one or the other.")
     kept = {name: take.readings[name] for name in keys}
-    found = rows.rows_of(replace(take, readings=kept), where)
-    arrays = {keys[name]: rows.whole(readings, source.sensors[name], where) for name, readings in kept.items()}
-    arrays[TIME] = found.time_s
+    counts = rows.rows_of(replace(take, readings=kept), where)
+    arrays = {keys[name]: rows.stored_values(readings, source.sensors[name], where) for name, readings in kept.items()}
+    arrays[TIME] = counts.time_s
     if take.task:
         arrays[TASK] = np.array(take.task)
     if take.start_ns is not None:

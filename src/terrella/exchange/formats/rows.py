@@ -1,4 +1,4 @@
-"""Arrays of rows (episodes as reinforcement learning keeps them) as sensors and back, shared by the formats that have rows."""
+"""Arrays with a row per step as sensors, and back: shared by the formats that store episodes as rows."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from ...core.errors import DatasetError
 from ...data.format import sensor_from_json, sensor_json
@@ -19,12 +20,13 @@ from ...data.source import Readings, Sensor, Source, Take
 OBSERVATION, ACTION, INFO = "observation", "action", "info"
 REWARD, DONE, TRUNCATED = "next.reward", "next.done", "next.truncated"
 IMAGES, DEPTH = "observation.images.", "observation.depth"
-CAMERA = "rgb"  # the name of a camera that its format does not name
-LEAST_PICTURE_SIDE = 32  # Minari's rule too: smaller arrays of bytes are codes (MiniGrid's 7 x 7 x 3), not pictures
+CAMERA = "rgb"  # the camera's name where the format has none
+LEAST_PICTURE_SIDE = 32  # as in Minari: smaller byte arrays are codes (MiniGrid's 7 x 7 x 3)
 MAX_SIDE, MAX_PIXELS = 16_384, 1 << 26
-FPS_UNKNOWN = 10.0  # where neither the recording nor the caller says how long a row lasts
-MOST_BYTES = 1 << 33  # of one episode's array: more is a damaged or hostile file
-_TIMES_AGREE = 0.5  # of a row: how far the clocks of one row's sensors may lie apart
+FPS_UNKNOWN = 10.0  # rows per second if neither the recording nor the caller gives it
+MAX_BYTES = 1 << 33  # of an episode's array; more means a damaged or hostile file
+_MAX_CLOCK_SKEW = 0.5  # rows by which the sensors of one row may differ in time
+PICTURE_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning)
 _STORED = "stored_shape"
 
 
@@ -32,7 +34,7 @@ _STORED = "stored_shape"
 
 
 def picture_layout(shape: Sequence[int], dtype: np.dtype | str, least: int = LEAST_PICTURE_SIDE) -> str | None:
-    """ "hwc", "chw", "hw1" or "hw" where bytes of that shape are a picture, else None."""
+    """The layout "hwc", "chw", "hw1" or "hw" of a byte array that is a picture, else None."""
     if np.dtype(dtype) != np.uint8 or len(shape) not in (2, 3):
         return None
     if len(shape) == 2:
@@ -45,17 +47,17 @@ def picture_layout(shape: Sequence[int], dtype: np.dtype | str, least: int = LEA
 
 
 def sensor_for(role: str, key: str, shape: Sequence[int], dtype, least: int = LEAST_PICTURE_SIDE) -> Sensor:
-    """The sensor of an array [n, *shape]: a picture where its bytes look like one (observations only), else a vector.
+    """The sensor of an array [n, *shape]: a picture if its bytes look like one (observations only), else a vector.
 
-    role, key: "observation", "agent.pos" -> "observation.agent.pos", or "observation.images.agent.pos" for a picture;
-    an empty key is "observation.state" ("observation.images.rgb") or the role itself. A shape that a vector or an RGB
-    picture has not is kept in facts["stored_shape"]; `to_stored` gives it back. DatasetError for what is not numbers.
+    role, key: "observation", "agent.pos" -> "observation.agent.pos", or "observation.images.agent.pos" for a picture. An
+    empty key gives "observation.state" ("observation.images.rgb") or the role itself. A shape other than a flat vector or
+    an RGB picture is kept in facts["stored_shape"]; `to_stored` restores it. DatasetError for non-numeric arrays.
     """
     shape, dtype = tuple(int(n) for n in shape), np.dtype(dtype)
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
-        raise DatasetError(f"'{key or role}' holds {dtype}, not numbers: leave it out of the recording.")
+        raise DatasetError(f"'{key or role}' holds {dtype}, not numbers; leave it out of the recording.")
     if min(shape, default=0) < 0:
-        raise DatasetError(f"'{key or role}' has the shape {list(shape)}, which no array has.")
+        raise DatasetError(f"'{key or role}' has the impossible shape {list(shape)}.")
     layout = picture_layout(shape, dtype, least) if role == OBSERVATION else None
     if layout is None:
         name = f"{role}.{key}" if role and key else ("observation.state" if role == OBSERVATION else role or key)
@@ -66,13 +68,13 @@ def sensor_for(role: str, key: str, shape: Sequence[int], dtype, least: int = LE
 
 
 def stored_as(sensor: Sensor, shape: tuple[int, ...]) -> Sensor:
-    """The sensor, its readings kept with another shape; where that cannot be, `stored_shape` does not give it back."""
+    """The sensor with `shape` as the stored shape of its readings; `stored_shape` ignores one that does not fit."""
     facts = {key: value for key, value in sensor.facts.items() if key != _STORED}
     return replace(sensor, facts=facts if shape == sensor.shape else {**facts, _STORED: list(shape)})
 
 
 def stored_shape(sensor: Sensor) -> tuple[int, ...]:
-    """The shape of one reading as its format keeps it."""
+    """The shape of one reading in its file."""
     given, shape = sensor.facts.get(_STORED), sensor.shape
     if not isinstance(given, list | tuple) or not all(isinstance(n, int) and n >= 0 for n in given):
         return shape
@@ -94,7 +96,7 @@ def from_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def to_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """[n, *sensor.shape] -> [n, *stored_shape], with the sensor's dtype; grey is the mean of red, green and blue."""
+    """[n, *sensor.shape] -> [n, *stored_shape], in the sensor's dtype; grey is the mean of red, green and blue."""
     shape = stored_shape(sensor)
     values = np.asarray(values, sensor.dtype)
     if sensor.kind != "image" or shape == sensor.shape:
@@ -106,7 +108,7 @@ def to_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def check_size(height: int, width: int, what: str) -> None:
-    """DatasetError for a picture that no camera takes (a damaged or hostile file)."""
+    """DatasetError for a picture that is too large to be real (a damaged or hostile file)."""
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
         raise DatasetError(
             f"{what} is {width} x {height}; more than {MAX_PIXELS >> 20} megapixels are not read: scale it down."
@@ -114,12 +116,12 @@ def check_size(height: int, width: int, what: str) -> None:
 
 
 def metres(depth_mm: np.ndarray) -> np.ndarray:
-    """Depth float32 in metres of whole millimetres; 0 is how these say that nothing was measured (inf)."""
+    """Integer millimetres as float32 metres; 0 means no measurement and becomes inf."""
     return np.where(depth_mm > 0, depth_mm.astype(np.float32) / np.float32(1000), np.float32(np.inf))
 
 
 def depth_lost(name: str, depth_m: np.ndarray, unit_m: float = 0.001) -> list[str]:
-    """What depth in metres loses as 16-bit counts of `unit_m`, in sentences; inf and NaN lose nothing."""
+    """Notes on what depth in metres loses as 16-bit multiples of `unit_m`; inf and NaN lose nothing."""
     steps = np.asarray(depth_m, np.float64) / unit_m
     steps = steps[np.isfinite(steps) & (steps >= 0)]
     far, finer = steps > 65_535.5, np.abs(steps - np.rint(steps)) > 0.01
@@ -131,27 +133,27 @@ def depth_lost(name: str, depth_m: np.ndarray, unit_m: float = 0.001) -> list[st
 
 
 def clean(part: str) -> str:
-    """A part of a sensor's name: letters, digits, _ and -."""
+    """Text as part of a sensor's name: other characters than letters, digits, _ and - become _."""
     return re.sub(r"[^\w-]+", "_", part, flags=re.ASCII).strip("_") or "unnamed"
 
 
 def unique(name: str, taken: Collection[str]) -> str:
-    """`name`, or name_2, name_3 … where it is taken."""
-    number, found = 1, name
-    while found in taken:
+    """`name`, or name_2, name_3, … if it is taken."""
+    number, free = 1, name
+    while free in taken:
         number += 1
-        found = f"{name}_{number}"
-    return found
+        free = f"{name}_{number}"
+    return free
 
 
 def natural(name: str | Path) -> list[tuple[int, int, str]]:
-    """Sorting key under which frame2 comes before frame10."""
+    """Sorting key that puts frame2 before frame10."""
     parts = re.split(r"(\d+)", str(name), flags=re.ASCII)
     return [(0, int(part), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
 
 
 def role_of(name: str) -> str:
-    """Of a sensor's name: "observation", "action", "info", "next.reward", "next.done", "next.truncated", or "" for others."""
+    """The role in a sensor's name: "observation", "action", "info", "next.reward", "next.done", "next.truncated" or ""."""
     if name in (REWARD, DONE, TRUNCATED):
         return name
     head = name.split(".", 1)[0]
@@ -163,15 +165,15 @@ def role_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class RowCounts:
-    """A take whose sensors agree row by row: `observations` rows, `steps` actions (one less, or as many)."""
+    """The rows of a take whose sensors share one clock."""
 
     observations: int
-    steps: int
-    time_s: np.ndarray  # of the observations
+    steps: int  # actions: as many as observations, or one less
+    time_s: np.ndarray  # of the observations, s
 
 
 def rows_of(take: Take, where: str) -> RowCounts:
-    """How many rows a take has; DatasetError where its sensors do not march in step."""
+    """The rows of a take; DatasetError where its sensors have different clocks."""
     seen = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) == OBSERVATION}
     done = {name: len(r.time_s) for name, r in take.readings.items() if role_of(name) not in (OBSERVATION, INFO, "")}
     for name, readings in take.readings.items():
@@ -188,20 +190,20 @@ def rows_of(take: Take, where: str) -> RowCounts:
     row_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.inf
     for name in (*seen, *done):
         other = take.readings[name].time_s
-        if len(other) and np.abs(other - time_s[: len(other)]).max() > _TIMES_AGREE * row_s:
+        if len(other) and np.abs(other - time_s[: len(other)]).max() > _MAX_CLOCK_SKEW * row_s:
             raise DatasetError(f"'{name}' in {where} was not read when '{first}' was; convert it to LeRobot first.")
     return RowCounts(count, steps, time_s)
 
 
-def even(time_s: np.ndarray, fps: float | None) -> bool:
-    """Whether the times are row / fps."""
+def is_even(time_s: np.ndarray, fps: float | None) -> bool:
+    """Whether row i lies at i / fps seconds."""
     return fps is not None and bool(np.allclose(time_s, np.arange(len(time_s)) / fps, rtol=0, atol=0.01 / fps))
 
 
 def batches(
     values: Sequence[np.ndarray] | np.ndarray, sensor: Sensor, where: str, count: int | None = None, size: int = 64
 ) -> Iterator[np.ndarray]:
-    """The (first `count`) values, `size` at a time, [m, *sensor.shape]; DatasetError where one has another shape."""
+    """The (first `count`) values in batches of `size`, [m, *sensor.shape]; DatasetError where one has another shape."""
     count = len(values) if count is None else count
     for start in range(0, count, size):
         part = values[start : min(start + size, count)]
@@ -212,34 +214,34 @@ def batches(
         yield np.asarray(part).reshape(len(part), *sensor.shape)
 
 
-def whole(readings: Readings, sensor: Sensor, where: str) -> np.ndarray:
+def stored_values(readings: Readings, sensor: Sensor, where: str) -> np.ndarray:
     """All values of a sensor as one array [n, *stored_shape]."""
     parts = [to_stored(part, sensor) for part in batches(readings.values, sensor, where)]
     return np.concatenate(parts) if parts else np.empty((0, *stored_shape(sensor)), sensor.dtype)
 
 
 def check_fps(fps: float | None, what: str) -> None:
-    """DatasetError for a rate that is no rate."""
+    """DatasetError for an fps that is not positive and finite."""
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise DatasetError(f"{what} has {fps} rows a second; give an fps above 0.")
 
 
 def rate_of(given: float | None, known: object, what: str) -> tuple[float, tuple[str, ...]]:
-    """Rows a second: the caller's word, else the file's, else FPS_UNKNOWN and a note that says so."""
+    """Rows per second: the caller's, else the file's, else FPS_UNKNOWN with a note."""
     if given is not None:
         return float(given), ()
     if isinstance(known, int | float) and not isinstance(known, bool) and np.isfinite(known) and known > 0:
         return float(known), ()
     return FPS_UNKNOWN, (
-        f"{what} keeps no times: rows are taken to be 1/{FPS_UNKNOWN:g} s apart; give fps to say better.",
+        f"{what} stores no times: rows are assumed to be 1/{FPS_UNKNOWN:g} s apart; give fps to correct that.",
     )
 
 
-# -- descriptions kept with the arrays, so that what we wrote comes back with its names, units and frames
+# -- our own description, stored with the arrays: names, units and frames
 
 
 def describe(source: Source) -> dict:
-    """JSON of everything about a source that its arrays do not say."""
+    """JSON of everything in a source that its arrays do not hold."""
     return {
         "sensors": [{"name": name, **sensor_json(sensor)} for name, sensor in source.sensors.items()],
         "fps": source.fps,
@@ -250,16 +252,16 @@ def describe(source: Source) -> dict:
 
 
 def sensors_described(text: object, where: str) -> dict[str, Sensor]:
-    """The sensors of a description; DatasetError where it is not one of ours."""
+    """The sensors of a description; DatasetError where it is damaged."""
     try:
-        found = [sensor_of(item) for item in text["sensors"]]  # type: ignore[index]
+        sensors = [sensor_of(item) for item in text["sensors"]]  # type: ignore[index]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"the description of sensors in {where} is damaged ({error}); delete it.") from error
-    return {sensor.name: sensor for sensor in found}
+    return {sensor.name: sensor for sensor in sensors}
 
 
 def sensor_of(item: Mapping) -> Sensor:
-    """A sensor out of a file's description of it; ValueError, TypeError or KeyError where it is none."""
+    """A sensor from its description in a file; ValueError, TypeError or KeyError where it is invalid."""
     sensor = sensor_from_json(str(item["name"]), item)
     dimensions = {"image": 3, "depth": 2, "points": 2}.get(sensor.kind, len(sensor.shape))
     dtype = {"image": "uint8", "depth": "float32", "points": "float32"}.get(sensor.kind, sensor.dtype)
@@ -271,21 +273,21 @@ def sensor_of(item: Mapping) -> Sensor:
 
 
 def read_json(path: Path, missing: dict | None = None) -> dict:
-    """A JSON object; DatasetError where it is damaged (or missing, unless `missing` says what to give)."""
+    """A JSON object; DatasetError where it is damaged, or missing without a default `missing`."""
     if missing is not None and not path.exists():
         return missing
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         what = "damaged" if path.exists() else "missing"
         raise DatasetError(f"{path} is {what} ({error}); restore it from a copy.") from error
-    if not isinstance(found, dict):
+    if not isinstance(value, dict):
         raise DatasetError(f"{path} is not a JSON object; restore it from a copy.")
-    return found
+    return value
 
 
 def json_or_none(value: object) -> object:
-    """The value if JSON can hold it, numpy's numbers and arrays as plain ones; else None."""
+    """The value if JSON can represent it, with numpy's numbers and arrays as plain ones; else None."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     if isinstance(value, np.generic | np.ndarray):
@@ -298,7 +300,7 @@ def json_or_none(value: object) -> object:
 
 
 def numbered(source: Source, progress: Callable[[int, int], None] | None) -> Iterator[tuple[int, Take]]:
-    """The takes with their numbers; `progress(takes, 0)` after each is written. DatasetError where there are none."""
+    """Numbered takes; `progress(takes, 0)` is called after each is written. DatasetError where there are none."""
     number = -1
     for number, take in enumerate(source.takes()):
         yield number, take

@@ -1,4 +1,4 @@
-"""Gymnasium spaces as JSON (in Minari's spelling), and the arrays and texts that they flatten into."""
+"""Gymnasium spaces as JSON, as Minari spells it, and the arrays and texts that they flatten into."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from ...data.source import Sensor
 from .arrays import Array, Place
 from .rows import stored_shape
 
-_INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # texts that are a take's task
-_DEEPEST = 32
+_INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # Text spaces that hold the task
+_MAX_DEPTH = 32
 
 
 def leaves(space: object, role: str, where: str) -> dict[Place, Array | None]:
-    """The arrays of a space as JSON, without rows, where they lie (keys of Dicts, indices of Tuples); None for texts."""
+    """Place (keys of Dicts, indices of Tuples) -> array without rows, for each leaf of a space given as JSON; None for texts."""
     try:
-        return dict(_walked(space, ()))
+        return dict(_flat(space, ()))
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"the {role} space of {where} cannot be read ({error}).") from error
 
 
-def _walked(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
+def _flat(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
     kind = space["type"]
-    if len(place) > _DEEPEST:
+    if len(place) > _MAX_DEPTH:
         raise ValueError("it nests too deep")
     if kind in ("Dict", "Tuple"):
         parts = space["subspaces"]
         for key, part in parts.items() if kind == "Dict" else enumerate(parts):
-            yield from _walked(part, (*place, str(key) if kind == "Dict" else key))
+            yield from _flat(part, (*place, str(key) if kind == "Dict" else key))
     elif kind == "Text":
         yield place, None
     else:
@@ -40,15 +40,15 @@ def _walked(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
         yield place, Array((0, *shape), np.dtype(dtype))
 
 
-def said(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[str, dict[str, list[str]]]:
-    """(a take's task, what else was said): texts named mission, task, … that do not change are the task."""
+def split_texts(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[str, dict[str, list[str]]]:
+    """(a take's task, its other texts): a text named mission, task, … is the task if it stays the same for the whole take."""
     kept = {}
-    for place, found in texts.items():
+    for place, values in texts.items():
         instruction = len(place) < 2 or str(place[-1]).lower() in _INSTRUCTIONS
-        if instruction and len(set(found)) == 1 and task in ("", found[0]):
-            task = found[0]
+        if instruction and len(set(values)) == 1 and task in ("", values[0]):
+            task = values[0]
         else:
-            kept["/".join(map(str, place))] = list(found)
+            kept["/".join(map(str, place))] = list(values)
     return task, kept
 
 
@@ -61,11 +61,11 @@ def _shape_of(kind: str, space) -> tuple[tuple[int, ...], str]:
         return np.shape(space["nvec"]), space.get("dtype", "int64")
     if kind == "MultiBinary":
         return tuple(np.atleast_1d(space["n"]).tolist()), "int8"
-    raise ValueError(f"spaces of type {kind} are not known")
+    raise ValueError(f"spaces of type {kind} are unknown")
 
 
 def to_json(space: spaces.Space) -> dict:
-    """The space as Minari writes it, but for bounds that are one number everywhere, which are that number."""
+    """The space as Minari writes it, except that constant bounds become one number."""
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "subspaces": {str(key): to_json(part) for key, part in space.spaces.items()}}
     if isinstance(space, spaces.Tuple):
@@ -83,11 +83,11 @@ def to_json(space: spaces.Space) -> dict:
     if isinstance(space, spaces.Text):
         low, high = space.min_length, space.max_length
         return {"type": "Text", "max_length": high, "min_length": low, "charset": space.characters}
-    raise DatasetError(f"spaces like {space} have no place in a recording; wrap the environment so that it has arrays.")
+    raise DatasetError(f"spaces like {space} cannot be recorded; wrap the environment so that it has arrays.")
 
 
 def compact(space):
-    """A space as JSON with each bound that is one number everywhere as that number; JSON holds infinities as text."""
+    """A space as JSON with constant bounds as one number; infinities become text."""
     if isinstance(space, dict):
         if space.get("type") == "Box":
             lists = {key: space[key] for key in ("low", "high") if isinstance(space.get(key), list)}
@@ -116,8 +116,8 @@ def _spread(bound, shape: tuple[int, ...], dtype: str) -> list:
 def _bound(values: np.ndarray):
     first = values.flat[0] if values.size else 0
     same = values.size and bool((values == first).all())
-    found = (first.item() if isinstance(first, np.generic) else first) if same else values.tolist()
-    return _no_infinity(found)
+    bound = (first.item() if isinstance(first, np.generic) else first) if same else values.tolist()
+    return _no_infinity(bound)
 
 
 def _no_infinity(value):

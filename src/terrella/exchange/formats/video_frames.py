@@ -1,4 +1,4 @@
-"""Pictures of a film by number; and H.264 and H.265 as messages, one frame each."""
+"""Video frames by number; and H.264 and H.265 streams with one frame per message."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ import numpy as np
 from ...core.errors import DatasetError
 from .rows import MAX_PIXELS
 
-_HELD_BACK = 16  # messages after which a picture must have come out
-_NEAR = 2  # pictures ahead that are decoded without a look at where keyframes are
+_MAX_DELAY = 16  # messages after which the decoder must have returned a frame
+_NEAR = 2  # frames ahead that are decoded without looking for a keyframe
 _CODECS = {"h264": "h264", "h265": "hevc"}
 _KEY_UNITS = {"h264": (lambda byte: byte & 31, {5}), "h265": (lambda byte: byte >> 1 & 63, set(range(16, 22)))}
 
 
 class FrameReader:
-    """Pictures by number, uint8 [H, W, 3]: going on in order decodes each once, elsewhere begins at the last keyframe.
+    """Frames of a video by number, uint8 [H, W, 3]. In order, each is decoded once; a jump starts at the last keyframe.
 
-    begin(i) gives (number, frame) from keyframe i on; key(i) is the last keyframe not after frame i; show(frame) is its
-    picture; `what` is filmed, for errors. One thread decodes at a time.
+    begin: (i) -> (number, frame) pairs from keyframe i on.
+    key:   (i) -> the last keyframe that is not after frame i.
+    show:  (frame) -> its picture.
+    what:  the video's name in errors.
+    One thread decodes at a time.
     """
 
     def __init__(
@@ -39,7 +42,7 @@ class FrameReader:
         self._lock = threading.Lock()
 
     def __call__(self, index: int) -> np.ndarray:
-        """Frame `index`; DatasetError where it does not decode."""
+        """Frame `index`; DatasetError where it cannot be decoded."""
         with self._lock:
             if self._last[0] != index:
                 try:
@@ -49,8 +52,8 @@ class FrameReader:
                     raise
             return self._last[1].copy()
 
-    def rest(self) -> None:
-        """Lets go of the file, when no more is looked at."""
+    def release(self) -> None:
+        """Closes the file until the next frame is read."""
         self._run = None
 
     def _frame(self, index: int) -> av.VideoFrame:
@@ -59,42 +62,42 @@ class FrameReader:
             if self._run is None or not key <= self._next <= index:
                 self._run, self._next = self._begin(key), key
         for again in (False, True):
-            if again:  # the container's index led elsewhere
+            if again:  # the container's index was wrong
                 self._run = self._begin(0)
             for number, frame in self._run:
                 self._next = number + 1
                 if number == index:
                     return frame
-                if number > index + _HELD_BACK:
+                if number > index + _MAX_DELAY:
                     break
-        raise DatasetError(f"frame {index} of {self._what} decodes to no picture; restore it from a copy.")
+        raise DatasetError(f"frame {index} of {self._what} cannot be decoded; restore it from a copy.")
 
 
 def decodable_messages(read: Callable[[int], bytes], after_gap: np.ndarray, format: str) -> np.ndarray:
-    """int64 [m], ascending: which messages of a film can be decoded: those from a keyframe on, up to the next gap.
+    """int64 [m], ascending: the messages that can be decoded, from each keyframe up to the next gap.
 
-    read(i) gives the data of message i; after_gap bool [n]: whether messages are missing just before message i.
+    read: (i) -> the data of message i. after_gap: bool [n], whether messages are missing just before message i.
     """
     if format not in _CODECS:
         raise DatasetError(f"its video is '{format}', and only h264 and h265 are read")
-    found, good = [], False
+    numbers, decodable = [], False
     gaps = after_gap[1:].any()
     for i, gap in enumerate(after_gap.tolist()):
-        good = good and not gap
-        if not good:
+        decodable = decodable and not gap
+        if not decodable:
             try:
-                good = is_key(read(i), format)
+                decodable = is_keyframe(read(i), format)
             except DatasetError:
                 continue
-            if good and not gaps:  # nothing is missing after the first keyframe
+            if decodable and not gaps:  # no message is missing after the first keyframe
                 return np.arange(i, len(after_gap))
-        if good:
-            found.append(i)
-    return np.array(found, np.int64)
+        if decodable:
+            numbers.append(i)
+    return np.array(numbers, np.int64)
 
 
-def is_key(data: bytes, format: str) -> bool:
-    """Whether a decoder can begin with this message."""
+def is_keyframe(data: bytes, format: str) -> bool:
+    """Whether a decoder can start at this message."""
     at, (unit, keys) = -1, _KEY_UNITS[format]
     while (at := data.find(b"\x00\x00\x01", at + 1)) >= 0:
         if at + 3 < len(data) and unit(data[at + 3]) in keys:
@@ -103,7 +106,7 @@ def is_key(data: bytes, format: str) -> bool:
 
 
 def message_frames(read: Callable[[int], bytes], count: int, format: str) -> FrameReader:
-    """The film of `count` messages, the first of which is a keyframe; read(i) gives the data of message i."""
+    """The frames of `count` messages, the first a keyframe; read(i) is the data of message i."""
 
     def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
         codec: Any = av.CodecContext.create(_CODECS[format], "r")
@@ -111,9 +114,9 @@ def message_frames(read: Callable[[int], bytes], count: int, format: str) -> Fra
         codec.options = {"max_pixels": str(MAX_PIXELS)}
         seen = key
         for i in range(key, count + 1):
-            if i > seen + _HELD_BACK:
-                raise DatasetError("it decodes to no picture")
-            packet = None  # the end: what the decoder still holds comes out
+            if i > seen + _MAX_DELAY:
+                raise DatasetError("it cannot be decoded")
+            packet = None  # at the end, flushes the decoder
             if i < count:
                 packet = av.Packet(read(i))
                 packet.pts = i
@@ -128,7 +131,7 @@ def message_frames(read: Callable[[int], bytes], count: int, format: str) -> Fra
 
     def last_key(index: int) -> int:
         for i in range(index, -1, -1):
-            if is_key(read(i), format):
+            if is_keyframe(read(i), format):
                 return i
         raise DatasetError("no keyframe comes before it")
 

@@ -1,4 +1,4 @@
-"""Folders of plain videos, without actions: read with their true times, and written."""
+"""Folders of videos without actions, read with their true frame times, and written."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _CODEC = {"preset": "veryfast", "crf": "18", "g": "8", "bf": "0", "threads": "1"
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
-    """A folder of videos as a Source of pictures alone.
+    """A folder of videos as a Source of pictures.
 
-    Videos in the folder itself are one take each, of the camera "observation.images.rgb". Or the folder has sub-folders:
-    each is one take, and each video in it a camera named after its file ("front.mp4": "observation.images.front"). Takes
-    are in the natural order of their names. Any container that PyAV reads; other files are ignored.
+    Either each video in the folder is one take of the camera "observation.images.rgb"; or each subfolder is one take, and
+    each video in it a camera named after its file ("front.mp4": "observation.images.front"). Takes are in the natural order
+    of their names. Every container that PyAV reads is accepted; other files are ignored.
 
-    time_s are the file's own presentation times, counted from the take's first frame; they need not be even. A phone's
-    rotation is applied. Frames are decoded when looked at: one after another without seeking, others from the last
-    keyframe on. DatasetError where there are no videos, one is damaged, of absurd size, or not of its camera's size.
+    time_s are the file's presentation times, from the take's first frame on; they may be uneven. A phone's rotation is
+    applied. Frames are decoded when read, without seeking if in order. DatasetError where there are no videos, or one is
+    damaged, too large, or of another size than its camera's first.
     """
     path = Path(path)
     takes = folders.takes_of(path, VIDEOS, "videos", deep=False)
@@ -65,7 +65,7 @@ def _video_take(name: str, folder: Mapping[str, list[Path]], sensors: Mapping[st
 
 @dataclass(frozen=True)
 class _Video:
-    """One video file: when its frames are shown, and the frames. It is open only while frames are looked at."""
+    """One video file: its frame times and frames. It is open only while frames are read."""
 
     path: Path
     shape: tuple[int, ...]
@@ -78,7 +78,7 @@ class _Video:
         if picture.shape != self.shape:
             raise DatasetError(f"the video {self.path} changes its size at frame {i}; cut it in two.")
         if i == len(self.time_s) - 1:
-            self.frames.rest()
+            self.frames.release()
         return picture
 
 
@@ -90,7 +90,7 @@ def _video(path: Path) -> _Video:
         shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
     ticks = sorted({pts for pts, _ in shown if pts is not None})
     place: dict[int | None, int] = {pts: i for i, pts in enumerate(ticks)}
-    timed = len(ticks) == len(shown)  # whether each frame has a time of its own
+    timed = len(ticks) == len(shown)  # every frame has its own time
     keys = sorted({0, *(place[pts] for pts, is_key in shown if is_key)}) if timed else [0]
 
     def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
@@ -113,8 +113,8 @@ def _video(path: Path) -> _Video:
         times = [frame.time for frame in _decoded(path, None)]
         if None in times or any(a >= b for a, b in zip(times, times[1:])):
             times = [i / (rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
-    film = FrameReader(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
-    return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), film)
+    frames = FrameReader(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
+    return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), frames)
 
 
 def _decoded(path: Path, seek_to: int | None) -> Iterator[av.VideoFrame]:
@@ -126,9 +126,9 @@ def _decoded(path: Path, seek_to: int | None) -> Iterator[av.VideoFrame]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video and its first stream of pictures; what FFmpeg stumbles over inside is a DatasetError.
+    """A video and its first picture stream; FFmpeg's errors become a DatasetError.
 
-    FFmpeg gets an open file and may open no other, so that no playlist leads it out of the folder.
+    FFmpeg gets an open file and may open no other, so that a playlist cannot lead it out of the folder.
     """
     try:
         with open(path, "rb") as file, av.open(file, "r", options={"protocol_whitelist": "none"}) as container:
@@ -140,11 +140,12 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Writes a source's pictures as mp4 files in a folder as `read` reads it; returns what had no place in it.
+    """Writes a source's pictures as a folder of mp4 files, as `read` reads it; returns a note on everything left out.
 
-    take_0.mp4, take_1.mp4, … where the only camera is "observation.images.rgb", else take_0/CAMERA.mp4. Times are kept to
-    the microsecond. H.264 in 4:2:0, which every player shows, loses a little and needs even sizes. `progress(takes, 0)` is
-    called after each take. DatasetError for odd sizes, frames at the same time, no pictures at all, or where `path` exists.
+    Files are take_0.mp4, take_1.mp4, … if the only camera is "observation.images.rgb", else take_0/CAMERA.mp4. Times are
+    kept to the microsecond. H.264 in 4:2:0, which every player shows, is slightly lossy and needs even sizes.
+    `progress(takes, 0)` is called after each take. DatasetError for odd sizes, two frames at one time, no pictures, or
+    where `path` exists.
     """
     cameras, notes = folders.cameras(source, ("image",), "a video")
     for name in cameras:
