@@ -94,6 +94,34 @@ def test_misspelt_words_are_recognised(given, meant, capsys):
     assert meant in said.err and said.out == "" and "Traceback" not in said.err
 
 
+@pytest.mark.parametrize(
+    "given, sentence",
+    [
+        (
+            ["play", "doom-maze", "--compare", "doom:my_way_home"],
+            "--compare takes no value; --truth GAME names the game.",
+        ),
+        (["play", "doom-maze", "--compare=doom:my_way_home"], "--compare takes no value; --truth GAME names the game."),
+        (["play", "doom-maze", "--remember", "eye.onnx"], "--remember takes no value; --estimator FILE names"),
+        (["space", "fit", "x", "--out", "y", "--watch", "80"], "--watch takes no value; --port PORT chooses the port."),
+        (["space", "edit", "x", "--delete", "3"], "--delete takes no value; --box, --sphere, --plane or --object"),
+        (["space", "edit", "x", "--undo", "2"], "--undo takes no value; leave the value out."),
+    ],
+)
+def test_a_flag_that_was_given_a_value_is_explained(given, sentence, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(given)
+    shown = capsys.readouterr()
+    assert stop.value.code == 2 and f"terrella: {sentence}" in shown.err and shown.out == ""
+
+
+def test_a_positional_behind_a_flag_is_not_its_value(capsys):
+    with pytest.raises(SystemExit):
+        main(["play", "--compare", "doom-maze", "--prot", "8"])
+    shown = capsys.readouterr()
+    assert "takes no value" not in shown.err and "--port" in shown.err
+
+
 def test_a_missing_command_shows_what_there_is(capsys):
     assert main([]) == 2 and main(["data"]) == 2
     assert "terrella data doctor" in capsys.readouterr().err

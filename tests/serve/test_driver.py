@@ -339,10 +339,10 @@ def test_an_instruction_is_typed_on_the_page(serve_world, open_page):  # noqa: F
 def test_goals_that_nobody_can_seek_are_refused():
     with pytest.raises(ServeError, match="no instructions"):
         Timeline([Mapped()], 0, policy=walker()).seek(Goal(words="go north"))
-    for agents, kind in ((None, "no place"), (walker(), "no place")):
+    for agents, kind in ((None, "walk to a place"), (walker(), "walk to a place")):
         with pytest.raises(ServeError, match=kind):
             Timeline([Mapped()], 0, policy=agents).seek(Goal(at=(0.0, 0.0)))
-    with pytest.raises(ServeError, match="no picture"):
+    with pytest.raises(ServeError, match="seek a picture"):
         Timeline([Mapped()], 0, policy=walker()).seek(Goal(here=True))
     with pytest.raises(ServeError, match="no image"):
         Timeline([Mapped()], 0, policy=Agents(walker().make, pictures=True)).seek(Goal(picture=b"junk"))

@@ -165,7 +165,7 @@ def test_what_cannot_be_merged(two, capsys):
     assert not (path / "a" / "world.edits.jsonl").exists()
     made(path / "c", boxes=False)
     assert edit(path / "a", "--merge", str(path / "c"), "--move", "900", "900", "900") == 0
-    assert "read in cells of" in capsys.readouterr().err
+    assert "have cells of" in capsys.readouterr().err
     assert edit(path / "a", "--undo") == 0
     assert edit(path / "b", "--merge", str(path / "a")) == 0
     assert edit(path / "a", "--merge", str(path / "b")) == 2  # a within b within a

@@ -138,13 +138,20 @@ def _run(given: list[str]) -> int:
 
     import tyro
 
+    from .flags import value_of_flag
+
     module, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int | None] = getattr(import_module(f"{__name__}.{module}"), function)
     markers, words = (
         (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
         [RENAMED.get(word, word) for word in rest],
     )
-    return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
+    try:
+        return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
+    except SystemExit as stop:
+        if stop.code == 2 and (sentence := value_of_flag(command, words)):
+            print(f"terrella: {sentence}", file=sys.stderr)
+        raise
 
 
 def _command(given: list[str]) -> tuple[str, list[str]]:

@@ -1,0 +1,49 @@
+"""Says what is wrong when a flag that takes no value was given one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass
+from typing import Any, get_args, get_type_hints
+
+from tyro.conf import Positional
+
+# What to write instead of a value behind the flag.
+INSTEAD = {
+    "--compare": "--truth GAME names the game",
+    "--remember": "--estimator FILE names the estimator",
+    "--fast": "--device DEVICE names the device",
+    "--watch": "--port PORT chooses the port",
+    "--human": "--port PORT chooses the port",
+    "--delete": "--box, --sphere, --plane or --object selects a part",
+    "--repair": "--out FOLDER names the folder",
+}
+
+
+def value_of_flag(command: Callable[..., Any], words: Sequence[str]) -> str:
+    """One sentence if a flag of `command` was given a value ("--compare GAME" or "--compare=GAME"), else ""."""
+    flags, positionals = set(_flags(command)), sum(map(_is_positional, _hints(command, include_extras=True)))
+    first = next((at for at, word in enumerate(words) if word.startswith("-")), len(words))
+    for word, following in zip(words, [*words[1:], "-"]):
+        flag, equals, _ = word.partition("=")
+        if flag in flags and (equals or (first >= positionals and not following.startswith("-"))):
+            instead = f"; {INSTEAD[flag]}" if flag in INSTEAD else "; leave the value out"
+            return f"{flag} takes no value{instead}."
+    return ""
+
+
+def _hints(command: Callable[..., Any], **options: Any) -> list[Any]:
+    return list(get_type_hints(command, **options).values())
+
+
+def _flags(command: Callable[..., Any]) -> Iterator[str]:
+    """The options of a command, or of a dataclass among its parameters, that take no value."""
+    for name, kind in get_type_hints(command).items():
+        if is_dataclass(kind):
+            yield from _flags(kind)
+        elif kind is bool:
+            yield from (f"--{name.replace('_', '-')}", f"--no-{name.replace('_', '-')}")
+
+
+def _is_positional(hint: Any) -> bool:
+    return get_args(Positional[int])[1] in getattr(hint, "__metadata__", ())
