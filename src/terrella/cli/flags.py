@@ -36,7 +36,7 @@ def _hints(command: Callable[..., Any], **options: Any) -> list[Any]:
     return list(get_type_hints(command, **options).values())
 
 
-def _flags(command: Callable[..., Any]) -> Iterator[str]:
+def _flags(command: Any) -> Iterator[str]:
     """The options of a command, or of a dataclass among its parameters, that take no value."""
     for name, kind in get_type_hints(command).items():
         if is_dataclass(kind):
