@@ -3,28 +3,62 @@
 `import terrella` imports nothing heavy and configures nothing; each name below is imported when it is first used.
 """
 
+# ruff: noqa: F401  (imports for type checkers; `__all__` is computed)
 from __future__ import annotations
 
+import sys
 from importlib import import_module
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from .version import __version__
 
 if TYPE_CHECKING:
     from .core import Spec, State, World, check_world, make_rng, rollout
     from .core.env import as_env
     from .library import as_sb3, load, load_policy, worlds
+    from .workflows.collect import CollectConfig, CollectResult, collect
+    from .workflows.learn import LearnConfig, LearnResult, learn
+    from .workflows.opening import ControlsConfig, EnvironmentConfig
+    from .workflows.practise import PractiseConfig, PractiseResult, practise
+    from .workflows.score import ScoreConfig, ScoreResult, score
+    from .workflows.train_policy import TrainPolicyConfig, TrainPolicyResult, train_policy
 
-__version__ = "0.1.0"
-__all__ = ["Spec", "State", "World", "as_env", "as_sb3", "check_world", "load", "load_policy"]
-__all__ += ["make_rng", "rollout", "worlds"]
-
-_HOME = {
-    **dict.fromkeys(["Spec", "State", "World", "check_world", "make_rng", "rollout"], ".core"),
-    "as_env": ".core.env",
-    **dict.fromkeys(["as_sb3", "load", "load_policy", "worlds"], ".library"),
+_NAMES = {
+    ".core": ("Spec", "State", "World", "check_world", "make_rng", "rollout"),
+    ".core.env": ("as_env",),
+    ".library": ("as_sb3", "load", "load_policy", "worlds"),
+    ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
+    ".workflows.learn": ("LearnConfig", "LearnResult"),
+    ".workflows.opening": ("ControlsConfig", "EnvironmentConfig"),
+    ".workflows.practise": ("PractiseConfig", "PractiseResult", "practise"),
+    ".workflows.score": ("ScoreConfig", "ScoreResult", "score"),
+    ".workflows.train_policy": ("TrainPolicyConfig", "TrainPolicyResult", "train_policy"),
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = [*_HOME, "__version__", "learn"]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+class _LearnRoom(ModuleType):
+    """The room `terrella.learn`, which is called as the workflow of the same name: `terrella.learn("gym:CarRacing-v3")`."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> LearnResult:
+        return import_module(".workflows.learn", __name__).learn(*arguments, **named)
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:  # as importing a room sets it
+        if name == "learn" and isinstance(value, ModuleType):
+            value.__class__ = _LearnRoom
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str):
+    if name == "learn":
+        return import_module(".learn", __name__)
     if name not in _HOME:
         raise AttributeError(f"module 'terrella' has no attribute '{name}'")
     value = globals()[name] = getattr(import_module(_HOME[name], __name__), name)
@@ -32,4 +66,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return list(__all__)

@@ -26,7 +26,7 @@ GAME = "doom:my_way_home"
 
 
 class Entry(NamedTuple):
-    """One world at hand: `load(name)` opens it. source: "bundled", "game" or "checkpoint"; card: facts for people."""
+    """One available world: `load(name)` opens it. source: "bundled", "game" or "checkpoint"; card: facts for people."""
 
     name: str
     source: str
@@ -44,36 +44,34 @@ def load(
 ) -> World:
     """Opens a world.
 
-    name:    a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment
-             ("gym:CartPole-v1"), a robot in MuJoCo ("mujoco:go1", "mujoco:FILE.xml"), or the path of a checkpoint folder or of
-             a training run.
-    options: for a learned world what its `load` takes (memory=False, device="cuda") and fast=True (ONNX Runtime or a
-             compiled graph where that is faster here: worlds/fast.py), for the game the fields of
-             DoomConfig (size=(192, 256)), for MuJoCo what MujocoWorld takes, for Gymnasium what GymnasiumWorld
-             takes (with forkable=True MuJoCo's are copied, too).
-    remember: with a spatial memory around it (space/remembering.py), unless it has one of its own; `estimator`, a file that
-             `terrella train estimator` wrote or a world that has one, gives pose and depth where the world does not (to give one
-             asks to remember).
-    randomise: a TOML or JSON file of distributions, of which each episode draws (sim/randomised.py).
-    memory_mb: the budget in MiB of what an episode remembers; as its world was saved, or 16.
+    name:      a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment ("gym:CartPole-v1"), a
+               robot in MuJoCo ("mujoco:go1", "mujoco:FILE.xml"), or the path of a checkpoint folder or of a training run.
+    remember:  adds a spatial memory (space/remembering.py) to a world without one.
+    estimator: a file of `terrella train estimator`, or a world that has one: it estimates pose and depth for the memory, which
+               it implies.
+    memory_mb: the memory's budget in MiB per episode; default: as the world was saved, or 16.
+    randomise: a TOML or JSON file of distributions, from which each episode draws (sim/randomised.py).
+    options:   of a learned world those of its `load` (memory=False, device="cuda") and fast=True (ONNX Runtime or a compiled
+               graph, where that is faster here: worlds/fast.py); of the game the fields of DoomConfig (size=(192, 256)); of
+               MuJoCo those of MujocoWorld; of Gymnasium those of GymnasiumWorld (forkable=True makes states that can be copied).
     Raises TerrellaError (no such world, a missing optional package) or CheckpointError (a foreign or damaged folder).
     """
     if randomise is not None:
         from .sim import randomised
 
-        drawn = randomised.read(randomise)
+        distributions = randomised.read(randomise)
         same: dict[str, Any] = {"remember": remember, "estimator": estimator, "memory_mb": memory_mb, **options}
-        return randomised.Randomised(load(name, **same), drawn)
+        return randomised.Randomised(load(name, **same), distributions)
     if remember or estimator is not None:
         from .space import remembering
 
         inner = load(name, memory_mb=None if is_truth(name) else memory_mb, **options)
-        seeing = None if estimator is None else open_estimator(estimator)
-        return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, seeing)
+        opened = None if estimator is None else open_estimator(estimator)
+        return remembering.remember(inner, 16.0 if memory_mb is None else memory_mb, opened)
     text = str(name)
     if memory_mb is not None and is_truth(name):
         raise TerrellaError(
-            f"{text} is the truth itself and remembers nothing; leave `memory_mb` out, or remember=True."
+            f"{text} is the truth itself and remembers nothing; leave `memory_mb` out, or pass remember=True."
         )
     if options.get("fast") and is_truth(name):
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
@@ -88,18 +86,18 @@ def load(
 
         return MujocoWorld(text.partition(":")[2], **options)
     if text.startswith("gym:"):
-        return _open_gymnasium(*_repeated(text), options)
+        return _open_gymnasium(*_id_and_repeat(text), options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
 
 
-def _repeated(name: str) -> tuple[str, int]:
-    """gym:ID@N: the id, and for how many steps each action is held."""
-    found = re.fullmatch(r"gym:(.+)@(\d+)", name)
-    if found is None:
+def _id_and_repeat(name: str) -> tuple[str, int]:
+    """Of gym:ID@N the environment's id, and the number of steps for which each action is held."""
+    match = re.fullmatch(r"gym:(.+)@(\d+)", name)
+    if match is None:
         return name.partition(":")[2], 1
-    if not 1 <= int(found[2]) <= 100:
-        raise TerrellaError(f"{name}: after @ is said for how many steps each action is held, 1 to 100.")
-    return found[1], int(found[2])
+    if not 1 <= int(match[2]) <= 100:
+        raise TerrellaError(f"{name}: the number after @ is for how many steps each action is held, 1 to 100.")
+    return match[1], int(match[2])
 
 
 def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:
@@ -118,8 +116,8 @@ def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:
 
 
 def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:
-    """`num_envs` episodes of a world as a VecEnv of Stable-Baselines3: see core/stable_baselines3.py for the options, which
-    are those of `as_env`. TerrellaError where that is not installed."""
+    """`num_envs` episodes of a world as a VecEnv of Stable-Baselines3, with the options of `as_env`. TerrellaError where that is
+    not installed."""
     _require("stable_baselines3", "as_sb3 needs Stable-Baselines3", "sb3")
     from .core.stable_baselines3 import WorldVecEnv
 
@@ -132,8 +130,8 @@ def load_policy(name: str | Path, spec: Spec, world: World | None = None) -> Pol
     name:  random, idle, explorer; constant:VALUE (a number for each axis, or the action's name); plan, or with settings
            plan:samples=16,horizon=12, which plans for reward in `world`; the folder of a learned policy; MODULE:NAME or
            FILE.py:NAME of your own (a Policy, a function (observation, rng) -> actions, or a function of a Spec that returns
-           such). With @0.3 behind it each action is a random one instead with probability 0.3.
-    Raises TerrellaError where there is none of that name, or where it is for other actions.
+           one of these). With @0.3 after the name each action is replaced by a random one with probability 0.3.
+    Raises TerrellaError for an unknown name, or a policy for other actions.
     """
     from .act.policies_by_name import policy_of
 
@@ -141,20 +139,20 @@ def load_policy(name: str | Path, spec: Spec, world: World | None = None) -> Pol
 
 
 def load_adapter(source: str) -> Adapter:
-    """The `adapter` of a Python file, or of "FILE.py:NAME" the object of that name: it says where an environment has depth, poses
-    and more (sim/gymnasium.py)."""
+    """The `adapter` of a Python file, or the object NAME of "FILE.py:NAME": it finds an environment's depth, poses and more
+    (sim/gymnasium.py)."""
     from .sim.environment_loading import load_adapter
 
     return load_adapter(source)
 
 
 def is_truth(name: str | Path) -> bool:
-    """Whether the name is that of a game or an environment, not of a learned world."""
+    """Whether this is the name of a game or an environment, not of a learned world."""
     return str(name).partition(":")[0] in ("doom", "gym", "mujoco")
 
 
 def folder_of(name: str | Path) -> Path:
-    """The folder of a learned world: a bundled one by its name, a checkpoint, or that in the folder of a training run."""
+    """The folder of a learned world: a bundled world by its name, a checkpoint, or the world of a training run."""
     text = str(name)
     if (BUNDLED / text / "world.json").is_file():
         return BUNDLED / text
@@ -163,16 +161,16 @@ def folder_of(name: str | Path) -> Path:
         return run if (run / "world.json").is_file() else Path(text)
     bundled = sorted(_bundled())
     environment = f"; did you mean 'gym:{text}'?" if re.search(r"-v\d+$", text) else ""
-    likest = environment or did_you_mean(text, [*bundled, GAME]) or "."
+    hint = environment or did_you_mean(text, [*bundled, GAME]) or "."
     raise TerrellaError(
-        f"There is no world '{text}'{likest} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
+        f"There is no world '{text}'{hint} Bundled are {', '.join(bundled) or 'none'}; the real game is {GAME}, an "
         "environment gym:CartPole-v1, a robot mujoco:go1; or give the path of a checkpoint folder."
     )
 
 
 def folder_for_keys(name: str | Path) -> Path | None:
-    """The folder of a learned world that may keep other keys (worlds/folder.py); None for games, for bundled worlds, and
-    where it cannot be written."""
+    """The folder of a learned world in which changed keys may be saved (worlds/folder.py); None for games, for bundled worlds, and
+    for a folder that cannot be written."""
     folder = None if is_truth(name) else folder_of(name)
     if folder is None or folder.parent == BUNDLED:
         return None
@@ -193,8 +191,8 @@ def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
         if not folder.is_dir():
             raise TerrellaError(f"{folder} is not a folder; give one that holds checkpoints (each has a world.json).")
         patterns = ("world.json", "world/world.json", "*/world.json", "*/world/world.json")  # checkpoints, and runs
-        found = sorted({file.parent for pattern in patterns for file in folder.glob(pattern)})
-        entries += [Entry(str(path), "checkpoint", _read_card(path)) for path in found]
+        paths = sorted({file.parent for pattern in patterns for file in folder.glob(pattern)})
+        entries += [Entry(str(path), "checkpoint", _read_card(path)) for path in paths]
     return entries
 
 
@@ -220,12 +218,12 @@ def _read_card(folder: Path) -> Mapping[str, object]:
 def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     from .worlds.folder import load_world, open_world
 
-    said = {name: value for name, value in options.items() if name != "fast"}
+    rest = {name: value for name, value in options.items() if name != "fast"}
     if not options.get("fast"):
-        return open_world(folder, **said)
+        return open_world(folder, **rest)
     from .worlds.fast import quickened
 
-    return quickened(load_world(folder, **said))[0]
+    return quickened(load_world(folder, **rest))[0]
 
 
 def _require(module: str, need: str, extra: str) -> None:
@@ -234,7 +232,7 @@ def _require(module: str, need: str, extra: str) -> None:
 
 
 def open_estimator(source: str | Path) -> Estimator:
-    """The estimator in a file that `terrella train estimator` wrote, or of a world that has one."""
+    """The estimator in a file of `terrella train estimator`, or of a world that has one."""
     from .space.estimator import Estimator, load_estimator
 
     if Path(source).is_file():

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from terrella.cli import main
-from terrella.cli.learn import _slowed
-from terrella.cli.named import Environment
-from terrella.cli.plan import RECORDING, SCORING, TRAINING, Plan, folder_for
-from terrella.cli.record import explore
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
 from terrella.learn.trainer import Trainer
+from terrella.workflows.collect import explore
+from terrella.workflows.learn import held_to_real_time
+from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from terrella.workflows.opening import EnvironmentConfig
 
 from .tiny import NAME
 
@@ -27,9 +27,9 @@ ROOT = Path(__file__).parents[2]
 FRAMES = 300
 
 
-def begun(folder: Path, asked: dict, minutes: float) -> Plan:
+def begun(folder: Path, settings: dict, minutes: float) -> LearnSchedule:
     """A plan of which something is recorded."""
-    plan = Plan(folder, asked, minutes)
+    plan = LearnSchedule(folder, settings, minutes)
     (folder / RECORDING / "meta").mkdir(parents=True)
     (folder / RECORDING / "meta" / "info.json").write_text("{}")
     plan.save()
@@ -38,7 +38,7 @@ def begun(folder: Path, asked: dict, minutes: float) -> Plan:
 
 @pytest.mark.parametrize("minutes", [0.5, 3, 30, 600])
 def test_the_minutes_are_divided_and_none_is_left_over(minutes, tmp_path):
-    plan = Plan(tmp_path / "new", {}, minutes)
+    plan = LearnSchedule(tmp_path / "new", {}, minutes)
     share = plan.share_s
     assert sum(share.values()) == pytest.approx(60 * minutes, abs=6) and share[TRAINING] > 0.5 * 60 * minutes
     assert minutes != 30 or share[SCORING] == 120
@@ -52,29 +52,29 @@ def test_the_minutes_are_divided_and_none_is_left_over(minutes, tmp_path):
 
 def test_a_plan_goes_on_with_its_own_settings_alone(tmp_path):
     begun(tmp_path / "a", {"environment": "gym:A-v1", "seed": 0}, 3).note(RECORDING, {"frames": 5})
-    assert Plan(tmp_path / "a", {"environment": "gym:A-v1", "seed": 0}, 3).facts == {RECORDING: {"frames": 5}}
+    assert LearnSchedule(tmp_path / "a", {"environment": "gym:A-v1", "seed": 0}, 3).facts == {RECORDING: {"frames": 5}}
     with pytest.raises(TerrellaError, match="environment gym:A-v1, not gym:B-v1"):
-        Plan(tmp_path / "a", {"environment": "gym:B-v1", "seed": 0}, 3)
+        LearnSchedule(tmp_path / "a", {"environment": "gym:B-v1", "seed": 0}, 3)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(TerrellaError, match="something else"):
-        Plan(tmp_path / "mine", {}, 3)
+        LearnSchedule(tmp_path / "mine", {}, 3)
     (tmp_path / "a" / "learn.json").write_text("{")
     with pytest.raises(TerrellaError, match="damaged"):
-        Plan(tmp_path / "a", {}, 3)
+        LearnSchedule(tmp_path / "a", {}, 3)
 
 
 def test_more_minutes_train_a_finished_world_on(tmp_path):
     plan = begun(tmp_path / "a", {}, 3)
     for stage in (RECORDING, TRAINING, SCORING):
         plan.note(stage, {})
-    assert set(Plan(tmp_path / "a", {}, 2).facts) == {RECORDING, TRAINING, SCORING}
-    assert set(Plan(tmp_path / "a", {}, 5).facts) == {RECORDING}
+    assert set(LearnSchedule(tmp_path / "a", {}, 2).facts) == {RECORDING, TRAINING, SCORING}
+    assert set(LearnSchedule(tmp_path / "a", {}, 5).facts) == {RECORDING}
 
 
 def test_a_plan_of_which_nothing_was_recorded_binds_nobody(tmp_path):
-    Plan(tmp_path / "a", {"seed": 0}, 3).save()
-    assert Plan(tmp_path / "a", {"seed": 1}, 3).facts == {} and not (tmp_path / "a").exists()
+    LearnSchedule(tmp_path / "a", {"seed": 0}, 3).save()
+    assert LearnSchedule(tmp_path / "a", {"seed": 1}, 3).facts == {} and not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize(
@@ -112,13 +112,13 @@ def test_what_cannot_be_learned_is_said_and_leaves_nothing(given, said, tmp_path
 
 
 def test_of_a_fast_game_every_action_is_held_so_that_it_is_played_in_real_time():
-    assert _slowed("gym:CartPole-v1", Environment()) == "gym:CartPole-v1@2"  # 50 steps a second
+    assert held_to_real_time("gym:CartPole-v1", EnvironmentConfig()) == "gym:CartPole-v1@2"  # 50 steps a second
     for name, environment in (
-        ("gym:Pendulum-v1", Environment()),  # 20 steps a second
-        ("gym:CartPole-v1@1", Environment()),
-        ("gym:CartPole-v1", Environment(fps=40)),
+        ("gym:Pendulum-v1", EnvironmentConfig()),  # 20 steps a second
+        ("gym:CartPole-v1@1", EnvironmentConfig()),
+        ("gym:CartPole-v1", EnvironmentConfig(fps=40)),
     ):
-        assert _slowed(name, environment) == name
+        assert held_to_real_time(name, environment) == name
 
 
 def command(out: Path) -> list[str]:
@@ -172,9 +172,9 @@ def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monk
             enough.append(more["enough"]())
         return explore(world, out, 20, seed, report, *rest, **more)
 
-    monkeypatch.setattr("terrella.cli.learn.explore", slow)
+    monkeypatch.setattr("terrella.workflows.learn.explore", slow)
     monkeypatch.setattr("terrella.workflows.progress.LINE_EVERY_S", -1.0)
-    monkeypatch.setattr(Plan, "share_s", property(lambda plan: {RECORDING: 0.0, TRAINING: 1.0, SCORING: 1.0}))
+    monkeypatch.setattr(LearnSchedule, "share_s", property(lambda plan: {RECORDING: 0.0, TRAINING: 1.0, SCORING: 1.0}))
     main(command(tmp_path / "slow"))
     assert enough == [False, False, False, True]
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("recording")]
@@ -183,7 +183,7 @@ def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monk
 
 def test_too_few_frames_are_said_and_kept(tmp_path, capsys, monkeypatch):
     few = lambda world, out, frames, *rest, **more: explore(world, out, 20, *rest, **more)  # noqa: E731
-    monkeypatch.setattr("terrella.cli.learn.explore", few)
+    monkeypatch.setattr("terrella.workflows.learn.explore", few)
     out = tmp_path / "few"
     assert main(command(out)) == 2
     assert "20 frames" in (said := capsys.readouterr().err) and "goes on recording" in said

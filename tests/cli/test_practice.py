@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from terrella.cli import main, practising
+from terrella.cli import main
 from terrella.data import Dataset
+from terrella.workflows import practise as practising
 
 SHORT = ["--steps", "2", "--batch", "8", "--horizon", "4", "--hidden", "8", "--episodes", "2"]
 
@@ -34,14 +35,17 @@ def test_what_cannot_be_practised_is_said_in_a_sentence(tmp_path, capsys) -> Non
 
 
 def test_rounds_of_practice_go_on_where_they_were_stopped(tmp_path, capsys, monkeypatch) -> None:
-    for name, value in {"ROUNDS": 2, "TRIED": 2, "FEWEST": 100}.items():
+    for name, value in {"ROUNDS": 2, "TRIAL_EPISODES": 2, "FEWEST_FRAMES": 100}.items():
         monkeypatch.setattr(practising, name, value)
     asked = ["learn", "gym:CartPole-v1", "--practise", "--minutes", "1000", "--frames", "300", "--json"]
     asked += ["--out", str(tmp_path / "learned")]
     learn, practise = practising.train_latent, practising.train_policy
     small = {"steps": 2, "batch": 4, "latent": 4, "rollout": 1, "history": 1}
 
+    hours = {}
+
     def learned(data, out, config, report):
+        hours[out.name] = config.hours
         return learn(data, out, replace(config, **small), report)
 
     def practised(world, name, out, config, *more):
@@ -63,6 +67,12 @@ def test_rounds_of_practice_go_on_where_they_were_stopped(tmp_path, capsys, monk
     assert [one["frames"] for one in told["rounds"]][-1] == rows and "chance in" in told["verdict"]
     notes = json.loads((tmp_path / "learned" / "practise.json").read_text())
     assert notes["rounds"] == told["rounds"]
+    hours.clear()
+    more = ["3000" if word == "1000" else word for word in asked]
+    assert main(more) == 0, "with more minutes the last round is trained on"
+    again = json.loads(capsys.readouterr().out)["rounds"]
+    assert list(hours) == ["world-1"] and hours["world-1"] == pytest.approx(0.5 * 2500 / 60)
+    assert again[:1] == told["rounds"][:1] and [one["minutes"] for one in again] == [500, 2500]
     other = [*asked[:-3], "--seed", "1", *asked[-3:]]
     assert main(other) == 2 and "begun with other settings" in capsys.readouterr().err
 
@@ -75,7 +85,7 @@ def test_counts_are_whole(options, tmp_path, capsys) -> None:
 
 
 def test_nothing_is_collected_while_the_world_of_what_was_is_learned(tmp_path, monkeypatch) -> None:
-    for name, value in {"ROUNDS": 1, "FEWEST": 100, "SHARES": {**practising.SHARES, "collecting": 0.0}}.items():
+    for name, value in {"ROUNDS": 1, "FEWEST_FRAMES": 100, "SHARES": {**practising.SHARES, "collecting": 0.0}}.items():
         monkeypatch.setattr(practising, name, value)
 
     def stopped(data, out, config, report):
@@ -92,6 +102,6 @@ def test_nothing_is_collected_while_the_world_of_what_was_is_learned(tmp_path, m
 
 def test_the_policy_that_earned_most_is_gone_on_from() -> None:
     earned = lambda *returns: [{"return": value} for value in returns]  # noqa: E731
-    assert practising._best(earned(-1213.0)) == 0, "the explorer's round has a policy that nobody has tried"
-    assert practising._best(earned(-100.0, -217.0)) == 0, "what the explorer earned is no policy's"
-    assert practising._best(earned(-1213.0, -217.0, -170.0, -368.0)) == 1
+    assert practising.best_round(earned(-1213.0)) == 0, "the explorer's round has a policy that nobody has tried"
+    assert practising.best_round(earned(-100.0, -217.0)) == 0, "what the explorer earned is no policy's"
+    assert practising.best_round(earned(-1213.0, -217.0, -170.0, -368.0)) == 1

@@ -16,6 +16,7 @@ from terrella.core import Spec, State, make_rng
 from terrella.core.policy import Random
 from terrella.data import Layout, Recorder, record
 from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.workflows.score import arms_of
 
 from ..data.layouts import layout_of
 
@@ -40,6 +41,27 @@ class Still:
     def render(self, state, channels):
         self.spec.check_channels(channels)
         return {name: state[name] for name in channels}
+
+
+class Map(Still):
+    """A world that knows its places from the start, as a place of Gaussians does: it observes its pose alone."""
+
+    def __init__(self):
+        super().__init__()
+        shapes = {"pose": (7,), "known": (24, 32), "places": (4, 4)}
+        channels = {name: spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in shapes.items()}
+        self.spec = replace(self.spec, channels={**self.spec.channels, **channels}, observes=("pose",))
+
+
+def test_a_world_that_keeps_nothing_of_what_it_sees_has_no_memory_to_leave_out(monkeypatch):
+    def load(name, **options):
+        assert options.get("memory", True) and "memory_mb" not in options
+        return Map()
+
+    monkeypatch.setattr(library, "load", load)
+    for quick in (True, False):
+        arms, closing = arms_of("map", "cpu", fast=False, quick=quick)
+        assert list(arms) == ["world"] and not closing
 
 
 @pytest.fixture

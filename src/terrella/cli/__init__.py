@@ -1,4 +1,4 @@
-"""The command line: finds the command that is asked for, runs it, and turns errors into one sentence."""
+"""The command line: finds the command, runs it, and turns errors into one sentence."""
 
 from __future__ import annotations
 
@@ -18,43 +18,46 @@ from ..similar import did_you_mean
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
 
-# Each command: the function of this package that runs it, and what it does. Its module is imported when it runs.
+# Each command: the function of this package that runs it, and a line of help. Its module is imported when it runs.
 COMMANDS = {
-    "learn": ("learn:learn", "record, train and score a world of an environment, in one go"),
+    "learn": ("learn:learn", "record an environment, train a world on it and score it, in one go"),
     "play": ("play:play", "play a world in the browser"),
     "plan": ("planning:plan", "plan in a world, act in the real environment"),
-    "evaluate": ("evaluate:evaluate", "judge policies in a world and in the real environment"),
-    "transfer": ("transfer:transfer", "carry policies over to a real robot that differs, and measure what helps"),
-    "bench acceleration": ("acceleration:acceleration", "how much faster than time a world imagines, beside MuJoCo"),
+    "evaluate": ("evaluate:evaluate", "evaluate policies in a world and in the real environment"),
+    "transfer": ("transfer:transfer", "transfer policies to a real robot that differs, and measure which methods help"),
+    "bench acceleration": (
+        "acceleration:acceleration",
+        "how much faster than real time a world imagines, beside MuJoCo",
+    ),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
-    "train policy": ("practice:policy", "let a policy practise in a world alone"),
-    "train goals": ("train:goals", "learn to reach goals in a latent world, without a search"),
+    "train policy": ("train_policy:policy", "train a policy on imagined rollouts of a world"),
+    "train goals": ("train:goals", "train a policy that reaches goals in a latent world, without a search"),
     "train estimator": ("train:estimator", "learn to estimate depth and camera motion from pictures"),
     "train uncertainty": ("train:uncertainty", "add an estimator and an uncertainty to a trained world"),
-    "train objects": ("train:objects", "learn what moving objects do, from another recording"),
+    "train objects": ("train:objects", "train the moving objects of a world, on another recording"),
     "train latent-actions": ("train:latent_actions", "learn actions from pictures alone"),
-    "train distil": ("train:few_steps", "make a slow world draw a frame in one or two steps"),
-    "train dreams": ("train:dreams", "go on training a world on its own rollouts"),
+    "train distil": ("train:few_steps", "distil a world that draws a frame in many steps into one of one or two"),
+    "train dreams": ("train:dreams", "continue training a world on its own rollouts"),
     "export policy": ("export:policy", "write a learned policy as an ONNX file that runs without PyTorch"),
     "score": ("score:score", "compare a world's predictions with a recording"),
-    "space fit": ("space:fit", "make a place of Gaussians of a recording with depth and poses"),
-    "space build": ("space:build", "make a place to walk in of words, or of a layout of rooms and furniture"),
-    "space import": ("space:import_", "make a world of a file of another tool (.ply, .spz, .sog, .glb)"),
+    "space fit": ("space:fit", "fit a place of Gaussians to a recording with depth and poses"),
+    "space build": ("space:build", "build a place to walk in from a sentence or a layout of rooms and furniture"),
+    "space import": ("space:import_", "import a file of another tool as a world (.ply, .spz, .sog, .glb)"),
     "space export": ("space:export", "write a world's Gaussians for other tools, or as a page to walk in"),
     "space view": ("space:view", "walk in a place and edit it by hand, drawn by your browser"),
     "space edit": ("space:edit", "move, turn, scale, recolour, duplicate or delete a part of a place; undo"),
-    "list": ("worlds:list_worlds", "show the worlds at hand"),
-    "convert-world": ("worlds:convert_world", "convert a world that an earlier release saved"),
-    "data doctor": ("data:doctor", "look for faults in a recording, and repair them"),
+    "list": ("worlds:list_worlds", "list the available worlds"),
+    "convert-world": ("worlds:convert_world", "convert a world of an earlier release"),
+    "data doctor": ("data:doctor", "find faults in a recording, and repair them"),
     "data convert": ("data:convert", "convert a recording to another format"),
     "data merge": ("data:merge", "merge recordings of several robots"),
     "data label": ("data:label", "write learned actions into a recording"),
     "data view": ("data:view", "look through a recording in the browser"),
 }
-# other names of commands and options, most of them those of older releases
+# names of commands and options in older releases
 RENAMED = {
     "train eye": "train estimator",
     "train things": "train objects",
@@ -63,22 +66,16 @@ RENAMED = {
     "--eye": "--estimator",
 }
 
-_THEIRS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
-_DRAWERS = (
-    "mujoco.egl",
-    "mujoco.glfw",
-    "mujoco.osmesa",
-    "mujoco.cgl",
-    "mujoco.gl_context",
-    "glfw",
-    "OpenGL",
+_OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
+_RENDERERS = (
+    "mujoco.egl", "mujoco.glfw", "mujoco.osmesa", "mujoco.cgl", "mujoco.gl_context", "glfw", "OpenGL",
     "gymnasium.envs.mujoco.mujoco_rendering",
-)
+)  # fmt: skip
 
 
 @contextmanager
-def _ended_as_a_whole() -> Iterator[None]:
-    """Lets SIGTERM end the workers of this process, and itself as Ctrl-C does."""
+def _ending_workers() -> Iterator[None]:
+    """Lets SIGTERM end the workers of this process, and then the process as Ctrl-C does."""
 
     def end(number: int, frame: object) -> None:
         for worker in multiprocessing.active_children():
@@ -96,8 +93,8 @@ def _ended_as_a_whole() -> Iterator[None]:
 
 
 @contextmanager
-def _warned_plainly() -> Iterator[None]:
-    """Lets warnings be their sentence, without a line of our source."""
+def _plain_warnings() -> Iterator[None]:
+    """Prints a warning as its sentence, without a line of source."""
     before, plain = warnings.formatwarning, lambda message, *_, **__: f"terrella: {message}\n"
     warnings.formatwarning = plain
     try:
@@ -110,12 +107,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command. The exit code is 0, the command's own, 2 with one sentence on stderr, or 130 after Ctrl-C or SIGTERM."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _ended_as_a_whole(), _warned_plainly():
+        with _ending_workers(), _plain_warnings():
             return _run(given)
     except KeyboardInterrupt as stop:
         print(f"terrella: {str(stop) or 'stopped.'}", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # whoever read our output has gone
+    except BrokenPipeError:  # the reader of our output has exited
         sys.stdout = None
         return 0
     except Exception as error:
@@ -128,13 +125,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: list[str]) -> int:
     if given[:1] in (["--version"], ["-V"]):
-        from .. import __version__
+        from ..version import __version__
 
         print(f"terrella {__version__}")
         return 0
     name, rest = _command(given)
     if name not in COMMANDS:
-        return _help(name, asked=bool(rest))
+        return _help(name, requested=bool(rest))
 
     import tyro
 
@@ -155,7 +152,7 @@ def _run(given: list[str]) -> int:
 
 
 def _command(given: list[str]) -> tuple[str, list[str]]:
-    """The command's name, "" or a group's where none is named yet, and what follows it; TerrellaError for unknown names."""
+    """The command's name and the words after it; of a missing command "" or the group. TerrellaError for unknown names."""
     group = ""
     for at, word in enumerate(given[:2]):
         name = f"{group} {word}".strip()
@@ -166,13 +163,13 @@ def _command(given: list[str]) -> tuple[str, list[str]]:
             break
         known = _members(group)
         if name not in known:
-            likest = did_you_mean(word, known)
-            raise TerrellaError(f"there is no command '{name}'{likest or '.'} The commands are {', '.join(known)}.")
+            hint = did_you_mean(word, known)
+            raise TerrellaError(f"there is no command '{name}'{hint or '.'} The commands are {', '.join(known)}.")
         group = name
     rest = given[len(group.split()) :]
     if rest and rest[0] not in ("-h", "--help"):
-        likest = did_you_mean(rest[0], ("--help", "--version"))
-        raise TerrellaError(f"there is no option '{rest[0]}'{likest or '.'} `terrella --help` lists the commands.")
+        hint = did_you_mean(rest[0], ("--help", "--version"))
+        raise TerrellaError(f"there is no option '{rest[0]}'{hint or '.'} `terrella --help` lists the commands.")
     return group, rest
 
 
@@ -183,7 +180,7 @@ def _members(group: str) -> list[str]:
     return list(dict.fromkeys(words[at] for words in names))
 
 
-def _help(group: str, asked: bool) -> int:
+def _help(group: str, requested: bool) -> int:
     """Lists the commands; on stderr with exit code 2 where a command is missing."""
     shown = {name: words for name, (_, words) in COMMANDS.items() if not group or name.startswith(f"{group} ")}
     lines = [f"usage: terrella {group + ' ' if group else ''}COMMAND ...", ""]
@@ -191,29 +188,31 @@ def _help(group: str, asked: bool) -> int:
     lines += [f"  terrella {name:<22} {words}" for name, words in shown.items()]
     lines += ["", "`terrella COMMAND --help` explains a command and its options."]
     lines += [] if group else ["`terrella --version` prints the version."]
-    print("\n".join(lines), file=sys.stdout if asked else sys.stderr)
-    return 0 if asked else 2
+    print("\n".join(lines), file=sys.stdout if requested else sys.stderr)
+    return 0 if requested else 2
 
 
 def _sentence(error: Exception) -> str | None:
-    """What to tell a person of an error that is theirs or their machine's; None for a fault of ours: that needs its trace."""
+    """The sentence for an error of the input or the machine; None for a fault of this program, which needs its trace."""
     if isinstance(error, TerrellaError):
         return str(error)
-    if isinstance(error, OSError) and error.errno in _THEIRS:
+    if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
         where = f" ({error.filename})" if error.filename else ""
         return f"{error.strerror}{where}; choose another folder, or free some space."
     if isinstance(error, ModuleNotFoundError) and error.name in ("mujoco", "glfw", "OpenGL"):
         return f"{error.name} is not installed; `pip install 'terrella[mujoco]'` installs what MuJoCo's worlds need."
     if _of_a_renderer(error):
-        sys.unraisablehook = lambda _: None  # half-made renderers complain again when they are thrown away
+        sys.unraisablehook = lambda _: None  # a renderer that failed to start complains again when it is deleted
         what = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
         return f"the simulator cannot draw without a display ({what}); set MUJOCO_GL=egl or MUJOCO_GL=osmesa and try again."
     return None
 
 
 def _of_a_renderer(error: Exception) -> bool:
-    """Whether MuJoCo's drawing, or a library that it draws with, raised the error or called what did."""
+    """Whether MuJoCo's renderer, or a library that it draws with, is in the error's trace."""
     if type(error).__module__ == "mujoco" and any(word in str(error) for word in ("OpenGL", "gladLoadGL", "EGL")):
         return True
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return any(f"{name}.".startswith(f"{drawer}.") for name in (type(error).__module__, *frames) for drawer in _DRAWERS)
+    return any(
+        f"{name}.".startswith(f"{renderer}.") for name in (type(error).__module__, *frames) for renderer in _RENDERERS
+    )

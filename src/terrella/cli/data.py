@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from .. import progress
-from .say import Host, Json, Port, Seed, Token, result, say
+from ..workflows.progress import stage
+from .say import Host, Json, Port, Token, result, say
 
 Fps = Annotated[float | None, arg(help="Frames per second of the new dataset. Default: those of the recording.")]
 Policy = Annotated[
@@ -22,13 +23,13 @@ Policy = Annotated[
 
 @contextmanager
 def _whole_or_nothing(target: Path) -> Iterator[None]:
-    """Says what Ctrl-C leaves of a command that writes all of `target` or nothing."""
+    """After Ctrl-C, says whether a command that writes all of `target` or nothing has written it."""
     before = target.exists()
     try:
         yield
     except KeyboardInterrupt:
         left = f"{target} was written whole" if target.exists() and not before else f"nothing was written at {target}"
-        say(f"terrella: stopped; {left}, and what was read is untouched.")
+        say(f"terrella: stopped; {left}, and the source is untouched.")
         raise SystemExit(130) from None
 
 
@@ -54,50 +55,57 @@ def doctor(
             return sys.stdin.readline().strip().lower() in ("y", "yes")
         return False
 
-    found = examine(folder)
-    facts: dict[str, object] = {"dataset": str(folder), "sound": not found.faults, **found.facts()}
-    lines = [found.report(str(folder))]
+    diagnosis = examine(folder)
+    facts: dict[str, object] = {"dataset": str(folder), "sound": not diagnosis.faults, **diagnosis.facts()}
+    lines = [diagnosis.report(str(folder))]
     if repair:
         target = out or folder.resolve().with_name(f"{folder.resolve().name}-mended")
-        with _whole_or_nothing(target), progress.shown("mending") as report:
+        with _whole_or_nothing(target), stage("mending", say) as report:
             done = mend(folder, target, progress=lambda pieces, of: report(pieces, of), allow_loss=yes or allowed)
         facts |= {"mended": str(target), "done": done}
         lines += [*done, f"the mended copy: {target}"]
     result(facts, json, "\n".join(lines))
-    return 1 if found.faults and not repair else 0
+    return 1 if diagnosis.faults and not repair else 0
+
+
+@dataclass(frozen=True)
+class ConvertConfig:
+    """Settings of `data convert`."""
+
+    to: Literal["auto", "lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"] = "auto"
+    """Format to write, if the name of the target does not imply it."""
+    fps: Fps = None
+    policy: Policy = "previous"
+    pictures: Literal["video", "png"] = "video"
+    """How a LeRobot dataset stores pictures: H.264 video, or PNG (lossless, larger)."""
+    episodes: int = 10
+    """Number of rollouts to record from "gym:ID"."""
+    seed: int = 0
+    """The same seed gives the same result."""
 
 
 def convert(
-    source: Positional[str],
-    target: Positional[Path],
-    to: Literal["auto", "lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"] = "auto",
-    fps: Fps = None,
-    policy: Policy = "previous",
-    pictures: Literal["video", "png"] = "video",
-    episodes: int = 10,
-    seed: Seed = 0,
-    json: Json = False,
+    source: Positional[str], target: Positional[Path], config: ConvertConfig = ConvertConfig(), json: Json = False
 ) -> None:
     """Convert a recording to another format: LeRobot v3, MCAP, Minari, HDF5, rollouts (.npz), videos, images.
 
     Whatever the new format cannot hold is listed at the end. The target is written completely or not at all.
 
     Args:
-        source: The recording to read. Its format is recognised from its content. "gym:ID" draws rollouts of a Gymnasium
+        source: The recording to read. Its format is recognised from its content. "gym:ID" records rollouts of a Gymnasium
             environment with random actions.
         target: The recording to write. NAME.mcap and NAME.hdf5 choose their formats; any other name is a LeRobot v3 folder.
-        to: Format to write, if the name of the target does not say it.
-        pictures: How a LeRobot dataset stores pictures: H.264 video, or PNG (lossless, larger).
-        episodes: Number of rollouts to draw from "gym:ID".
     """
     from ..exchange.convert import open_source, write_source
     from ..exchange.formats.lerobot import LeRobotRows
 
-    found = open_source(source, fps, episodes, seed)
-    rows = LeRobotRows(fps if found.fps is None or fps != found.fps else None, policy, pictures)
-    with _whole_or_nothing(target), progress.shown(f"converting {found.name}") as report:
-        left_out = write_source(found, target, None if to == "auto" else to, rows, lambda done, of: report(done, of))
-    facts = {"source": str(source), "target": str(target), "sensors": sorted(found.sensors), "left_out": left_out}
+    fps = config.fps
+    recording = open_source(source, fps, config.episodes, config.seed)
+    rows = LeRobotRows(fps if recording.fps is None or fps != recording.fps else None, config.policy, config.pictures)
+    with _whole_or_nothing(target), stage(f"converting {recording.name}", say) as report:
+        to = None if config.to == "auto" else config.to
+        left_out = write_source(recording, target, to, rows, lambda done, of: report(done, of))
+    facts = {"source": str(source), "target": str(target), "sensors": sorted(recording.sensors), "left_out": left_out}
     result(
         facts, json, "\n".join([*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"])
     )
@@ -116,16 +124,16 @@ def merge(
     Args:
         sources: Recordings in any format.
         out: Folder of the merged dataset (LeRobot v3).
-        mapping: TOML file that says which number of which robot fills which merged dimension. Without it, a mapping is
-            guessed from the names and written to OUT.toml, for you to check, edit and pass here.
+        mapping: TOML file that maps the numbers of each robot to merged dimensions. Without it, a mapping is guessed from the names
+            and written to OUT.toml, for you to check, edit and pass here.
         dry: Write the guessed mapping and stop.
     """
     from ..exchange.convert import open_source
     from ..exchange.merging.write import merge_into
 
-    found = {path: open_source(path) for path in sources}
-    with _whole_or_nothing(out), progress.shown("merging") as report:
-        facts, text = merge_into(found, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
+    recordings = {path: open_source(path) for path in sources}
+    with _whole_or_nothing(out), stage("merging", say) as report:
+        facts, text = merge_into(recordings, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
     result(facts, json, text)
 
 
@@ -170,7 +178,7 @@ def label(
     out: Path,
     labelled: Path | None = None,
     frames: int = 200,
-    seed: Seed = 0,
+    seed: int = 0,
     json: Json = False,
 ) -> None:
     """Write a copy of a recording with the latent actions that `terrella train latent-actions` learned.
@@ -181,12 +189,13 @@ def label(
         out: Folder of the labelled copy. `terrella train video` can learn a world from it.
         labelled: Recording with real actions, used to map keys to latent actions.
         frames: Number of its frames to use.
+        seed: The same seed gives the same result.
     """
     from ..exchange import write_source
     from ..exchange.formats.lerobot import LeRobotRows
     from ..learn import latent_codes
 
-    with progress.shown("labelling") as report:
+    with stage("labelling", say) as report:
         keys = latent_codes.map_keys(run, labelled, report, frames, seed=seed) if labelled else None
         labels = latent_codes.labelled(run, folder, report, keys)
         pictures = "png" if labels.exact else "video"  # exact ones stay exact

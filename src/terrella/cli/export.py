@@ -1,4 +1,4 @@
-"""The commands `terrella export ...`: what was learned, as files for other programs."""
+"""The commands `terrella export ...`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def policy(name: Positional[Path], world: str, out: Path, json: Json = False) ->
     """Write a learned policy as one ONNX file, with normalisation and action limits inside: it runs without PyTorch.
 
     Args:
-        name: The folder of the policy, or of its training run. Policies for goals (`terrella train goals`) have no such file yet.
-        world: A world with the actions that it gives, as the one that it practised in (mujoco:go1).
+        name: The folder of the policy, or of its training run. Policies of `terrella train goals` cannot be exported yet.
+        world: A world with the same actions, such as the one in which it practised (mujoco:go1).
         out: The file, NAME.onnx.
     """
     from ..act.actor import Actor, policy_folder, read_policy
@@ -25,8 +25,8 @@ def policy(name: Positional[Path], world: str, out: Path, json: Json = False) ->
 
     if read_policy(policy_folder(name)).get("kind") == GOALS:
         raise TerrellaError(
-            f"{name} is a policy for goals, which acts through the world that it was learned in: it has no ONNX file; "
-            "`terrella plan WORLD --agent` plays it."
+            f"{name} is a policy for goals, which needs its world to act, so it cannot be exported; `terrella plan WORLD --agent` "
+            "plays it."
         )
     spec = library.load(world).spec
     inputs = write_onnx(Actor.load(name, spec), out)

@@ -1,4 +1,4 @@
-"""The commands that train. Imported only when one of them is asked for: their settings live in rooms slow to import."""
+"""The commands `terrella train ...`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from .. import progress
 from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining, train_latent
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
@@ -23,10 +22,11 @@ from ..learn.recipes.post_training import DistilConfig, DreamsConfig, distil, tr
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.trainer import device_named
 from ..library import folder_of
+from ..workflows.opening import Device, load_named
+from ..workflows.progress import stage
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
-from .named import Device, load_named
-from .say import Json, result
+from .say import Json, result, say
 
 
 def video(data: Positional[str], out: str, config: TrainConfig, json: Json = False) -> None:
@@ -40,8 +40,8 @@ def video(data: Positional[str], out: str, config: TrainConfig, json: Json = Fal
 
 
 def latent(data: Positional[str], out: str, config: LatentTraining, json: Json = False) -> None:
-    """Train a latent world on a recording with pictures, state vectors or both: it predicts what matters instead of pixels, by the
-    thousand at once. Stop it with Ctrl-C at any time; the same command continues.
+    """Train a latent world on a recording with pictures, state vectors or both: it predicts a latent instead of pixels, for
+    thousands of rollouts at once. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
         data: The recording: a folder, or an address (hf://..., s3://...).
@@ -58,21 +58,20 @@ def goals(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Train a policy that reaches goals in a latent world at once, without a search: whatever an episode came to was a goal that
-    its actions reached. Takes a minute or two; the same command continues.
+    """Train a policy that reaches goals in a latent world without a search, by hindsight relabelling: each state that an episode
+    reached is a goal for the actions before it. Takes a minute or two; the same command continues.
 
     Args:
         world: The latent world, a run of `train latent`.
-        recording: The recording that it was learned of.
-        out: Folder of the run; the policy is in OUT/policy: for `terrella plan --agent OUT` or `--proposal OUT`.
+        recording: The recording on which it was trained.
+        out: Folder of the run. `terrella plan --agent OUT` and `--proposal OUT` use the policy.
     """
     inside = load_named(world, device)
     _shown(lambda report: train_goals(inside, world, recording, out, config, report), json, run=out)
 
 
 def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: Json = False) -> None:
-    """Train a depth and odometry estimator on a recording with depth and poses. It reads depth off one picture, and motion
-    off two.
+    """Train a depth and odometry estimator on a recording with depth and poses: depth from one picture, motion from two.
 
     Args:
         data: The recording: a folder, or an address.
@@ -82,8 +81,8 @@ def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: 
 
 
 def uncertainty(name: Positional[str], data: str, out: str, config: SensesConfig, json: Json = False) -> None:
-    """Train a world's estimator, so that it can begin with a single picture, and its uncertainty, so that it says when it
-    invents. `train video` ends with both.
+    """Train a world's estimator, so that it can start from a single picture, and its uncertainty, the error to expect. `train
+    video` ends with both.
 
     Args:
         name: The world: a name that `terrella list` shows, or a folder.
@@ -98,14 +97,14 @@ def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining,
 
     Args:
         name: The world: a name that `terrella list` shows, or a folder.
-        data: A recording of the same game that tells objects apart.
+        data: A recording of the same game with the identity of each object.
         out: Folder of the run; the world is in OUT/world.
     """
     _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json)
 
 
 def latent_actions(data: Positional[str], out: str, config: LatentConfig, json: Json = False) -> None:
-    """Learn a few actions from pictures alone. `terrella data label` then writes them into a recording.
+    """Learn a few latent actions from pictures alone. `terrella data label` then writes them into a recording.
 
     Args:
         data: The recording: a folder, or an address. Its own actions, if it has any, are not used.
@@ -147,14 +146,14 @@ def dreams(
         name: The world: a name that `terrella list` shows, or a folder.
         data: A recording of the same game.
         out: Folder of the run: the world, a log, and pictures of truth, the old prediction and the new.
-        teacher: A world that draws a frame in many steps, whose sharpness the predictions should reach; see `train distil`.
+        teacher: A world that draws a frame in many steps, as in `train distil`: its frames are the target of sharpness.
     """
     master = None if teacher is None else _learned(teacher, device)
     _shown(lambda report: train_dreams(_learned(name, device), data, out, config, report, master), json, run=out)
 
 
 def _shown(train: Callable[[Callable[..., None]], dict], json: bool, **more: str) -> None:
-    with progress.shown("training") as report:
+    with stage("training", say) as report:
         facts = train(report)
     result({**more, **facts}, json)
 

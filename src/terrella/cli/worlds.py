@@ -1,4 +1,4 @@
-"""The commands about saved worlds: list them, and convert one of an earlier release."""
+"""The commands `terrella list` and `terrella convert-world`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .say import Json
 
 
 def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) -> None:
-    """Show the worlds at hand, each with what is known of it.
+    """List the available worlds, each with its card.
 
     Args:
         folders: Folders with checkpoints of your own.
@@ -29,10 +29,10 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
 
 
 def convert_world(old: Positional[Path], new: Positional[Path]) -> None:
-    """Convert a world that an earlier release saved to the format of this one. Nothing is lost.
+    """Convert a world of an earlier release to the format of this one. Nothing is lost.
 
     Args:
-        old: Its folder; it stays as it is.
+        old: Its folder, which is not changed.
         new: The folder to write.
     """
     from ..worlds import convert

@@ -45,7 +45,7 @@ def check_alike(world: Spec, real: Spec) -> None:
         raise ActionError(
             f"{world.name} takes actions in {world.action}, and {real.name} in {real.action}: they differ."
         )
-    if why := misunderstood(facts_of(world), facts_of(real)):
+    if why := meaning_difference(facts_of(world), facts_of(real)):
         raise ActionError(f"the actions of {world.name} and {real.name} mean different things: {why}.")
     if not math.isclose(world.dt_s, real.dt_s, rel_tol=0.02):
         held = round(world.dt_s / real.dt_s)
@@ -69,7 +69,7 @@ def check_alike(world: Spec, real: Spec) -> None:
             )
 
 
-def misunderstood(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+def meaning_difference(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     """How the meanings of two worlds' actions differ, by their facts (data/channels.py): mode, frame, order of the axes, units.
     "" where all that both declare agrees. The sizes of units may differ: a weaker motor is a gap to measure."""
     mode, frame, names, units = (
@@ -88,7 +88,7 @@ def misunderstood(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     return ""
 
 
-def compared(world: Spec, real: Spec) -> tuple[str, ...]:
+def comparable_channels(world: Spec, real: Spec) -> tuple[str, ...]:
     """The channels in which imagination and reality can be compared: pictures and vectors that both render."""
     both = {
         name: space

@@ -1,0 +1,20 @@
+"""The command `terrella train policy`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from tyro.conf import arg
+
+from ..workflows.train_policy import TrainPolicyConfig, train_policy
+from .say import Json, say, show
+
+
+def policy(world: Annotated[str, arg(name="in")], config: TrainPolicyConfig, json: Json = False) -> None:
+    """Train a policy on imagined rollouts of a world, hundreds at once, and measure its return in the real environment.
+    Stop it with Ctrl-C at any time; the same command continues.
+
+    Args:
+        world: The world to practise in: what `terrella list` shows, the path of a checkpoint or a run, or a simulator (gym:ID).
+    """
+    show(train_policy(world, config, progress=say), json)

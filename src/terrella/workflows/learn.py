@@ -1,0 +1,309 @@
+"""`learn`: from an environment's id to a playable world with a scorecard, within a number of minutes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import DatasetError, TerrellaError
+from ..core.world import World, make_rng
+from ..data import Dataset
+from ..data.recording import LONGEST
+from ..learn.recipes.video import TrainConfig, train_video
+from ..learn.recording import MOST, learned_size
+from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
+from .collect import explore, storage_of
+from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from .opening import ControlsConfig, EnvironmentConfig
+from .progress import Progress, Report, duration, silent, stage
+from .recording_facts import describe, recording_facts
+from .results import jsonable
+from .score import QUICK_HORIZONS, ExamRequest, arms_of, exam_of, write_card
+
+ENDLESS = 10**9  # steps: training ends with its time
+EPISODES = 12  # recorded at least, shorter ones if need be: scoring needs some that training did not see
+CLIP_COUNTS, FEWEST_CLIPS = (50, 24, 12, 6, 3), 6  # scoring takes the most clips for which there is time
+SAVE_EVERY_S = 30.0
+SMALL = (
+    64 * 96
+)  # pixels of a picture at most, in fewer minutes than SHORT_MIN: more pixels learn too little in that time
+SHORT_MIN = 60
+FEW_FRAMES, FEWEST_FRAMES = 600, 100  # a slow game is recorded for up to half of the time until it has 600 frames
+REAL_TIME_FPS, HELD_FPS = (
+    32,
+    25,
+)  # steps per second that a learned world plays on two cores; faster games are held to 25
+FEW_STEPS = 600  # training steps after which a world has learned next to nothing
+_DOES = {RECORDING: "records for up to", TRAINING: "trains for", SCORING: "scores for"}
+_DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for"}
+
+
+@dataclass(frozen=True)
+class LearnConfig:
+    """Settings of `learn`."""
+
+    minutes: float = 30.0
+    """Time for all of it, earlier runs included. With more than a finished world had, it is trained on."""
+    out: Path | None = None
+    """Folder for the recording, the run and the score; default: learned/ and the environment's name."""
+    frames: int = 20_000
+    """Frames to record at most; recording ends sooner after an eighth of the time."""
+    seed: int = 0
+    """The same seed gives the same result."""
+    controls: ControlsConfig = ControlsConfig()
+    environment: EnvironmentConfig = EnvironmentConfig()
+
+
+@dataclass(frozen=True)
+class LearnResult:
+    """A world that was learned, and its score."""
+
+    verdict: tuple[str, ...]
+    """Sentences: is it better than copying the last frame, and how far can it be trusted?"""
+    world: Path
+    """Folder of the run: `load` and `terrella play` open it."""
+    card: Path | None
+    """The page of the scorecard; None where too little was recorded to score."""
+    spent_s: Mapping[str, float]
+    """Seconds of each stage: recording, training, scoring."""
+
+    @property
+    def play(self) -> str:
+        return f"terrella play {self.world}"
+
+    def to_json(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {"verdict": self.verdict} | ({"card": self.card} if self.card else {})
+        minutes = {f"{name}_minutes": round(seconds / 60, 2) for name, seconds in self.spent_s.items()}
+        return jsonable({**facts, "world": self.world, "play": self.play, **minutes})
+
+    def summary(self) -> str:
+        lines = [*self.verdict, f"play it: {self.play}"]
+        lines += [f"the card: {self.card}"] if self.card else []
+        stages = ", ".join(f"{text} {duration(self.spent_s[name])}" for name, text in _DID.items())
+        return "\n".join([*lines, f"It took {duration(sum(self.spent_s.values()))}: {stages}."])
+
+
+def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Progress = silent) -> LearnResult:
+    """Learns a world of an environment: a script explores and records it, a world is trained on that recording and scored.
+
+    environment: gym:CarRacing-v3, gym:ALE/Breakout-v5, gym:PACKAGE:ID, or a game (doom:my_way_home).
+    The same call continues where an earlier one was stopped. TerrellaError for what cannot be learned.
+    """
+    check_budget(config.minutes, config.frames)
+    settings = {"environment": environment, "frames": config.frames, "seed": config.seed}
+    settings |= asdict(config.environment) | asdict(config.controls)
+    schedule = LearnSchedule(config.out or folder_for(environment), settings, config.minutes)
+    if SCORING in schedule.facts:
+        progress(f"{schedule.folder} is finished; --minutes with more than {config.minutes:g} trains it on.")
+    else:
+        _Learning(environment, config, schedule, progress).run()
+    score = schedule.facts[SCORING]
+    card = Path(score["card"]) if "card" in score else None
+    return LearnResult(tuple(score["verdict"]), schedule.folder / "run", card, dict(schedule.spent))
+
+
+def check_budget(minutes: float, frames: int) -> None:
+    """TerrellaError for a time or a number of frames with which nothing can be learned."""
+    if not 0 < minutes < math.inf or frames < 100:
+        raise TerrellaError("--minutes is a time above 0, and --frames are 100 or more.")
+
+
+@dataclass(frozen=True)
+class _Learning:
+    """The stages of `learn`."""
+
+    name: str
+    config: LearnConfig
+    schedule: LearnSchedule
+    progress: Progress
+
+    def run(self) -> None:
+        """All stages that are not over."""
+        schedule, progress = self.schedule, self.progress
+        spent = ", ".join(f"{text} {duration(schedule.spent[at])}" for at, text in _DID.items() if schedule.spent[at])
+        if spent:
+            progress(f"Goes on in {schedule.folder}: {spent} so far.")
+        if RECORDING in schedule.facts:
+            self._announce()
+        for name, work in ((RECORDING, self._record), (TRAINING, self._train), (SCORING, self._score)):
+            if name in schedule.facts:
+                continue
+            try:
+                with stage(name, progress) as shown, schedule.stage(name, shown) as report:
+                    facts = work(report)
+            except KeyboardInterrupt as stop:
+                raise KeyboardInterrupt(
+                    str(stop) or f"stopped while {name}; the same command goes on from there."
+                ) from stop
+            except Exception:
+                schedule.forget()
+                raise
+            schedule.note(name, facts)
+            if name != SCORING:
+                progress(f"{_DID[name].capitalize()} {duration(schedule.spent[name])}: {_in_words(facts)}")
+
+    def _announce(self) -> None:
+        """One line about the stages to come, with their times."""
+        schedule = self.schedule
+        parts = [f"{text} {duration(schedule.left_s(at))}" for at, text in _DOES.items() if at not in schedule.facts]
+        self.progress(f"Of {duration(schedule.seconds)} it {', '.join(parts)}; all files are in {schedule.folder}.")
+
+    def _record(self, report: Report) -> dict[str, object]:
+        schedule, name, environment = self.schedule, self.name, self.config.environment
+        opened = schedule.facts.setdefault(
+            "opened", name if schedule.has_recording else held_to_real_time(name, environment)
+        )
+        most = SMALL if schedule.seconds < 60 * SHORT_MIN else MOST
+        world = self.config.controls.of(open_small(opened, environment, most))
+        self._announce()  # after it was opened: nothing is announced of an environment that does not open
+        if opened != name:
+            held = opened.rpartition("@")[2]
+            self.progress(
+                f"Each action is held for {held} steps, for the game has more steps per second than are played in real time; "
+                f"{name}@1 records every step."
+            )
+        for line in describe(world.spec):
+            self.progress(line)
+        out, frames = schedule.folder / RECORDING, self.config.frames
+        schedule.facts.setdefault("longest", longest_episode(world, frames, schedule.share_s[RECORDING]))
+        schedule.save()
+        rows = 0
+
+        def overtime_s() -> float:
+            """Seconds beyond the stage's time that a slow game needs for a few frames, at this pace."""
+            spent = schedule.spent[RECORDING]
+            return min(schedule.seconds / 2 - spent, (FEW_FRAMES / max(rows, 1) - 1) * spent)
+
+        def counted(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
+            nonlocal rows
+            rows = done
+            late = schedule.left_s(RECORDING) <= 0 < overtime_s()
+            slow = (f"a slow game: until it has {FEW_FRAMES} frames", overtime_s())
+            report(done, total, *(slow if late else (text, left_s)))
+
+        def enough() -> bool:
+            return schedule.left_s(RECORDING) <= 0 and overtime_s() <= 0
+
+        limits: dict[str, Any] = {"max_episode_steps": schedule.facts["longest"], "enough": enough}
+        explore(world, out, frames, self.config.seed, counted, storage_of(world.spec), **limits)
+        dataset = Dataset(out)
+        if dataset.length < min(FEWEST_FRAMES, frames):
+            raise DatasetError(
+                f"{name} gave {dataset.length} frames in {duration(schedule.spent[RECORDING])}, too few to learn from; the same "
+                "command with more --minutes goes on recording."
+            )
+        return recording_facts(dataset, world.spec.name, self.progress)
+
+    def _train(self, report: Report) -> dict[str, object]:
+        folder = self.schedule.folder
+        hours = self.schedule.share_s[TRAINING] / 3600
+        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
+        facts = train_video(folder / RECORDING, folder / "run", config, report)
+        if facts["step"] < FEW_STEPS:
+            self.progress(
+                f"Warning: there was time for {facts['step']} training steps only; the same command with more --minutes trains "
+                "it on."
+            )
+        return {"world": facts["world"], "steps": facts["step"]}
+
+    def _score(self, report: Report) -> dict[str, object]:
+        schedule = self.schedule
+        run, data = str(schedule.folder / "run"), schedule.folder / RECORDING
+        arms, closing = arms_of(run, "auto", fast=False, quick=True)
+        try:
+            exam, identity = _longest_exam(
+                ExamRequest(arms, closing, data, clips=max(CLIP_COUNTS), drift=0, seed=self.config.seed), report
+            )
+        except DatasetError as error:
+            return {"verdict": [f"{schedule.folder.name} is not scored: {error}"]}
+        report(0, 1, "measuring how fast the world is")
+        if "clips" not in schedule.facts:
+            schedule.note("clips", most_clips_within(exam, schedule.left_s(SCORING), CLIP_COUNTS))
+        exam = exam.of(schedule.facts["clips"])
+        card, files = write_card(run, exam, identity, schedule.folder / "score", report)
+        return {"verdict": verdict(card), "card": str(files[1])}
+
+
+def held_to_real_time(name: str, environment: EnvironmentConfig) -> str:
+    """The environment's name, with each action held for several of its steps (gym:ID@N) where it has more steps per second than
+    are played in real time."""
+    if not name.startswith("gym:") or "@" in name or environment.fps:
+        return name
+    world = environment.open(name)
+    rate = 1 / world.spec.dt_s
+    if callable(close := getattr(world, "close", None)):
+        close()
+    return name if rate <= REAL_TIME_FPS else f"{name}@{max(2, round(rate / HELD_FPS))}"
+
+
+def open_small(name: str, environment: EnvironmentConfig, most: int) -> World:
+    """The environment, with pictures of the size at which they are learned, of `most` pixels, if that is smaller."""
+    world = environment.open(name)
+    drawn = world.spec.channels.get("rgb")
+    if drawn is None:
+        raise TerrellaError(
+            f"{name} shows no pictures, and a world is learned from them; an environment draws itself as rgb_array, "
+            "or its observation is a picture."
+        )
+    height, width = (drawn.shape or (0, 0))[:2]
+    if environment.size or not name.startswith("gym:") or height * width <= most:
+        return world
+    if callable(close := getattr(world, "close", None)):
+        close()
+    return replace(environment, size=learned_size(height, width, most)).open(name)
+
+
+def longest_episode(world: World, frames: int, seconds: float) -> int:
+    """The most steps of an episode with which several episodes are recorded in the time, by a trial of a few steps."""
+    rng = make_rng(0)
+    state = world.start(1, rng)
+    began, done = time.monotonic(), 0
+    while done < 20 or (done < 200 and time.monotonic() - began < 1):
+        state = world.imagine(state, world.spec.sample_action(1, rng), rng)
+        seen = world.render(state, list(world.spec.channels))
+        done += 1
+        if "done" in seen and bool(seen["done"][0]):
+            state = world.start(1, rng)
+    pace_s = (time.monotonic() - began) / done
+    expected = min(frames, seconds / pace_s)
+    return min(world.spec.max_episode_steps or LONGEST, LONGEST, max(100, int(expected / EPISODES)))
+
+
+def _longest_exam(request: ExamRequest, report: Report) -> tuple[Exam, str]:
+    """The exam over the longest horizon of which enough clips fit into the episodes that training did not see."""
+    exams: list[tuple[Exam, str]] = []
+    first_error: DatasetError | None = None
+    for horizons in (QUICK_HORIZONS, (1, 8, 16), (1, 8), (1, 4)):
+        try:
+            exams.append(exam_of(request, ExamConfig.quick(horizons), report=report))
+        except DatasetError as error:
+            first_error = first_error or error
+            continue
+        if _clip_count(exams[-1][0]) >= FEWEST_CLIPS:
+            return exams[-1]
+    if not exams:
+        assert first_error is not None
+        raise first_error
+    return max(exams, key=lambda each: _clip_count(each[0]))
+
+
+def _clip_count(exam: Exam) -> int:
+    return min(len(clips) for clips in exam.sets[CLIPS].values())
+
+
+def _in_words(facts: Mapping[str, object]) -> str:
+    names = (
+        "frames",
+        "episodes",
+        "frames_that_change",
+        "places",
+        "actions_with_a_clear_effect",
+        "look",
+        "steps",
+        "world",
+    )
+    return "; ".join(f"{name.replace('_', ' ')} {facts[name]}" for name in names if name in facts)

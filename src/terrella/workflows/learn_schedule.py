@@ -1,0 +1,134 @@
+"""The schedule of `learn`: how its minutes are divided among its stages, and what is done of it, kept in a file."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import TerrellaError
+from ..core.files import write_json
+from .progress import Report
+
+RECORDING, TRAINING, SCORING = "recording", "training", "scoring"
+STARTING_S = 5.0  # of each stage, for imports and for reading again
+SAVE_EVERY_S = 5.0
+
+
+def folder_for(name: str) -> Path:
+    """The default folder in which the world of an environment is learned: learned/CarRacing-v3."""
+    title = re.sub(r"[^\w.-]+", "-", re.split(r"[:/]", name.rstrip(":/"))[-1]) or "world"
+    return Path("learned") / title
+
+
+def refuse_other_settings(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """TerrellaError where the run in `folder` was begun with other settings than those of now."""
+    other = [f"{name} {begun.get(name)}, not {value}" for name, value in now.items() if begun.get(name) != value]
+    if other:
+        raise TerrellaError(
+            f"{folder} was begun with other settings ({'; '.join(other)}); repeat them, or give another --out."
+        )
+
+
+def refuse_foreign_folder(folder: Path) -> None:
+    """TerrellaError where the folder of a new run is a file, or has files already."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise TerrellaError(f"{folder} holds something else than a world that is being learned; give another --out.")
+
+
+class LearnSchedule:
+    """The stages of a folder with `recording`, `run` and `score`; the file learn.json keeps the settings and what is done.
+
+    settings: JSON values, which must not change once something is recorded.
+    minutes:  for all stages and all runs of the command together.
+    facts:    what is known of the stages that are over, by their names.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], minutes: float):
+        self.folder, self.settings, self.seconds = folder, json.loads(json.dumps(settings)), 60 * minutes
+        self.spent: dict[str, float] = dict.fromkeys((RECORDING, TRAINING, SCORING), 0.0)
+        self.facts: dict[str, Any] = {}
+        self._file, self._began = folder / "learn.json", time.monotonic()
+        if self._file.exists():
+            self._resume()
+        else:
+            refuse_foreign_folder(folder)
+
+    @property
+    def has_recording(self) -> bool:
+        """Whether a part of the recording is on disk."""
+        return (self.folder / RECORDING / "meta" / "info.json").exists()
+
+    @property
+    def share_s(self) -> dict[str, float]:
+        """Seconds of each stage. Recording has an eighth, scoring a fifteenth (between one and ten minutes, at most a fifth);
+        training has the rest."""
+        scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 5)
+        recording = self.spent[RECORDING] if RECORDING in self.facts else self.seconds / 8
+        training = self.seconds - recording - scoring - STARTING_S
+        return {RECORDING: recording, TRAINING: max(training, 1.0), SCORING: scoring}
+
+    def left_s(self, stage: str) -> float:
+        """Seconds until a stage should end; for the last stage, until the command should."""
+        if stage == SCORING and TRAINING in self.facts:
+            return max(self.seconds - sum(self.spent.values()), self.share_s[SCORING] / 2)
+        return self.share_s[stage] - self.spent[stage]
+
+    @contextmanager
+    def stage(self, name: str, report: Report) -> Iterator[Report]:
+        """Counts the time of a stage, from the end of the last one. Gives a `report` that adds the time left by schedule."""
+        before, began, saved = self.spent[name], self._began, 0.0
+
+        def timed(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
+            nonlocal saved
+            self.spent[name] = before + time.monotonic() - began
+            if time.monotonic() - saved > SAVE_EVERY_S:
+                saved = time.monotonic()
+                self.save()
+            report(done, total, text, max(1.0, self.left_s(name)) if left_s is None else left_s)
+
+        try:
+            yield timed
+        finally:
+            self._began = time.monotonic()
+            self.spent[name] = before + self._began - began
+            if self._file.exists():
+                self.save()
+
+    def note(self, name: str, facts: object) -> None:
+        """Keeps the facts of a stage that is over."""
+        self.facts[name] = facts
+        self.save()
+
+    def save(self) -> None:
+        whole = {"asked": self.settings, "minutes": self.seconds / 60, "spent_s": self.spent, "facts": self.facts}
+        write_json(self._file, whole)
+
+    def forget(self) -> None:
+        """Removes the folder's files, if nothing was recorded."""
+        if self.has_recording or not self._file.exists():
+            return
+        shutil.rmtree(self.folder / RECORDING, ignore_errors=True)
+        self._file.unlink()
+        if not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+    def _resume(self) -> None:
+        try:
+            kept = json.loads(self._file.read_text(encoding="utf-8"))
+            settings, minutes = dict(kept["asked"]), float(kept["minutes"])
+            spent, facts = {name: float(kept["spent_s"][name]) for name in self.spent}, dict(kept["facts"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise TerrellaError(f"{self._file} is damaged ({error}); give another --out.") from error
+        if not self.has_recording:
+            return self.forget()
+        refuse_other_settings(self.folder, settings, self.settings)
+        self.spent, self.facts = spent, facts
+        if self.seconds > 60 * minutes and TRAINING in facts:  # more time for a finished world: train it on
+            self.facts = {name: fact for name, fact in facts.items() if name == RECORDING}
+            self.spent[SCORING] = 0.0

@@ -1,0 +1,155 @@
+"""`train policy`: a policy practises in a world only, and is then tried in the real environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import torch
+from tyro.conf import arg
+
+from .. import library
+from ..act.actor import Actor
+from ..act.belief import load_learned_policy
+from ..act.planning.episodes import play
+from ..core.errors import TerrellaError
+from ..core.policy import Policy, Random, observed_channels
+from ..core.world import World, make_rng
+from ..learn.growth import Scaled
+from ..learn.recipes import policy as recipe
+from ..learn.recipes.policy import Practice
+from ..measure.statistics import Figure, mean_interval
+from .opening import Device, EnvironmentConfig, load_named
+from .progress import Progress, silent, stage
+from .real_environment import STEPS, check_alike, open_copied, open_real
+from .results import jsonable
+
+
+@dataclass(frozen=True)
+class TrainPolicyConfig:
+    """Settings of `train policy`."""
+
+    out: Path
+    """Folder of the run: the policy, its checkpoint and a log."""
+    practice: Practice = Practice()
+    recording: Annotated[str | None, arg(name="from")] = None
+    """A recording in whose states practice begins; default: where the world's own episodes begin."""
+    grow: bool = False
+    """Start with --randomise ranges of width zero and widen them to those of the file while the policy copes."""
+    real: str | None = None
+    """The environment in which the policy is tried afterwards (gym:Pendulum-v1), beside random actions from the same starts."""
+    episodes: int = 20
+    """Episodes of that trial."""
+    device: Device = "auto"
+    environment: EnvironmentConfig = EnvironmentConfig()
+
+
+@dataclass(frozen=True)
+class TrainPolicyResult:
+    """A policy that practised, and its trial in the real environment."""
+
+    world: str
+    """The world in which it practised."""
+    facts: Mapping[str, Any]
+    """Of the training run: policy (its folder), practised_steps, minutes, losses."""
+    trial: PolicyTrial | None
+    """None without a real environment."""
+
+    def to_json(self) -> dict[str, Any]:
+        if self.trial is None:
+            hint = (
+                f"terrella train policy --in {self.world} --out {Path(self.facts['policy']).parent} --real ENVIRONMENT"
+            )
+            return jsonable({**self.facts, "play": f"{hint} tries it there"})
+        return jsonable({**self.trial.to_json(), **self.facts})
+
+    def summary(self) -> str:
+        if self.trial is None:
+            return "\n".join(f"{name}: {value}" for name, value in self.to_json().items())
+        practised = f"{self.facts['practised_steps']:,} steps of practice in {self.facts['minutes']:.1f} minutes"
+        return "\n".join([*self.trial.lines(), practised, f"the policy: {self.facts['policy']}"])
+
+
+@dataclass(frozen=True)
+class PolicyTrial:
+    """A policy's episodes in the real environment, beside random actions from the same starts."""
+
+    real: str
+    inside: str
+    figures: Mapping[str, Figure]
+    """Returns: "return" of the policy, "at random", "better by" (start by start), "promised" by the learned world."""
+
+    @property
+    def verdict(self) -> str:
+        better = self.figures["better by"]
+        if better.low > 0:
+            return f"It acts better than chance in {self.real}, by {better}."
+        if better.high < 0:
+            return f"It acts worse than chance in {self.real}, by {better}: the world that it practised in misleads it."
+        return f"It is not seen to act better than chance in {self.real}: by {better}."
+
+    def lines(self) -> list[str]:
+        figures = self.figures
+        lines = [self.verdict, f"return {figures['return']}; at random from the same starts {figures['at random']}"]
+        if "promised" in figures:
+            lines.append(f"in {self.inside} itself, where it practised: {figures['promised']}")
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        return {"verdict": self.verdict, **{name: asdict(figure) for name, figure in self.figures.items()}}
+
+
+def train_policy(world: str, config: TrainPolicyConfig, *, progress: Progress = silent) -> TrainPolicyResult:
+    """Trains a policy on imagined rollouts of a world, hundreds at once, and tries it in the real environment.
+
+    world: a name that `terrella.worlds()` lists, the path of a checkpoint or a run, or a simulator (gym:ID). The same call
+    continues where an earlier one was stopped. TerrellaError for what cannot be practised.
+    """
+    environment = config.environment
+    if config.episodes < 1:
+        raise TerrellaError("--episodes is a whole number from 1 up.")
+    if config.grow and environment.randomise is None:
+        raise TerrellaError("--grow widens the ranges of a file: name it with --randomise FILE.")
+    if environment.randomise is not None and not library.is_truth(world):
+        raise TerrellaError(f"{world} was learned and is as it is; --randomise is for simulators (mujoco:NAME).")
+    truth = library.is_truth(world)
+    inside = open_copied(world, environment) if truth else load_named(world, config.device, progress=progress)
+    outside = None if config.real is None else open_real(config.real, environment, inside.spec)
+    if outside is not None:
+        check_alike(inside.spec, outside.spec)
+    growing = cast(Scaled, inside) if config.grow else None
+    with stage("practising", progress) as report:
+        facts = recipe.train_policy(
+            inside, world, config.out, config.practice, report, config.recording, growing=growing
+        )
+    if outside is None:
+        return TrainPolicyResult(world, facts, None)
+    return TrainPolicyResult(
+        world, facts, try_policy(config.out, inside, outside, config.episodes, config.practice.seed, progress)
+    )
+
+
+def try_policy(
+    folder: Path, inside: World, outside: World, episodes: int, seed: int, progress: Progress
+) -> PolicyTrial:
+    """Plays the policy in `folder` in the environment, random actions from the same starts, and, where the world that it practised
+    in is learned, the policy in that world."""
+    steps = outside.spec.max_episode_steps or STEPS
+
+    def returns(world: World, policy: Policy, what: str, sees: Sequence[str] = ()) -> torch.Tensor:
+        with stage(what, progress) as report:
+            played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
+        return torch.tensor([episode.reward for episode in played.episodes])
+
+    actor = load_learned_policy(folder, outside.spec, inside)
+    sees = [name for name in observed_channels(actor, outside.spec) if name in outside.spec.channels]
+    mine = returns(outside, actor, "acting", sees)
+    floor = returns(outside, Random(outside.spec), "acting at random")
+    values = {"return": mine, "at random": floor, "better by": mine - floor}
+    if inside.spec.observes:
+        dreamer = Actor.load(folder, inside.spec)
+        values["promised"] = returns(inside, dreamer, "acting in the learned world", dreamer.sees)
+    figures = {name: mean_interval(each, make_rng(seed)) for name, each in values.items()}
+    return PolicyTrial(outside.spec.name, inside.spec.name, figures)
