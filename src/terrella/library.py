@@ -209,7 +209,7 @@ def _bundled() -> list[str]:
 
 
 def _read_card(folder: Path) -> Mapping[str, object]:
-    from .worlds.folder import read_about
+    from .worlds.checkpoint import read_about
 
     card = read_about(folder).get("card")
     return card if isinstance(card, dict) else {}

@@ -24,6 +24,7 @@ from terrella.learn.paired import paired
 from terrella.learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.trainer import Now
+from terrella.worlds.checkpoint import data_file
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
 from terrella.worlds.uncertainty import UncertaintyProbe
@@ -173,7 +174,7 @@ def test_a_teacher_may_watch_the_dreams(recording, teacher, places, tmp_path):
     student = load_world(tmp_path / "few" / "world")
     train_dreams(student, recording, tmp_path / "watched", DREAMS, quiet, teacher)
     train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet)
-    watched, alone = (load_file(tmp_path / name / "world" / "weights.safetensors") for name in ("watched", "alone"))
+    watched, alone = (load_file(data_file(tmp_path / name / "world", "weights")) for name in ("watched", "alone"))
     assert any(not torch.equal(watched[name], alone[name]) for name in alone)
     with pytest.raises(TrainingError, match="other settings"):
         train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet, teacher)

@@ -26,6 +26,7 @@ from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, choose_keyframes, usable_rows
 from terrella.learn.trainer import Now, Trainer
 from terrella.space.keyframes import Glimpse
+from terrella.worlds.checkpoint import data_file
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import Conditioning, context_thumbnail
@@ -69,7 +70,7 @@ def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
     config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
     stages = {"motion": 7, "estimator": 1, "flow": 0, "uncertainty": 3}
     goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
-    worlds = [load_file(tmp_path / run / "world" / "weights.safetensors") for run in ("a", "b")]
+    worlds = [load_file(data_file(tmp_path / run / "world", "weights")) for run in ("a", "b")]
     assert all(torch.allclose(worlds[0][name].float(), worlds[1][name].float(), atol=1e-4) for name in worlds[0])
 
 
@@ -219,8 +220,8 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
     broken.mkdir()
     for file in source.iterdir():
         (broken / file.name).write_bytes(file.read_bytes())
-    weights = (source / "weights.safetensors").read_bytes()
-    (broken / "weights.safetensors").write_bytes(weights[: len(weights) // 2])
+    weights = data_file(source, "weights").read_bytes()
+    data_file(broken, "weights").write_bytes(weights[: len(weights) // 2])
     with pytest.raises(CheckpointError, match="damaged"):
         load_world(broken)
 

@@ -24,6 +24,7 @@ from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run
 from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
+from terrella.worlds.checkpoint import data_file
 from terrella.worlds.folder import load_world
 from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
 
@@ -126,7 +127,7 @@ def test_a_world_is_given_an_estimator_and_an_uncertainty(bare, sensing):
     gone = world.imagine(state, world.spec.sample_action(1, make_rng(0)), make_rng(0))
     assert float(gone["uncertainty"]) > 0 and float(gone["gone"][0, 0]) == 1
     assert not list(out.glob("*.partial"))
-    assert (out / "memory.safetensors").read_bytes() == (bare / "memory.safetensors").read_bytes()
+    assert data_file(out, "memory").read_bytes() == data_file(bare, "memory").read_bytes()
 
 
 def test_a_foreign_picture_begins_in_an_empty_corner(sensing):

@@ -27,10 +27,10 @@ from terrella.worlds.parts import (
     Generator,
     Objects,
     Outcome,
-    Part,
     Scene,
     Uncertainty,
     Walls,
+    WorldPart,
     newest_frame,
 )  # fmt: skip
 from terrella.worlds.uncertainty import (
@@ -104,7 +104,7 @@ def test_these_worlds_have_a_part_of_every_kind_that_a_folder_can_name():
 
 def test_every_part_keeps_its_protocol(world):
     for name, part in world.parts.items():
-        assert isinstance(part, Part) and isinstance(part, PROTOCOLS.get(name, Part)), name
+        assert isinstance(part, WorldPart) and isinstance(part, PROTOCOLS.get(name, WorldPart)), name
         assert part.kind in KINDS[name] or part.kind == Absent.kind
         assert part.kind == Absent.kind or isinstance(part.config, KINDS[name][part.kind][0])
         assert type(part.to("cpu")) is type(part)

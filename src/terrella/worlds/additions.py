@@ -1,4 +1,4 @@
-"""Additions: what the pictures that an episode saw changed of its place, as rows of an arena that its State points at."""
+"""Additions: how the pictures that an episode saw changed its place, as rows of an arena that its State points at."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0, plain_sh
 
 ROWS = "added_rows"  # the pointer into the arena; 0: the place as it was
-TRUSTED = 20.0  # pixels' worth that a Gaussian counts as seen in before the episode
+TRUSTED = 20.0  # pixels in which a recorded Gaussian counts as seen before the episode
 OBSERVED, INVENTED = 1, 0  # provenance of a Gaussian
-Moved = Callable[[Gaussians, int], Gaussians]  # the Gaussians with those of an episode's things where these are
+Placed = Callable[[Gaussians, int], Gaussians]  # Gaussians and an entry -> with those of its things where these are now
 
 
 @final
 class Additions:
-    """A place and its provenance uint8 [N], with room for `room` more Gaussians. A row holds colours, opacities, weights and
-    provenance of all of them, and where those beyond the place's own lie."""
+    """A place and its provenance uint8 [N], with room for `room` more Gaussians. A row of the arena holds colours, opacities,
+    weights and provenance of all, and means and deviations of the added ones."""
 
     def __init__(self, place: Gaussians, provenance: torch.Tensor, room: int):
         self.place, self.provenance, self.room = place, provenance, room
@@ -40,11 +40,11 @@ class Additions:
 
     @property
     def arenas(self) -> dict[str, Arena]:
-        """For the State that is made of `empty`."""
+        """To go with `empty` into a State."""
         return {ROWS: self._arena}
 
     def empty(self, batch: int) -> dict[str, torch.Tensor]:
-        """The tensors of episodes that saw nothing yet."""
+        """State entries of episodes that saw nothing yet."""
         return {ROWS: torch.zeros(batch, dtype=torch.int64)}
 
     def of(self, state: State, entry: int) -> tuple[Gaussians, torch.Tensor]:
@@ -52,7 +52,9 @@ class Additions:
         part = self._part(state, entry)
         return (self.place, self.provenance) if part is None else (self._whole(part), part["known"])
 
-    def observed(self, state: State, rgb: torch.Tensor, depth: torch.Tensor, camera: Intrinsics, moved: Moved) -> State:
+    def observed(
+        self, state: State, rgb: torch.Tensor, depth: torch.Tensor, camera: Intrinsics, placed: Placed
+    ) -> State:
         """`state`, whose episodes saw pictures uint8 [B, 3, H, W] with depth [B, H, W] from their poses."""
         state, kept, count = state.into(self.arenas), [], len(self.place)
         spare = torch.arange(count, count + self.room)
@@ -60,7 +62,7 @@ class Additions:
             part = self._part(state, entry) or self._blank()
             known, pose = part["known"], state["pose"][entry]
             picture = rgb[entry].float() / 255, depth[entry], pose, camera
-            after, weight, shown = fuse(moved(self._whole(part), entry), part["weight"], spare, *picture)
+            after, weight, shown = fuse(placed(self._whole(part), entry), part["weight"], spare, *picture)
             kept.append({
                 "colours": 0.5 + Y0 * after.sh[:, 0], "opacities": after.opacities, "weight": weight,
                 "known": torch.where(shown, OBSERVED, known).to(torch.uint8),
@@ -74,7 +76,7 @@ class Additions:
         return {name: arena.read(name)[row] for name in arena.parts} if row else None
 
     def _blank(self) -> dict[str, torch.Tensor]:
-        """The row of the place as it was."""
+        """The row of the unchanged place."""
         none = torch.zeros(self.room)
         trust = TRUSTED * (self.provenance == OBSERVED)
         return {
@@ -85,7 +87,7 @@ class Additions:
         }  # fmt: skip
 
     def _whole(self, part: Mapping[str, torch.Tensor]) -> Gaussians:
-        """Of a row, all Gaussians: the place's own, then those that were added, round ones of degree 0."""
+        """All Gaussians of a row: the place's own, then the added ones, which are round and of degree 0."""
         place, room = self.place, self.room
         round_ = torch.tensor([[1.0, 0, 0, 0]]).expand(room, 4)
         more = torch.cat([place.sh[:, 1:], place.sh.new_zeros(room, place.sh.shape[1] - 1, 3)])

@@ -1,6 +1,6 @@
-"""What moves: the last two frames brought into a view by their own depth, and what of a frame stands still.
+"""The last two frames carried into a view by their own depth, and which pixels of a frame stand still.
 
-A memory of places holds what stands still; monsters, shots and doors are known from the last frames alone.
+Keyframes hold what stands still; monsters, shots and doors are known from the last frames alone.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ import torch
 from ..space.camera import Intrinsics
 from ..space.reproject import carry_things, least_around
 
-PLANES = 6  # that `carry_frames` adds to the last frame's colour and trust
+PLANES = 6  # planes that `carry_frames` adds to the last frame's colour and trust
 
 
 class Frame(NamedTuple):
-    """B frames as they were seen: rgb uint8 [B, 3, H, W]; depth [B, H, W] metres; things [B, H, W] in 0..1, where something
-    is that may move or vanish; pose [B, 7]; covered bool [B, H, W], where a billboard was painted (worlds/objects.py), which
-    hides what is there."""
+    """B frames as they were seen: rgb uint8 [B, 3, H, W]; depth [B, H, W] metres; things [B, H, W] in 0..1, where something may
+    move or vanish; pose [B, 7]; covered bool [B, H, W], what a painted billboard (worlds/objects.py) hides."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -28,20 +27,20 @@ class Frame(NamedTuple):
 
 
 def covering(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
-    """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and what of `things` [B, H, W] is around
-    them, for a rim is theirs in part."""
+    """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and the `things` [B, H, W] around them,
+    since the pixels of their rim are mixed."""
     bare = (instances == 0).float()
     return (bare == 0) | ((least_around(bare) == 0) & (things > 0.5))
 
 
 def still(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
-    """Depth [B, H, W] as a keyframe keeps it: 0, which says nothing, where `things` are."""
+    """Depth [B, H, W] as a keyframe keeps it: 0 (unknown) where `things` are."""
     return torch.where(things > 0.5, 0.0, depth)
 
 
 def carry_frames(last: Frame, earlier: Frame, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """The last two frames as they would look from `pose` [B, 7], had nothing moved but the camera: [B, 4 + PLANES, H, W] =
-    colour in [0, 1] and trust of the last; its depth in metres and its things; colour and trust of the one before."""
+    """The last two frames as they would look from `pose` [B, 7] if only the camera had moved: [B, 4 + PLANES, H, W] = colour in
+    [0, 1] and trust of the last, its depth in metres and its things, colour and trust of the one before."""
     rgb, depth, things, at, covered = map(torch.cat, zip(last, earlier))
     now, before = carry_things(rgb, depth, things, covered, at, torch.cat([pose, pose]), camera).chunk(2)
     return torch.cat([now, before[:, :4]], 1)

@@ -18,48 +18,44 @@ from ..space.matching import FEW, clearest, explained, explains, fetched, prefer
 from ..space.mosaic import recalled
 from .generator import Block, Conditioning, down_and_up, encode_depth
 
-COARSE = 4  # the trunk sees squares of so many pixels; what is chosen is chosen for each pixel
-PIXEL = 16  # features of each pixel, of the squares and of its own neighbours each
-HIDDEN = 32  # of each pixel, of which its choice is made
-CHANCE = 0.25  # of the logits' noise: with 1 frames are drawn as likely as they are, with 0 always the likeliest
-AROUND = 8  # pixels of a side of the squares, near which colours are counted
-UNKNOWN = -1e4  # the logit of what is not there
+COARSE = 4  # side in pixels of the squares that the trunk sees; choices are made for each pixel
+PIXEL = 16  # features of each pixel from its square, and as many from its neighbours
+HIDDEN = 32  # features of each pixel that its choice is read from
+CHANCE = 0.25  # temperature: 1 samples frames by their probability, 0 takes the likeliest
+AROUND = 8  # side in pixels of the squares in and around which colours are counted
+UNKNOWN = -1e4  # logit of a source that does not exist
 
 
 @dataclass(frozen=True)
 class CodecConfig:
-    """size: (height, width) of the frames; slots: last frames that it sees; context: numbers that it is conditioned on; moves:
-    displacements in pixels among which it chooses, beside none; colours: of the palette; channels: at 1/4, 1/8, ... of the
-    size."""
+    """Of the codec."""
 
-    size: tuple[int, int]
-    slots: int
-    context: int
-    moves: int
-    colours: int
-    channels: tuple[int, ...] = (48, 64, 96)
-    steps: int = 1  # a frame is drawn at once
+    size: tuple[int, int]  # height and width of a frame, pixels
+    slots: int  # last frames that it sees
+    context: int  # numbers that it is conditioned on beside maps
+    moves: int  # displacements among which it chooses, beside (0, 0)
+    colours: int  # of the palette
+    channels: tuple[int, ...] = (48, 64, 96)  # at 1/4, 1/8, ... of the size
+    steps: int = 1  # a frame is drawn in one step
     residual: bool = True
 
 
 class CodecInputs(NamedTuple):
-    """What a frame is made from: `sources` uint8 [B, slots + 1, 3, H, W], the last frames, the newest first, and what the mosaic
-    knows of the next one (where `known` [B, 1, H, W]); `scrolled` uint8 [B, 3, H, W], the newest displaced by the moves `along`
-    int64 [B, H, W], by which the picture scrolls but for what lies `over` it (bool [B, H, W]); `went` [B, moves + 1, H, W], how
-    well each of the moves, at what it leads to this pixel, explained the last step; `common` [B, h, w, colours, 2], the share of
-    pixels of each colour of the palette, in all of `scrolled` and in and around each square."""
+    """What a frame is made from."""
 
-    sources: torch.Tensor
-    scrolled: torch.Tensor
-    known: torch.Tensor
-    along: torch.Tensor
-    over: torch.Tensor
-    went: torch.Tensor
-    common: torch.Tensor
+    sources: torch.Tensor  # uint8 [B, slots + 1, 3, H, W]: the last frames, the newest first, and the mosaic
+    scrolled: torch.Tensor  # uint8 [B, 3, H, W]: the newest frame displaced by `along`
+    known: torch.Tensor  # [B, 1, H, W]: where the mosaic knows the next frame
+    along: torch.Tensor  # int64 [B, H, W]: the move by which a pixel scrolls, 0 where something lies over the picture
+    over: torch.Tensor  # bool [B, H, W]: what lies over the picture and does not scroll with it
+    went: torch.Tensor  # [B, moves + 1, H, W]: how well each move that leads to a pixel explained the last step there
+    common: (
+        torch.Tensor
+    )  # [B, h, w, colours, 2]: share of each palette colour, in all of `scrolled` and around each square
 
 
 class Scroll(nn.Module):
-    """Which of the moves most of the picture goes on by."""
+    """Predicts by which of the moves most of the picture scrolls next."""
 
     def __init__(self, config: CodecConfig):
         super().__init__()
@@ -74,20 +70,20 @@ class Scroll(nn.Module):
         self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * config.moves))  # untrained, nothing scrolls
 
     def glanced(self, frame: torch.Tensor) -> torch.Tensor:
-        """What is seen in the newest frame uint8 [B, 3, H, W]: [B, 64]."""
+        """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
         return self.glance(frame.float() / 127.5 - 1)
 
     def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
-        """Logits [B, moves + 1] from what is `glanced`, and how well each of the moves explained each of the frames by the one
-        before, 0..1 [B, slots - 1, moves + 1]."""
+        """Logits [B, moves + 1]. seen: features of `glanced`; went [B, slots - 1, moves + 1]: how well each move explained each
+        frame by the one before, 0..1."""
         went = went / went.amax(2, keepdim=True).clamp_min(0.01)
         return self.votes(F.silu(self.known(torch.cat([seen, context, went.pow(4).flatten(1)], 1))))
 
 
 @final
 class Codec(nn.Module):
-    """`moves` int64 [moves + 1, 2] = x, y, the first of them 0, 0; `palette` uint8 [colours, 3]; `stress` []: a pixel is drawn
-    as if it were so many times as likely to stay as the choices say, which were learned with what changes counting for more."""
+    """`moves` int64 [moves + 1, 2] = x, y in pixels, (0, 0) first; `palette` uint8 [colours, 3]; `stress` []: the factor by which
+    the probability to stay is raised, since changing pixels were given more weight in training."""
 
     kind = "codec"
     moves: torch.Tensor
@@ -112,13 +108,10 @@ class Codec(nn.Module):
         self.going = nn.Conv2d(moves, PIXEL, 1)
         self.nearby = nn.Conv2d(PIXEL, PIXEL, 3, padding=3, dilation=3)
         self.mixed = nn.Conv2d(2 * PIXEL, HIDDEN, 1)
-        self.choice = nn.Conv2d(
-            HIDDEN, self.sources + 3, 1
-        )  # its last two: goes as most of the picture does, and as before
+        # its last two logits: goes on as most of the picture does, and as before
+        self.choice = nn.Conv2d(HIDDEN, self.sources + 3, 1)
         self.colour = nn.Sequential(nn.Linear(HIDDEN + 6, 64), nn.SiLU(), nn.Linear(64, config.colours))
-        self.common = nn.Parameter(
-            torch.tensor([0.3, 0.3])
-        )  # how much likelier are colours that are in the picture, and near
+        self.common = nn.Parameter(torch.tensor([0.3, 0.3]))  # weights of colours in the picture, and near
         nn.init.zeros_(self.choice.weight)
         bias = torch.full((self.sources + 3,), -1.0)
         bias[0], bias[-2], bias[-1] = 3.0, 6.0, 2.0  # at first everything goes as most of the picture does
@@ -127,11 +120,11 @@ class Codec(nn.Module):
 
     @property
     def sources(self) -> int:
-        """Pixels that one may be fetched from: the moves of the last frame, then the older frames, then the mosaic."""
+        """Sources of a pixel: the moves of the last frame, then the older frames, then the mosaic."""
         return self.config.moves + self.config.slots + 1
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
-        """The next frame [B, 4, H, W] in the generator's code, by the chance that is in `noisy`; the time says nothing to it."""
+        """The next frame [B, 4, H, W] in the generator's code; `noisy` is its source of chance, the time is not used."""
         mosaic, over, scroll = conditioning.mosaic, conditioning.over, conditioning.scroll
         assert mosaic is not None and over is not None and scroll is not None
         seen = self.seen(_frames(conditioning), mosaic, over, scroll)
@@ -140,7 +133,7 @@ class Codec(nn.Module):
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
-        """With `scroll`, by which of the moves most of the picture goes on, where there is a mosaic."""
+        """With `scroll`, the move by which most of the picture goes on, where there is a mosaic."""
         if conditioning.mosaic is None:
             return conditioning
         frames, context = _frames(conditioning), conditioning.context
@@ -149,8 +142,8 @@ class Codec(nn.Module):
         return replace(conditioning, scroll=least_off(logits, self.moves))
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:
-        """What the next frame is made from, if most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over: bool
-        [B, H, W], the pixels that are no part of it."""
+        """The inputs where most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over bool [B, H, W]: pixels that
+        are no part of it."""
         memory = recalled(mosaic, self.config.size, self.moves[move])
         known = (memory[:, 3:] > 0) & ~over[:, None]
         last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
@@ -162,8 +155,7 @@ class Codec(nn.Module):
         return CodecInputs(sources, scrolled, known, along, over, went, self.common_colours(scrolled))
 
     def choices(self, seen: CodecInputs, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where each pixel comes from, logits [B, sources + 1, H, W], the last for "painted"; and the pixels' features [B, HIDDEN,
-        H, W]."""
+        """Logits [B, sources + 1, H, W] of each pixel's source, the last for "painted"; the pixels' features [B, HIDDEN, H, W]."""
         batch, (height, width), last = len(seen.known), self.config.size, torch.channels_last
         shown = torch.cat([seen.sources.flatten(1, 2), seen.scrolled], 1).float() / 127.5 - 1
         shown = torch.cat([shown, seen.known.float()], 1)
@@ -177,21 +169,21 @@ class Codec(nn.Module):
         features = torch.cat([F.pixel_shuffle(self.leave(x), COARSE), near], 1)
         features = F.silu(self.mixed(F.silu(features).contiguous(memory_format=last)))
         choices, scrolls, goes = self.choice(features).split((self.sources + 1, 1, 1), 1)
-        moved, others, memory, painted = choices.split((len(self.moves), self.config.slots - 1, 1, 1), 1)
-        moved = moved + goes * seen.went
+        displaced, others, memory, painted = choices.split((len(self.moves), self.config.slots - 1, 1, 1), 1)
+        displaced = displaced + goes * seen.went
         along = seen.along[:, None]
-        moved = moved.scatter(1, along, torch.logaddexp(moved.gather(1, along), scrolls))
-        beyond = self._beyond(seen.over) & seen.known  # what the last frame does not show is as the mosaic knows it
+        displaced = displaced.scatter(1, along, torch.logaddexp(displaced.gather(1, along), scrolls))
+        beyond = self._beyond(seen.over) & seen.known  # not in the last frame, but in the mosaic: taken from there
         memory = torch.where(seen.known, memory, UNKNOWN)
-        memory = torch.logaddexp(memory, torch.where(beyond, moved, UNKNOWN).logsumexp(1, keepdim=True))
-        moved = torch.where(beyond, UNKNOWN, moved)
-        comes = beyond.gather(1, along)  # nor is it painted anew
+        memory = torch.logaddexp(memory, torch.where(beyond, displaced, UNKNOWN).logsumexp(1, keepdim=True))
+        displaced = torch.where(beyond, UNKNOWN, displaced)
+        comes = beyond.gather(1, along)  # and not painted either
         memory = torch.logaddexp(memory, torch.where(comes, painted, UNKNOWN))
         painted = torch.where(comes, UNKNOWN, painted)
-        return torch.cat([moved, others, memory, painted], 1), features
+        return torch.cat([displaced, others, memory, painted], 1), features
 
     def colours(self, seen: CodecInputs, features: torch.Tensor, where: torch.Tensor | None = None) -> torch.Tensor:
-        """Which colour of the palette the pixels `where` (bool [B, H, W]; None: all) would be painted in: logits [n, colours]."""
+        """Logits [n, colours] of the palette colour in which the pixels `where` (bool [B, H, W]; None: all) would be painted."""
         near = torch.cat([seen.sources[:, 0], seen.scrolled], 1)
         often = (seen.common + 1e-3).log() @ self.common
         if where is None:
@@ -203,8 +195,8 @@ class Codec(nn.Module):
         return self.colour(torch.cat(known, 1)) + often[batch, v // AROUND, u // AROUND]
 
     def common_colours(self, frame: torch.Tensor) -> torch.Tensor:
-        """The share of pixels of uint8 [B, 3, H, W] to which each colour of the palette is the nearest, in the whole picture and in
-        and around each square: [B, H / AROUND, W / AROUND, colours, 2]."""
+        """Share of the pixels of uint8 [B, 3, H, W] whose nearest palette colour is each, in the whole picture and in and around
+        each square: [B, H / AROUND, W / AROUND, colours, 2]."""
         every = frame[..., ::2, ::2].permute(0, 2, 3, 1)
         nearest = torch.cdist(every.flatten(1, 2).float(), self.palette.float()).argmin(2)
         each = F.one_hot(nearest, len(self.palette)).float().transpose(1, 2).unflatten(2, every.shape[1:3])
@@ -212,9 +204,9 @@ class Codec(nn.Module):
         return torch.stack([around.mean((1, 2), keepdim=True).expand_as(around), around], -1)
 
     def drawn(self, seen: CodecInputs, choices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """The next frames, uint8 [B, 3, H, W]: each pixel in the colour that is likeliest, whatever source it comes from."""
+        """The next frames, uint8 [B, 3, H, W]: each pixel in its likeliest colour, summed over sources of that colour."""
         share = choices.softmax(1)
-        if share.device.type == "cpu":  # few pixels may be painted, in most frames
+        if share.device.type == "cpu":  # in most frames few pixels are painted
             paints = share[:, -1] >= FEW
             painted = torch.zeros(*paints.shape, 3, dtype=torch.uint8)
             painted[paints] = self.palette[self.colours(seen, features, paints).argmax(1)]
@@ -223,8 +215,8 @@ class Codec(nn.Module):
         return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
     def _beyond(self, over: torch.Tensor) -> torch.Tensor:
-        """bool [B, moves + 1, H, W]: the pixels that each move would fetch from outside of the last frame, or from what lies `over`
-        it (bool [B, H, W])."""
+        """bool [B, moves + 1, H, W]: pixels that each move would fetch from outside of the last frame, or from what lies `over` it
+        (bool [B, H, W])."""
         height, width = self.config.size
         x = torch.arange(width, device=over.device) - self.moves[:, :1]
         y = torch.arange(height, device=over.device) - self.moves[:, 1:]
@@ -232,7 +224,7 @@ class Codec(nn.Module):
         return outside | self._carried(over[:, None].expand(-1, len(self.moves), -1, -1))
 
     def _carried(self, went: torch.Tensor) -> torch.Tensor:
-        """What each of the moves has at a pixel, [B, moves + 1, H, W], at the pixel to which it would lead next."""
+        """Maps of the moves [B, moves + 1, H, W], each displaced by its move."""
         height, width = self.config.size
         x = (torch.arange(width, device=went.device) - self.moves[:, :1]).clamp(0, width - 1)
         y = (torch.arange(height, device=went.device) - self.moves[:, 1:]).clamp(0, height - 1)
@@ -246,14 +238,14 @@ def _frames(conditioning: Conditioning) -> torch.Tensor:
 
 
 def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:
-    """Gumbel noise [B, K, 1, 1] for choices [B, K, H, W], of normal `noise`: the same for all pixels of a picture, so that those
-    which are in doubt go one way together, and a thing stays whole (a maximal coupling of their choices)."""
+    """Gumbel noise [B, K, 1, 1] for choices [B, K, H, W], from normal `noise`. It is the same for all pixels of a picture: where
+    they are uncertain they choose alike, and a thing stays whole (a maximal coupling)."""
     uniform = torch.special.ndtr(noise.flatten(1)[:, : choices.shape[1]]).clamp(1e-6, 1 - 1e-6)
     return -(-uniform.log()).log()[:, :, None, None]
 
 
 def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
-    """Of `moves` [K, 2] of these logits [B, K] the one that is expected to be the fewest pixels off: int64 [B]. Where much is
-    likely that is a middle one, and a picture that is off stays off."""
+    """The move int64 [B], of `moves` [K, 2] with logits [B, K], with the least expected error in pixels: where several are likely
+    one in the middle, since a picture that is off stays off."""
     off = (moves[:, None] - moves).abs().sum(2).float()
     return (logits.softmax(1) @ off).argmin(1)

@@ -1,4 +1,4 @@
-"""Controls: what an action of a learned world is (buttons, one choice of several, axes), and how networks take it."""
+"""Controls: the kind of a world's actions (buttons, choices, axes), and their encoding for networks."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ AXES = "axes"
 
 @dataclass(frozen=True)
 class Controls:
-    """kind: "buttons", each 0 or 1; "choice", a whole number from low to high, or several; "axes", numbers between low and high.
-    low and high: limits, one for each number of an action. What axes mean: mode, units and frame, as in Spec."""
+    """What an action is."""
 
-    kind: str
-    low: tuple[float, ...]
+    kind: str  # "buttons", each 0 or 1; "choice", one or several whole numbers; "axes", numbers between limits
+    low: tuple[float, ...]  # limits, one for each number of an action
     high: tuple[float, ...]
-    mode: str = ""
+    mode: str = ""  # what axes mean: mode, units and frame as in Spec
     units: tuple[str, ...] = ()
     frame: str = ""
 
@@ -33,7 +32,7 @@ class Controls:
 
     @staticmethod
     def of(spec: Spec) -> Controls:
-        """Those of a world with this spec; ContractError for axes without limits and for actions that are no plain list."""
+        """The controls of a spec; ContractError for axes without limits and for actions of more than one dimension."""
         low, high = (np.asarray(limit, np.float64).ravel() for limit in spec.action_limits)
         if len(shape_of(spec.action)) > 1 or not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise ContractError(
@@ -45,12 +44,12 @@ class Controls:
 
     @property
     def numbers(self) -> int:
-        """How many numbers networks take of an action."""
+        """Numbers of an encoded action."""
         return sum(self.counts) if self.kind == CHOICE else len(self.low)
 
     @property
     def counts(self) -> list[int]:
-        """Of how many each choice is one, in the order of the numbers of an action."""
+        """The number of options of each choice."""
         return [int(high - low) + 1 for low, high in zip(self.low, self.high)]
 
     def space(self) -> spaces.Space:
@@ -65,8 +64,7 @@ class Controls:
         return spaces.Box(np.array(self.low, np.float32), np.array(self.high, np.float32))
 
     def encode(self, action: torch.Tensor) -> torch.Tensor:
-        """[B, ...], as recorded or as `space` has it, to float32 [B, numbers]: buttons as they are, each choice one-hot (all zero
-        would be no choice at all), axes so that their limits are -1 and 1."""
+        """Actions [B, ...] of `space` as float32 [B, numbers]: buttons as they are, choices one-hot, axes scaled to -1..1."""
         given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
             whole = given.round().long()

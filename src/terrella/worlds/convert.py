@@ -8,54 +8,53 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 
 from ..core.errors import CheckpointError
+from .checkpoint import data_file, read_about, read_data
 from .config import VideoConfig
 from .controls import Controls
-from .folder import KIND, MEMORY_FILE, VERSION, WEIGHTS_FILE, first_line, load_world, read_about, write_folder
+from .folder import KIND, VERSION, first_line, load_world, write_world
 from .parts import Absent
 
 OLD_KIND, OLD_VERSION = "video", 2
-PARTS = {"motion": "body", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}  # the others keep their names
-LAYERS = {"leave": "output", "time": "context"}  # of generator, estimator and uncertainty
-RETIRED = ("own_keyframes",)  # settings that mean nothing any more
+PARTS = {"motion": "body", "cast": "objects", "eye": "estimator", "doubt": "uncertainty"}  # the others are the same
+LAYERS = {"leave": "output", "time": "context"}  # in generator, estimator and uncertainty
+RETIRED = ("own_keyframes",)  # settings that no longer exist
 
 
 def convert_world(old: str | Path, new: str | Path) -> None:
-    """Writes the world in the folder `old`, of format version 2, to the folder `new`. Nothing is lost: weights are copied, and
-    the remembered pictures stay byte for byte.
+    """Writes the world in the folder `old`, of format version 2, to the new folder `new`. Weights are copied, and the remembered
+    pictures stay byte for byte.
 
-    CheckpointError where `old` is no such world, or `new` is a folder with files in it, `old` itself among them.
+    CheckpointError where `old` is no such world, or `new` holds files.
     """
     old, new = Path(old), Path(new)
     about = read_about(old)
     if (about.get("kind"), about.get("version")) != (OLD_KIND, OLD_VERSION):
-        found = f"kind {about.get('kind')!r}, version {about.get('version')}"
-        raise CheckpointError(f"{old} is {found}; only kind '{OLD_KIND}' of version {OLD_VERSION} needs converting.")
+        kind = f"kind {about.get('kind')!r}, version {about.get('version')}"
+        raise CheckpointError(f"{old} is {kind}; only kind '{OLD_KIND}' of version {OLD_VERSION} needs converting.")
     if new.resolve() == old.resolve():
         raise CheckpointError(f"{old} cannot be converted in place; name a new folder.")
     if new.exists() and any(new.iterdir()):
         raise CheckpointError(f"{new} is not empty; name a new folder.")
     try:
-        weights, remembered = load_file(old / WEIGHTS_FILE), (old / MEMORY_FILE).read_bytes()
-        starts = load_file(old / MEMORY_FILE)
-        told = _described(about, starts)
-        write_folder(new, told, {_renamed(name): value for name, value in weights.items()}, remembered)
+        about, (weights, memory) = read_data(old, about, "weights", "memory")
+        renamed = {_renamed(name): value for name, value in weights.items()}
+        write_world(new, _described(about, memory), renamed, data_file(old, "memory", about).read_bytes())
     except (OSError, SafetensorError, LookupError, TypeError, ValueError) as error:
         raise CheckpointError(f"{old} cannot be converted ({first_line(error)}); copy or train it again.") from error
     load_world(new)
 
 
-def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
+def _described(about: dict, memory: dict[str, torch.Tensor]) -> dict:
     """What world.json of version 3 says of such a world."""
     config = _config(about["config"])
     posed, (usual, ending) = config.geometry, about["rewards"]
     outcome = _part("constant", {"usual": usual, "ending": ending if posed else 0.0})
     if about.get("outcome"):
         begins = list(config.vitals)
-        if not posed and "starts.vitals" in starts:  # such worlds took those that recordings usually begin with
-            begins = starts["starts.vitals"].median(0).values.tolist()
+        if not posed and "starts.vitals" in memory:  # such worlds began with the usual ones of recordings
+            begins = memory["starts.vitals"].median(0).values.tolist()
         outcome = _part("frames", {**about["outcome"], "begins": begins})
     parts = {
         "body": _part("motion", asdict(config.motion) if posed else None),
@@ -67,7 +66,7 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
         "estimator": _part("network", about.get("eye")),
     }
     controls = about.get("controls") or asdict(Controls.buttons(config.actions))
-    said = {name: about[name] for name in ("dt_s", "action_names", "keys")}
+    played = {name: about[name] for name in ("dt_s", "action_names", "keys")}
     card = {
         {"eye": "estimator"}.get(name, name).replace("cast_", "objects_"): fact for name, fact in about["card"].items()
     }
@@ -75,15 +74,15 @@ def _described(about: dict, starts: dict[str, torch.Tensor]) -> dict:
         "kind": KIND,
         "version": VERSION,
         "name": about["name"],
-        "about": {"controls": controls, **said, "ignored": []},
+        "about": {"controls": controls, **played, "ignored": []},
         "parts": parts,
         "card": card,
     }
 
 
-def _config(told: dict) -> VideoConfig:
+def _config(saved: dict) -> VideoConfig:
     settings: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in saved.items():
         if name not in RETIRED:
             settings["objects" if name == "cast" else name] = tuple(value) if isinstance(value, list) else value
     return VideoConfig(**settings)

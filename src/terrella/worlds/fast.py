@@ -1,6 +1,6 @@
-"""Fast play: a learned world's generator through ONNX Runtime, or torch.compile on a GPU, where that is faster here.
+"""Fast play: a learned world's generator through ONNX Runtime, or torch.compile on a GPU, where that is faster.
 
-The graph is made in memory from the weights at hand, when the world is loaded; nothing is stored and nothing unpickled.
+The graph is made in memory when the world is loaded; nothing is stored and nothing unpickled.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from .generator import Conditioning
 from .learned import LearnedWorld
 
 Forward = Callable[..., torch.Tensor]
-TURNS = 15  # frames that each way draws when they are held against one another
+TURNS = 15  # frames that each way draws in the comparison
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which way won; milliseconds a frame of the generator alone (medians, drawn in turns), seconds to prepare it."""
+    """The faster way; milliseconds a frame of the generator alone (medians of alternating runs), seconds to prepare it."""
 
     way: str
     eager_ms: float
@@ -49,10 +49,10 @@ EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
 
 
 def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
-    """The same world with the faster way of drawing, ONNX Runtime on a CPU or a compiled graph on a GPU, if it is faster than
-    eager torch when both draw the same frames in turns; and which it is.
+    """The world with the faster of two ways of drawing, and which it is: eager torch, or ONNX Runtime on a CPU and a compiled
+    graph on a GPU. Frames that need a gradient are always drawn by eager torch.
 
-    TerrellaError where ONNX Runtime is not installed. Eager torch goes on drawing whatever needs a gradient.
+    TerrellaError where ONNX Runtime is not installed.
     """
     generator: nn.Module = copy.deepcopy(world.generator)
     if isinstance(generator, Codec):
@@ -77,7 +77,7 @@ def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
 
 
 def _either(eager: Forward, quick: Forward) -> Forward:
-    """A generator's way of drawing: `quick`, but where a gradient is needed `eager`."""
+    """`eager` where a gradient is needed, else `quick`."""
 
     def forward(*given) -> torch.Tensor:
         learns = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in _flat(given))
@@ -87,7 +87,7 @@ def _either(eager: Forward, quick: Forward) -> Forward:
 
 
 def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioning]:
-    """What the generator is given for a frame of one episode: noise, flow time and conditioning."""
+    """Inputs of the generator for a frame of one episode: noise, flow time and conditioning."""
     rng = make_rng(0)
     state = world.start(1, rng)
     numbers = world.controls.encode(world.spec.sample_action(1, rng)).to(world.device)
@@ -98,7 +98,7 @@ def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioni
 
 
 def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
-    """The generator as ONNX Runtime runs it on the CPU, for any batch; it keeps to torch's number of threads."""
+    """The generator in ONNX Runtime on the CPU, for any batch, with torch's number of threads."""
     # torch writes graphs with onnx
     if missing := [package for package in ("onnxruntime", "onnx") if not find_spec(package)]:
         raise TerrellaError(
@@ -115,7 +115,9 @@ def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
             if session is None:
                 options = onnxruntime.SessionOptions()
                 options.intra_op_num_threads = threads
-                options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # others need the cores too
+                options.add_session_config_entry(
+                    "session.intra_op.allow_spinning", "0"
+                )  # leave the cores to other threads
                 session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
                 sessions.clear()
                 sessions[threads] = session
@@ -127,8 +129,8 @@ def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
 
 
 def compiled(generator: nn.Module) -> Forward:
-    """The generator as torch.compile makes it: for one batch size, CUDA graphs on a GPU; other batches are drawn eagerly.
-    The first frame waits for the compiler. The GPU's way is written, but was never run on one."""
+    """The generator under torch.compile for one batch size, with CUDA graphs on a GPU; other batches are drawn eagerly. The
+    first frame waits for the compiler."""
     on_gpu = next(generator.parameters()).device.type == "cuda"
     eager: Forward = generator.forward
     quick: Forward = torch.compile(eager, mode="reduce-overhead" if on_gpu else None, dynamic=False)
@@ -142,7 +144,7 @@ def compiled(generator: nn.Module) -> Forward:
 
 
 def in_turns(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float]:
-    """Median milliseconds of each way, run one after the other so that all meet the same machine."""
+    """Median milliseconds of each way, run alternately so that all meet the same load."""
     times: list[list[float]] = [[] for _ in ways]
     for _ in range(turns):
         for way, took in zip(ways, times):
@@ -155,10 +157,10 @@ def in_turns(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float
 
 
 def _exported(generator: nn.Module, inputs: tuple) -> bytes:
-    """The generator as an ONNX graph, the batch free."""
+    """The generator as an ONNX graph for any batch."""
 
     class Flat(nn.Module):
-        """Tensors in, since a graph knows no dataclasses."""
+        """Takes tensors, since a graph has no dataclasses."""
 
         def __init__(self):
             super().__init__()
@@ -180,6 +182,6 @@ def _exported(generator: nn.Module, inputs: tuple) -> bytes:
 
 
 def _flat(inputs: tuple) -> list[torch.Tensor]:
-    """The tensors of noise, flow time and conditioning, in one row."""
+    """The tensors of noise, flow time and conditioning."""
     noisy, time, conditioning = inputs
     return [noisy, time, *vars(conditioning.glimpse).values(), conditioning.last, conditioning.context]

@@ -1,7 +1,7 @@
-"""A learned world on disk: a folder of world.json, weights.safetensors, memory.safetensors and README.md.
+"""Learned and latent worlds on disk: a folder of world.json, weights.safetensors, memory.safetensors and README.md.
 
-world.json names each part's kind and settings; weights.safetensors holds its tensors behind the part's name. Keyframes are
-stored as JPEG (colour) and zlib-packed uint16 millimetres (depth); nothing is ever unpickled.
+world.json names each part's kind and settings; the weights are tensors named PART.NAME. Keyframes are stored as JPEG (colour)
+and zlib-packed uint16 millimetres (depth); nothing is ever unpickled. A folder is replaced as a whole (checkpoint.py).
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 import simplejpeg
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ..core.errors import CheckpointError
@@ -26,6 +25,7 @@ from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
 from ..space.keyframes import Keyframes
 from . import splat_folder
 from .body import Motion, MotionBody
+from .checkpoint import WORLD_FILE, Tensors, data_file, read_about, read_data, write_about, write_checkpoint
 from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
@@ -43,13 +43,11 @@ from .uncertainty import UncertaintyConfig, UncertaintyNetwork
 
 KIND, VERSION = "learned", 3
 LATENT, LATENT_VERSION = "latent", 1
-WORLD_FILE, WEIGHTS_FILE, MEMORY_FILE = "world.json", "weights.safetensors", "memory.safetensors"
-Tensors = Mapping[str, torch.Tensor]
 Make = Callable[[Any, Tensors, Tensors], Any]
-# Of files that are not what they should be.
+# What reading a damaged folder may raise.
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
-HALVED = ("uncertainty", "estimator")  # what these learned by descent is stored in half precision
+HALVED = ("uncertainty", "estimator")  # parts whose weights are stored in half precision
 
 
 def save_world(
@@ -59,36 +57,38 @@ def save_world(
     quality: int = 92,
     remembered: str | Path | None = None,
 ) -> None:
-    """Writes the folder; each file is replaced whole. card: its facts, in place of the world's own. remembered: the folder that
-    the world was loaded from, whose pictures stay as they are: packed again they would lose a little.
+    """Makes or replaces the folder as a whole. card: facts in place of the world's own. quality: of JPEG, 1..100. remembered: the
+    folder that the world was loaded from, whose pictures stay as they are; to pack them again would lose a little.
 
-    CheckpointError where it cannot be written (a full disk): the old files stay.
+    CheckpointError where it cannot be written, for example on a full disk: the old world stays.
     """
-    path, about = Path(path), world.about
     weights = {
         f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()
     }
     parts = {name: {"kind": part.kind, "config": _plain(part.config)} for name, part in world.parts.items()}
-    told = _told(KIND, VERSION, about, parts) | ({} if card is None else {"card": dict(card)})
+    about = _described(KIND, VERSION, world.about, parts) | ({} if card is None else {"card": dict(card)})
     try:
-        kept = None if remembered is None else (Path(remembered) / MEMORY_FILE).read_bytes()
-        write_folder(path, told, weights, kept if kept is not None else _remembered(world.scene, quality))
+        if remembered is None:
+            memory = _remembered(world.scene, quality)
+        else:
+            memory = data_file(remembered, "memory").read_bytes()
+        write_world(path, about, weights, memory)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
 
 
 def save_latent(world: LatentWorld, path: str | Path) -> None:
-    """Writes the folder of a latent world; CheckpointError where it cannot be written."""
+    """Makes or replaces the folder of a latent world; CheckpointError where it cannot be written."""
     network = world.network
     parts = {"network": {"kind": network.kind, "config": asdict(network.config)}}
     try:
-        told = _told(LATENT, LATENT_VERSION, world.about, parts)
-        write_folder(Path(path), told, network.state_dict(), {"starts": world.starts})
+        about = _described(LATENT, LATENT_VERSION, world.about, parts)
+        write_world(path, about, network.state_dict(), {"starts": world.starts})
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
 
 
-def _told(kind: str, version: int, about: About, parts: Mapping[str, Any]) -> dict[str, Any]:
+def _described(kind: str, version: int, about: About, parts: Mapping[str, Any]) -> dict[str, Any]:
     """What world.json says."""
     return {
         "kind": kind,
@@ -104,36 +104,32 @@ def _told(kind: str, version: int, about: About, parts: Mapping[str, Any]) -> di
     }  # fmt: skip
 
 
+def write_world(path: str | Path, about: dict, weights: Tensors, memory: Tensors | bytes) -> None:
+    """The files of a world: what world.json says, the weights, and the memory as tensors or as a file's bytes."""
+    write_checkpoint(path, about, {"weights": weights, "memory": memory}, _readme(about))
+
+
 def save_keys(path: str | Path, spec: Spec) -> None:
-    """Writes the keys and the names of the actions, and what rests, into a world's folder; nothing else of it changes.
+    """Writes the keys, the names of the actions and the idle action into a world's folder; the rest of it stays.
 
     CheckpointError where it is no world's folder, or cannot be written."""
-    about = read_about(Path(path))
-    said = {"keys": {code: list(value) for code, value in spec.keys.items()}, "action_names": list(spec.action_names)}
+    about = read_about(path)
     try:
-        about["about"] |= {**said, "idle": list(spec.idle)}
-        _replace(Path(path) / WORLD_FILE, lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
+        about["about"] |= {
+            "keys": {code: list(value) for code, value in spec.keys.items()},
+            "action_names": list(spec.action_names),
+            "idle": list(spec.idle),
+        }
+        write_about(Path(path), about)
     except (OSError, LookupError, TypeError) as error:
         raise CheckpointError(f"the keys cannot be written to {path} ({error}).") from error
-
-
-def write_folder(path: Path, about: dict, weights: Tensors, remembered: Tensors | bytes) -> None:
-    """The files of a world: what world.json says, the weights, and what is remembered, as tensors or as a file's bytes."""
-    path.mkdir(parents=True, exist_ok=True)
-    _replace(path / WEIGHTS_FILE, lambda file: save_file(_whole(weights), file))
-    if isinstance(remembered, bytes):
-        _replace(path / MEMORY_FILE, lambda file: Path(file).write_bytes(remembered))
-    else:
-        _replace(path / MEMORY_FILE, lambda file: save_file(_whole(remembered), file))
-    _replace(path / "README.md", lambda file: Path(file).write_text(_readme(about)))
-    _replace(path / WORLD_FILE, lambda file: Path(file).write_text(json.dumps(about, indent=1) + "\n"))
 
 
 def load_world(
     path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
 ) -> LearnedWorld:
-    """Reads what `save_world` wrote; `memory=False` leaves the recordings' keyframes out (starts stay); `memory_mb` is the
-    budget of an episode's own memory, where it is not to be the saved one; `device`: where all of it runs.
+    """Reads what `save_world` wrote. memory=False leaves the recordings' keyframes out (starts stay); memory_mb: another budget
+    in MiB for an episode's own memory; device: where all of it runs.
 
     CheckpointError says what is missing or foreign.
     """
@@ -142,7 +138,7 @@ def load_world(
     if about.get("version") != VERSION or about.get("kind") != KIND:
         raise CheckpointError(_foreign(path, about))
     try:
-        weights, remembered = load_file(path / WEIGHTS_FILE), load_file(path / MEMORY_FILE)
+        about, (weights, remembered) = read_data(path, about, "weights", "memory")
         made = {}
         for name, part in about["parts"].items():
             if part["kind"] != Absent.kind:
@@ -166,10 +162,11 @@ def load_latent(path: str | Path, device: str = "cpu") -> LatentWorld:
     if (about.get("kind"), about.get("version")) != (LATENT, LATENT_VERSION):
         raise CheckpointError(_foreign(path, about))
     try:
+        about, (weights, remembered) = read_data(path, about, "weights", "memory")
         config, make = NETWORKS[about["parts"]["network"]["kind"]]
         network = make(_settings(config, about["parts"]["network"]["config"]))
-        network.load_state_dict(load_file(path / WEIGHTS_FILE))
-        world = LatentWorld(_about(about), network, load_file(path / MEMORY_FILE)["starts"])
+        network.load_state_dict(weights)
+        world = LatentWorld(_about(about), network, remembered["starts"])
     except DAMAGE as error:
         raise CheckpointError(
             f"{path} is damaged or incomplete ({first_line(error)}); copy or train it again."
@@ -180,8 +177,7 @@ def load_latent(path: str | Path, device: str = "cpu") -> LatentWorld:
 def open_world(
     path: str | Path, memory: bool = True, device: str = "cpu", memory_mb: float | None = None
 ) -> LearnedWorld | LatentWorld | SplatWorld:
-    """The world of a folder, whatever its kind. One that is latent or of Gaussians has no keyframes to leave out, and no budget
-    for them."""
+    """The world of a folder, of any kind. Parameters as in `load_world`; latent worlds and places of Gaussians have no memory."""
     about = read_about(Path(path))
     kind = about.get("kind")
     if kind not in (LATENT, splat_folder.KIND):
@@ -190,35 +186,31 @@ def open_world(
         what = "latent world" if kind == LATENT else "world of Gaussians"
         raise CheckpointError(f"{path} is a {what}, which keeps no pictures of an episode; leave `memory_mb` out.")
     if kind == splat_folder.KIND:
-        return splat_folder.load_splat(path, about)  # it is drawn on the CPU, whatever the device
+        return splat_folder.load_splat(path, about)  # always on the CPU
     return load_latent(path, device)
 
 
-def _about(told: dict) -> About:
-    said = told["about"]
-    names = tuple(said["action_names"]), said["keys"], told["card"], tuple(said["ignored"])
-    names = *names, tuple(said.get("idle", ())), said.get("max_episode_steps")
-    return About(told["name"], _settings(Controls, said["controls"]), said["dt_s"], *names)
+def _about(world: dict) -> About:
+    """The About of what world.json says."""
+    about = world["about"]
+    return About(
+        world["name"],
+        _settings(Controls, about["controls"]),
+        about["dt_s"],
+        action_names=tuple(about["action_names"]),
+        keys=about["keys"],
+        card=world["card"],
+        ignored=tuple(about["ignored"]),
+        idle=tuple(about.get("idle", ())),
+        max_episode_steps=about.get("max_episode_steps"),
+    )
 
 
 def with_kept(about: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """What a recording says of its world, with the keys and names of the world that is in `folder`, if one is there: they may
-    have been changed while it was played."""
+    """`about` of a recording's world, with the keys and names of the world in `folder`, if there is one: a player may have
+    changed them."""
     kept = read_about(folder)["about"] if (folder / WORLD_FILE).exists() else {}
     return {**about, **{name: kept[name] for name in ("keys", "action_names", "idle") if kept.get(name)}}
-
-
-def read_about(path: Path) -> dict:
-    """What world.json says; CheckpointError where there is none, or none that can be read."""
-    try:
-        about = json.loads((path / WORLD_FILE).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointError(f"{path} holds no world.json: it is no Terrella world; give the folder of one.") from None
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}/world.json cannot be read ({error}).") from error
-    if not isinstance(about, dict):
-        raise CheckpointError(f"{path}/world.json describes no world; copy it again.")
-    return about
 
 
 def first_line(error: Exception) -> str:
@@ -240,9 +232,9 @@ def _foreign(path: Path, about: dict) -> str:
 # -- parts ----------------------------------------------------------------------------------------------------------------
 
 
-def _settings(config: type, told: dict) -> Any:
-    """A config of JSON, whose lists are tuples."""
-    return config(**{name: _tuple(value) for name, value in told.items()})
+def _settings(config: type, settings: dict) -> Any:
+    """A config of its JSON, with tuples for lists."""
+    return config(**{name: _tuple(value) for name, value in settings.items()})
 
 
 def _tuple(value: Any) -> Any:
@@ -258,7 +250,7 @@ def _network(kind: type) -> Make:
 
 
 def _weights(name: str, part: Any) -> Tensors:
-    """The tensors of a part, those that it learned by descent in half precision where that is enough."""
+    """The tensors of a part, its weights in half precision where that is enough."""
     network = part.motion if name == "body" and part else part
     if not isinstance(network, nn.Module):
         return {}
@@ -351,16 +343,6 @@ def _unpack_frames(packed: Tensors) -> torch.Tensor:
 def _parts(packed: Tensors, name: str) -> list[bytes]:
     data, ends = packed[f"{name}_bytes"].numpy().tobytes(), packed[f"{name}_ends"].tolist()
     return [data[a:b] for a, b in zip([0, *ends], ends)]
-
-
-def _whole(tensors: Tensors) -> dict[str, torch.Tensor]:
-    return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
-
-
-def _replace(path: Path, write) -> None:
-    partial = path.with_name(path.name + ".partial")
-    write(partial)
-    partial.replace(path)
 
 
 def _readme(about: dict) -> str:

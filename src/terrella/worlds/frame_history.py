@@ -1,7 +1,7 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
-The last frames take the place of keyframes, unwarped, and the actions are part of the context, since no motion model turns
-them into a view. Where pictures scroll, a mosaic remembers what left the picture.
+The last frames take the place of keyframes, unwarped. The actions are part of the context, since no motion model turns them
+into a view. Where pictures scroll, a mosaic remembers what left the picture.
 """
 
 from __future__ import annotations
@@ -25,23 +25,21 @@ from .config import HistoryConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
-TRUST = 0.03  # in a frame, against the one after it: what is merged from all of them is nearly the newest alone
+TRUST = 0.03  # of a frame relative to the next one: merged, they are nearly the newest alone
 
 
 @dataclass(frozen=True)
 class StartClips:
-    """Where episodes begin, S pieces of recording, the newest first: frames uint8 [S, slots, 3, H, W]; the actions that led to
-    them as networks take them [S, slots, A]; vitals [S, V]; what a mosaic knew of the frame before the newest, uint8 [S, 4, H,
-    W] (colour and votes)."""
+    """S clips of recordings with which episodes begin, the newest frame first."""
 
-    frames: torch.Tensor
-    actions: torch.Tensor
-    vitals: torch.Tensor
-    known: torch.Tensor
+    frames: torch.Tensor  # uint8 [S, slots, 3, H, W]
+    actions: torch.Tensor  # [S, slots, A], encoded: those that led to the frames
+    vitals: torch.Tensor  # [S, V]
+    known: torch.Tensor  # uint8 [S, 4, H, W]: colour and votes of a mosaic at the frame before the newest
 
     @staticmethod
     def of(frames: torch.Tensor, actions: int) -> StartClips:
-        """No button held, and no vitals."""
+        """Clips of frames alone: no button held, no vitals, an empty mosaic."""
         known = torch.zeros(len(frames), 4, *frames.shape[3:], dtype=torch.uint8)
         return StartClips(frames, torch.zeros(*frames.shape[:2], actions), torch.zeros(len(frames), 0), known)
 
@@ -124,7 +122,7 @@ class FrameHistory:
         return state, Walls(nothing[0], nothing)
 
     def look(self, state: State, before: State) -> Conditioning:
-        """The last frames in the place of what a memory knows. Nothing of it lies in a place: `familiar` is 0."""
+        """The last frames in the place of keyframes; `familiar` is 0, since they lie in no place."""
         frames, actions = state["frames"], state["actions"].flip(1)
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
@@ -135,18 +133,18 @@ class FrameHistory:
         return Conditioning(past(frames), last, context, familiar, self._joined(state), over)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
-        """With the frame as its newest, how it was made to scroll, and the last frame in its mosaic."""
+        """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
         return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:
-        """The mosaic with the newest frame in its middle. That of a state lags by a frame, so that evidence may yet replace it.
-        It goes on as the frame was made to: new ground, of which little is known, is too plain to tell how it scrolled."""
+        """The mosaic with the newest frame in its middle. A state's mosaic lags by a frame, which evidence may still replace. It
+        scrolls by the move that was drawn: new ground is often too plain to estimate the move from."""
         return remembered(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]], self.over)
 
     def _whole(self, state: State) -> torch.Tensor:
-        """The mosaic, and what lies over it where it knows nothing."""
+        """The mosaic; where it is empty, what lies over it."""
         frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
         joined, none = self._joined(state), torch.zeros_like(self.over)
         return torch.where(joined[:, 3:] > 0, joined, remembered(state["mosaic"], frame, move, none))
@@ -161,13 +159,13 @@ class FrameHistory:
 
 
 def _shown(mosaic: torch.Tensor) -> torch.Tensor:
-    """The channel `mosaic` (core/world.py) of mosaics uint8 [B, 4, H', W'], colour and votes."""
+    """The channel `mosaic` (core/world.py) of mosaics uint8 [B, 4, H', W'] of colour and votes."""
     seen = (mosaic[:, 3:] > 0).to(torch.uint8) * 255
     return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
 
 
 def past(frames: torch.Tensor) -> Glimpse:
-    """The last frames (uint8 [B, slots, 3, H, W], the newest first) in the place of what a memory knows."""
+    """The last frames (uint8 [B, slots, 3, H, W], the newest first) as a Glimpse."""
     batch, slots, _, height, width = frames.shape
     trust = TRUST ** torch.arange(slots, dtype=torch.float32, device=frames.device)
     everywhere = torch.ones(batch, height, width, device=frames.device)

@@ -1,4 +1,4 @@
-"""Generator: the network that draws a frame from what memory knows, what was just seen and noise (flow matching)."""
+"""The U-Net that draws a frame from the conditioning and noise (flow matching), and the code of its frames."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .config import THUMBNAIL, GeneratorConfig
 
 Network = TypeVar("Network", bound=nn.Module)
 FAR_DEPTH_M, NEAR_DEPTH_M = 60.0, 0.1
-AT_ONCE = 16  # frames that are drawn together on a CPU: the maps of more leave its caches
-LASTING = 5.0  # by how much (a logit) the last frame is the likelier source where a thing was
+AT_ONCE = 16  # frames in a pass on a CPU: the maps of more do not fit its caches
+LASTING = 5.0  # added to the logit of the last frame as a source where a thing was
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Block(nn.Module):
 
 
 def down_and_up(net: Any, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-    """Maps [B, C, h, w] through the levels of a U-Net, whose blocks `before` and `after` and steps `down` and `up` are those of
-    `net`; laid out as its weights are (channels_last)."""
+    """Maps [B, C, h, w] through the levels of the U-Net `net`: its blocks `before` and `after`, its steps `down` and `up`. The maps
+    are laid out channels last, like its weights."""
     x, kept = x.contiguous(memory_format=torch.channels_last), []
     for level, block in enumerate(net.before):
         x = block(x, context)
@@ -95,12 +95,12 @@ def down_and_up(net: Any, x: torch.Tensor, context: torch.Tensor) -> torch.Tenso
 
 @final
 class UNet(nn.Module):
-    """A U-Net that, from noise and what memory knows, predicts the clean frame (flow matching, x-prediction).
+    """Predicts the clean frame from noise and the conditioning (flow matching, x-prediction).
 
-    Each pixel is a mixture of the warped colours, the last frame carried over, and a colour of the net's own; so what
-    is known comes through as sharp as it was seen. It begins with a 2x pixel-unshuffle: a quarter of the cost.
-    With `residual` it is the newest frame and what the net changes in it: where hardly a pixel ever changes, a mixture
-    soon copies, and then no gradient corrects it.
+    Each pixel is a mixture of the warped colours, the carried last frame and a colour of the net's own, so that what is known
+    stays as sharp as it was seen. A 2x pixel-unshuffle at the start makes it four times as cheap.
+    With `residual` a frame is the newest one plus the net's change: where few pixels ever change, a mixture soon copies, and
+    then no gradient corrects it.
     """
 
     kind = "unet"
@@ -126,12 +126,12 @@ class UNet(nn.Module):
         self.output.bias.data = bias.repeat_interleave(4)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
-        """It derives nothing: the same."""
+        """The same: it derives nothing from it."""
         return conditioning
 
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
-        """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]. Returns the clean frame in the code of `noisy`; where
-        things move, with a fifth plane, the logit that a thing is there."""
+        """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]. Returns the clean frame in the same code; where things
+        move, with a fifth plane, the logit of a thing."""
         glimpse, last = conditioning.glimpse, conditioning.last
         if self.residual:
             noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
@@ -150,7 +150,7 @@ class UNet(nn.Module):
         x = down_and_up(self, x, context)
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
-        if self.moving:  # a thing stays as it was unless the network knows better; what was not seen is not copied
+        if self.moving:  # by default a thing stays as it was; what was not seen is not copied
             thing = LASTING * last[:, 5:6] - 1e4 * (last_trust <= 0).float()
             votes = torch.cat([votes[:, :-2], votes[:, -2:-1] + thing, votes[:, -1:]], 1)
         share = votes.softmax(1)
@@ -162,13 +162,13 @@ class UNet(nn.Module):
             for slot in range(self.slots):
                 rgb = rgb + share[:, 1 + slot : 2 + slot] * colours[:, slot]
         if self.moving:
-            trusted = share[:, -2:-1]  # as far as the last frame's colour is taken, so is its depth
+            trusted = share[:, -2:-1]  # the last frame's depth has the same share as its colour
             return torch.cat([rgb, depth + trusted * (carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
         return torch.cat([rgb, depth + out[:, -1:]], 1)
 
 
 def channels_last(generator: Network) -> Network:
-    """The same network with its weights laid out for faster convolutions on a CPU (a third less time)."""
+    """The same network with its weights laid out channels last: a third less time on a CPU."""
     for weight in generator.parameters():
         if weight.ndim == 4:
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -176,7 +176,7 @@ def channels_last(generator: Network) -> Network:
 
 
 def encode_depth(depth: torch.Tensor) -> torch.Tensor:
-    """Metres -> about [-1, 1], logarithmic."""
+    """Metres to a logarithmic code of about [-1, 1]."""
     return depth.clamp(NEAR_DEPTH_M, FAR_DEPTH_M).log() / 2 - 0.6
 
 
@@ -185,8 +185,8 @@ def decode_depth(code: torch.Tensor) -> torch.Tensor:
 
 
 def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
-    """The look of frames (uint8 [B, 3, H, W]) as a tiny picture in [-1, 1]: [B, 36]. Where nothing is known of a view,
-    what was just seen says best what the place is like."""
+    """Frames uint8 [B, 3, H, W] as tiny pictures in [-1, 1]: [B, 36]. Where nothing is known of a view, the last frame is the
+    best hint of how the place looks."""
     return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, THUMBNAIL).flatten(1)
 
 

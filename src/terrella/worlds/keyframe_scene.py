@@ -1,4 +1,4 @@
-"""KeyframeScene: what is known of a view, from posed RGB-D keyframes of the recordings and of an episode's own memory."""
+"""KeyframeScene: what is known of a view from posed RGB-D keyframes, of the recordings and of an episode's own memory."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from .localisation import AWAY_M, arrive
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
 SEEN: tuple[str, ...] = "rgb", "depth", "things", "pose", "instances"  # state entries of a frame
-NEAR_M = 1.0  # from a recorded keyframe: there the recordings know the walls, and those of dreamt frames do not count
-CELL_M = 0.25  # side of the cells of the map in which that is looked up
+NEAR_M = 1.0  # from a recorded keyframe, within which only walls of recordings and evidence count
+CELL_M = 0.25  # side of a cell of the map of that
 BLIND = " For a picture alone it needs an estimator of depth: `terrella train uncertainty`."
 EXACTLY = "donot_use_mm_for_euclid_dist"
 
@@ -63,13 +63,13 @@ class KeyframeScene:
 
     @cached_property
     def _table(self) -> torch.Tensor:
-        """The recordings' part of the channel `places`."""
+        """Recorded keyframes in the channel `places`."""
         kinds = torch.full((len(self.recorded),), RECORDED, device=self.device)
         return keyframe_table(self.recorded.pose, kinds)
 
     @cached_property
     def _small(self) -> torch.Tensor:
-        """By which a lone picture's place is sought."""
+        """Thumbnails in which a picture's place is looked up."""
         return thumbnails(self.recorded.rgb)
 
     @cached_property
@@ -78,7 +78,7 @@ class KeyframeScene:
 
     @cached_property
     def _cells(self) -> torch.Tensor:
-        """The cells of the map that lie within NEAR_M of a recorded keyframe, ascending; never none."""
+        """Codes of the map's cells within NEAR_M of a recorded keyframe, ascending; never empty."""
         reach = int(NEAR_M / CELL_M) + 1
         steps = CELL_M * torch.arange(-reach, reach + 1, device=self.device)
         around = torch.cartesian_prod(steps, steps)
@@ -109,15 +109,14 @@ class KeyframeScene:
         keys = self.starts.at(pick)
         rgb, depth = F.interpolate(keys.rgb.float(), self.config.size, mode="area"), keys.depth
         seen = {"rgb": rgb.round().to(torch.uint8), "depth": depth}
-        if self.config.moving:  # of what moves, a keyframe keeps the place only
+        if self.config.moving:  # a keyframe has no depth where things were
             seen["depth"] = fill_holes(torch.where(depth > 0, depth, FAR_M))
             seen["things"] = (depth <= 0).float()
         return Evidence(len(pick), self.device, keys.pose, seen), pick
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
-        """Evidence: rgb, depth and pose together; a pose alone, from which a frame is dreamt (it needs a prior); or a picture
-        alone, seen from the prior's pose, or without a prior from the remembered place that it shows, else from an empty
-        corner (localisation.py), its depth then being the estimator's."""
+        """One of three: rgb, depth and pose; a pose alone with a prior, whose frame is then drawn; or a picture alone with depth of
+        the estimator, at the prior's pose, or without a prior at the place that it is recognised as (localisation.py)."""
         lone = None
         if set(observation) & {"rgb", "depth", "pose"} == {"rgb"} and estimator:
             observation, lone = self._arrived(observation, prior, estimator)
@@ -150,7 +149,7 @@ class KeyframeScene:
         return Evidence(batch, self.device, pose, seen, lone)
 
     def _things(self, observation: Mapping, prior: State | None, depth: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Where things are: as the evidence says, else where they were dreamt."""
+        """Where things are: as observed, else as the prior has them."""
         if not self.config.moving:
             return {}
         if "things" not in observation:
@@ -161,7 +160,7 @@ class KeyframeScene:
         return {"things": things}
 
     def _arrived(self, observation: Mapping, prior: State | None, estimator: Any) -> tuple[dict, torch.Tensor | None]:
-        """The observation of a lone picture with the pose and the depth that it is given, and which are of elsewhere [B]."""
+        """The observation of a picture alone, with its pose and depth; which are outside of the recordings [B]."""
         rgb = picture_of(observation, self.config.size, self.device)
         if prior is not None:
             check_prior(prior.batch, len(rgb))
@@ -208,9 +207,9 @@ class KeyframeScene:
         return state, Walls(self._plan, own)
 
     def _away(self, state: State) -> torch.Tensor:
-        """The entries of the batch [n] that are in no cell of the map that recorded keyframes are near."""
+        """The entries of the batch [n] that are not within NEAR_M of a recorded keyframe."""
         cells, codes = self._cells, _cell_codes(state["pose"][:, :2])
-        if codes.is_meta:  # it has no values to ask for
+        if codes.is_meta:  # a meta tensor has no values
             return torch.zeros(state.batch, dtype=torch.int64, device=codes.device)
         return (cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] != codes).nonzero()[:, 0]
 
@@ -265,18 +264,18 @@ class KeyframeScene:
         return shown
 
     def _lasting(self, state: State) -> torch.Tensor:
-        """What a keyframe may keep of the frame's depth."""
+        """The frame's depth as a keyframe keeps it."""
         return still(state["depth"], state["things"]) if self.config.moving else state["depth"]
 
 
 def _cell_codes(places: torch.Tensor) -> torch.Tensor:
-    """The number of the cell of the map in which places [N, 2] lie: int64 [N]."""
+    """Codes int64 [N] of the map's cells in which places [N, 2] lie."""
     column, row = (places / CELL_M).floor().clamp(-(2**30), 2**30).long().unbind(-1)
     return column * 2**31 + row
 
 
 def own_memory(config: KeyframesConfig, device: str) -> Memory:
-    """The memory of an episode's own; where its budget has no room, one of the last frame, which each new one replaces."""
+    """An episode's own memory; where its budget has no room for a keyframe, it holds the last frame alone."""
     rules = config.memory_mb, config.new_view, config.known_enough
     whole = Memory(config.camera, config.size, *rules, device=device)
     if whole.capacity:

@@ -1,9 +1,8 @@
-"""LatentWorld: a world that predicts what matters instead of pixels, for agents that plan and practise by the thousand.
+"""LatentWorld: a world that predicts latents instead of pixels, for agents that plan and practise in thousands of episodes.
 
 An encoder turns pictures, state vectors or both into a latent; an ensemble of predictors moves it under actions; heads read
-reward, end and state vectors off it; how much the ensemble disagrees says how wrong it may be. Pictures are decoded for people
-alone, when one is asked for (LeWorldModel, Maes et al. 2026, for the joint-embedding loss; PETS, Chua et al. 2018, for the
-ensemble).
+reward, end and state vectors off it; the ensemble's disagreement gives the error to expect. Pictures are decoded only on
+request, for people (joint-embedding loss: LeWorldModel, Maes et al. 2026; ensemble: PETS, Chua et al. 2018).
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ UNIT = "expected error of the latent, 0 exact to 1 no better than its mean"
 
 @final
 class LatentWorld:
-    """State: window [B, K, D], the last latents, the newest last; actions [B, K - 1, A] between them; reward, done and its
-    probability; spread, the variance of the ensemble summed since the last evidence. starts: latents [N, D] in which episodes
-    begin. Nothing in a step is drawn by chance."""
+    """State: window [B, K, D], the last latents, the newest last; actions [B, K - 1, A] between them; reward, done,
+    done_probability; spread, the ensemble's variance summed since the last evidence. starts: latents [N, D] with which
+    episodes begin. A step is deterministic."""
 
     def __init__(self, about: About, network: LatentNetwork, starts: torch.Tensor):
         self.about, self.controls = about, about.controls
@@ -92,8 +91,8 @@ class LatentWorld:
         return self._begun(self.starts[(drawn * len(self.starts)).long()], None)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """The latent of what is seen in place of the one that was imagined. Without a prior nothing is known of what came before:
-        a lone picture, such as a goal, has no velocity."""
+        """The latent of the observation in place of the imagined one. Without a prior nothing is known of what came before: a
+        single picture, such as a goal, has no velocity."""
         lacks = [name for name in self.spec.observes if name not in observation]
         if lacks:
             raise ObservationError(f"{self.spec.name} observes {', '.join(lacks)}, which the observation lacks.")
@@ -115,18 +114,18 @@ class LatentWorld:
         return self._begun(network.encode(rgb, numbers), prior)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One step. What is over stands still."""
+        """One step. Episodes that are over stand still."""
         taken = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
         network, window, still = self.network, state["window"], state["done"]
         actions = torch.cat([state["actions"], taken[:, None]], 1)
         members = network.predict(window, actions)
         latent = members.mean(0)
-        found = network.outcome(window, taken, latent)
+        outcome = network.outcome(window, taken, latent)
         after = {
             "window": torch.cat([window[:, 1:], latent[:, None]], 1),
             "actions": actions[:, 1:],
-            "reward": network.paid(found.reward),
-            "done_probability": found.done.sigmoid(),
+            "reward": network.paid(outcome.reward),
+            "done_probability": outcome.done.sigmoid(),
             "spread": state["spread"] + members.var(0, correction=0).mean(1),
         }
         held = {"reward": torch.zeros_like(state["reward"])}
@@ -134,11 +133,11 @@ class LatentWorld:
             name: torch.where(still.view(-1, *[1] * (now.ndim - 1)), held.get(name, state[name]), now)
             for name, now in after.items()
         }
-        return state.replace(**kept, done=still | (found.done > 0))
+        return state.replace(**kept, done=still | (outcome.done > 0))
 
     def leap(self, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
-        """`Spec.leap` steps at once, under actions [B, leap, *action.shape]. Latents alone go on: reward, end and uncertainty stay
-        as they are. What is over stands still."""
+        """`Spec.leap` steps at once, under actions [B, leap, *action.shape]. Only latents and actions change; reward, end and
+        uncertainty stay. Episodes that are over stand still."""
         flat = self.spec.check_action(actions.flatten(0, 1), actions.shape[0] * actions.shape[1]).to(self.device)
         taken = self.controls.encode(flat).unflatten(0, actions.shape[:2])
         past = torch.cat([state["actions"], taken], 1)
@@ -200,7 +199,7 @@ class LatentWorld:
 
 
 def _lone(name: str, width: int) -> bool:
-    """Whether a channel is one number, such as the player's health: recordings hold lists of one, for want of anything less."""
+    """Whether a channel is one number, such as the player's health; recordings hold it as a list of one."""
     return width == 1 and kind_of(name) not in ("observation", "state")
 
 

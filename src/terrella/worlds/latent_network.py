@@ -12,30 +12,26 @@ from torch import nn
 from ..core.spec import kind_of
 
 KNOTS = 17  # of the map from the spread of the ensemble to the error to expect
-FARTHEST = 8.0  # a latent is held within so many standard deviations, inputs likewise
-COARSE = 16  # the encoder's last map has a cell for so many pixels
+FARTHEST = 8.0  # standard deviations to which latents and inputs are clamped
+COARSE = 16  # side in pixels of a cell of the encoder's last map
 
 
 @dataclass(frozen=True)
 class LatentConfig:
-    """actions: numbers in an action; rewards: values between which a reward is told apart, ascending; vectors: (name, width) of
-    the channels of numbers, all of which are predicted; size: (height, width) of the pictures, multiples of 16, None without;
-    sees_pictures, sees_vectors: which of them are evidence; latent: its width; history: last latents and actions that the
-    predictor sees; hidden: width of its layers; members: predictors of the ensemble; leap: steps that a leap takes at once, 0
-    without; identity: the latent is the vectors themselves, scaled, all of which are evidence: there is no encoder."""
+    """Of the networks of a latent world."""
 
-    actions: int
-    rewards: tuple[float, ...] = (0.0, 1.0)
-    vectors: tuple[tuple[str, int], ...] = ()
-    size: tuple[int, int] | None = None
-    sees_pictures: bool = True
-    sees_vectors: bool = True
-    latent: int = 32
-    history: int = 3
-    hidden: int = 192
-    members: int = 3
-    leap: int = 0
-    identity: bool = False
+    actions: int  # numbers of an encoded action
+    rewards: tuple[float, ...] = (0.0, 1.0)  # values of the two-hot code of rewards, ascending
+    vectors: tuple[tuple[str, int], ...] = ()  # name and width of the channels of numbers, which are all predicted
+    size: tuple[int, int] | None = None  # height and width of pictures, multiples of 16; None without pictures
+    sees_pictures: bool = True  # whether pictures are evidence
+    sees_vectors: bool = True  # whether vectors are evidence
+    latent: int = 32  # width of the latent
+    history: int = 3  # last latents and actions that the predictor sees
+    hidden: int = 192  # width of its layers
+    members: int = 3  # predictors of the ensemble
+    leap: int = 0  # steps of a leap, 0 without
+    identity: bool = False  # the latent is the scaled vectors, all of which are evidence; there is no encoder
 
     @property
     def width(self) -> int:
@@ -44,12 +40,12 @@ class LatentConfig:
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """The vectors that are evidence: all but poses, which few know of themselves."""
+        """The vectors that are evidence: all but poses, which robots seldom measure."""
         return tuple(name for name, _ in self.vectors if kind_of(name) != "pose") if self.sees_vectors else ()
 
     @property
     def columns(self) -> list[int]:
-        """Of all numbers, those of the vectors that are evidence."""
+        """Columns of the vectors that are evidence."""
         names = [name for name, width in self.vectors for _ in range(width)]
         return [column for column, name in enumerate(names) if name in self.seen]
 
@@ -60,7 +56,7 @@ class LatentConfig:
 
 
 class Outcomes(NamedTuple):
-    """Logits [B, len(rewards)] of the reward, and [B] of the episode's end."""
+    """Logits [B, len(rewards)] of the reward and [B] of the end."""
 
     reward: torch.Tensor
     done: torch.Tensor
@@ -87,19 +83,19 @@ class LatentEncoder(nn.Module):
             nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.SiLU(), nn.Linear(hidden, config.latent)
         )
 
-    def forward(self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, there: torch.Tensor | None):
-        """rgb uint8 [N, 3, H, W]; numbers [N, S], scaled; there [N]: 0 where the numbers are unknown. Returns [N, D]."""
+    def forward(self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, known: torch.Tensor | None):
+        """rgb uint8 [N, 3, H, W]; numbers [N, S], scaled; known [N]: 0 where the numbers are not. Returns [N, D]."""
         parts = []
         if rgb is not None:
             parts.append(self.look((rgb.float() / 127.5 - 1).contiguous(memory_format=torch.channels_last)))
         if numbers is not None:
-            known = numbers.new_ones(len(numbers)) if there is None else there.float()
+            known = numbers.new_ones(len(numbers)) if known is None else known.float()
             parts.append(self.sense(torch.cat([numbers * known[:, None], known[:, None]], 1)))
         return self.project(torch.cat(parts, 1))
 
 
 class Ensemble(nn.Module):
-    """Residual perceptrons that share nothing but their input, all computed at once; `slowly` is the same, one by one."""
+    """Residual perceptrons with one input, computed at once; `slowly` computes the same one by one."""
 
     def __init__(self, members: int, into: int, hidden: int, out: int):
         super().__init__()
@@ -122,12 +118,12 @@ class Ensemble(nn.Module):
 
     def slowly(self, x: torch.Tensor) -> torch.Tensor:
         """The same, one member after the other."""
-        found = []
+        outputs = []
         for one in range(len(self.enter)):
             first = F.silu(_normed(x @ self.enter[one] + self.entered[one]))
             second = first + F.silu(_normed(first @ self.inner[one] + self.bias[one]))
-            found.append(second @ self.leave[one] + self.left[one])
-        return torch.stack(found)
+            outputs.append(second @ self.leave[one] + self.left[one])
+        return torch.stack(outputs)
 
 
 def _normed(x: torch.Tensor) -> torch.Tensor:
@@ -135,8 +131,8 @@ def _normed(x: torch.Tensor) -> torch.Tensor:
 
 
 class Decoder(nn.Module):
-    """A latent as a picture, for people: it learns from latents, never they from it. What is left of its cost is at low
-    resolution (sub-pixel convolution, Shi et al. 2016)."""
+    """A latent as a picture, for people; no gradient goes from it to latents. Most of its layers are at low resolution (sub-pixel
+    convolution, Shi et al. 2016)."""
 
     def __init__(self, latent: int, size: tuple[int, int]):
         super().__init__()
@@ -154,14 +150,14 @@ class Decoder(nn.Module):
 
 
 class LatentNetwork(nn.Module):
-    """All that is learned. A window [B, K, D] holds the last latents, the newest last."""
+    """All networks of a latent world. A window [B, K, D] holds the last latents, the newest last."""
 
-    mean: torch.Tensor  # of each number of the vectors
-    scale: torch.Tensor  # its standard deviation
+    mean: torch.Tensor  # [width] of the vectors
+    scale: torch.Tensor  # [width], their standard deviation
     rewards: torch.Tensor
     spread: torch.Tensor  # KNOTS summed variances of the ensemble, ascending from 0
-    error: torch.Tensor  # the error usual at each
-    unit: torch.Tensor  # by which each number of the latent usually changes in a step, where the latent is the vectors
+    error: torch.Tensor  # the usual error at each
+    unit: torch.Tensor  # [latent], the usual change in a step, where the latent is the vectors; else 1
 
     kind = "joint-embedding"
 
@@ -195,38 +191,38 @@ class LatentNetwork(nn.Module):
         return ((numbers - self.mean) / self.scale).clamp(-FARTHEST, FARTHEST)
 
     def encode(
-        self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, there: torch.Tensor | None = None
+        self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, known: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Evidence to latents [N, D]: rgb uint8 [N, 3, H, W] where the world sees pictures; numbers [N, width] as recorded, of
-        which it takes those that it sees; there [N]: whether they are known (they need not be, beside a picture)."""
+        """Evidence to latents [N, D]: rgb uint8 [N, 3, H, W] where pictures are evidence; numbers [N, width] as recorded, of all
+        vectors; known [N]: whether they are known, which beside a picture they need not be."""
         seen = None
         if self.config.columns:
             if numbers is None:
                 assert rgb is not None
-                numbers, there = self.mean.expand(len(rgb), -1), torch.zeros(len(rgb), device=rgb.device)
+                numbers, known = self.mean.expand(len(rgb), -1), torch.zeros(len(rgb), device=rgb.device)
             seen = self.scaled(numbers)[:, self.config.columns]
             if self.config.identity:
                 return seen
-        return self.encoder(rgb if self.config.pictured else None, seen, there)
+        return self.encoder(rgb if self.config.pictured else None, seen, known)
 
     def predict(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """The next latent as each member has it [members, B, D], after actions [B, K, A], the newest last."""
-        found = window[:, -1] + self.unit * self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
-        return found.clamp(-FARTHEST, FARTHEST)
+        """The next latent of each member [members, B, D], after actions [B, K, A], the newest last."""
+        latents = window[:, -1] + self.unit * self.predictor(torch.cat([window.flatten(1), actions.flatten(1)], 1))
+        return latents.clamp(-FARTHEST, FARTHEST)
 
     def leap(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """The window [B, K, D] `config.leap` steps later, at once, after actions [B, K - 1 + leap, A], the newest last."""
-        found = self.leaper(torch.cat([window.flatten(1), actions.flatten(1)], 1))[0].view_as(window)
-        return (window[:, -1:] + self.unit * found).clamp(-FARTHEST, FARTHEST)
+        """The window [B, K, D] after `config.leap` steps, under actions [B, K - 1 + leap, A], the newest last."""
+        change = self.leaper(torch.cat([window.flatten(1), actions.flatten(1)], 1))[0].view_as(window)
+        return (window[:, -1:] + self.unit * change).clamp(-FARTHEST, FARTHEST)
 
     def numbers(self, window: torch.Tensor) -> torch.Tensor:
-        """The vectors that are read off a window, scaled: [B, width]."""
+        """The scaled vectors [B, width] of a window."""
         return window[:, -1] if self.config.identity else self.heads["numbers"](window.flatten(1))
 
     def outcome(self, window: torch.Tensor, action: torch.Tensor, after: torch.Tensor) -> Outcomes:
-        """What a step from `window` by `action` [B, A] to the latent `after` [B, D] brings."""
-        found = self.heads["outcome"](torch.cat([window.flatten(1), action, after], 1))
-        return Outcomes(found[:, :-1], found[:, -1])
+        """Of a step from `window` by `action` [B, A] to the latent `after` [B, D]."""
+        logits = self.heads["outcome"](torch.cat([window.flatten(1), action, after], 1))
+        return Outcomes(logits[:, :-1], logits[:, -1])
 
     def paid(self, logits: torch.Tensor) -> torch.Tensor:
         """The reward expected [B]."""
@@ -241,8 +237,8 @@ class LatentNetwork(nn.Module):
         return (self.decoder(latent) * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1)
 
     def expected(self, spread: torch.Tensor) -> torch.Tensor:
-        """The error [B] that is usual at this spread [B] of the ensemble, linear between the knots; at a larger spread than any
-        seen, in proportion to the last, 1 at most."""
+        """The usual error [B] at this spread [B] of the ensemble: linear between the knots, beyond the last in proportion to it, at
+        most 1."""
         at = torch.searchsorted(self.spread, spread.contiguous()).clamp(1, KNOTS - 1)
         low, high = self.spread[at - 1], self.spread[at]
         share = ((spread - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""Arrival: where an episode stands that begins with one picture, and how deep it sees there."""
+"""Localisation: the pose and depth of an episode that begins with one picture."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ..space.keyframes import Keyframes, look, retrieve
 from ..space.recognise import recognise
 from .parts import Absent
 
-AWAY_M = 1000.0  # from the recordings, of a picture of elsewhere: nothing that they hold is seen from there
-ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # a picture is of a remembered place from there up (see docs/lab/log.md)
+AWAY_M = 1000.0  # from the recordings, where pictures of unknown places are put: no keyframe is seen from there
+ALIKE, ALIKE_EDGES, KNOWN = 0.75, 0.3, 0.7  # likeness, edges and known share above which a place is recognised
 
 
 @final
 class NoEstimator(Absent):
-    """Of a world that cannot see depth in a lone picture."""
+    """Of a world that cannot estimate depth from a picture."""
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """pose [B, 7]; depth [B, H, W] metres; recognised bool [B]: the picture is of a place that memory holds."""
+    """Where B pictures were taken."""
 
-    pose: torch.Tensor
-    depth: torch.Tensor
-    recognised: torch.Tensor
+    pose: torch.Tensor  # [B, 7]
+    depth: torch.Tensor  # [B, H, W] metres
+    recognised: torch.Tensor  # bool [B]: of a place that memory holds
 
 
 def arrive(
@@ -40,9 +40,8 @@ def arrive(
     camera: Intrinsics,
     sources: int,
 ) -> Arrival:
-    """Pictures, uint8 [B, 3, H, W], in the place among `memory` (its `thumbnails` are `small`) where they were taken, or
-    else in an empty corner of the world at the height of the `starts`; depth is memory's where it knows it, else the
-    estimator's."""
+    """Localises pictures uint8 [B, 3, H, W] among the keyframes `memory`, whose `thumbnails` are `small`; those that are not
+    recognised are put far from it, at the height of the `starts`. Depth is memory's where known, else the estimator's."""
     depth, recognised, poses = estimator.depth(rgb), [], []
     corner = starts.pose[:1].clone()
     corner[0, 0] = starts.pose[:, 0].max() + AWAY_M

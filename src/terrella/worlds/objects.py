@@ -1,7 +1,7 @@
-"""Objects: the things of a place as billboards that stand in it, each with a place and a look that change as in recordings.
+"""Objects: things as billboards, each with a place and a look that change as in recordings.
 
-A look is one of those that the recording showed (space/billboards.py), a move one of those that it saw, and which comes next
-is drawn by chance from the logits of a small network: a figure is never the mean of what it could do, so it stays sharp.
+Looks (space/billboards.py) and moves are those that the recording showed. The next ones are sampled from the logits of a small
+network: a figure is never a mean of what it could do, so it stays sharp.
 """
 
 from __future__ import annotations
@@ -25,38 +25,37 @@ from ..space.floorplan import NOWHERE
 from .generator import DrawnFrame
 from .parts import GOES, LOOKS, MOVES, Absent, Channels, Evidence, Tensors, Walls
 
-# A billboard: its number (0: none), place (x, y, z), look (NONE: not known), steps since it looks so, the look before, its
-# last move (x, y), steps since that, and its light, of its look's own.
+# Columns of a billboard: number (0: none), place (x, y, z), look (NONE: unknown), steps with that look, the look before, last
+# move (x, y), steps since that move, and brightness relative to its look's own.
 NUMBER, PLACE, LOOK, AGE, BEFORE, GOING, RESTED, LIGHT = 0, slice(1, 4), 4, 5, 6, slice(7, 9), 9, 10
 COLUMNS = 11
 NONE = -1
-ALIKE = 0.6  # how far marks may lie from a look's to be taken for it
-STICKS = 0.2  # how much nearer another look must be for a thing to be seen to change
-STOREY_M = 2.0  # between feet and viewer, above which a billboard is on another floor
-ROWS = 16  # billboards of a place at most
+ALIKE = 0.6  # distance of marks up to which two looks are the same
+STICKS = 0.2  # how much nearer another look must be for a thing to change to it
+STOREY_M = 2.0  # height between feet and viewer above which a billboard is on another floor
+ROWS = 16  # most billboards of a place
 STARTS = 32  # sets of billboards with which episodes begin
-AGES = 24  # steps that are counted; more are as many
-WIDE_M = 0.65  # beside its middle, where a thing counts as looked at by 1/e
-UNLIKELY = 0.01  # a look less likely than that in a step does not come: so many of them would fell a man now and then
-FINE = (8, 6)  # rows and columns of the pictures by which looks are told apart
+AGES = 24  # steps are counted up to this
+WIDE_M = 0.65  # beside its middle, where a thing is aimed at by 1/e
+UNLIKELY = 0.01  # less likely looks are never sampled: over many steps they would fell a figure by chance
+FINE = (8, 6)  # rows and columns of the pictures that looks are compared by
 
 
 @dataclass(frozen=True)
 class BillboardsConfig:
-    """actions: numbers in an action; history: of the last actions that count, the present one among them; looks and moves:
-    that it has room for (move 0 is none); rows: billboards of a place; starts: sets of them; hidden: width of the network."""
+    """Of the billboards."""
 
-    actions: int
-    history: int
-    looks: int = 160
-    moves: int = 33
-    rows: int = ROWS
-    starts: int = STARTS
-    hidden: int = 192
+    actions: int  # numbers of an encoded action
+    history: int  # last actions that it sees, the present one among them
+    looks: int = 160  # that it has room for
+    moves: int = 33  # that it has room for; move 0 is none
+    rows: int = ROWS  # billboards of a place
+    starts: int = STARTS  # sets of billboards with which episodes begin
+    hidden: int = 192  # width of the network
 
 
 class BillboardLogits(NamedTuple):
-    """Logits of the next look [n, looks], of the move [n, moves] and of its being gone [n]."""
+    """Logits of the next look [n, looks], the move [n, moves] and the end of a billboard [n]."""
 
     look: torch.Tensor
     move: torch.Tensor
@@ -65,16 +64,16 @@ class BillboardLogits(NamedTuple):
 
 @final
 class Billboards(nn.Module):
-    """What the things of a place look like, and what they do next."""
+    """The looks of the things of a place, and a network of what they do next."""
 
     kind = "billboards"
 
     pictures: torch.Tensor  # uint8 [looks, 4, *PICTURE]
     boxes: torch.Tensor  # [looks, 4]
-    solid: torch.Tensor  # [looks] metres to which a body can come near along x or y; 0: it can walk through
-    follows: torch.Tensor  # bool [looks + 1, looks], which look was seen to follow which; the first row is that of NONE
+    solid: torch.Tensor  # [looks] metres along x or y to which a body can come near; 0: it passes through
+    follows: torch.Tensor  # bool [looks + 1, looks], which look followed which; the first row is that of NONE
     moves: torch.Tensor  # [moves, 3] metres
-    begun: torch.Tensor  # [starts, rows, COLUMNS], those with which episodes begin
+    begun: torch.Tensor  # [starts, rows, COLUMNS], billboards with which episodes begin
 
     def __init__(self, config: BillboardsConfig):
         super().__init__()
@@ -164,8 +163,7 @@ class Billboards(nn.Module):
     # -- what happens -------------------------------------------------------------------------------------------------
 
     def foresee(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
-        """What comes next of billboards [n, COLUMNS], seen from `pose` [n, 7] to which the actions [n, history, A], the newest
-        last, have led."""
+        """Of billboards [n, COLUMNS], seen from `pose` [n, 7] after the actions [n, history, A], the newest last."""
         apart, heading = billboards[:, PLACE] - pose[:, :3], yaw(pose)
         c, s = heading.cos(), heading.sin()
         ahead, aside = apart[:, 0] * c + apart[:, 1] * s, apart[:, 1] * c - apart[:, 0] * s
@@ -177,17 +175,17 @@ class Billboards(nn.Module):
         ]  # fmt: skip
         look, before = ((billboards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
         age, rested = (billboards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # how straight it is looked at now
+        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # how straight it is aimed at
         parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
-        next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another by chance
+        next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another
         return BillboardLogits(next_look, self.next_move(known), self.goes(known)[:, 0])
 
     def act(
         self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor
     ) -> torch.Tensor:
-        """The billboards [B, K, COLUMNS] one step later, by chance; seen [B, K] bool: the others wait; pose [B, 7] and acts
-        [B, history, A] as for `foresee`; seeds [B] (core/chance.py)."""
+        """The billboards [B, K, COLUMNS] one step later, sampled by seeds [B] (core/chance.py). seen bool [B, K]: the others wait;
+        pose [B, 7] and acts [B, history, A] as for `foresee`."""
         rows = billboards.shape[1]
         flat = billboards.flatten(0, 1)
         logits = self.foresee(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
@@ -205,24 +203,24 @@ class Billboards(nn.Module):
     def painted(
         self, billboards: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Frames with billboards [B, K, COLUMNS] in them: see space/billboards.painted."""
+        """Frames with billboards [B, K, COLUMNS] in them, as space/billboards.painted gives them."""
         look = billboards[..., LOOK].long()
-        there = (billboards[..., NUMBER] > 0) & (look != NONE)
+        visible = (billboards[..., NUMBER] > 0) & (look != NONE)
         look = look.clamp_min(0)
         light = billboards[..., LIGHT, None].expand(-1, -1, 3)
         lit = torch.cat([light, torch.ones_like(light[..., :1])], -1)[..., None, None]
         pictures = (self.pictures[look].float() / 255 * lit).clamp_max(1)
-        return painted(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), there, pose, camera)
+        return painted(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), visible, pose, camera)
 
     def bodies(self, state: State, half_m: float) -> torch.Tensor:
         """The sides [B, 4 K, 4] of those billboards that stop a body of half width `half_m` at the pose of `state`, as walls
-        (space/floorplan.py); those of the others are NOWHERE."""
+        (space/floorplan.py); NOWHERE for the others."""
         billboards, position = state["billboards"], state["pose"][:, None, :3]
         known = (billboards[..., NUMBER] > 0) & (billboards[..., LOOK] != NONE)
         reach = self.solid[billboards[..., LOOK].long().clamp_min(0)]
         apart = (billboards[..., PLACE] - position).abs()
         level = apart[..., 2] < STOREY_M
-        outside = apart[..., :2].amax(-1) >= reach - 0.02  # who stands in one may leave
+        outside = apart[..., :2].amax(-1) >= reach - 0.02  # a body inside of one may leave it
         stops = known & level & (reach > half_m) & outside
         (x, y), half = billboards[..., PLACE][..., :2].unbind(-1), reach - half_m
         left, right, low, high = x - half, x + half, y - half, y + half
@@ -231,11 +229,11 @@ class Billboards(nn.Module):
         return torch.where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
 
     def recognised(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-        """The billboards [B, K, COLUMNS] that evidence shows, each in its row of `listed` [B, K, 4] = number and place; of those
-        `before` [B, K, COLUMNS] that it does not list, as many as there is room for wait where they were."""
+        """The billboards [B, K, COLUMNS] of evidence, in the rows of `listed` [B, K, 4] = number and place. Those `before`
+        [B, K, COLUMNS] that it does not list wait where they were, in rows that are free."""
         batch, rows = listed.shape[:2]
         pictures = self.pictures.float() / 255
-        off = before.new_full((batch, rows, self.config.looks), torch.inf)  # what is not seen is like nothing
+        off = before.new_full((batch, rows, self.config.looks), torch.inf)  # unseen: unlike any look
         off[cut.view, cut.row] = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes))
         bright, whole = before.new_zeros(batch, rows), torch.zeros(batch, rows, dtype=torch.bool, device=before.device)
         bright[cut.view, cut.row], whole[cut.view, cut.row] = brightness(cut.picture), cut.whole
@@ -247,7 +245,7 @@ class Billboards(nn.Module):
         was = torch.where(known, old[..., LOOK].long(), NONE)
         look = torch.where(whole, likest(off, was), NONE)
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
-        # seen in part, or like none, it looks as it did, or else as it may
+        # seen in part or unlike any look: as before, else the nearest look
         look, place = torch.where(look == NONE, guess, look), listed[..., 1:]
         now = torch.where(known[..., None], noted(old, place, look.float()), fresh(number, place, look))
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
@@ -287,14 +285,14 @@ class NoObjects(Absent):
 
 
 def in_sight(state: State) -> torch.Tensor:
-    """Which of the billboards [B, K] the last frame shows."""
+    """bool [B, K]: whether the last frame shows each billboard."""
     rows = torch.arange(1, state["billboards"].shape[1] + 1, device=state["instances"].device)
     return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 
 def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
-    """Of looks `off` [..., looks] away the one [...] that a thing has which looked like `was` [...]: that one, unless another is
-    clearly nearer; NONE where all are far."""
+    """The look [...] of a thing, from its distances `off` [..., looks] and its look before, `was` [...]: the same, unless another
+    is clearly nearer; NONE where all are far."""
     least, best = off.min(-1)
     before = torch.as_tensor(was, device=off.device)
     stays = (before != NONE) & (off.gather(-1, before.clamp_min(0)[..., None])[..., 0] < least + STICKS)
@@ -302,7 +300,7 @@ def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
 
 
 def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
-    """Billboards [..., COLUMNS] that are seen for the first time: number and look [...], place [..., 3]."""
+    """New billboards [..., COLUMNS]: number and look [...], place [..., 3]."""
     billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
     billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
     billboards[..., BEFORE], billboards[..., LIGHT] = NONE, 1.0
@@ -311,26 +309,26 @@ def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor 
 
 
 def noted(billboards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
-    """Billboards [..., COLUMNS] one step later, at place [..., 3] with look [...]: their ages and last moves go on."""
+    """Billboards [..., COLUMNS] one step later at place [..., 3] with look [...], their ages and last moves updated."""
     after = billboards.clone()
-    moved = place - billboards[..., PLACE]
-    went, other = moved[..., :2].norm(dim=-1) > 1e-3, look != billboards[..., LOOK]
+    move = place - billboards[..., PLACE]
+    went, other = move[..., :2].norm(dim=-1) > 1e-3, look != billboards[..., LOOK]
     after[..., PLACE], after[..., LOOK] = place, look
     after[..., BEFORE] = torch.where(other, billboards[..., LOOK], billboards[..., BEFORE])
     after[..., AGE] = torch.where(other, 0.0, (billboards[..., AGE] + 1).clamp_max(AGES))
-    after[..., GOING] = torch.where(went[..., None], moved[..., :2], billboards[..., GOING])
+    after[..., GOING] = torch.where(went[..., None], move[..., :2], billboards[..., GOING])
     after[..., RESTED] = torch.where(went, 0.0, (billboards[..., RESTED] + 1).clamp_max(AGES))
     return after
 
 
 def brightness(picture: torch.Tensor) -> torch.Tensor:
-    """Mean of the colours [n] where pictures [n, 4, h, w] cover."""
+    """Mean colour [n] of pictures [n, 4, h, w] where they cover."""
     cover = picture[:, 3]
     return (picture[:, :3].mean(1) * cover).sum((1, 2)) / cover.sum((1, 2)).clamp_min(1e-3)
 
 
 def marks(picture: torch.Tensor, box: torch.Tensor) -> torch.Tensor:
-    """By which looks are told apart: pictures [n, 4, h, w], small and at one brightness, and their boxes [n, 4]: [n, D]."""
+    """What looks are compared by: pictures [n, 4, h, w], small and at one brightness, and their boxes [n, 4]: [n, D]."""
     cover = picture[:, 3:]
     colour = 0.3 * picture[:, :3] / brightness(picture).clamp_min(0.02)[:, None, None, None]
     small = F.adaptive_avg_pool2d(torch.cat([colour * cover, 0.5 * cover], 1), FINE)

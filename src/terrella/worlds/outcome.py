@@ -1,4 +1,4 @@
-"""Outcome: what a step brings beside its picture (reward, the episode's end, the player's vitals), read off two frames."""
+"""Outcome: reward, end and the player's vitals of a step; a network reads them off two frames."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
 
 @dataclass(frozen=True)
 class ConstantConfig:
-    """The reward of every step, and what the last one pays beside it."""
+    """Of a constant outcome."""
 
-    usual: float = 0.0
-    ending: float = 0.0
+    usual: float = 0.0  # reward of every step
+    ending: float = 0.0  # added to that of the last
 
 
 @final
 class ConstantOutcome:
-    """The same reward for every step, and another for the last: where an episode ends is the body's to say."""
+    """The same reward for every step but the last; the body says where an episode ends."""
 
     kind = "constant"
     begins: tuple[float, ...] = ()
@@ -60,46 +60,43 @@ class ConstantOutcome:
 
 @dataclass(frozen=True)
 class OutcomeConfig:
-    """actions: numbers in an action; rewards: the values between which a reward is told apart, ascending; vitals: names of the
-    numbers that belong to the player ("health", "lives"); changes: for each of them the changes that a step may bring,
-    ascending; spans: the usual size of each; begins: their values where an episode begins; side: larger frames are shrunk to
-    it."""
+    """Of the outcome network."""
 
-    actions: int
-    rewards: tuple[float, ...]
-    vitals: tuple[str, ...] = ()
-    changes: tuple[tuple[float, ...], ...] = ()
-    spans: tuple[float, ...] = ()
-    hidden: int = 64
-    side: int = 64
-    begins: tuple[float, ...] = ()
+    actions: int  # numbers of an encoded action
+    rewards: tuple[float, ...]  # values of the two-hot code of rewards, ascending
+    vitals: tuple[str, ...] = ()  # names of the player's numbers, such as "health" and "lives"
+    changes: tuple[tuple[float, ...], ...] = ()  # of each vital the changes that a step may bring, ascending
+    spans: tuple[float, ...] = ()  # of each vital its usual size
+    hidden: int = 64  # width of the GRU
+    side: int = 64  # pixels; larger frames are shrunk to it
+    begins: tuple[float, ...] = ()  # vitals of a new episode
 
 
 class OutcomePrediction(NamedTuple):
-    """reward float32 [B], expected; done [B], a logit; vitals [B, V] after the step; hidden [B, hidden]."""
+    """The outcome of a step."""
 
-    reward: torch.Tensor
-    done: torch.Tensor
-    vitals: torch.Tensor
-    hidden: torch.Tensor
+    reward: torch.Tensor  # float32 [B], the expectation
+    done: torch.Tensor  # [B], a logit
+    vitals: torch.Tensor  # [B, V] after the step
+    hidden: torch.Tensor  # [B, hidden]
 
 
 class OutcomeLogits(NamedTuple):
-    """reward [B, len(rewards)]; for each vital [B, len(changes)]; hidden [B, hidden]; seen and remembered [B, inner]."""
+    """What the network reads off two frames."""
 
-    reward: torch.Tensor
-    changes: list[torch.Tensor]
-    hidden: torch.Tensor
-    known: torch.Tensor
+    reward: torch.Tensor  # [B, len(rewards)]
+    changes: list[torch.Tensor]  # of each vital [B, len(changes)]
+    hidden: torch.Tensor  # [B, hidden]
+    known: torch.Tensor  # [B, inner], what was seen and remembered
 
 
 @final
 class FrameOutcome(nn.Module):
-    """A small convolutional network over the frame before and the frame after a step, and a GRU cell that remembers.
+    """A small convolutional network over the frames before and after a step, and a GRU cell that remembers.
 
-    Rewards and changes are classified among the values that the recording knows (two-hot between them, as in Dreamer 3):
-    a reward is the expectation; a vital changes by one of them, drawn by chance, so that a count of lives stays whole. Whether
-    it is over is judged from all that and from the vitals after the step: most games end when one of them is used up.
+    Rewards and changes are classified among the values of the recording (two-hot, as in Dreamer 3). A reward is the
+    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end also depends on the vitals
+    after the step: most games end when one of them is used up.
     """
 
     kind = "frames"
@@ -121,7 +118,7 @@ class FrameOutcome(nn.Module):
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
     def begin(self, batch: int) -> torch.Tensor:
-        """The hidden state in which an episode begins: [batch, hidden]."""
+        """The hidden state of a new episode: [batch, hidden]."""
         return self.rewards.new_zeros(batch, self.config.hidden)
 
     # -- as a part of a world -----------------------------------------------------------------------------------------
@@ -162,7 +159,7 @@ class FrameOutcome(nn.Module):
     # -- the network --------------------------------------------------------------------------------------------------
 
     def seen(self, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-        """What two frames, uint8 [B, 3, H, W], say without memory: [B, 128]."""
+        """Features [B, 128] of two frames uint8 [B, 3, H, W]."""
         small = [_shrunk(frame, self.config.side) for frame in (before, after)]
         x = F.pixel_unshuffle(torch.cat([small[1], small[1] - small[0]], 1), 2)
         for layer in self.look:
@@ -179,9 +176,9 @@ class FrameOutcome(nn.Module):
         return OutcomeLogits(self.paid(known), [head(known) for head in self.changed], hidden, known)
 
     def ends(self, known: torch.Tensor, vitals: torch.Tensor) -> torch.Tensor:
-        """The logit [B] that it is over, of OutcomeLogits.known and the vitals [B, V] after the step."""
+        """The logit [B] that the episode is over, from OutcomeLogits.known and the vitals [B, V] after the step."""
         spans = torch.tensor(self.config.spans, device=known.device)
-        used_up = 4.0 * (vitals <= 0)  # loud, so that it is learned from few ends
+        used_up = 4.0 * (vitals <= 0)  # large, so that it is learned from few ends
         return self.ending(torch.cat([known, vitals / spans, used_up], 1))[:, 0]
 
     def forward(
@@ -193,17 +190,17 @@ class FrameOutcome(nn.Module):
         hidden: torch.Tensor,
         seeds: torch.Tensor | None = None,
     ) -> OutcomePrediction:
-        """The outcome of a step; arguments as for `seen` and `judge`. With `seeds` [B] (core/chance.py) each vital changes by
-        chance, as likely as it should; without, by the likeliest."""
-        found = self.judge(self.seen(before, after), action, vitals, hidden)
-        reward = (found.reward.float().softmax(1) * self.rewards).sum(1)
-        moved = []
-        for column, (logits, values) in enumerate(zip(found.changes, self.config.changes)):
+        """The outcome of a step; arguments as for `seen` and `judge`. With `seeds` [B] (core/chance.py) the changes of vitals are
+        sampled; without, they are the likeliest."""
+        read = self.judge(self.seen(before, after), action, vitals, hidden)
+        reward = (read.reward.float().softmax(1) * self.rewards).sum(1)
+        changes = []
+        for column, (logits, values) in enumerate(zip(read.changes, self.config.changes)):
             levels, chances = torch.tensor(values, device=logits.device), logits.float().softmax(1)
             picked = logits.argmax(1) if seeds is None else chance.choice(seeds, chances, stream=CHANGES + column)
-            moved.append(levels[picked])
-        left = vitals.float() + torch.stack(moved, 1) if moved else vitals
-        return OutcomePrediction(reward, self.ends(found.known, left).float(), left, found.hidden.float())
+            changes.append(levels[picked])
+        left = vitals.float() + torch.stack(changes, 1) if changes else vitals
+        return OutcomePrediction(reward, self.ends(read.known, left).float(), left, read.hidden.float())
 
 
 def _going(evidence: Evidence) -> Tensors:

@@ -56,7 +56,7 @@ class Evidence:
 
 
 @runtime_checkable
-class Part(Protocol):
+class WorldPart(Protocol):
     """Common to all parts. kind: the name in world.json; config: the settings as a dataclass, or None."""
 
     kind: str
@@ -68,7 +68,7 @@ class Part(Protocol):
 
 
 @runtime_checkable
-class Body(Part, Protocol):
+class Body(WorldPart, Protocol):
     """How an action moves the viewer. history: actions before the present one that `step` needs; half_m: half its width."""
 
     history: int
@@ -90,7 +90,7 @@ class Body(Part, Protocol):
 
 
 @runtime_checkable
-class Scene(Part, Protocol):
+class Scene(WorldPart, Protocol):
     """What is known of a view. camera: None in a world without poses; history: actions that `look` needs; recorded: keyframes
     of the recordings; starts: where episodes begin; drawn_names: state entries that follow from drawing a frame;
     earlier_names: those of them whose value of the frame before is kept as `earlier_NAME`."""
@@ -142,7 +142,7 @@ class Scene(Part, Protocol):
 
 
 @runtime_checkable
-class Generator(Part, Protocol):
+class Generator(WorldPart, Protocol):
     """Draws a frame by flow matching; config.steps: Euler steps a frame."""
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
@@ -156,7 +156,7 @@ class Generator(Part, Protocol):
 
 
 @runtime_checkable
-class Objects(Part, Protocol):
+class Objects(WorldPart, Protocol):
     """Things that move by themselves."""
 
     def channels(self, size: tuple[int, int]) -> Channels: ...
@@ -190,7 +190,7 @@ class Objects(Part, Protocol):
 
 
 @runtime_checkable
-class Outcome(Part, Protocol):
+class Outcome(WorldPart, Protocol):
     """What a step brings beside its frame: reward float32 [B], done bool [B], vitals. begins: vitals of a new episode."""
 
     begins: tuple[float, ...]
@@ -211,7 +211,7 @@ class Outcome(Part, Protocol):
 
 
 @runtime_checkable
-class Uncertainty(Part, Protocol):
+class Uncertainty(WorldPart, Protocol):
     """The error to expect of a drawn frame."""
 
     def channels(self) -> Channels: ...

@@ -1,4 +1,4 @@
-"""SplatWorld: a place of Gaussians in which one walks and flies, with floors and walls read off them."""
+"""SplatWorld: a place of Gaussians to walk and fly in, with floors and walls read off them."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ KEYS = {
     "KeyW": "MOVE_FORWARD", "KeyS": "MOVE_BACKWARD", "KeyA": "MOVE_LEFT", "KeyD": "MOVE_RIGHT", "ArrowLeft": "TURN_LEFT",
     "ArrowRight": "TURN_RIGHT", "ArrowUp": "MOVE_FORWARD", "ArrowDown": "MOVE_BACKWARD", "Space": "UP", "KeyC": "DOWN",
 }  # fmt: skip
-# what a button pushes: forward, left, turn to the left, up
+# the push of each button: forward, left, turn to the left, up
 _PUSH = torch.tensor(
     [[1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1]]
 ).float()
 GRAVITY = 9.81  # m/s^2
-MOST_PLACES = 8192  # that the channel `places` tells
+MOST_PLACES = 8192  # rows of the channel `places`
 
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """camera and size of its pictures; dt_s of a step; buttons, some of BUTTONS (without UP nobody flies); pace: m, m, rad and m a
-    step that each push adds (forward, sideways, turning, upward), and keep: the share of each speed that stays; body: who walks."""
+    """Of a place of Gaussians."""
 
     camera: Intrinsics = (0.5, 0.667, 0.5, 0.5)
-    size: tuple[int, int] = (192, 256)
-    dt_s: float = 1 / 30
-    buttons: tuple[str, ...] = BUTTONS
+    size: tuple[int, int] = (192, 256)  # height and width of its pictures
+    dt_s: float = 1 / 30  # of a step
+    buttons: tuple[str, ...] = BUTTONS  # some of BUTTONS; without UP nobody flies
+    # m, m, rad and m a step that a push adds forward, sideways, turning and upward
     pace: tuple[float, float, float, float] = (0.03, 0.025, 0.018, 0.025)
-    keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)
+    keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)  # share of each speed that stays in a step
     body: Walker = Walker()
-    additions: int = 32768
+    additions: int = 32768  # Gaussians that pictures may add to the place of an episode
 
 
 @final
@@ -125,7 +125,7 @@ class SplatWorld:
 
     @property
     def object_names(self) -> list[str]:
-        """Of the objects 1, 2, ..., as far as they are known."""
+        """Names of the objects 1, 2, ..., if the card has them."""
         named = self.card.get("objects")
         return [str(one) for one in named] if isinstance(named, list) else []
 
@@ -136,16 +136,16 @@ class SplatWorld:
 
     @cached_property
     def collider(self) -> Solids | Occupancy:
-        """What stops who walks, but for what can be pushed."""
+        """What stops a body, without the things that can be pushed."""
         still = ~torch.isin(self.bodies, torch.tensor(self.things, dtype=torch.int32))
         return Solids(self.solids[still]) if len(self.solids) else self.occupancy
 
     @cached_property
     def places(self) -> torch.Tensor:
-        """The channel `places` [MOST_PLACES, 4]: where one can walk to from where episodes begin; zeros for the rest."""
-        found = walkable(self.collider, self.starts[:, :3], self.config.body, MOST_PLACES)
+        """The channel `places` [MOST_PLACES, 4]: where one can walk to from the starts; zeros in the other rows."""
+        places = walkable(self.collider, self.starts[:, :3], self.config.body, MOST_PLACES)
         table = torch.zeros(MOST_PLACES, 4)
-        table[: len(found), :2], table[: len(found), 3] = found[:, :2], WALKABLE
+        table[: len(places), :2], table[: len(places), 3] = places[:, :2], WALKABLE
         return table
 
     @cached_property
@@ -176,7 +176,7 @@ class SplatWorld:
         return self._standing(self.starts[row])
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
-        """The eye is where the evidence says; a picture with its depth (metres, 0: unknown) changes the place of that episode."""
+        """The viewer is put at the pose; a picture with depth (metres, 0: unknown) is fused into the place of its episode."""
         if "pose" not in observation:
             raise ObservationError(f"{self.name} observes `pose`.")
         pose = torch.as_tensor(observation["pose"]).float()
@@ -214,16 +214,15 @@ class SplatWorld:
         walked = torch.where(stand >= place[:, 2] - 0.2, climbed, torch.maximum(stand, place[:, 2] - falling))
         falling = torch.where(walked <= stand + 0.2, 0.0, falling)
         z = torch.where(flying, place[:, 2], walked)
-        moved = place[:, :2] - pose[:, :2]
-        gone = torch.where(
-            moved.abs() < 0.5 * speed[:, :2].abs(), moved, speed[:, :2]
-        )  # a wall takes the speed into it
+        shift = place[:, :2] - pose[:, :2]
+        # a wall takes the speed that goes into it
+        gone = torch.where(shift.abs() < 0.5 * speed[:, :2].abs(), shift, speed[:, :2])
         speed = torch.cat([gone, speed[:, 2:]], 1)
         pose = torch.cat([place[:, :2], z[:, None], _yawed(pose[:, 3:], speed[:, 2])], 1)
         return state.replace(pose=pose, speed=speed, falling=falling, flying=flying, **pushed)
 
     def _gone(self, state: State, level: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Where who wishes to go by `level` [B, 3] comes, and what that does to the things that stand there."""
+        """Where a body that wants to go by `level` [B, 3] metres arrives, and the things that it pushes on the way."""
         eye, body = state["pose"][:, :3], self.config.body
         goal = self.collider.moved(eye, level, body)
         if not self.things:
@@ -234,7 +233,7 @@ class SplatWorld:
         return place, {"bodies": poses, "body_speeds": speeds}
 
     def _floor(self, state: Mapping[str, torch.Tensor], place: torch.Tensor) -> torch.Tensor:
-        """How high the floor under `place` [B, 3] is: the place's own, or the top of a thing on which one stands."""
+        """Height [B] of the floor under `place` [B, 3]: the place's own, or the top of a thing."""
         level = self.collider.floor(place, self.config.body)
         if not self.things:
             return level
@@ -242,19 +241,19 @@ class SplatWorld:
         return torch.maximum(level, Solids(self.rigid.boxes(state["bodies"])).highest(place, low))
 
     def render(self, state: State, channels: Sequence[str]) -> Observation:
-        """The asked channels; `pose`, `bodies` and `places` cost no drawing."""
+        """Channels by name; `pose`, `bodies` and `places` need no drawing."""
         self.spec.check_channels(channels)
-        found = {name: state[name] for name in channels if name in state}
+        seen = {name: state[name] for name in channels if name in state}
         if "places" in channels:
-            found["places"] = self.places.expand(state.batch, -1, -1)
-        drawn = [name for name in channels if name not in found]
+            seen["places"] = self.places.expand(state.batch, -1, -1)
+        drawn = [name for name in channels if name not in seen]
         if drawn:
             shown = [self._seen(state, entry, drawn) for entry in range(state.batch)]
-            found |= {name: torch.cat([one[name] for one in shown]) for name in drawn}
-        return {name: found[name] for name in channels}
+            seen |= {name: torch.cat([one[name] for one in shown]) for name in drawn}
+        return {name: seen[name] for name in channels}
 
     def _seen(self, state: State, entry: int, channels: Sequence[str]) -> dict[str, torch.Tensor]:
-        """What has to be drawn of the channels for one entry of a state."""
+        """The drawn channels of one entry of a state."""
         scene, provenance = self.added.of(state, entry)
         scene = self._ridden(scene, state, entry)
         with torch.no_grad():
@@ -262,15 +261,15 @@ class SplatWorld:
         return {name: _shown(seen, provenance, name) for name in channels}
 
     def _ridden(self, scene: Gaussians, state: State, entry: int) -> Gaussians:
-        """The Gaussians of things where these are."""
+        """The scene with the Gaussians of things where these are now."""
         if not self.things or torch.equal(state["bodies"][entry], self.rigid.rest):
             return scene
         (rows, on), poses = self._riders, state["bodies"][entry]
         off = scene.means[rows] - self.rigid.rest[on, :3]
         means = (rotation(poses)[on] @ off[..., None])[..., 0] + poses[on, :3]
         quats = multiplied(poses[on, 3:], scene.quats[rows])
-        moved = {"means": scene.means.index_copy(0, rows, means), "quats": scene.quats.index_copy(0, rows, quats)}
-        return replace(scene, **moved)
+        ridden = {"means": scene.means.index_copy(0, rows, means), "quats": scene.quats.index_copy(0, rows, quats)}
+        return replace(scene, **ridden)
 
     def _standing(self, pose: torch.Tensor) -> State:
         count = len(pose)
@@ -282,7 +281,7 @@ class SplatWorld:
         return State({"pose": pose.clone(), **still, **self.added.empty(count)}, self.added.arenas)
 
     def _ahead(self, pose: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
-        """What wishes [B, 4] forward, left, turn, up add to the speeds along world x and y, of turning, and upward."""
+        """What pushes [B, 4] forward, left, turning and up add to the speeds along world x and y, of turning, and upward."""
         heading = yaw(pose)
         c, s = heading.cos(), heading.sin()
         forward, left, turn, up = (wish * torch.tensor(self.config.pace)).unbind(1)
@@ -298,7 +297,7 @@ def _yawed(quats: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 
 def _shown(seen: Drawing, provenance: torch.Tensor, name: str) -> torch.Tensor:
-    """A channel of what was drawn of Gaussians with that provenance."""
+    """A channel of a drawing of Gaussians with this provenance."""
     if name == "rgb":
         return (seen.rgb.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
     if name == "depth":

@@ -1,5 +1,4 @@
-"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md; one made
-of a file."""
+"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md."""
 
 from __future__ import annotations
 
@@ -15,25 +14,25 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 
 from ..core.errors import CheckpointError, ContractError
+from ..core.files import not_written
 from ..space.camera import planar_pose
 from ..space.edits import Edit, Edited, edited, merges, placed_boxes
 from ..space.files import replace_whole
 from ..space.occupancy import Walker
 from ..space.raster import Gaussians
 from .additions import INVENTED, OBSERVED
+from .checkpoint import WORLD_FILE, data_file, read_data, write_checkpoint
 from .splat import SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
 MOST_ADDITIONS = 10_000_000
-WORLD_FILE, SCENE_FILE = "world.json", "scene.safetensors"
-EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # those in force; those taken back, the newest last
+EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # edits in force; edits taken back, the newest last
 
 
 def save_splat(world: SplatWorld, path: str | Path) -> None:
-    """Writes the folder; each file is replaced whole. CheckpointError where something else lies there, or edits do."""
+    """Makes or replaces the folder as a whole. CheckpointError where something else lies there, or a world with edits."""
     path = Path(path)
     check_free(path)
     about = {
@@ -47,17 +46,17 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
         "solids": world.solids,
         "bodies": world.bodies,
     }
-    whole = {name: part.detach().clone().contiguous() for name, part in tensors.items()}
-    replace_whole(path / SCENE_FILE, lambda file: save_file(whole, file))
-    lines = (
+    readme = (
         f"# {world.name}\n\nA place of {len(world.gaussians):,} Gaussians: `terrella play {path.name}` walks in it.\n"
     )
-    replace_whole(path / "README.md", lambda file: file.write_text(lines))
-    replace_whole(path / WORLD_FILE, lambda file: file.write_text(json.dumps(about, indent=1) + "\n"))
+    try:
+        write_checkpoint(path, about, {"scene": tensors}, readme)
+    except OSError as error:
+        raise not_written(path, error) from error
 
 
 def check_free(path: str | Path) -> None:
-    """CheckpointError where a world of Gaussians would overwrite what is no such, or one that somebody has edited."""
+    """CheckpointError where a world of Gaussians would overwrite something else, or a world with edits."""
     path = Path(path)
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
@@ -72,18 +71,17 @@ def check_free(path: str | Path) -> None:
 
 
 def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | None = None) -> SplatWorld:
-    """Reads what `save_splat` wrote; `about`: what its world.json says; `edits` instead of its own. CheckpointError where it is
-    foreign or damaged."""
+    """Reads what `save_splat` wrote. about: its world.json; edits: in place of its own. CheckpointError where it is foreign or
+    damaged."""
     path = Path(path)
     if about.get("version") != VERSION:
         raise CheckpointError(
             f"{path} has version {about.get('version')}, this release reads {VERSION}; update Terrella."
         )
     try:
-        tensors, said = load_file(path / SCENE_FILE), dict(about["config"])
-        body = Walker(**said.pop("body"))
-        given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in said.items()}
-        config = SplatConfig(body=body, **given)
+        about, (tensors,) = read_data(path, about, "scene")
+        settings: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in about["config"].items()}
+        config = SplatConfig(**{**settings, "body": Walker(**settings["body"])})
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
         solids, bodies = tensors.pop("solids", None), tensors.pop("bodies", None)
@@ -123,8 +121,7 @@ def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], Sp
 def _solids(
     source: SplatWorld, edits: Sequence[Edit], merged: Sequence[SplatWorld], after: Edited
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Boxes and bodies after edits; none where edits moved what they describe, or a place has none: then the Gaussians stop
-    bodies."""
+    """Boxes and bodies after edits; None where edits moved what they describe, or a place has none: then Gaussians stop bodies."""
     solids, bodies = [source.solids], [source.bodies]
     for edit, one, lift in zip(merges(edits), merged, after.raised):
         boxes = placed_boxes(one.solids, edit)
@@ -147,42 +144,42 @@ def source_of(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld
 
 
 def merging(path: Path, other: Path, by: Sequence[float] = (0, 0, 0), degrees: float = 0) -> Edit:
-    """The edit that merges the world in the folder `other`, as it is now with its edits, into that in `path`: turned to the left
-    about the vertical through its origin, then moved by metres. ContractError for a place in itself."""
+    """The edit that merges the world in the folder `other`, with its present edits, into that in `path`: turned by `degrees` to
+    the left about the vertical through its origin, then moved `by` metres. ContractError for a place in itself."""
     path, other = path.resolve(), other.resolve()
     if path in _within(other):
         raise ContractError(f"{other.name} is {path.name} itself, or has it merged; --duplicate makes a second one.")
     try:
-        told = Path(os.path.relpath(other, path))
+        place = Path(os.path.relpath(other, path))
     except ValueError:  # on another drive
-        told = other
-    return {"do": "merge", "place": told.as_posix(), "sha256": _digest(other), "by": list(by), "degrees": degrees}
+        place = other
+    return {"do": "merge", "place": place.as_posix(), "sha256": _digest(other), "by": list(by), "degrees": degrees}
 
 
 def _within(path: Path) -> list[Path]:
-    """A world's folder, and those of all that it merges."""
+    """The folders of a world and of all worlds merged into it."""
     return [path, *(one for edit in merges(read_edits(path)) for one in _within((path / edit["place"]).resolve()))]
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of what a world says, holds and edits: through the lines of its merges of what it merges, too."""
+    """SHA-256 of a world's files; its edits hold those of merged worlds."""
     whole = hashlib.sha256()
-    for file in (path / WORLD_FILE, path / SCENE_FILE, path / EDITS_FILE):
+    for file in (path / WORLD_FILE, data_file(path, "scene"), path / EDITS_FILE):
         with file.open("rb") if file.exists() or file.name != EDITS_FILE else io.BytesIO() as stream:
             whole.update(hashlib.file_digest(stream, "sha256").digest())
     return whole.hexdigest()
 
 
 def other_of(path: str | Path) -> Callable[[Edit], SplatWorld]:
-    """What opens the world that a merge of the one in `path` names, with its edits, each once. CheckpointError where it is gone or
-    was changed."""
+    """A function that opens the world that a merge of the one in `path` names, each once. CheckpointError where it is gone or was
+    changed."""
 
     @functools.cache
     def opened(place: str, sha256: str) -> SplatWorld:
         folder = Path(os.path.normpath(Path(path).resolve() / place))
         try:
             fault = "" if _digest(folder) == sha256 else "was changed"
-        except OSError:
+        except (OSError, CheckpointError):
             fault = "is not there"
         if fault:
             raise CheckpointError(
@@ -192,16 +189,16 @@ def other_of(path: str | Path) -> Callable[[Edit], SplatWorld]:
         return source_of(folder, None)
 
     def other(edit: Edit) -> SplatWorld:
-        told = edit.get("place"), edit.get("sha256")
-        if not isinstance(told[0], str) or not isinstance(told[1], str):
-            raise ContractError(f"a merge names a `place` and its `sha256`; got {told!r:.80}.")
-        return opened(*told)
+        place, sha256 = edit.get("place"), edit.get("sha256")
+        if not isinstance(place, str) or not isinstance(sha256, str):
+            raise ContractError(f"a merge names a `place` and its `sha256`; got {place!r:.40} and {sha256!r:.40}.")
+        return opened(place, sha256)
 
     return other
 
 
 def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
-    """The edits of a world (those taken back: `file=UNDONE_FILE`), the oldest first; CheckpointError for a line that is no JSON."""
+    """The edits of a world, or with `file=UNDONE_FILE` those taken back, the oldest first. CheckpointError for damaged lines."""
     try:
         return parse_edits((path / file).read_text()) if (path / file).exists() else []
     except (OSError, ValueError, RecursionError) as error:
@@ -209,7 +206,7 @@ def read_edits(path: Path, file: str = EDITS_FILE) -> list[Edit]:
 
 
 def parse_edits(text: str) -> list[Edit]:
-    """Edits of lines of JSON; ValueError for a line that is none."""
+    """The edits in lines of JSON; ValueError for other lines."""
     edits = [json.loads(line) for line in text.splitlines() if line.strip()]
     if not all(isinstance(edit, dict) for edit in edits):
         raise ValueError("a line is no edit")
@@ -217,8 +214,7 @@ def parse_edits(text: str) -> list[Edit]:
 
 
 def checked_edits(path: Path, text: str) -> list[Edit]:
-    """The edits of a text of lines of JSON, after they were tried on the world in `path` as it was before all edits;
-    ContractError where they do not fit it."""
+    """The edits in lines of JSON, tried on the world in `path` without its edits; ContractError where they do not fit it."""
     source = source_of(path)
     try:
         edits = parse_edits(text)
@@ -229,7 +225,7 @@ def checked_edits(path: Path, text: str) -> list[Edit]:
 
 
 def write_edits(path: Path, edits: Sequence[Edit], undone: Sequence[Edit] = ()) -> None:
-    """Replaces the edits of a world, and those that were taken back. What gains an edit is written first: a crash loses none."""
+    """Replaces the edits of a world and those taken back. The file that gains an edit is written first: a crash loses none."""
     files = [(EDITS_FILE, edits), (UNDONE_FILE, undone)]
     if len(undone) > len(read_edits(path, UNDONE_FILE)):
         files.reverse()
@@ -246,14 +242,13 @@ def world_of(
     objects: torch.Tensor | None = None,
     solids: torch.Tensor | None = None,
 ) -> SplatWorld:
-    """A world of Gaussians of which nobody said where one stands in them: in the free place with a floor that is nearest to their
-    middle, looking eight ways."""
+    """A world of Gaussians that starts at the free place with a floor that is nearest to their middle, in eight directions."""
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     world = SplatWorld(name, gaussians, observed, torch.zeros(1, 7), config, card, objects, solids)
     some = gaussians.means[:: max(len(gaussians) // 100_000, 1)]
     low, middle, high = torch.quantile(some, torch.tensor([0.05, 0.5, 0.95]), dim=0)
     rng = torch.Generator().manual_seed(0)
-    high[2] += config.body.eye_m  # an eye is over the floor, and may be over all that there is
+    high[2] += config.body.eye_m  # the eye may be above all Gaussians
     wide = low + (high - low) * torch.rand(400, 3, generator=rng)
     places = torch.cat([middle[None], wide])
     level = world.occupancy.surface(places, config.body)

@@ -1,7 +1,7 @@
-"""Uncertainty: how wrong a world expects the frame that it has just drawn to be, learned from its own dreams.
+"""Uncertainty: the error that a world expects of the frame that it has just drawn, learned from its own dreams.
 
-One small network beside the generator, no ensemble: it reads what memory knew, what was drawn, and how far the dream has
-gone since it last saw anything, and answers with the mean absolute error that such frames had.
+One small network beside the generator, no ensemble: from the conditioning, the drawn frame, and the way since the last
+evidence, it predicts the mean absolute error that such frames had.
 """
 
 from __future__ import annotations
@@ -22,32 +22,30 @@ from ..space.keyframes import merge
 from .generator import Conditioning
 from .parts import Absent, Channels
 
-# Of an episode: steps since a picture was seen, the way and the turns since a pose was, whether it began with a lone picture
-# of elsewhere, and how strange that was (0..1).
+# Of an episode: steps since the last picture, way and turns since the last pose, whether it began with a picture of an
+# unknown place, and how strange that was (0..1).
 GONE = ("steps", "metres", "radians", "lone", "strange")
-SITUATION = len(GONE) - 1 + 2  # the last is replaced by how far the next recorded keyframe is, and how many it holds
-CLUES = 15  # maps of `clues`
-CELLS = 4  # pixels a side of one of its cells; the error is expected in cells of twice that
-KNOTS = 17
+SITUATION = len(GONE) - 1 + 2  # without the last, and with Conditioning.familiar
+CLUES = 15  # maps that `clues` gives
+CELLS = 4  # side in pixels of a cell of those maps; errors are predicted in cells of twice that
+KNOTS = 17  # of the calibration
 
 
 @dataclass(frozen=True)
 class UncertaintyConfig:
-    """situation: numbers that say in what situation a frame was drawn; channels: of the network's maps."""
+    """Of the network."""
 
-    situation: int = SITUATION
-    channels: tuple[int, int] = (24, 40)
+    situation: int = SITUATION  # numbers of the situation in which a frame was drawn
+    channels: tuple[int, int] = (24, 40)  # of its maps
 
 
 @final
 class UncertaintyNetwork(nn.Module):
-    """The network, and a monotone map (isotonic regression on other dreams) from its answer to the error that was found."""
+    """The network, and a monotone calibration of its answer (isotonic regression on held-out dreams)."""
 
     kind = "network"
-    found: torch.Tensor  # KNOTS answers of the network, ascending
-    meant: torch.Tensor  # the mean error at each
-    sure: torch.Tensor  # the error usual where memory knows the place
-    invents: torch.Tensor  # the error usual where it does not
+    sure: torch.Tensor  # the usual error where memory knows the place
+    invents: torch.Tensor  # and where it does not
 
     def __init__(self, config: UncertaintyConfig):
         super().__init__()
@@ -59,17 +57,27 @@ class UncertaintyNetwork(nn.Module):
         self.wider = nn.Conv2d(second, second, 3, 1, 2, 2)
         self.output = nn.Conv2d(second, 1, 1)
         self.output.bias = nn.Parameter(torch.tensor([-3.0]))
-        self.register_buffer("found", torch.linspace(0, 1, KNOTS))
+        self.register_buffer("found", torch.linspace(0, 1, KNOTS))  # names in the weights' file
         self.register_buffer("meant", torch.linspace(0, 1, KNOTS))
         self.register_buffer("sure", torch.tensor(0.02))
         self.register_buffer("invents", torch.tensor(0.08))
+
+    @property
+    def answers(self) -> torch.Tensor:
+        """Knots of the calibration: KNOTS answers of the network, ascending."""
+        return self.get_buffer("found")
+
+    @property
+    def errors(self) -> torch.Tensor:
+        """The mean error at each of the `answers`."""
+        return self.get_buffer("meant")
 
     def channels(self) -> Channels:
         unit = "expected mean absolute error of the picture, intensity 0..1"
         return Channels({"uncertainty": spaces.Box(0, 1, (), np.float32)}, {"uncertainty": unit})
 
     def forward(self, maps: torch.Tensor, situation: torch.Tensor) -> torch.Tensor:
-        """maps [B, CLUES, h, w] of `clues`; situation [B, S] -> expected error of each cell, 0..1: [B, h/2, w/2]."""
+        """maps [B, CLUES, h, w] of `clues`; situation [B, S]. Returns the expected error of each cell, 0..1: [B, h/2, w/2]."""
         gain, shift = self.situate(situation)[:, :, None, None].chunk(2, 1)
         x = F.silu(self.wide(F.silu(self.enter(maps))) * (1 + gain) + shift)
         x = F.silu(x + self.wider(x))
@@ -78,25 +86,25 @@ class UncertaintyNetwork(nn.Module):
     def expected(
         self, conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor, strange: torch.Tensor
     ) -> torch.Tensor:
-        """The calibrated mean absolute error expected of the frames `clean` [B, 4, H, W] that were drawn from `conditioning`, in
-        units of intensity from 0 to 1: [B]. Of an episode that began with a picture unlike the recordings (`strange` [B], 0..1)
-        no less is expected than of invention."""
+        """The calibrated mean absolute error of frames `clean` [B, 4, H, W] drawn from `conditioning`, intensity 0..1: [B]. In an
+        episode that began with a picture unlike the recordings (`strange` [B], 0..1) at least that of invention."""
         learned = self.calibrated(self(clues(conditioning, clean), situation).mean((1, 2)))
         return torch.maximum(learned, self.invents * strange)
 
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
-        """Linear between the knots; beyond them in proportion."""
-        at = torch.searchsorted(self.found, answer).clamp(1, KNOTS - 1)
-        low, high = self.found[at - 1], self.found[at]
+        """Linear between the knots; in proportion beyond them."""
+        answers, errors = self.answers, self.errors
+        at = torch.searchsorted(answers, answer).clamp(1, KNOTS - 1)
+        low, high = answers[at - 1], answers[at]
         share = ((answer - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
-        inside = torch.lerp(self.meant[at - 1], self.meant[at], share)
-        below, above = answer / self.found[0].clamp_min(1e-6), answer / self.found[-1].clamp_min(1e-6)
+        inside = torch.lerp(errors[at - 1], errors[at], share)
+        below, above = answer / answers[0].clamp_min(1e-6), answer / answers[-1].clamp_min(1e-6)
         return (inside * below.clamp_max(1) * above.clamp_min(1)).clamp(0, 1)
 
 
 @final
 class NoUncertainty(Absent):
-    """Of a world that does not say how wrong it expects to be."""
+    """Of a world that expects no error."""
 
     def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
         return torch.zeros_like(strange)
@@ -104,7 +112,7 @@ class NoUncertainty(Absent):
 
 @final
 class UncertaintyProbe(Absent):
-    """In the place of an uncertainty: notes what one would be asked, for those who teach it."""
+    """In the place of an uncertainty: passes on its inputs, from which one is learned, and expects no error."""
 
     def __init__(self, note: Callable[[Conditioning, torch.Tensor, torch.Tensor], None]):
         self.note = note
@@ -118,20 +126,20 @@ class UncertaintyProbe(Absent):
 
 
 def gone_on(before: State, after: State, led: bool) -> torch.Tensor:
-    """`gone` [B, len(GONE)] of `after`, one step further from its evidence than `before`; `led`: its pose was given."""
+    """`gone` [B, len(GONE)] of `after`, one step further from evidence than `before`. led: whether its pose was observed."""
     gone = before["gone"]
     steps, way = gone[:, :1] + 1, gone[:, 1:3]
     if led:
         way = torch.zeros_like(way)
     elif "pose" in after:
         turn = yaw(after["pose"]) - yaw(before["pose"])
-        moved = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
-        way = way + torch.stack([moved, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
+        metres = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
+        way = way + torch.stack([metres, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
     return torch.cat([steps, way, gone[:, 3:]], 1)
 
 
 def clues(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
-    """What a drawn frame and its sources look like, in cells of CELLS pixels: [B, CLUES, H / CELLS, W / CELLS]."""
+    """Maps [B, CLUES, H / CELLS, W / CELLS] of a drawn frame and its sources."""
     glimpse, last = conditioning.glimpse, conditioning.last
     drawn, merged = clean[:, :3].clamp(-1, 1), merge(glimpse) * 2 - 1
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)

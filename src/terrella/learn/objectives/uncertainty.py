@@ -277,8 +277,8 @@ def calibrate(uncertainty: UncertaintyNetwork, seen: Dreamt) -> None:
     meant = pooled([float(seen.error[part].mean()) for part in bins], [len(part) for part in bins])
     while len(found) < KNOTS:
         found, meant = [*found, found[-1]], [*meant, meant[-1]]
-    uncertainty.found.copy_(torch.tensor(found))
-    uncertainty.meant.copy_(torch.tensor(meant))
+    uncertainty.answers.copy_(torch.tensor(found))
+    uncertainty.errors.copy_(torch.tensor(meant))
     known = torch.tensor([arm == MEMORY for arm in ARMS])[seen.arm]
     sure = seen.error[known].median() if known.any() else seen.error.quantile(0.25)
     rest = seen.error[~known].quantile(0.6) if (~known).any() else seen.error.quantile(0.9)

@@ -15,7 +15,8 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
 from ...data import Clips, Dataset
-from ...worlds.folder import WORLD_FILE, save_latent, with_kept
+from ...worlds.checkpoint import WORLD_FILE
+from ...worlds.folder import save_latent, with_kept
 from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About

@@ -19,8 +19,9 @@ from ...space.fitting import Fit, PosedViews, decibels, nearest_views, psnr
 from ...space.occupancy import Occupancy, Walker
 from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
+from ...worlds.checkpoint import WORLD_FILE
 from ...worlds.splat import SplatConfig, SplatWorld
-from ...worlds.splat_folder import WORLD_FILE, check_free, save_splat
+from ...worlds.splat_folder import check_free, save_splat
 from ..trainer import Report
 from .splat_views import SplatFit, read_views
 
