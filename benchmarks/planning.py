@@ -19,6 +19,7 @@ from terrella.act.planning import (
     FullyObserved,
     Planner,
     PlayResult,
+    PlaySettings,
     SearchConfig,
     SuccessCriterion,
     distance_to,
@@ -69,10 +70,11 @@ def curve(name: str, case: Case, episodes: int) -> dict[str, dict[str, Figure]]:
     cost = negative_reward(world.spec)
     if case.goal:
         cost = distance_to(world, {"observation": torch.tensor(case.goal)})
-    rows = {"random": figures(play(world, Random(world.spec), episodes, case.steps, 0, judge), case)}
+    settings = PlaySettings(case.steps, judge)
+    rows = {"random": figures(play(world, Random(world.spec), episodes, settings), case)}
     for samples in case.samples:
         planner = Planner(world, cost, replace(case.config, samples=samples))
-        played = play(world, planner, episodes, case.steps, 0, judge, world.spec.observes)
+        played = play(world, planner, episodes, settings)
         rows[f"{samples} plans a round"] = figures(played, case)
         print(
             f"{name}, {samples}: " + "; ".join(f"{k} {v}" for k, v in rows[f"{samples} plans a round"].items()),

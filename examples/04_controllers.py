@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 
 import terrella
-from terrella.act.planning import play
+from terrella.act.planning import PlaySettings, play
 
 
 def swing_up(seen, rng):
@@ -76,7 +76,7 @@ def main(episodes: int = 8) -> dict[str, float]:
     found = {}
     for name in ("balance", "follow", "lean", "random"):
         policy = terrella.load_policy(name if name == "random" else f"{__file__}:{name}", world.spec)
-        played = play(world, policy, episodes, steps=200, seed=0, sees=("observation",))
+        played = play(world, policy, episodes, PlaySettings(steps=200, sees=("observation",)))
         found[name] = sum(episode.reward for episode in played.episodes) / episodes
         print(f"{name:>8}: {found[name]:.0f} of 200 steps")
     return found

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .workflows.opening import ControlsConfig, EnvironmentConfig
     from .workflows.practise import PractiseConfig, PractiseResult, practise
     from .workflows.score import ScoreConfig, ScoreResult, score
+    from .workflows.train import TrainResult, train_latent, train_video
     from .workflows.train_policy import TrainPolicyConfig, TrainPolicyResult, train_policy
 
 _NAMES = {
@@ -33,6 +34,7 @@ _NAMES = {
     ".workflows.opening": ("ControlsConfig", "EnvironmentConfig"),
     ".workflows.practise": ("PractiseConfig", "PractiseResult", "practise"),
     ".workflows.score": ("ScoreConfig", "ScoreResult", "score"),
+    ".workflows.train": ("TrainResult", "train_latent", "train_video"),
     ".workflows.train_policy": ("TrainPolicyConfig", "TrainPolicyResult", "train_policy"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}

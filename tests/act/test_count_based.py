@@ -66,9 +66,9 @@ def test_the_same_seed_plays_the_same_way_and_a_log_brings_it_back(tmp_path):
     rng = make_rng(9)
     for each in (recalled, known):
         each.begin(1, rng)
-    found, before = recalled._seeker.findings, known._seeker.findings
+    found, before = recalled._seeker.novelty, known._seeker.novelty
     assert found.visits == before.visits and np.array_equal(found.holds, before.holds)
-    assert all(np.array_equal(found.known[0][cell], before.known[0][cell]) for cell in before.known[0])
+    assert all(np.array_equal(found.values[0][cell], before.values[0][cell]) for cell in before.values[0])
 
 
 def test_any_action_space_and_a_world_without_pictures():

@@ -77,7 +77,7 @@ def test_actions_of_a_policy_for_goals():
 
 def test_worlds_that_others_cannot_plan_in_are_refused():
     for world in (Point(), made(CHOICES, **SEEN), made(STEERING, sees_pictures=False)):
-        with pytest.raises(PlanningError, match="sees no pictures alone"):
+        with pytest.raises(PlanningError, match="must observe pictures alone"):
             CostModel(world)
 
 

@@ -125,7 +125,7 @@ def test_an_echo_begins_again_where_it_ends():
 
 
 def test_a_return_that_is_no_number_is_said():
-    with pytest.raises(TerrellaError, match="of mine in the dream is no finite number in 1 of 2"):
+    with pytest.raises(TerrellaError, match="of mine in the dream is not finite in 1 of 2"):
         check_finite("mine", "the dream", [PlayedEpisode(reward=1.0), PlayedEpisode(reward=math.nan)])
 
 

@@ -11,6 +11,7 @@ from tests.act.tiny_worlds import Broken, Grid, Point, Windy
 from terrella.act.planning import (
     FullyObserved,
     Planner,
+    PlaySettings,
     SearchConfig,
     SuccessCriterion,
     distance_to,
@@ -93,13 +94,27 @@ def test_the_same_seed_plans_alike_and_a_batch_as_its_episodes_alone(world, kind
         start = world.imagine(start, action, make_rng(5))
 
 
+@pytest.mark.parametrize("world", [Point, Windy], ids=lambda world: world.__name__)
+def test_every_step_of_a_batch_is_imagined_once(world):
+    world, rows = world(), []
+    imagine = world.imagine
+    world.imagine = lambda state, action, rng: rows.append(state.batch) or imagine(state, action, rng)
+    policy = planner(world, "cem", samples=4, iterations=1, horizon=2)
+    memory, seen = policy.begin(3, make_rng(1)), world.render(world.start(3, make_rng(3)), SEEN)
+    for _ in range(2):
+        rows.clear()
+        _, memory = policy.act(seen, memory, make_rng(9))
+    assert sum(rows) == 3 * (2 * 4 + 2 + 1)  # candidates, the mean, and the step that is taken
+    assert len(rows) == (15 if isinstance(world, Windy) else 5)  # a world of chance is imagined episode by episode
+
+
 def test_a_plan_ends_where_the_world_no_longer_knows():
     world, goal = Point(), {"observation": torch.tensor([9.0, 0.0])}
     start = world.observe({"observation": torch.tensor([[1.0, 0.0]])}, None, make_rng(0))
     for trust, most in ((0.3, 4), (1.0, 12)):
         policy = planner(world, "icem", distance_to(world, goal), horizon=12, samples=64, trust=trust)
         _, memory = policy.act(world.render(start, SEEN), policy.begin(1, make_rng(0)), make_rng(0))
-        known = memory[0].decision.known
+        known = memory[0].decision.trusted_moves
         assert known == 12 if most == 12 else 1 <= known <= 4
     with pytest.raises(PlanningError, match="uncertainty"):
         planner(Grid(), "tree", negative_reward(Grid().spec), trust=0.1)
@@ -108,7 +123,7 @@ def test_a_plan_ends_where_the_world_no_longer_knows():
 def test_nothing_is_chosen_by_chance_where_costs_are_no_numbers():
     world = Broken()
     for kind in AXES:
-        with pytest.raises(PlanningError, match="no action is chosen by chance"):
+        with pytest.raises(PlanningError, match="no action is chosen"):
             walked(world, planner(world, kind, negative_reward(world.spec), samples=8), 1, 1)
 
 
@@ -155,14 +170,14 @@ def test_bad_goals_and_worlds_are_refused_in_a_sentence():
         negative_reward(Spec("mute", spaces.Discrete(2), {"rgb": spaces.Box(0, 255, (2, 2, 3), np.uint8)}, (), 1.0))
     with pytest.raises(PlanningError, match="cannot be planned in"):
         Planner(Point(forkable=False), distance_to(world, GOAL))
-    with pytest.raises(PlanningError, match="no end of them"):
+    with pytest.raises(PlanningError, match="continuous actions have none"):
         walked(world, planner(world, "tree"), 1, 1)
     with pytest.raises(PlanningError, match="have no gradient"):
         walked(Grid(), planner(Grid(), "gradient", negative_reward(Grid().spec)), 1, 1)
     with pytest.raises(PlanningError, match="no gradients flow"):
         stiff = Point(differentiable=False)
         walked(stiff, planner(stiff, "gradient"), 1, 1)
-    with pytest.raises(ObservationError, match="not there to be seen"):
+    with pytest.raises(ObservationError, match="the observation lacks"):
         policy = planner(world, "cem")
         policy.act({}, policy.begin(1, make_rng(0)), make_rng(0))
     with pytest.raises(PlanningError):
@@ -188,8 +203,8 @@ def test_episodes_are_judged_from_unsolved_starts():
     world = Point()
     judge = SuccessCriterion({"observation": torch.zeros(1, 2)}, within=0.1)
     cost = distance_to(world, {"observation": torch.zeros(2)})
-    mine = play(world, planner(world, "icem", cost), 12, 20, 0, judge, SEEN, SEEN, 2)
-    floor = play(world, Random(world.spec), 12, 20, 0, judge, SEEN, SEEN, 12)
+    mine = play(world, planner(world, "icem", cost), 12, PlaySettings(20, judge, SEEN, SEEN, 2))
+    floor = play(world, Random(world.spec), 12, PlaySettings(20, judge, SEEN, SEEN, 12))
     assert all(episode.success for episode in mine.episodes) and mine.skipped == floor.skipped > 0
     assert sum(bool(episode.success) for episode in floor.episodes) < 9
     for one, other in zip(mine.episodes[:2], floor.episodes):
@@ -197,7 +212,8 @@ def test_episodes_are_judged_from_unsolved_starts():
         assert len(one.seen) == one.steps + 1 == len(one.actions) + 1 and one.nearest <= 0.1
     assert not mine.episodes[2].seen
     with pytest.raises(PlanningError, match="already solved"):
-        play(world, Random(world.spec), 4, 5, 0, SuccessCriterion({"observation": torch.zeros(1, 2)}, within=2.0), SEEN)
+        criterion = SuccessCriterion({"observation": torch.zeros(1, 2)}, within=2.0)
+        play(world, Random(world.spec), 4, PlaySettings(5, criterion, SEEN))
 
 
 def test_a_revealed_simulator_is_a_world():
@@ -210,7 +226,7 @@ def test_a_revealed_simulator_is_a_world():
 def test_a_planner_in_the_simulator_keeps_the_pole_up():
     world = FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False))
     policy = Planner(world, negative_reward(world.spec), SearchConfig(samples=16, iterations=2, horizon=12, replan=3))
-    mine = play(world, policy, 1, 200, 0, sees=world.spec.observes)
-    floor = play(world, Random(world.spec), 8, 200, 0)
+    mine = play(world, policy, 1, PlaySettings(200))
+    floor = play(world, Random(world.spec), 8, PlaySettings(200))
     assert mine.episodes[0].reward == 200
     assert max(episode.reward for episode in floor.episodes) < 150

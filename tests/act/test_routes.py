@@ -117,7 +117,7 @@ def test_who_is_off_all_ways_goes_to_the_nearest_place_that_lies_on_one():
 
 
 def test_a_place_that_nobody_knows_is_refused_in_a_sentence():
-    with pytest.raises(PlanningError, match="no way to that place is known"):
+    with pytest.raises(PlanningError, match="no route to that place is known"):
         walk((20.0, 20.0))
     assert not np.isfinite(routes_to(np.array([20.0, 20.0]), KNOWN).left_m).any()
 
@@ -170,8 +170,8 @@ def test_a_destination_is_reached_near_it_and_facing_as_it_does():
     turned = lambda heading: [math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2)]  # noqa: E731
     goal = Destination(torch.tensor([1.0, 2.0, 0.0, *turned(3.1)]))
     poses = torch.tensor([[1.3, 2.0, 9.0, *turned(-3.1)], [1.3, 2.0, 0.0, *turned(0.0)], [1.3, 3.0, 0.0, *turned(3.1)]])
-    away = goal.away(poses)
+    away = goal.distance_m(poses)
     assert (away <= goal.near_m).tolist() == [True, False, False]
     assert float(away[0]) == pytest.approx(0.3) and float(away[2]) > 1
     nowhere = Destination(torch.tensor([1.0, 2.0, *[torch.nan] * 5]))
-    assert nowhere.heading is None and (nowhere.away(poses) <= 0.5).tolist() == [True, True, False]
+    assert nowhere.heading is None and (nowhere.distance_m(poses) <= 0.5).tolist() == [True, True, False]

@@ -67,7 +67,7 @@ def test_one_policy_in_a_world_alone(capsys, tmp_path):
         (["idle", "--episodes", "0"], "whole numbers from 1 up"),
         (["idle", "--goal", "99"], "can never be reached"),
         (["idle", "--goal", "5", "--within", "3"], "already solved"),
-        (["tests/cli/tiny.py:NAME"], "is no policy"),
+        (["tests/cli/tiny.py:NAME"], "is not a policy"),
     ],
 )
 def test_what_cannot_be_judged_is_said_in_a_sentence(capsys, tmp_path, words, said):

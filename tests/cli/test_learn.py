@@ -135,6 +135,7 @@ def killed_while_recording(out: Path) -> None:
 
 
 def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 8)
     out = tmp_path / "tiny"
     killed_while_recording(out)
     stepped = Trainer._step

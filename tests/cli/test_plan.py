@@ -58,7 +58,7 @@ def test_reality_and_dream_are_filmed(capsys, tmp_path):
         (["--search", "gradient"], "no gradient"),
         (["--real", "gym:CartPole-v1"], "they differ"),
         (["--trust", "0.1"], "uncertainty"),
-        (["--samples", "1"], "samples are 2 or more"),
+        (["--samples", "1"], "samples must be 2 or more"),
         (["--agent", "random", "--proposal", "random", "--budget-ms", "5"], "leave --proposal, --budget-ms out"),
         (["--goal", "reward", "--cost", "last"], "leave --cost out"),
     ],

@@ -57,7 +57,7 @@ def test_each_episode_walks_to_a_view_that_is_far_enough_from_its_start():
     def walker(goal):
         goals.append(goal)
         config = SearchConfig(samples=8).filled(**search_of(world.spec))
-        return goal.walker(Planner(world, goal.cost(world), config))
+        return goal.navigator(Planner(world, goal.cost(world), config))
 
     played = walks.played(world, walker, 3, 60, 0, world.spec.observes, ("pose",), lambda done, total: None)
     again = walks.played(world, lambda goal: Random(world.spec), 3, 5, 0, (), (), lambda done, total: None)

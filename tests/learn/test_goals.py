@@ -15,6 +15,7 @@ from terrella.act.goal_network import GoalActor
 from terrella.act.planning import (
     GoalBeliefPolicy,
     Planner,
+    PlaySettings,
     SearchConfig,
     SuccessCriterion,
     distance_to,
@@ -73,7 +74,8 @@ def test_it_reaches_goals_that_random_play_does_not(made):
     assert isinstance(acting, GoalBeliefPolicy)
     judge = SuccessCriterion({name: value[None] for name, value in goal.items()}, within=0.04)
     mine, floor = (
-        play(world, policy, 20, 25, 0, judge, ("observation",)).episodes for policy in (acting, Random(world.spec))
+        play(world, policy, 20, PlaySettings(25, judge, ("observation",))).episodes
+        for policy in (acting, Random(world.spec))
     )
     assert sum(bool(one.success) for one in mine) >= 18 > 6 >= sum(bool(one.success) for one in floor)
 
@@ -115,7 +117,7 @@ def test_a_search_that_hardly_searches_is_better_for_its_proposals(made):
     config = SearchConfig("random", samples=4, iterations=1, horizon=6)
 
     def ended(proposal):
-        played = play(world, Planner(world, cost, config, proposal=proposal), 6, 6, 0, None, ("observation",), kept=0)
+        played = play(world, Planner(world, cost, config, proposal=proposal), 6, PlaySettings(6))
         return np.mean([one.best_cost for one in played.episodes])
 
     assert ended(proposal_policy(str(folder / "run"), world)) < 0.7 * ended(None)

@@ -1,4 +1,4 @@
-"""Actor: a learned policy. A network of what it sees gives the actions; it lies in a folder of JSON and safetensors."""
+"""Actor: a learned policy, a network from observations to actions, saved as a folder of JSON and safetensors."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from .actor_network import ActorConfig, ActorNetwork, check_seen
 
 KIND, VERSION = "actor", 1
 POLICY_FILE, WEIGHTS_FILE = "policy.json", "weights.safetensors"
-RUN = "policy"  # the folder of the policy in that of a training run
+RUN_SUBFOLDER = "policy"  # of the folder of a training run
 Module = TypeVar("Module", bound=nn.Module)
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError
 
 
 @final
 class Actor:
-    """A Policy without memory for the actions of `spec`; ActionError or ChannelError where the network is one for others.
+    """A Policy without memory for the actions of `spec`; ActionError or ChannelError if the network is for others.
 
-    greedy: it takes the likeliest action each time; else it draws. card: facts for people.
+    greedy: it takes the most likely action, else it samples. card: facts for people.
     """
 
     def __init__(self, network: ActorNetwork, spec: Spec, greedy: bool = True, card: Mapping[str, Any] | None = None):
@@ -39,7 +39,7 @@ class Actor:
 
     @property
     def sees(self) -> tuple[str, ...]:
-        """The channels that it must be shown."""
+        """The channels to show it."""
         return tuple(name for name, _ in self.network.config.sees)
 
     def begin(self, batch: int, rng: torch.Generator) -> None:
@@ -49,19 +49,19 @@ class Actor:
         """The actions [B, *action.shape], on the network's device."""
         check_seen(self.network.config, observation)
         distribution = self.network(observation)
-        drawn = distribution.mode() if self.greedy else distribution.sample(rng)
-        return self.network.config.actions(drawn, self.spec), None
+        samples = distribution.mode() if self.greedy else distribution.sample(rng)
+        return self.network.config.actions(samples, self.spec), None
 
     def save(self, folder: str | Path) -> None:
-        """Writes the folder, each file whole; CheckpointError where it cannot be written."""
-        told = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
-        write_policy(folder, told, self.network)
+        """Writes the folder, each file atomically; CheckpointError if it cannot be written."""
+        description = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
+        write_policy(folder, description, self.network)
 
     @staticmethod
     def load(folder: str | Path, spec: Spec, greedy: bool = True) -> Actor:
-        """Reads what `save` wrote, from its folder or that of the training run. CheckpointError for what is missing or foreign,
-        ActionError or ChannelError where `spec` has other actions or does not show what it sees."""
-        make = lambda told: ActorNetwork(ActorConfig(**told))  # noqa: E731
+        """Loads a saved policy, from its folder or that of the training run. CheckpointError if it is missing or foreign,
+        ActionError or ChannelError if `spec` has other actions or lacks a channel."""
+        make = lambda config: ActorNetwork(ActorConfig(**config))  # noqa: E731
         network, card = load_network(folder, KIND, VERSION, make)
         return Actor(network, spec, greedy, card)
 
@@ -69,32 +69,32 @@ class Actor:
 def load_network(
     folder: str | Path, kind: str, version: int, make: Callable[[dict[str, Any]], Module]
 ) -> tuple[Module, dict[str, Any]]:
-    """The network of a policy of this kind, which `make` makes of its config, ready to act; and its card. The folder is its own,
-    or that of the training run. CheckpointError for what is missing, foreign or damaged."""
+    """The network of a saved policy of this kind, built by `make(config)`, in evaluation mode, and the policy's card. The folder is
+    its own or that of the training run. CheckpointError if it is missing, foreign or damaged."""
     folder = policy_folder(folder)
-    told = read_policy(folder)
-    if (told.get("kind"), told.get("version")) != (kind, version):
+    saved = read_policy(folder)
+    if (saved.get("kind"), saved.get("version")) != (kind, version):
         raise CheckpointError(
-            f"{folder} is a policy of kind {told.get('kind')!r}, version {told.get('version')}; this takes kind '{kind}', "
+            f"{folder} is a policy of kind {saved.get('kind')!r}, version {saved.get('version')}; expected kind '{kind}', "
             f"version {version}."
         )
     try:
-        network = make({name: _tuple(value) for name, value in told["config"].items()})
+        network = make({name: _tuple(value) for name, value in saved["config"].items()})
         network.load_state_dict(load_file(folder / WEIGHTS_FILE))
     except DAMAGE as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{folder} is damaged or incomplete ({why}); copy or train it again.") from error
-    return network.eval().requires_grad_(False), dict(told.get("card") or {})
+    return network.eval().requires_grad_(False), dict(saved.get("card") or {})
 
 
-def write_policy(folder: str | Path, told: Mapping[str, Any], network: nn.Module) -> None:
-    """policy.json and the weights, each file whole; CheckpointError where they cannot be written."""
+def write_policy(folder: str | Path, description: Mapping[str, Any], network: nn.Module) -> None:
+    """Writes policy.json and the weights, each file atomically; CheckpointError if they cannot be written."""
     folder = Path(folder)
     weights = {name: value.detach().cpu().clone().contiguous() for name, value in network.state_dict().items()}
     try:
         with replacing(folder / WEIGHTS_FILE) as staged:
             save_file(weights, staged)
-        write_text(folder / POLICY_FILE, json.dumps(told, indent=1) + "\n")
+        write_text(folder / POLICY_FILE, json.dumps(description, indent=1) + "\n")
     except (OSError, SafetensorError) as error:
         raise CheckpointError(
             f"the policy cannot be written to {folder} ({error}); free some space, or choose another folder."
@@ -102,22 +102,22 @@ def write_policy(folder: str | Path, told: Mapping[str, Any], network: nn.Module
 
 
 def policy_folder(folder: str | Path) -> Path:
-    """The folder of a policy: the one that is named, or the one that a training run left in it."""
-    inner = Path(folder) / RUN
+    """The folder of a policy: this one, or the one inside the folder of a training run."""
+    inner = Path(folder) / RUN_SUBFOLDER
     return inner if (inner / POLICY_FILE).is_file() else Path(folder)
 
 
 def read_policy(folder: str | Path) -> dict[str, Any]:
-    """What policy.json says; CheckpointError where there is none, or none that can be read."""
+    """The content of policy.json; CheckpointError if it is missing or cannot be read."""
     try:
-        told = json.loads((Path(folder) / POLICY_FILE).read_text(encoding="utf-8"))
+        saved = json.loads((Path(folder) / POLICY_FILE).read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
-        raise CheckpointError(f"{folder} holds no {POLICY_FILE}: it is no policy; give the folder of one.") from None
+        raise CheckpointError(f"{folder} holds no {POLICY_FILE}: give the folder of a policy.") from None
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder}/{POLICY_FILE} cannot be read ({error}).") from error
-    if not isinstance(told, dict):
-        raise CheckpointError(f"{folder}/{POLICY_FILE} describes no policy; copy it again.")
-    return told
+    if not isinstance(saved, dict):
+        raise CheckpointError(f"{folder}/{POLICY_FILE} does not describe a policy; copy it again.")
+    return saved
 
 
 def _tuple(value: Any) -> Any:

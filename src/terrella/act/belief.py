@@ -1,4 +1,4 @@
-"""BeliefPolicy: a policy that sees an environment as a world does, by the world's latent or whatever else that makes of it."""
+"""BeliefPolicy: a policy that acts on a world's state, folded from the observations of an environment."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .planning import Cost, GoalBeliefPolicy
 
 @final
 class BeliefPolicy:
-    """The world folds what is seen into its state, the policy is shown what it sees of that. Its memory is the world's state."""
+    """The world folds observations into its state, and the policy is shown channels rendered from that. Its memory is the state."""
 
     def __init__(self, world: World, actor: Actor):
         self.world, self.actor = world, actor
@@ -36,12 +36,12 @@ class BeliefPolicy:
 
 
 def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
-    """The learned policy of a folder, for the actions of `spec`; where it sees what that does not show but `world` does, through
-    the world; one for goals, towards the goal of `cost`. ActionError, ChannelError or PlanningError where it does not fit."""
+    """The learned policy of a folder, for the actions of `spec`. One that sees channels which only `world` has acts through the
+    world; a goal-conditioned one acts towards the goal of `cost`. ActionError, ChannelError or PlanningError if it does not fit."""
     if read_policy(policy_folder(folder)).get("kind") == KIND:
         if world is None or cost is None:
             raise PlanningError(
-                f"{folder} is a policy for goals: it needs the world that it was learned in, and a goal."
+                f"{folder} is a goal-conditioned policy: it needs the world that it was learned in, and a goal."
             )
         return GoalBeliefPolicy(world, GoalActor.load(folder, world.spec), cost)
     try:
@@ -49,7 +49,7 @@ def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = No
     except ChannelError:
         if world is None:
             raise
-    lacks = [name for name in world.spec.observes if name not in spec.channels]
-    if lacks:
-        raise ChannelError(f"{world.spec.name} observes {', '.join(lacks)}, which {spec.name} does not show.")
+    missing = [name for name in world.spec.observes if name not in spec.channels]
+    if missing:
+        raise ChannelError(f"{world.spec.name} observes {', '.join(missing)}, which {spec.name} lacks.")
     return BeliefPolicy(world, Actor.load(folder, world.spec))

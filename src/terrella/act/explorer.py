@@ -1,4 +1,4 @@
-"""Explorer: a scripted player that walks a first-person world by what it sees, so that recordings cover all of it."""
+"""Explorer: a scripted policy that covers a first-person world, for recordings of all of it."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from ..space.camera import yaw
 from .count_based import CountBased
 
 LEGS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
-_BODY_M = 0.55  # half the width that must be free to walk
-_CELL_M = 1.5  # of the grid in which visits are counted
-_Moves = Generator[tuple[str, ...], "_View", "_View"]  # yields the buttons of a step, is sent what is seen after it
+_BODY_M = 0.55  # half the width that must be free to walk through
+_CELL_M = 1.5  # side of a cell of the visit counts
+_Moves = Generator[tuple[str, ...], "_View", "_View"]  # yields the buttons of a step, and is sent the view after it
 
 
 @dataclass(frozen=True)
 class _View:
-    """What the walker uses of an observation: where it stands and how far it can see in each direction of the picture."""
+    """The part of an observation that walking uses: the position, and the distances in each direction of the picture."""
 
     x: float
     y: float
     yaw: float  # radians, counter-clockwise
     bearing: torch.Tensor  # [C] radians from straight ahead, left positive
     free_m: torch.Tensor  # [C] level distance to the first obstacle
-    thing_m: torch.Tensor  # [C] distance to the nearest thing that may move or be picked up, inf where there is none
-    target_m: torch.Tensor  # [C] the same of what stands at the height of the eye
+    thing_m: torch.Tensor  # [C] distance to the nearest object that may move or be picked up, inf for none
+    target_m: torch.Tensor  # [C] the same, of objects at eye height
 
     def walkable_m(self) -> torch.Tensor:
-        """[C] metres that a body with width can go in each direction, as far as is seen."""
+        """[C] metres that a body with width can go in each direction, as far as it sees."""
         apart = self.bearing[None, :] - self.bearing[:, None]
         along, across = self.free_m * torch.cos(apart), (self.free_m * torch.sin(apart)).abs()
         blocks = (across < _BODY_M) | (apart == 0)
@@ -49,14 +49,14 @@ class _View:
         return float((self.free_m * torch.cos(self.bearing))[blocks].min())
 
     def thing(self, towards: float | None = None, target: bool = False) -> tuple[float, float] | None:
-        """Bearing and distance of a thing in sight: the nearest, or that nearest to the bearing `towards`; with `target` of
-        those that stand at the height of the eye."""
+        """Bearing and distance of an object in sight: the nearest, or the one nearest to the bearing `towards`. target: only
+        objects at eye height."""
         far = self.target_m if target else self.thing_m
         seen = torch.isfinite(far)
         if not seen.any():
             return None
-        worth = far if towards is None else torch.where(seen, (self.bearing - towards).abs(), torch.inf)
-        pick = int(worth.argmin())
+        cost = far if towards is None else torch.where(seen, (self.bearing - towards).abs(), torch.inf)
+        pick = int(cost.argmin())
         near = seen & ((far - far[pick]).abs() < 1.0) & ((self.bearing - self.bearing[pick]).abs() < 0.3)
         return float(self.bearing[near].mean()), float(far[pick])
 
@@ -64,10 +64,10 @@ class _View:
 class Explorer:
     """A policy that covers a world.
 
-    In worlds with depth, pose and Doom's six movement buttons it goes where it has been least in this episode, by ways
-    that it sees to be open, between runs, turns, strafes, steps back, stops, looks around and key mashing. Where there is
-    a channel `things` it walks up to them, and shoots at them with ATTACK; USE it tries on what is in its way. Elsewhere it
-    learns what its actions do and seeks what it has seldom seen (act/count_based.py; `log` and `recall` are its).
+    In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places of the episode, through
+    openings that it sees, in between runs, turns, strafes, steps back, stops, looks around and random keys. With a channel
+    `things` it walks up to objects and shoots at them with ATTACK; it presses USE at obstacles. In other worlds it explores by
+    visit counts (act/count_based.py, to which `log` and `recall` belong).
     """
 
     def __init__(self, spec: Spec, log: Path | None = None):
@@ -76,11 +76,11 @@ class Explorer:
         self._seeker = CountBased(spec, log)
 
     def recall(self, steps: int) -> None:
-        """Goes on as after the first `steps` of the log."""
+        """Restores the state after the first `steps` of the log."""
         self._seeker.recall(steps)
 
     def begin(self, batch: int, rng: torch.Generator) -> list:
-        """The memory of `batch` episodes: walks that have not begun, which `act` moves on in place."""
+        """The memory of `batch` episodes: walks, which `act` advances in place."""
         return [_Walk(rng, self.spec) for _ in range(batch)] if self._walks else self._seeker.begin(batch, rng)
 
     def act(self, observation: Observation, memory: list, rng: torch.Generator) -> tuple[torch.Tensor, list]:
@@ -94,14 +94,14 @@ class Explorer:
 
 
 class _Walk:
-    """One episode of walking: endless moves, each a few steps to a few dozen long."""
+    """One episode of walking: an endless sequence of moves of a few to a few dozen steps."""
 
     def __init__(self, rng: torch.Generator, spec: Spec):
         self.rng = rng
         self.shoots, self.uses = "ATTACK" in spec.action_names, "USE" in spec.action_names
         self.meets = "things" in spec.channels
         self.visits: dict[tuple[int, int], int] = {}
-        self.boredom = 0.0  # grows while nothing new is found, and lowers what counts as promising
+        self.boredom = 0.0  # grows while nothing new is seen, and lowers the threshold for a promising direction
         self._moves: _Moves | None = None
 
     def next(self, view: _View) -> tuple[str, ...]:
@@ -127,14 +127,14 @@ class _Walk:
         self.visits[cell] = self.visits.get(cell, 0) + 1
         return view
 
-    # -- moves: each takes the present view, yields buttons and returns the last view ----------------------------
+    # -- moves: each takes the current view, yields buttons and returns the last view ----------------------------
 
     def seek(self, view: _View) -> _Moves:
         """Turns to the most promising open direction in sight and runs there, steering clear of walls."""
         score = self.promise(view)
         side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
         along = [(), (), ("MOVE_BACKWARD",), ("MOVE_LEFT",), ("MOVE_RIGHT",)][_whole(self.rng, 0, 4)]
-        for _ in range(100):  # while all in sight is a wall or well known, look elsewhere
+        for _ in range(100):  # while only walls and known places are in sight, look elsewhere
             if float(score.max()) > 0.3 - self.boredom:
                 break
             self.boredom += 0.005
@@ -143,7 +143,7 @@ class _Walk:
         self.boredom *= 0.5
         goal, stuck = self.choose(view, score), 0
         for step in range(1, _whole(self.rng, 12, 40)):
-            if step % 8 == 0:  # look again, and keep to the way taken unless another is clearly better
+            if step % 8 == 0:  # look again; keep the heading unless another is clearly better
                 apart = _wrapped(view.yaw + view.bearing - goal)
                 goal = self.choose(view, self.promise(view) + 0.3 * torch.exp(-((apart / 0.3) ** 2)))
             off, ahead = _wrapped(goal - view.yaw), view.ahead_m()
@@ -160,14 +160,14 @@ class _Walk:
         return view
 
     def choose(self, view: _View, score: torch.Tensor) -> float:
-        """A heading (radians in the world), likelier where the score is high."""
+        """A heading in the world (radians), sampled by softmax of the score."""
         likelihood = torch.exp(10 * (score - score.max()))
         return view.yaw + float(view.bearing[int(torch.multinomial(likelihood, 1, generator=self.rng))])
 
     def fight(self, view: _View) -> _Moves:
-        """Turns to the nearest thing that stands in sight and shoots at it, standing, strafing or walking, the trigger held or
-        pressed at times; in one fight of five it only aims, and in one of three it aims beside the thing, at times so little that
-        it grazes it: what a shot does can be told from what aiming does, and what a hit from what a shot."""
+        """Turns to the nearest object at eye height and shoots at it, standing, strafing or walking, the trigger held or pressed at
+        times. One fight of five only aims, and one of three aims beside the object, sometimes barely: so recordings separate the
+        effect of a hit from that of a shot, and of a shot from that of aiming."""
         along = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][
             _whole(self.rng, 0, 6)
         ]
@@ -176,42 +176,42 @@ class _Walk:
         if _chance(self.rng, 1 / 3):
             side = -1 if _chance(self.rng, 0.5) else 1
             beside = side * _whole(self.rng, 8, 45) / 100
-        found, turned = view.thing(target=True), 0.0
+        target, turned = view.thing(target=True), 0.0
         for _ in range(_whole(self.rng, 20, 70)):
-            if found is None:
+            if target is None:
                 break
-            off = found[0] - beside - turned  # a turn that has begun goes on for a step
+            off = target[0] - beside - turned  # a turn continues for one more step
             turn = () if abs(off) < 0.04 else ("TURN_LEFT",) if off > 0 else ("TURN_RIGHT",)
-            shot = ("ATTACK",) if abs(found[0] - beside) < 0.12 and _chance(self.rng, often) else ()
-            before, held = view.yaw, found[0]
+            shot = ("ATTACK",) if abs(target[0] - beside) < 0.12 and _chance(self.rng, often) else ()
+            before, held = view.yaw, target[0]
             view = yield from self.step(*along, *turn, *shot)
             turned = _wrapped(view.yaw - before)
-            found = view.thing(held - turned, target=True)
+            target = view.thing(held - turned, target=True)
         return view
 
     def fetch(self, view: _View) -> _Moves:
-        """Walks up to the nearest thing in sight, as to a pick-up."""
-        found, stuck = view.thing(), 0
-        while found and stuck < 8:
-            off = found[0]
+        """Walks up to the nearest object in sight, as to a pick-up."""
+        target, stuck = view.thing(), 0
+        while target and stuck < 8:
+            off = target[0]
             buttons = ["MOVE_FORWARD"] if abs(off) < 0.4 else []
             if abs(off) > 0.06:
                 buttons.append("TURN_LEFT" if off > 0 else "TURN_RIGHT")
             before = view
             view = yield from self.step(*buttons)
             stuck = stuck + 1 if buttons[:1] == ["MOVE_FORWARD"] and view.stands_at(before) else 0
-            found = view.thing(off) if _chance(self.rng, 0.98) else None  # some are never reached
+            target = view.thing(off) if _chance(self.rng, 0.98) else None  # some are never reached
         return view
 
     def use(self, view: _View) -> _Moves:
-        """Presses what is in the way, waits for it to open, and goes on if it does."""
+        """Presses USE at an obstacle, waits for it to open, and walks on if it does."""
         view = yield from self.hold(("USE",), 1, 3)
         for _ in range(_whole(self.rng, 10, 40)):
             view = yield from self.step(*(("MOVE_FORWARD",) if view.ahead_m() > 1.0 else ()))
         return view
 
     def dodge(self, view: _View) -> _Moves:
-        """Away from a wall: towards the more open half, now and then by a strafe or a step back."""
+        """Away from a wall, towards the more open half; sometimes by a strafe or a step back."""
         if self.uses and _chance(self.rng, 0.5):
             view = yield from self.use(view)
             if view.ahead_m() > 1.5:
@@ -230,9 +230,9 @@ class _Walk:
         return view
 
     def run(self, view: _View) -> _Moves:
-        """Straight on, at times diagonally or while turning, until a wall is near."""
+        """Straight ahead, sometimes diagonally or while turning, until a wall is near."""
         extra = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)][_whole(self.rng, 0, 6)]
-        bump = _chance(self.rng, 0.15)  # walls are to be felt too
+        bump = _chance(self.rng, 0.15)  # recordings should have collisions too
         for _ in range(_whole(self.rng, 8, 40)):
             view = yield from self.step("MOVE_FORWARD", *extra)
             if not bump and view.ahead_m() < 0.9:
@@ -244,7 +244,7 @@ class _Walk:
 
     def strafe(self, view: _View) -> _Moves:
         buttons = ("MOVE_LEFT",) if _chance(self.rng, 0.5) else ("MOVE_RIGHT",)
-        if _chance(self.rng, 0.4):  # circle around what is seen
+        if _chance(self.rng, 0.4):  # circle around the view
             buttons += ("TURN_RIGHT",) if buttons[0] == "MOVE_LEFT" else ("TURN_LEFT",)
         return (yield from self.hold(buttons, 5, 25))
 
@@ -258,7 +258,7 @@ class _Walk:
         return (yield from self.hold((), 3, 12))
 
     def look_around(self, view: _View) -> _Moves:
-        """A quarter to a full turn, sometimes there and back (memory has to close the loop)."""
+        """A quarter to a full turn, sometimes and back again (for loop closure)."""
         side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
         sides = [side, "TURN_RIGHT" if side == "TURN_LEFT" else "TURN_LEFT"] if _chance(self.rng, 0.4) else [side]
         angle = math.pi * (0.5 + 1.5 * _unit(self.rng))
@@ -286,20 +286,20 @@ class _Walk:
         return view
 
     def promise(self, view: _View) -> torch.Tensor:
-        """[C] of 0..1: how far one could go in each direction, and how new the places on the way are."""
+        """[C] in 0..1: the free distance in each direction times the novelty of the places along it."""
         free = view.walkable_m().clamp(0, 12.0)
-        news = torch.zeros_like(free)
+        novelty = torch.zeros_like(free)
         for index, (distance, bearing) in enumerate(zip(free.tolist(), view.bearing.tolist())):
             direction = view.yaw + bearing
             reach = [0.5 + i for i in range(1, 12) if 0.5 + i < distance - 0.4]
             cells = [_cell(view.x + r * math.cos(direction), view.y + r * math.sin(direction)) for r in reach]
             if cells:
-                news[index] = sum(1 / (1 + self.visits.get(cell, 0) / 3) for cell in cells) / len(cells)
-        return news * (free / 5.0).clamp(max=1.0)
+                novelty[index] = sum(1 / (1 + self.visits.get(cell, 0) / 3) for cell in cells) / len(cells)
+        return novelty * (free / 5.0).clamp(max=1.0)
 
 
 def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
-    """Bearings and free distances from the depth picture's rows about the horizon, and the pose."""
+    """Bearings and free distances from the depth rows around the horizon, and the pose."""
     focal, _, centre, horizon = spec.camera or (0.5, 0.8, 0.5, 0.5)
     depth = observation["depth"][0].float()
     height = depth.shape[0]
@@ -322,7 +322,7 @@ def _cell(x: float, y: float) -> tuple[int, int]:
 
 
 def _wrapped(angle):
-    """Radians in -pi to pi, of a number or a tensor."""
+    """An angle, a number or a tensor, wrapped to -pi..pi."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 

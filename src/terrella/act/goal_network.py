@@ -1,5 +1,5 @@
-"""A goal-conditioned policy over latents: from where one is, where one would be and how soon, to the action (inverse dynamics over
-many steps, learned with hindsight goals)."""
+"""A goal-conditioned policy over latents: from the current latent, the goal and the steps to it, to the action (multi-step inverse
+dynamics, learned with hindsight goals)."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from .distributions import ActionDistribution
 
 KIND, VERSION = "goal-actor", 1
 LATENT, GOAL = "latent", "goal.latent"
-BRISK = (0.4, 1.4)  # of the steps that are asked for, where plans are to differ
+STEP_FACTORS = (0.4, 1.4)  # range of the factor on the steps to the goal, for varied plans
 
 
 @dataclass(frozen=True)
 class GoalConfig:
-    """latent: its width; actor: the actions; farthest: steps to a goal at most; hidden, layers: of both perceptrons."""
+    """The size of a goal-conditioned policy."""
 
-    latent: int
-    actor: ActorConfig
-    farthest: int = 50
-    hidden: int = 256
-    layers: int = 3
+    latent: int  # width of the latent
+    actor: ActorConfig  # the actions
+    farthest: int = 50  # steps to a goal, at most
+    hidden: int = 256  # width of both MLPs
+    layers: int = 3  # of both MLPs
 
     @staticmethod
     def of(spec: Spec, farthest: int = 50, hidden: int = 256) -> GoalConfig:
@@ -40,17 +40,17 @@ class GoalConfig:
 
 
 def latent_space(spec: Spec) -> Any:
-    """The channel in which goals are told; ChannelError for a world without it."""
+    """The space of the goals, that of the channel `latent`; ChannelError for a world without it."""
     if LATENT not in spec.channels:
         raise ChannelError(
-            f"goals are told in latents, and {spec.name} has none (only {', '.join(spec.channels)}): `terrella train latent` "
+            f"goals are latents, and {spec.name} has none (only {', '.join(spec.channels)}): `terrella train latent` "
             "learns a world with latents."
         )
     return spec.channels[LATENT]
 
 
 class GoalNetwork(nn.Module):
-    """Two perceptrons: the action, and the steps that it takes."""
+    """Two MLPs: one for the action, one for the steps to the goal."""
 
     def __init__(self, config: GoalConfig):
         super().__init__()
@@ -60,16 +60,16 @@ class GoalNetwork(nn.Module):
         self.far = mlp(both, config.hidden, config.layers, 1, gain=0.1)
 
     def forward(self, latent: torch.Tensor, goal: torch.Tensor, steps: torch.Tensor) -> ActionDistribution:
-        """Of the actions from latents [N, D] that are at goals [N, D] after `steps` [N]."""
+        """The distribution over actions from latents [N, D] that reach goals [N, D] in `steps` [N]."""
         share = steps.clamp(1, self.config.farthest).log() / math.log(self.config.farthest)
         return self.config.actor.distribution(self.act(torch.cat([latent, goal - latent, share[:, None]], 1)))
 
     def steps(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-        """How many steps [N] it takes who is quick, 1 to the farthest."""
+        """The steps [N] to the goal at a quick pace, 1 to `farthest`."""
         return (self.share(latent, goal).clamp(0, 1) * math.log(self.config.farthest)).exp()
 
     def share(self, latent: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-        """Their logarithm [N] in shares of that of the farthest, as it was learned: it may leave 0..1."""
+        """log(steps) / log(farthest) [N] as the network predicts it, not clamped to 0..1."""
         return self.far(torch.cat([latent, goal - latent], 1))[:, 0]
 
 
@@ -77,7 +77,7 @@ class GoalNetwork(nn.Module):
 class GoalActor:
     """A Policy that sees `latent` and `goal.latent`, for the actions of `spec`; ActionError or ChannelError for others.
 
-    varied: each episode asks for the goal sooner or later than is usual, so that a planner has different plans to choose from.
+    varied: each episode asks for the goal sooner or later than usual, so that a planner gets different plans to choose from.
     """
 
     sees = (LATENT, GOAL)
@@ -92,8 +92,8 @@ class GoalActor:
         self.network, self.spec, self.varied, self.card = network, spec, varied, dict(card or {})
 
     def begin(self, batch: int, rng: torch.Generator) -> torch.Tensor:
-        """How the steps that are asked for are changed, [B]."""
-        low, high = BRISK
+        """The factor [B] on the steps to the goal."""
+        low, high = STEP_FACTORS
         return low + (high - low) * torch.rand(batch, generator=rng) if self.varied else torch.ones(batch)
 
     @torch.no_grad()
@@ -107,17 +107,17 @@ class GoalActor:
         return config.actions(self.network(latent, goal, steps).mode(), self.spec), memory
 
     def save(self, folder: str | Path) -> None:
-        """Writes the folder, each file whole; CheckpointError where it cannot be written."""
-        told = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
-        write_policy(folder, told, self.network)
+        """Writes the folder, each file atomically; CheckpointError if it cannot be written."""
+        description = {"kind": KIND, "version": VERSION, "config": asdict(self.network.config), "card": self.card}
+        write_policy(folder, description, self.network)
 
     @staticmethod
     def load(folder: str | Path, spec: Spec, varied: bool = False) -> GoalActor:
-        """What `save` wrote, from its folder or that of the training run. CheckpointError for what is damaged, ActionError or
-        ChannelError where it does not fit the world of `spec`."""
+        """Loads a saved policy, from its folder or that of the training run. CheckpointError if it is damaged, ActionError or
+        ChannelError if it does not fit the world of `spec`."""
 
-        def make(told: dict[str, Any]) -> GoalNetwork:
-            return GoalNetwork(GoalConfig(**{**told, "actor": ActorConfig(**told["actor"])}))
+        def make(config: dict[str, Any]) -> GoalNetwork:
+            return GoalNetwork(GoalConfig(**{**config, "actor": ActorConfig(**config["actor"])}))
 
         network, card = load_network(folder, KIND, VERSION, make)
         return GoalActor(network, spec, varied, card)

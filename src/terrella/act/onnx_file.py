@@ -1,4 +1,4 @@
-"""A learned policy as one ONNX file, normalisation and action limits inside, which runs at control rate without PyTorch."""
+"""A learned policy as one ONNX file, with normalisation and action limits inside, to run without PyTorch."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .actor import Actor
 
 
 class _Flat(nn.Module):
-    """What it sees, one tensor a channel, to the likeliest action."""
+    """Observations, one tensor a channel, to the most likely action."""
 
     def __init__(self, actor: Actor):
         super().__init__()
         self.network, self.actor = actor.network, actor
 
     def forward(self, *seen: torch.Tensor) -> torch.Tensor:
-        likeliest = self.network(dict(zip(self.actor.sees, seen))).mode()
-        return self.network.config.actions(likeliest, self.actor.spec)
+        mode = self.network(dict(zip(self.actor.sees, seen))).mode()
+        return self.network.config.actions(mode, self.actor.spec)
 
 
 def write_onnx(actor: Actor, file: str | Path) -> dict[str, list[int]]:
-    """Writes the policy; its inputs by name with their shapes, -1 for the batch. Inputs are the channels that it sees, as they
-    are rendered (float32, pictures uint8), the output is `action` [batch, *action.shape]. CheckpointError where it cannot be
+    """Writes the policy, and returns its inputs by name with their shapes, -1 for the batch. Inputs are the channels that it sees,
+    as rendered (float32, pictures uint8); the output is `action` [batch, *action.shape]. CheckpointError if it cannot be
     written."""
     if not find_spec("onnx"):
         raise TerrellaError("writing ONNX needs onnx, which is not installed: pip install 'terrella[fast]'.")
@@ -37,7 +37,7 @@ def write_onnx(actor: Actor, file: str | Path) -> dict[str, list[int]]:
     names = [*actor.sees, "action"]
     try:
         with replacing(file) as staged, warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # of tracing: what is asked of shapes does not depend on the numbers
+            warnings.simplefilter("ignore")  # of tracing: conditions on shapes do not depend on values
             torch.onnx.export(
                 _Flat(actor).eval(), seen, str(staged), input_names=names[:-1], output_names=names[-1:],
                 dynamic_axes={name: {0: "batch"} for name in names}, dynamo=False,

@@ -1,5 +1,4 @@
-"""Policies by the names that people give them: random, idle, plan:samples=16, constant:0.5, a module's own; NAME@0.3 is one with
-slips."""
+"""Policies by name: random, idle, plan:samples=16, constant:0.5, a user's MODULE:NAME; NAME@0.3 adds 30% random actions."""
 
 from __future__ import annotations
 
@@ -28,9 +27,9 @@ from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
 
-KNOWN = (
+POLICY_NAMES = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "
-    "FILE.py:NAME of your own; NAME@0.3 does something random three times in ten"
+    "FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by random ones"
 )
 _SETTINGS = {
     field.name: type(field.default) if isinstance(field.default, str | int) else float for field in fields(SearchConfig)
@@ -38,8 +37,8 @@ _SETTINGS = {
 
 
 class NoisyPolicy:
-    """Another policy whose actions are replaced by random ones, each with a probability; it is not told. So one policy becomes
-    many of different worth."""
+    """Another policy with each action replaced by a random one with a probability (epsilon-greedy): so one policy gives many of
+    different quality."""
 
     def __init__(self, policy: Policy, probability: float, spec: Spec):
         self.policy, self.probability, self.spec = policy, probability, spec
@@ -49,36 +48,36 @@ class NoisyPolicy:
         return self.policy.begin(batch, rng)
 
     def act(self, observation: Observation, memory: Any, rng: torch.Generator) -> tuple[torch.Tensor, Any]:
-        meant, memory = self.policy.act(observation, memory, rng)
-        other = self.spec.sample_action(len(meant), rng)
-        meant = torch.as_tensor(meant).to(other)
-        slips = torch.rand(len(meant), generator=rng) < self.probability
-        return torch.where(slips.view(-1, *[1] * (meant.ndim - 1)), other, meant), memory
+        action, memory = self.policy.act(observation, memory, rng)
+        noise = self.spec.sample_action(len(action), rng)
+        action = torch.as_tensor(action).to(noise)
+        replaced = torch.rand(len(action), generator=rng) < self.probability
+        return torch.where(replaced.view(-1, *[1] * (action.ndim - 1)), noise, action), memory
 
 
 def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
-    """The policy of a name (KNOWN) for the actions and channels of `spec`. `world`: in which `plan` plans, for `cost`: by default
-    for reward. TerrellaError, a sentence, where there is none."""
+    """The policy of a name (POLICY_NAMES) for the actions and channels of `spec`. world: the one in which `plan` plans. cost: of
+    `plan`, by default negative reward. TerrellaError for an unknown name."""
     text, at, share = name.rpartition("@")
     if not at or Path(name).is_dir():
-        return _plain(name, spec, world, cost)
+        return _without_noise(name, spec, world, cost)
     try:
         probability = float(share)
     except ValueError:
         probability = -1.0
     if not 0 <= probability <= 1:
-        raise TerrellaError(f"'{name}' slips with a probability of 0 to 1 after the @, as in {text or 'idle'}@0.3.")
-    return NoisyPolicy(_plain(text, spec, world, cost), probability, spec)
+        raise TerrellaError(f"'{name}': give a probability of 0 to 1 after the @, as in {text or 'idle'}@0.3.")
+    return NoisyPolicy(_without_noise(text, spec, world, cost), probability, spec)
 
 
 def proposal_policy(name: str, world: World) -> Policy:
-    """A policy whose plans a search in `world` tries as well, by its name; one for goals is told the search's own."""
+    """A policy, by name, whose plans a search in `world` evaluates as well; a goal-conditioned one gets the search's goal."""
     if Path(name).is_dir() and read_policy(policy_folder(name)).get("kind") == KIND:
         return GoalActor.load(name, world.spec, varied=True)
     return policy_of(name, world.spec, world)
 
 
-def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Policy:
+def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Policy:
     head, colon, rest = name.partition(":")
     simple: dict[str, Callable[[Spec], Policy]] = {"random": Random, "idle": Idle, "explorer": Explorer}
     if head in simple:
@@ -93,12 +92,12 @@ def _plain(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Pol
         return _own(name, spec)
     if Path(name).is_dir():
         return load_learned_policy(name, spec, world, cost)
-    likest = did_you_mean(name, [*simple, "constant", "plan"]) or "."
-    raise TerrellaError(f"there is no policy '{name}'{likest} There are: {KNOWN}.")
+    hint = did_you_mean(name, [*simple, "constant", "plan"]) or "."
+    raise TerrellaError(f"there is no policy '{name}'{hint} There are: {POLICY_NAMES}.")
 
 
 def _action(text: str, spec: Spec) -> torch.Tensor:
-    """One action, by its name or its numbers."""
+    """One action, from its name or its numbers."""
     named = {known.lower(): at for at, known in enumerate(spec.action_names)}
     shape, count = shape_of(spec.action), int(np.prod(shape_of(spec.action)))
     if text.lower() in named and (spec.action_mode == BUTTONS or shape == ()):
@@ -112,7 +111,7 @@ def _action(text: str, spec: Spec) -> torch.Tensor:
         if value.size != count:
             names = f" (or one of {', '.join(spec.action_names)})" if named and spec.action_mode not in AXES else ""
             raise TerrellaError(
-                f"'constant:{text}' is no action of {spec.name}: give {count} number{'s'[: count != 1]}{names}."
+                f"'constant:{text}' is not an action of {spec.name}: give {count} number{'s'[: count != 1]}{names}."
             )
     try:
         return spec.check_action(torch.as_tensor(np.reshape(value, (1, *shape))), 1)[0]
@@ -123,14 +122,14 @@ def _action(text: str, spec: Spec) -> torch.Tensor:
 def _planner(name: str, text: str, world: World | None, cost: Cost | None) -> Planner:
     """A planner over the world, by settings as in plan:samples=16,horizon=12."""
     if world is None:
-        raise TerrellaError(f"'{name}' plans in a world, and none is given.")
+        raise TerrellaError(f"'{name}' needs a world to plan in.")
     given: dict[str, Any] = {}
     for word in filter(None, text.split(",")):
         key, _, value = word.partition("=")
         key = key.strip().replace("-", "_")
         if key not in _SETTINGS:
-            likest = did_you_mean(key, _SETTINGS) or "."
-            raise TerrellaError(f"'{name}': there is no setting '{key}'{likest} There are: {', '.join(_SETTINGS)}.")
+            hint = did_you_mean(key, _SETTINGS) or "."
+            raise TerrellaError(f"'{name}': there is no setting '{key}'{hint} There are: {', '.join(_SETTINGS)}.")
         try:
             given[key] = _SETTINGS[key](value)
         except ValueError as error:
@@ -139,67 +138,66 @@ def _planner(name: str, text: str, world: World | None, cost: Cost | None) -> Pl
             ) from error
     if given.get("search", "icem") not in get_args(Kind):
         raise TerrellaError(f"'{name}': there is no search '{given['search']}'; there are {', '.join(get_args(Kind))}.")
-    said = world.spec.card.get("uncertainty")
-    invents = said.get("invents") if isinstance(said, dict) and "uncertainty" in world.spec.channels else None
-    price = negative_reward(world.spec) if cost is None else cost
-    return Planner(world, price, SearchConfig(**{"trust": invents, **given}))
+    levels = world.spec.card.get("uncertainty")
+    trust = levels.get("invents") if isinstance(levels, dict) and "uncertainty" in world.spec.channels else None
+    cost = negative_reward(world.spec) if cost is None else cost
+    return Planner(world, cost, SearchConfig(**{"trust": trust, **given}))
 
 
 def _own(name: str, spec: Spec) -> Policy:
-    """A user's: MODULE:NAME or FILE.py:NAME of a Policy, of a function (observation, rng) -> actions, or of what makes either
-    from a Spec."""
-    found: Any = _found(name)
+    """A user's policy: MODULE:NAME or FILE.py:NAME of a Policy, a function (observation, rng) -> actions, or a function of a Spec
+    that returns either."""
+    value: Any = _load(name)
     for _ in range(2):
-        if isinstance(found, Policy) and not isinstance(found, type):
-            return found
-        make: Callable[..., Any] | None = found if callable(found) else None
+        if isinstance(value, Policy) and not isinstance(value, type):
+            return value
+        make: Callable[..., Any] | None = value if callable(value) else None
         if make is None:
             break
         try:
-            needed = _needed(make)
-            if needed == 2 and not isinstance(found, type):
+            required = _required_arguments(make)
+            if required == 2 and not isinstance(value, type):
                 return Reactive(make)
-            found = make(spec) if needed == 1 else make()
+            value = make(spec) if required == 1 else make()
         except TerrellaError:
             raise
         except Exception as error:
             raise TerrellaError(f"{name} fails when it is made: {type(error).__name__}: {error}") from error
     raise TerrellaError(
-        f"{name} is no policy: it takes begin(batch, rng) and act(observation, memory, rng), a function (observation, rng) -> "
-        "actions, or a function of a Spec that returns such."
+        f"{name} is not a policy: give an object with begin(batch, rng) and act(observation, memory, rng), a function "
+        "(observation, rng) -> actions, or a function of a Spec that returns one of these."
     )
 
 
-def _needed(function: Callable) -> int:
-    """How many arguments it cannot do without."""
+def _required_arguments(function: Callable) -> int:
     plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    told = inspect.signature(function).parameters.values()
-    return sum(one.kind in plain and one.default is one.empty for one in told)
+    parameters = inspect.signature(function).parameters.values()
+    return sum(one.kind in plain and one.default is one.empty for one in parameters)
 
 
-def _found(name: str) -> Any:
-    """What a module, or a Python file, holds under the name after the colon."""
+def _load(name: str) -> Any:
+    """The object that a module, or a Python file, defines under the name after the colon."""
     source, _, attribute = name.rpartition(":")
     try:
         if source.endswith(".py"):
             if not Path(source).is_file():
                 raise TerrellaError(f"there is no file {source} to take the policy '{attribute}' from.")
-            held = runpy.run_path(source)
+            defined = runpy.run_path(source)
         else:
             if os.getcwd() not in sys.path:
                 sys.path.insert(0, os.getcwd())  # as `python -m` does
-            held = vars(importlib.import_module(source))
+            defined = vars(importlib.import_module(source))
     except TerrellaError:
         raise
     except ModuleNotFoundError as error:
         if error.name and source.startswith(error.name):
             raise TerrellaError(
-                f"there is no policy '{name}', and no Python module '{source}'. There are: {KNOWN}."
+                f"there is no policy '{name}', and no Python module '{source}'. There are: {POLICY_NAMES}."
             ) from error
         raise TerrellaError(f"{source} needs the package '{error.name}', which is not installed.") from error
     except Exception as error:
         raise TerrellaError(f"{source} fails when it is read: {type(error).__name__}: {error}") from error
-    if attribute not in held:
-        mine = [one for one in held if not one.startswith("_")]
+    if attribute not in defined:
+        mine = [one for one in defined if not one.startswith("_")]
         raise TerrellaError(f"{source} has no '{attribute}'{did_you_mean(attribute, mine) or '.'}")
-    return held[attribute]
+    return defined[attribute]

@@ -10,10 +10,9 @@ import torch
 from tyro.conf import Positional
 
 from .. import library
-from ..act.planning.episodes import play
+from ..act.planning import PlaySettings, play
 from ..act.policies_by_name import policy_of
 from ..core.errors import TerrellaError
-from ..core.policy import observed_channels
 from ..core.spec import BUTTONS, CHOICE
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import device_of
@@ -85,9 +84,7 @@ def retained(real: World, agent: str, reference: str, episodes: int, seed: int) 
     def returns(name: str) -> torch.Tensor:
         policy = policy_of(name, real.spec, real)
         steps = real.spec.max_episode_steps or STEPS
-        played = play(
-            real, policy, episodes, steps, seed, sees=observed_channels(policy, real.spec) if name != "random" else ()
-        )
+        played = play(real, policy, episodes, PlaySettings(steps), seed)
         return torch.tensor([one.reward for one in played.episodes])
 
     floor = returns("random")

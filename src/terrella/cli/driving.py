@@ -147,11 +147,11 @@ class Driving:
         planner = Planner(world, cost, config)
 
         def away(state: State) -> float:
-            return float(goal.away(self.played.render(state, ("pose",))["pose"].cpu())[0])
+            return float(goal.distance_m(self.played.render(state, ("pose",))["pose"].cpu())[0])
 
         futures = self._futures(planner)
-        shown = futures and (lambda memory: futures([memory[0].thought]))
-        return Agent("a walker", goal.walker(planner), self.see, away, goal.near_m, "m", shown)
+        shown = futures and (lambda memory: futures([memory[0].planner]))
+        return Agent("a walker", goal.navigator(planner), self.see, away, goal.near_m, "m", shown)
 
     def _first(self, world: World) -> State:
         """A state in which episodes begin, to time the world with."""

@@ -179,7 +179,7 @@ def _opened(inside, environment, real, steps, goal, within, success, device, see
         {} if success else {at: value[None] for at, value in wanted.items()}, within, success or ""
     )
     unpaid = [name for name, spec in specs.items() if "reward" not in spec.channels]
-    if unpaid and not judged.judges:
+    if unpaid and not judged.defined:
         raise PlanningError(
             f"{' and '.join(unpaid)} tell{'s' if len(unpaid) == 1 else ''} no reward, so there is no return to judge by: say what "
             "success is with --goal or --success."

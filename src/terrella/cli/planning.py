@@ -24,6 +24,7 @@ from ..act.planning import (
     Planner,
     PlayedEpisode,
     PlayResult,
+    PlaySettings,
     SearchConfig,
     SuccessCriterion,
     distance,
@@ -92,7 +93,7 @@ class _Case:
 
     def walker(self, config: SearchConfig, goal: Destination) -> Policy:
         """Its plans are short: the uncertainty, for which each picture would be drawn, ends them only if --trust asks for it."""
-        return goal.walker(Planner(self.world, goal.cost(self.world), config))
+        return goal.navigator(Planner(self.world, goal.cost(self.world), config))
 
     def planned(self, config: SearchConfig, what: str, keep: tuple[str, ...] = ()) -> PlayResult:
         """Episodes of the planner."""
@@ -111,8 +112,8 @@ class _Case:
         with progress.shown(what) as report:
             if self.walks:
                 return self.walks.played(self.real, policy, self.episodes, self.steps, self.seed, sees, keep, report)
-            told = (self.episodes, self.steps, self.seed, self.judge, sees, keep, 1 if keep else 0, report)
-            return play(self.real, policy, *told)
+            settings = PlaySettings(self.steps, self.judge, sees, keep, 1 if keep else 0)
+            return play(self.real, policy, self.episodes, settings, self.seed, report)
 
 
 @dataclass(frozen=True)

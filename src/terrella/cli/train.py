@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..learn.recipes.goals import GoalTraining, train_goals
-from ..learn.recipes.latent import LatentTraining, train_latent
+from ..learn.recipes.latent import LatentTraining
 from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
 from ..learn.recipes.parts import (
     EstimatorTraining,
@@ -19,14 +19,15 @@ from ..learn.recipes.parts import (
     train_uncertainty,
 )
 from ..learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
-from ..learn.recipes.video import TrainConfig, train_video
+from ..learn.recipes.video import TrainConfig
 from ..learn.trainer import device_named
 from ..library import folder_of
 from ..workflows.opening import Device, load_named
-from ..workflows.progress import stage
+from ..workflows.progress import Report
+from ..workflows.train import run_recipe, train_latent, train_video
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
-from .say import Json, result, say
+from .say import Json, say, show
 
 
 def video(data: Positional[str], out: str, config: TrainConfig, json: Json = False) -> None:
@@ -36,7 +37,7 @@ def video(data: Positional[str], out: str, config: TrainConfig, json: Json = Fal
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
-    _shown(lambda report: train_video(data, out, config, report), json, run=out)
+    show(train_video(data, out, config, progress=say), json)
 
 
 def latent(data: Positional[str], out: str, config: LatentTraining, json: Json = False) -> None:
@@ -47,7 +48,7 @@ def latent(data: Positional[str], out: str, config: LatentTraining, json: Json =
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, validation.json, and pictures of truth and prediction.
     """
-    _shown(lambda report: train_latent(data, out, config, report), json, run=out)
+    show(train_latent(data, out, config, progress=say), json)
 
 
 def goals(
@@ -152,10 +153,8 @@ def dreams(
     _shown(lambda report: train_dreams(_learned(name, device), data, out, config, report, master), json, run=out)
 
 
-def _shown(train: Callable[[Callable[..., None]], dict], json: bool, **more: str) -> None:
-    with stage("training", say) as report:
-        facts = train(report)
-    result({**more, **facts}, json)
+def _shown(recipe: Callable[[Report], dict], json: bool, **facts: str) -> None:
+    show(run_recipe(recipe, say, **facts), json)
 
 
 def _learned(name: str, device: str) -> LearnedWorld:

@@ -12,7 +12,7 @@ import torch
 
 from .. import library
 from ..act.actor import Actor
-from ..act.planning.episodes import SuccessCriterion, play
+from ..act.planning import PlaySettings, SuccessCriterion, play
 from ..act.policies_by_name import NoisyPolicy
 from ..core.files import write_json
 from ..core.policy import Idle, Policy, Random
@@ -151,8 +151,8 @@ class _Seed:
                 write_json(self.file, self.found)
 
     def _successes(self, world: World, policy: Policy) -> list[int]:
-        sees = tuple(getattr(policy, "sees", ()))
-        played = play(world, policy, self.asked.episodes, self.steps, STARTS, self.judge, sees=sees)
+        settings = PlaySettings(self.steps, self.judge, tuple(getattr(policy, "sees", ())))
+        played = play(world, policy, self.asked.episodes, settings, STARTS)
         return [int(bool(episode.success)) for episode in played.episodes]
 
     def _gathered(self, policy: Path, count: int, number: int = 0) -> Trials:

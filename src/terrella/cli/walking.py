@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..act.planning import STRIDE_S, Destination, PlayedEpisode, PlayResult, SuccessCriterion, play
+from ..act.planning import STRIDE_S, Destination, PlayedEpisode, PlayResult, PlaySettings, SuccessCriterion, play
 from ..act.planning.routes import NoRoute
 from ..core.errors import ObservationError, PlanningError
 from ..core.policy import Policy
@@ -53,13 +53,13 @@ class Walks:
             goal = self._goal(real, number, own)
             judge = judge_of(goal)
             try:
-                one = play(real, policy_for(goal), 1, steps, own, judge, sees, keep, 0 if filmed else 1)
+                one = play(real, policy_for(goal), 1, PlaySettings(steps, judge, sees, keep, 0 if filmed else 1), own)
                 found, skipped, filmed = found + one.episodes, skipped + one.skipped, True
             except NoRoute:
                 if len(self.views) == 1:
                     raise
                 seen = real.render(real.start(1, make_rng(own)), judge.channels)
-                found.append(PlayedEpisode(success=False, nearest=float(judge.away(real, seen)[0])))
+                found.append(PlayedEpisode(success=False, nearest=float(judge.distance(real, seen)[0])))
             report(number + 1, episodes)
         return PlayResult(found, skipped)
 
@@ -81,9 +81,9 @@ def judge_of(goal: Destination) -> SuccessCriterion:
     """Reached is near the place, and facing as the view does."""
 
     def apart(spec: Spec, wanted: Observation, seen: Observation) -> torch.Tensor:
-        return goal.away(seen["pose"])
+        return goal.distance_m(seen["pose"])
 
-    return SuccessCriterion({"pose": goal.pose[None]}, goal.near_m, apart=apart)
+    return SuccessCriterion({"pose": goal.pose[None]}, goal.near_m, distance_to_goal=apart)
 
 
 def search_of(world: Spec) -> dict[str, int]:

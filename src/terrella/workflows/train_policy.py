@@ -13,7 +13,7 @@ from tyro.conf import arg
 from .. import library
 from ..act.actor import Actor
 from ..act.belief import load_learned_policy
-from ..act.planning.episodes import play
+from ..act.planning import PlaySettings, play
 from ..core.errors import TerrellaError
 from ..core.policy import Policy, Random, observed_channels
 from ..core.world import World, make_rng
@@ -140,7 +140,7 @@ def try_policy(
 
     def returns(world: World, policy: Policy, what: str, sees: Sequence[str] = ()) -> torch.Tensor:
         with stage(what, progress) as report:
-            played = play(world, policy, episodes, steps, seed, sees=sees, report=report)
+            played = play(world, policy, episodes, PlaySettings(steps, sees=sees), seed, report)
         return torch.tensor([episode.reward for episode in played.episodes])
 
     actor = load_learned_policy(folder, outside.spec, inside)

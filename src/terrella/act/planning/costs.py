@@ -1,4 +1,4 @@
-"""What a plan costs: the distance to a goal in any channels, or the reward that it forgoes."""
+"""The cost of a plan: the distance to a goal in any channels, or the negative reward."""
 
 from __future__ import annotations
 
@@ -14,60 +14,57 @@ from ...core.errors import ObservationError, PlanningError
 from ...core.spec import Spec, kind_of
 from ...core.world import Observation, World, make_rng
 
-LATENT = "latent"  # the channel in which a world compares pictures, where it has one
-_ENDLESS = 1e6  # a range beyond which is none
-_TINY = 1e-12  # under a root, so that it has a slope at 0
+LATENT = "latent"  # the channel in which a world compares pictures, if it has one
+_UNBOUNDED = 1e6  # a channel with a wider range counts as unbounded
+_TINY = 1e-12  # under a square root, for a finite gradient at 0
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of futures, read off the channels that a world renders after each step.
+    """The cost of futures, from the channels that a world renders after each step."""
 
-    channels:   what is rendered.
-    of_step:    (seen: channel -> [B, N, ...], goal: channel -> [B or 1, ...]) -> the cost of a step, float [B, N].
-    goal:       channel -> [B or 1, ...]: one goal for all episodes, or one for each.
-    over:       "sum": all steps count, so that sooner is better; "last": the end of the horizon alone, the terminal cost of the
-                papers; "least": the best moment of the horizon.
-    until_done: what comes after the step that ended the episode costs nothing (a reward); otherwise it costs what it shows.
-    """
-
+    # The channels to render.
     channels: tuple[str, ...]
-    of_step: Callable[[Observation, Observation], torch.Tensor]
+    # (seen: channel -> [B, N, ...], goal: channel -> [B or 1, ...]) -> the cost of a step, float [B, N].
+    step_cost: Callable[[Observation, Observation], torch.Tensor]
+    # channel -> [B or 1, ...]: one goal for all episodes, or one for each.
     goal: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    # "sum" of all steps, "last": the terminal cost of the papers, "least": the best moment of the horizon.
     over: Literal["sum", "last", "least"] = "sum"
+    # Whether steps after the end of the episode cost nothing, as rewards do.
     until_done: bool = False
 
     def goal_of(self, entry: int, batch: int) -> dict[str, torch.Tensor]:
-        """The goal [1, ...] of one of `batch` episodes; PlanningError where there are goals for another number."""
+        """The goal [1, ...] of one of `batch` episodes; PlanningError if there are goals for another number of episodes."""
         counts = {len(tensor) for tensor in self.goal.values()} - {1, batch}
         if counts:
             raise PlanningError(f"there are goals for {counts.pop()} episodes, and {batch} are played.")
         return {name: tensor[entry : entry + 1] if len(tensor) > 1 else tensor for name, tensor in self.goal.items()}
 
-    def added(self, total: torch.Tensor | None, step: torch.Tensor) -> torch.Tensor:
-        """The cost of a future up to and with a step."""
+    def accumulate(self, total: torch.Tensor | None, step: torch.Tensor) -> torch.Tensor:
+        """The cost of a future up to and including a step."""
         if total is None or self.over == "last":
             return step
         return total + step if self.over == "sum" else torch.minimum(total, step)
 
 
 def negative_reward(spec: Spec) -> Cost:
-    """Less the sum of rewards up to the end of the episode. PlanningError for a world without the channel `reward`."""
+    """The negative return up to the end of the episode. PlanningError for a world without the channel `reward`."""
     if "reward" not in spec.channels:
-        raise PlanningError(f"{spec.name} tells no reward; it has {', '.join(spec.channels)}. Give it another goal.")
+        raise PlanningError(f"{spec.name} has no reward, only {', '.join(spec.channels)}. Give another goal.")
     return Cost(("reward",), lambda seen, goal: -seen["reward"].float(), until_done=True)
 
 
 def distance_to(
     world: World, goal: Mapping[str, torch.Tensor], over: Literal["sum", "last", "least"] = "sum", latent: bool = True
 ) -> Cost:
-    """The distance to a goal: channel -> its value [*shape], or one for each episode [B, *shape]; NaN for numbers that may be any.
+    """The distance to a goal: channel -> its value [*shape], or one for each episode [B, *shape]; NaN matches any number.
 
-    A world with the channel `latent` that can observe the goal compares latents (unless `latent` is False); others, and goals
-    with NaN, the channels themselves: see `distance`. Raises ChannelError or ObservationError for a goal that does not fit.
+    A world with the channel `latent` that can observe the goal compares latents, unless `latent` is False or the goal has NaN;
+    others compare the channels themselves (`distance`). ChannelError or ObservationError for a goal that does not fit.
     """
     spec = world.spec
-    goals = checked(spec, goal)
+    goals = checked_goal(spec, goal)
     whole = all(bool(torch.isfinite(tensor.float()).all()) for tensor in goals.values())
     if latent and LATENT in spec.channels and spec.observes and set(spec.observes) <= set(goals) and whole:
         with torch.no_grad():
@@ -76,39 +73,39 @@ def distance_to(
 
 
 def distance(spec: Spec, goal: Observation, seen: Observation) -> torch.Tensor:
-    """The mean over the channels of `goal` [B or 1, ...] of the root mean square difference of what is seen, [B, N, ...] or
-    [B, ...]: float [B, N] or [B]. Pictures count in shares of full brightness, numbers with bounds in shares of their range,
-    others as they are; NaN in a goal counts as met. Of the two quaternions of a pose's rotation the nearer one counts."""
+    """The mean over the channels of `goal` [B or 1, ...] of the RMS difference to `seen`, [B, N, ...] or [B, ...]: float [B, N]
+    or [B]. Pictures are in shares of full brightness, bounded numbers in shares of their range, others as they are. NaN in a
+    goal counts as met. Of the two quaternions of a rotation, the nearer counts."""
     total = []
     for name, wanted in goal.items():
         now = seen[name].float()
         wanted, lead = wanted.to(now.device).float(), now.ndim - wanted.ndim + 1  # 2 where there are candidates
         wanted = wanted[:, None] if lead == 2 else wanted
         if kind_of(name) == "pose":
-            away = (now * wanted)[..., 3:].nansum(-1, keepdim=True) < 0
-            now = torch.cat([now[..., :3], torch.where(away, -now[..., 3:], now[..., 3:])], -1)
-        asked = ~torch.isnan(wanted)
-        apart = torch.where(asked, (now - wanted) / scale_of(spec.channels[name]).to(now.device), 0.0)
-        apart, asked = (each[..., None].flatten(lead) for each in (apart, asked))
-        total.append((apart.square().sum(-1) / asked.sum(-1).clamp_min(1) + _TINY).sqrt())
+            flipped = (now * wanted)[..., 3:].nansum(-1, keepdim=True) < 0
+            now = torch.cat([now[..., :3], torch.where(flipped, -now[..., 3:], now[..., 3:])], -1)
+        mask = ~torch.isnan(wanted)
+        error = torch.where(mask, (now - wanted) / scale_of(spec.channels[name]).to(now.device), 0.0)
+        error, mask = (each[..., None].flatten(lead) for each in (error, mask))
+        total.append((error.square().sum(-1) / mask.sum(-1).clamp_min(1) + _TINY).sqrt())
     return torch.stack(total).mean(0)
 
 
 def scale_of(space: spaces.Space) -> torch.Tensor:
-    """By what differences of a channel are divided: the range of its numbers where they have one, else 1."""
+    """The divisor of a channel's differences: the range of each number if it is bounded, else 1."""
     if not isinstance(space, spaces.Box):
         return torch.ones(())
     width = space.high.astype(np.float64) - space.low.astype(np.float64)
-    return torch.from_numpy(np.where(np.isfinite(width) & (width > 0) & (width < _ENDLESS), width, 1.0)).float()
+    return torch.from_numpy(np.where(np.isfinite(width) & (width > 0) & (width < _UNBOUNDED), width, 1.0)).float()
 
 
-def checked(spec: Spec, goal: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The goal with a batch axis. ChannelError for channels that the world lacks, ObservationError for values of another shape or
-    outside of the channel's range."""
+def checked_goal(spec: Spec, goal: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The goal with a batch axis. ChannelError for a missing channel, ObservationError for a value of another shape or outside the
+    channel's range."""
     if not goal:
-        raise PlanningError("a goal is at least one channel and its value.")
+        raise PlanningError("a goal needs at least one channel and its value.")
     spec.check_channels(goal)
-    found = {}
+    goals = {}
     for name, value in goal.items():
         space, tensor = spec.channels[name], torch.as_tensor(value)
         shape = tuple(space.shape or ())
@@ -125,8 +122,8 @@ def checked(spec: Spec, goal: Mapping[str, torch.Tensor]) -> dict[str, torch.Ten
             if beyond.any():
                 value = float(tensor.double()[beyond].flatten()[0])
                 raise ObservationError(
-                    f"the goal for '{name}' holds {value:g}, outside of what {spec.name} can show there "
+                    f"the goal for '{name}' holds {value:g}, outside the range of {spec.name} "
                     f"({float(low.min()):g} to {float(high.max()):g}): it can never be reached."
                 )
-        found[name] = tensor
-    return found
+        goals[name] = tensor
+    return goals

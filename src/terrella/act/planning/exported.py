@@ -1,4 +1,4 @@
-"""A world as the cost model that other planners ask for: stable-worldmodel's solvers, and any that call `get_cost`."""
+"""A world as the cost model of other planners: stable-worldmodel's solvers, and any that call `get_cost`."""
 
 from __future__ import annotations
 
@@ -18,31 +18,32 @@ from .moves import ContinuousMoves, moves_of
 
 @final
 class CostModel(nn.Module):
-    """`get_cost(info, candidates)`: how far candidate plans end from a goal picture, in the latents of `world`.
+    """`get_cost(info, candidates)`: the distance of the ends of candidate plans to a goal picture, in the latents of `world`.
 
-    world: observes `rgb` and has the channel `latent`; else PlanningError. Its actions are axes, and candidates tell them from -1
-           to 1, as a share of their limits.
+    world: observes `rgb` and has the channel `latent` and continuous actions; else PlanningError. Candidates give actions from
+           -1 to 1, as a share of their limits.
     """
 
     def __init__(self, world: World):
         super().__init__()
         spec = world.spec
         if spec.observes != ("rgb",) or LATENT not in spec.channels or not isinstance(moves_of(spec), ContinuousMoves):
-            raise PlanningError(f"{spec.name} sees no pictures alone, or has no latent or no axes to be planned with.")
+            raise PlanningError(f"{spec.name} must observe pictures alone, and have latents and continuous actions.")
         self.world, self.moves = world, moves_of(spec)
-        self.whose_dtype = nn.Parameter(torch.zeros(()), requires_grad=False)  # solvers ask for the dtype of parameters
+        self.dtype_parameter = nn.Parameter(
+            torch.zeros(()), requires_grad=False
+        )  # solvers read the dtype of parameters
 
     @torch.no_grad()
     def get_cost(self, info: Mapping[str, Any], candidates: torch.Tensor) -> torch.Tensor:
-        """info: `pixels` and `goal`, uint8 [B, S, T, H, W, 3], the newest last, alike for all S; candidates [B, S, M, block * D].
-        Returns [B, S], lower is better."""
+        """info: `pixels` and `goal`, uint8 [B, S, T, H, W, 3], the newest last, equal for all S; candidates [B, S, M, block * D].
+        Returns costs [B, S]."""
         batch, samples = candidates.shape[:2]
         rng = make_rng(0)
         begun, goal = (self.world.observe({"rgb": info[name][:, 0, -1]}, None, rng) for name in ("pixels", "goal"))
         codes = candidates.reshape(batch * samples, -1, self.moves.size).float().clamp(-1, 1)
         ended = advanced(self.world, begun.fork(samples), self.moves.actions(codes), rng)
-        found = self.world.render(ended, (LATENT,))
-        seen = {LATENT: found[LATENT].unflatten(0, (batch, samples))}
+        seen = {LATENT: self.world.render(ended, (LATENT,))[LATENT].unflatten(0, (batch, samples))}
         return distance(self.world.spec, self.world.render(goal, (LATENT,)), seen)
 
     criterion = get_cost
@@ -55,7 +56,7 @@ class ActionModel(nn.Module):
     def __init__(self, world: World, actor: GoalActor):
         super().__init__()
         self.world, self.actor = world, actor
-        self.whose_dtype = nn.Parameter(torch.zeros(()), requires_grad=False)
+        self.dtype_parameter = nn.Parameter(torch.zeros(()), requires_grad=False)
 
     @torch.no_grad()
     def get_action(self, info: Mapping[str, Any], **more: Any) -> torch.Tensor:

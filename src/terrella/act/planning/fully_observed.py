@@ -1,4 +1,4 @@
-"""A simulator that shows its whole state, so that a planner begins where the real episode stands."""
+"""A simulator whose whole state is observed, so that a planner starts from the state of the real episode."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _KIND = "snapshot"
 
 
 class FullyObserved:
-    """A World around a World whose states are values: each tensor of the state is a channel `snapshot.NAME`, and to observe those
-    is to be in that state. So a Planner over a simulator is a Policy like any other: it sees what it needs to copy it.
+    """A World around a World whose states are values: each tensor of the state is a channel `snapshot.NAME`, and observing those
+    sets the state. So a Planner over a simulator is a Policy like any other: it sees what it needs to copy the state.
 
-    PlanningError for a world that cannot be copied (an external game), or whose state lies elsewhere (an arena), unless what is
-    shown is observed in this process while it is fresh (`here`): then the numbers of an arena's rows say enough.
+    PlanningError for a world that cannot be copied (an external game), or whose state holds rows of an arena, unless `here`:
+    channels are observed in the process that rendered them, while the rows are fresh.
     """
 
     def __init__(self, world: World, here: bool = False):
         spec = world.spec
         if not spec.forkable:
             raise PlanningError(
-                f"{spec.name} cannot be planned in: it cannot go back to a state (forkable=False). Learn a world of it first."
+                f"{spec.name} cannot be planned in: it cannot return to a state (forkable=False). Learn a world of it first."
             )
         state = world.start(1, make_rng(0))
         if state.arenas and not here:
             raise PlanningError(
-                f"{spec.name} remembers in an arena, which no channel can show; plan in the world itself."
+                f"the state of {spec.name} lies in an arena, which no channel can show; plan in the world itself."
             )
         self._world, self._arenas = world, state.arenas
         self._names = {f"{_KIND}.{name}": name for name in state}
@@ -47,10 +47,10 @@ class FullyObserved:
         return self._world.start(batch, rng)
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
-        """The very state that is shown; the prior has nothing to add."""
+        """The state that is shown; the prior is not used."""
         missing = [channel for channel in self._names if channel not in observation]
         if missing:
-            raise ObservationError(f"{self.spec.name} is told its whole state, and {', '.join(missing)} is missing.")
+            raise ObservationError(f"{self.spec.name} observes its whole state, and {', '.join(missing)} is missing.")
         for channel, name in self._names.items():
             if tuple(observation[channel].shape[1:]) != self.spec.channels[channel].shape:
                 raise ObservationError(

@@ -1,4 +1,4 @@
-"""Reaching: a goal-conditioned policy in place of a search: it acts at once, as far as it has learned to."""
+"""GoalBeliefPolicy: a goal-conditioned policy that acts on a world's latent, without a search."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from ...core.world import Observation, World
 from ..goal_network import GOAL, LATENT, GoalActor
 from .costs import Cost
 
-_GOAL, _MEMORY = "reaching.goal", "reaching.memory"
+_GOAL, _MEMORY = "policy.goal", "policy.memory"
 
 
 @final
 class GoalBeliefPolicy:
-    """The world folds what is seen into its latent, the policy acts from that towards the goal of `cost`, which is a latent (see
-    `distance_to`). Its memory is the world's state, with the goal. PlanningError for other goals."""
+    """The world folds observations into its state, and the policy acts on the latent of that towards the goal of `cost`, a latent
+    (see `distance_to`). Its memory is the world's state and the goal. PlanningError for other goals."""
 
     def __init__(self, world: World, actor: GoalActor, cost: Cost):
         if set(cost.goal) != {LATENT}:
-            told = ", ".join(cost.goal) or "the reward"
             raise PlanningError(
-                f"a goal-conditioned policy reaches what {world.spec.name} can observe whole "
-                f"({', '.join(world.spec.observes)}), and the goal is {told}."
+                f"a goal-conditioned policy needs a goal that {world.spec.name} can observe whole "
+                f"({', '.join(world.spec.observes)}), and the goal is {', '.join(cost.goal) or 'the reward'}."
             )
         self.world, self.actor, self.cost = world, actor, cost
         self.sees = (*world.spec.observes, *world.spec.may_observe)

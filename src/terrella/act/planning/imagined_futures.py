@@ -1,4 +1,4 @@
-"""The plans that a planner considered, imagined once more so that a person can see where each would lead."""
+"""The plans that a planner considered, imagined once more so that a person can see their outcomes."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from .planner import PlannerMemory
 
 
 class ImaginedFuture(NamedTuple):
-    """What a plan would lead to: its cost, and pictures uint8 [T, H, W, 3] of it, evenly spread from now to its end."""
+    """The outcome of a plan: its cost, and pictures uint8 [T, H, W, 3], evenly spread from now to its end."""
 
     cost: float
     pictures: torch.Tensor
 
 
 def imagined_futures(
-    world: World, cost: Cost, thought: PlannerMemory, block: int = 1, count: int = 6, channel: str = "rgb"
+    world: World, cost: Cost, memory: PlannerMemory, block: int = 1, count: int = 6, channel: str = "rgb"
 ) -> Iterator[list[ImaginedFuture] | None]:
-    """The futures of the plans that the last decision considered, the best first, after None for each step on the way: a step is
-    imagined when the next is asked for, so that whoever shows them can do something else between. Nothing without a decision."""
-    decision = thought.decision
+    """The futures of the plans that the last decision considered, the best first. Before them None is yielded after each imagined
+    step, so that the caller can do other work in between. Yields nothing without a decision."""
+    decision = memory.decision
     if decision is None or decision.state is None:
         return
-    plans = decision.considered.repeat_interleave(block, 1)[:, : max(1, decision.known) * block]
+    plans = decision.considered.repeat_interleave(block, 1)[:, : max(1, decision.trusted_moves) * block]
     total = alive = None
     pictures: list[torch.Tensor] = []
     times = np.linspace(0, plans.shape[1], count).round().astype(int).tolist()
-    rng, state = make_rng(thought.seed), decision.state.fork(len(plans))
+    rng, state = make_rng(memory.seed), decision.state.fork(len(plans))
     ends = cost.until_done and "done" in world.spec.channels
     read = [*cost.channels, *(["done"] if ends else [])]
     for step in range(plans.shape[1] + 1):
@@ -40,11 +40,11 @@ def imagined_futures(
             with torch.no_grad():
                 state = world.imagine(state, plans[:, step - 1].to(state.device), rng)
                 seen = {name: value[None] for name, value in world.render(state, read).items()}
-                price = cost.of_step(seen, decision.goal).cpu()
+                price = cost.step_cost(seen, decision.goal).cpu()
                 price = price if alive is None else torch.where(alive, price, 0.0)
                 alive = ~seen["done"].cpu() & (True if alive is None else alive) if ends else None
-                total = cost.added(total, price)
-                if state.deferred is not None:  # drawn bit by bit, not all at the end
+                total = cost.accumulate(total, price)
+                if state.deferred is not None:  # render step by step, not all at the end
                     state.deferred.values()
         if step in times:
             pictures += [world.render(state, (channel,))[channel].cpu()] * times.count(step)

@@ -1,4 +1,4 @@
-"""Planner: a policy that imagines what its actions would lead to, in any World, and takes those that cost least."""
+"""Planner: model-predictive control in any World. It imagines candidate plans, and takes the first actions of the cheapest."""
 
 from __future__ import annotations
 
@@ -16,53 +16,51 @@ from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import Cost
 from .moves import moves_of, shifted
-from .problem import PlanningProblem, by_episode, later
+from .problem import EpisodeSeeds, PlanningProblem, later
 from .searches import SearchConfig, SearchResult, WarmStart, search
 
-_OBSERVE, _PRIOR, _SEARCH, _PROPOSE = range(4)  # what an episode's seed is spent on, at each step
+_OBSERVE, _PRIOR, _SEARCH, _PROPOSE = range(4)  # random streams of an episode, at each step
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a plan was worth when it was made: its cost, the steps imagined for it, the time it took (of a batch: its share),
-    how many moves the world knew, and plans that were considered, as actions [M, H, *action.shape]: the one that was chosen, then
-    the median and the worst of the last round. state [1] and goal are those that it was made for."""
+    """A plan as it was judged when it was made."""
 
     cost: float
-    steps: int
-    ms: float
-    known: int
-    considered: torch.Tensor
-    state: State | None = None
+    steps: int  # imagined for it
+    ms: float  # of a batch: the episode's share
+    trusted_moves: int  # of the horizon, within `trust`
+    considered: (
+        torch.Tensor
+    )  # actions [M, H, *action.shape]: the chosen plan, then the median and the worst of the last round
+    state: State | None = None  # [1], in which it was made
     goal: Observation = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PlannerMemory:
-    """The planner's memory of one episode: its seed and step, the state [1] expected now, what is still to be done [n, D] of the
-    plan, the belief [H, D, K] and plan [H, D] to begin with next, the goal [1, ...], and the last decision."""
+    """The planner's memory of one episode."""
 
     seed: int
-    goal: Observation
+    goal: Observation  # channel -> [1, ...]
     step: int = 0
-    prior: State | None = None
-    queue: torch.Tensor | None = None
-    belief: torch.Tensor | None = None
-    plan: torch.Tensor | None = None
-    decision: Decision | None = None
+    prior: State | None = None  # [1], expected now
+    queue: torch.Tensor | None = None  # [n, D], the rest of the current plan
+    belief: torch.Tensor | None = None  # [H, D, K], warm start of the next search
+    plan: torch.Tensor | None = None  # [H, D], warm start of the next search
+    decision: Decision | None = None  # the last
 
 
 class Planner:
-    """Plans in `world` from what it observes, and acts.
+    """Folds what it observes into the state of `world`, searches for the cheapest plan from there, and acts on it.
 
-    cost:     what futures cost (costs.py). config: how to search, and how much of a plan to execute (searches.py).
-    proposal: a policy for the same actions whose `proposals` plans, rolled out in the world, are tried as well; the channels
-              that it sees are `sees`, by default its own or all that a recording of the world would hold; the goal is among
-              them, as `goal.` and its channel.
+    cost:     the cost of futures (costs.py). config: how to search, and how much of a plan to execute (searches.py).
+    proposal: a policy for the same actions; `proposals` of its plans, rolled out in the world, are evaluated as well. It is
+              shown `sees`, by default its own channels or all that a recording would hold, and the goal as `goal.CHANNEL`.
 
-    The memory is a list of one PlannerMemory an episode. The same seed gives the same actions; a batch gives those of its episodes
-    alone, but for what the world's own arithmetic rounds (and unless a budget in milliseconds is set).
-    Raises PlanningError, ObservationError or ChannelError; it never acts by chance.
+    Its memory is a list of one PlannerMemory an episode. The same seed gives the same actions, and a batch gives those of its
+    episodes alone, up to rounding in the world (and unless a time budget is set).
+    Raises PlanningError, ObservationError or ChannelError; it never acts at random.
     """
 
     def __init__(
@@ -77,24 +75,24 @@ class Planner:
         config, spec = (config or SearchConfig()).filled(), world.spec
         if not spec.forkable or (spec.max_batch is not None and spec.max_batch < config.samples):
             raise PlanningError(
-                f"{spec.name} cannot be planned in: it holds {spec.max_batch or 'no'} futures at once, and states of it "
-                f"{'can' if spec.forkable else 'cannot'} be returned to. Learn a world of it first."
+                f"{spec.name} cannot be planned in: it holds {spec.max_batch or 'no'} futures at once, and "
+                f"{'can' if spec.forkable else 'cannot'} return to a state. Learn a world of it first."
             )
         if config.trust is not None and "uncertainty" not in spec.channels:
-            raise PlanningError(
-                f"{spec.name} has no channel 'uncertainty' that could end the horizon; leave `trust` out."
-            )
+            raise PlanningError(f"{spec.name} has no channel 'uncertainty' to end the horizon by; leave `trust` out.")
         if config.replan > config.horizon:
-            raise PlanningError(f"a plan of {config.horizon} moves is made anew after 1 to {config.horizon} of them.")
+            raise PlanningError(
+                f"replan after 1 to {config.horizon} moves of a plan of {config.horizon}; got {config.replan}."
+            )
         spec.check_channels(cost.channels)
         self.world, self.cost, self.config, self.moves = world, cost, config, moves_of(spec)
-        self._proposal, self._proposals = proposal, proposals
+        self._proposal, self._proposals, self._episode_seeds = proposal, proposals, EpisodeSeeds()
         named = getattr(proposal, "sees", spec.recorded) if sees is None else sees
         self._sees = tuple(name for name in named if name in spec.channels)
 
     @property
     def sees(self) -> tuple[str, ...]:
-        """What it is to be shown: the evidence that its world takes."""
+        """The channels to show it: the evidence that its world takes."""
         return (*self.world.spec.observes, *self.world.spec.may_observe)
 
     def begin(self, batch: int, rng: torch.Generator) -> list[PlannerMemory]:
@@ -105,94 +103,106 @@ class Planner:
     def act(
         self, observation: Observation, memory: list[PlannerMemory], rng: torch.Generator
     ) -> tuple[torch.Tensor, list[PlannerMemory]]:
-        """The first actions of the best plans. `rng` is not used: each episode has a seed of its own since it began."""
-        state, memory = self._observed(observation, memory), list(memory)
-        new = [entry for entry, thought in enumerate(memory) if thought.queue is None]
-        old = [entry for entry, thought in enumerate(memory) if thought.queue is not None and not len(thought.queue)]
-        for entries in filter(None, (new, old)):  # the old ones have a plan to go on from
-            for entry, thought in zip(entries, self._planned(state.at(entries), [memory[at] for at in entries])):
-                memory[entry] = thought
-        codes = torch.stack([thought.queue[0] for thought in memory if thought.queue is not None])
+        """The first actions of the best plans. `rng` is not used: each episode draws from the seed that it began with."""
+        state, memory = self._observe(observation, memory), list(memory)
+        new = [entry for entry, episode in enumerate(memory) if episode.queue is None]
+        old = [entry for entry, episode in enumerate(memory) if episode.queue is not None and not len(episode.queue)]
+        for entries in filter(None, (new, old)):  # the old ones have a warm start
+            for entry, episode in zip(entries, self._plan(state.at(entries), [memory[at] for at in entries])):
+                memory[entry] = episode
+        codes = torch.stack([episode.queue[0] for episode in memory if episode.queue is not None])
         actions = self.moves.actions(codes).to(state.device)
-        seeds = [later(thought.seed, 4 * thought.step + _PRIOR) for thought in memory]
-        after = by_episode(lambda part, chance: self.world.imagine(state.at(part), actions[part], chance), seeds)
+        seeds = [later(episode.seed, 4 * episode.step + _PRIOR) for episode in memory]
+        imagine = lambda part, rng: self.world.imagine(state.at(part), actions[part], rng)  # noqa: E731
+        after = self._episode_seeds.run("imagine", imagine, seeds)
         return actions, [
-            replace(thought, step=thought.step + 1, prior=after.at(entry), queue=_rest(thought.queue))
-            for entry, thought in enumerate(memory)
+            replace(episode, step=episode.step + 1, prior=after.at(entry), queue=_rest(episode.queue))
+            for entry, episode in enumerate(memory)
         ]
 
-    def _observed(self, observation: Observation, memory: Sequence[PlannerMemory]) -> State:
-        """What is seen, folded into what was expected; where nothing was yet, into nothing."""
+    def _observe(self, observation: Observation, memory: Sequence[PlannerMemory]) -> State:
+        """The states after the evidence, given the priors of the episodes that have one."""
         spec = self.world.spec
         missing = [name for name in spec.observes if name not in observation]
         if missing:
             raise ObservationError(
-                f"{spec.name} plans from {', '.join(spec.observes)}, and {', '.join(missing)} is not there to be seen."
+                f"{spec.name} plans from {', '.join(spec.observes)}, and the observation lacks {', '.join(missing)}."
             )
         evidence = {name: observation[name] for name in (*spec.observes, *spec.may_observe) if name in observation}
         for name, value in evidence.items():
             if tuple(value.shape) != (len(memory), *(spec.channels[name].shape or ())):
                 raise ObservationError(
-                    f"{spec.name} sees '{name}' of shape {spec.channels[name].shape}; it was shown {tuple(value.shape[1:])}."
+                    f"{spec.name} takes '{name}' of shape {spec.channels[name].shape}; got {tuple(value.shape[1:])}."
                 )
-        new = [entry for entry, thought in enumerate(memory) if thought.prior is None]
-        old = [entry for entry, thought in enumerate(memory) if thought.prior is not None]
+        new = [entry for entry, episode in enumerate(memory) if episode.prior is None]
+        old = [entry for entry, episode in enumerate(memory) if episode.prior is not None]
         parts = [
-            self._folded({name: value[entries] for name, value in evidence.items()}, [memory[at] for at in entries])
+            self._fold({name: value[entries] for name, value in evidence.items()}, [memory[at] for at in entries])
             for entries in filter(None, (new, old))
         ]
         return State.stack(parts).at([(new + old).index(entry) for entry in range(len(memory))])
 
-    def _folded(self, shown: Observation, thoughts: Sequence[PlannerMemory]) -> State:
-        """For episodes that all expect something, or all expect nothing yet."""
-        priors = [thought.prior for thought in thoughts if thought.prior is not None]
+    def _fold(self, shown: Observation, episodes: Sequence[PlannerMemory]) -> State:
+        """The same, for episodes that all have a prior or all have none."""
+        priors = [episode.prior for episode in episodes if episode.prior is not None]
         prior = State.stack(priors) if priors else None
 
         def fold(part: slice, rng: torch.Generator) -> State:
             seen = {name: value[part] for name, value in shown.items()}
             return self.world.observe(seen, None if prior is None else prior.at(part), rng)
 
-        return by_episode(fold, [later(thought.seed, 4 * thought.step + _OBSERVE) for thought in thoughts])
+        name = "observe" if prior is None else "update"  # one may draw and the other not
+        return self._episode_seeds.run(name, fold, [later(one.seed, 4 * one.step + _OBSERVE) for one in episodes])
 
-    def _planned(self, state: State, thoughts: list[PlannerMemory]) -> list[PlannerMemory]:
+    def _plan(self, state: State, episodes: list[PlannerMemory]) -> list[PlannerMemory]:
         began, config = time.perf_counter(), self.config
-        names = thoughts[0].goal
-        goal = {name: torch.cat([thought.goal[name] for thought in thoughts]) for name in names}
-        seeds = [later(thought.seed, 4 * thought.step + _SEARCH) for thought in thoughts]
-        task = PlanningProblem(
-            self.world, self.moves, self.cost, state, goal, seeds, config.horizon, config.block, config.trust
+        names = episodes[0].goal
+        goal = {name: torch.cat([episode.goal[name] for episode in episodes]) for name in names}
+        seeds = [later(episode.seed, 4 * episode.step + _SEARCH) for episode in episodes]
+        problem = PlanningProblem(
+            self.world,
+            self.moves,
+            self.cost,
+            state,
+            goal,
+            seeds,
+            config.horizon,
+            config.block,
+            config.trust,
+            self._episode_seeds,
         )
-        proposed = None if self._proposal is None else self._proposals_of(state, thoughts)
-        found = search(task, config, WarmStart(_stacked(thoughts, "belief"), _stacked(thoughts, "plan"), proposed))
-        ms = 1e3 * (time.perf_counter() - began) / len(thoughts)
-        return [self._thought(thought, task, found, entry, ms) for entry, thought in enumerate(thoughts)]
+        proposed = None if self._proposal is None else self._proposals_of(state, episodes)
+        plans = search(problem, config, WarmStart(_stacked(episodes, "belief"), _stacked(episodes, "plan"), proposed))
+        ms = 1e3 * (time.perf_counter() - began) / len(episodes)
+        return [self._remember(episode, problem, plans, entry, ms) for entry, episode in enumerate(episodes)]
 
-    def _thought(
-        self, thought: PlannerMemory, task: PlanningProblem, found: SearchResult, entry: int, ms: float
+    def _remember(
+        self, episode: PlannerMemory, problem: PlanningProblem, plans: SearchResult, entry: int, ms: float
     ) -> PlannerMemory:
-        plan, known = found.plan[entry], int(task.known[entry])
-        done = min(self.config.replan, known)
-        fresh = self.moves.first(1, self.config.horizon, self.config.spread)[0]
-        considered = self.moves.actions(torch.cat([plan[None], found.considered[entry, 1:]]))
+        plan, trusted = plans.plan[entry], int(problem.trusted_moves[entry])
+        done = min(self.config.replan, trusted)
+        fresh = self.moves.initial(1, self.config.horizon, self.config.spread)[0]
+        considered = self.moves.actions(torch.cat([plan[None], plans.considered[entry, 1:]]))
+        state = problem.state.at(entry)
         decision = Decision(
-            float(found.cost[entry]), task.spent, ms, known, considered, task.state.at(entry), thought.goal
+            float(plans.cost[entry]), problem.imagined_steps, ms, trusted, considered, state, episode.goal
         )
         return replace(
-            thought,
+            episode,
             queue=plan[:done].repeat_interleave(self.config.block, 0),
-            belief=shifted(found.belief[entry], done, fresh),
+            belief=shifted(plans.belief[entry], done, fresh),
             plan=shifted(plan, done, plan[-1:].expand(done, -1)),
             decision=decision,
         )
 
-    def _proposals_of(self, state: State, thoughts: Sequence[PlannerMemory]) -> torch.Tensor:
-        """The policy's plans [B, M, H, D]: its action at the beginning of each move, held for a block as all moves are."""
-        found = []
-        for entry, thought in enumerate(thoughts):
-            rng = make_rng(later(thought.seed, 4 * thought.step + _PROPOSE))
+    def _proposals_of(self, state: State, episodes: Sequence[PlannerMemory]) -> torch.Tensor:
+        """The policy's plans [B, M, H, D]: its action at the beginning of each move, held for a block."""
+        plans = []
+        for entry, episode in enumerate(episodes):
+            rng = make_rng(later(episode.seed, 4 * episode.step + _PROPOSE))
             ahead, taken = state.at(entry).fork(self._proposals), []
             goal = {
-                f"goal.{name}": value.expand(self._proposals, *value.shape[1:]) for name, value in thought.goal.items()
+                f"goal.{name}": value.expand(self._proposals, *value.shape[1:]) for name, value in episode.goal.items()
             }
             try:
                 assert self._proposal is not None
@@ -205,16 +215,16 @@ class Planner:
                     for _ in range(self.config.block):
                         ahead = self.world.imagine(ahead, action, rng)
             except (ContractError, ActionError) as error:
-                raise PlanningError(f"the proposing policy is for other actions: {error}") from error
-            found.append(self.moves.codes(torch.stack(taken, 1)))
-        return torch.stack(found)
+                raise PlanningError(f"the proposed policy is for other actions: {error}") from error
+            plans.append(self.moves.codes(torch.stack(taken, 1)))
+        return torch.stack(plans)
 
 
 def _rest(queue: torch.Tensor | None) -> torch.Tensor | None:
     return None if queue is None else queue[1:]
 
 
-def _stacked(thoughts: Sequence[PlannerMemory], name: str) -> torch.Tensor | None:
-    """What all these episodes begin with; None where they have nothing yet."""
-    found = [getattr(thought, name) for thought in thoughts]
-    return None if found[0] is None else torch.stack(found)
+def _stacked(episodes: Sequence[PlannerMemory], name: str) -> torch.Tensor | None:
+    """A field of all these episodes as one tensor; None if they have none yet."""
+    values = [getattr(episode, name) for episode in episodes]
+    return None if values[0] is None else torch.stack(values)

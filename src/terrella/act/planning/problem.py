@@ -1,9 +1,9 @@
-"""One planning problem of several episodes: what candidates cost when a world imagines them."""
+"""One planning problem of several episodes: the costs of candidate plans, as a world imagines them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -15,18 +15,39 @@ from .costs import LATENT, Cost
 from .moves import Moves
 
 _GOLDEN, _SEEDS = 0x9E3779B97F4A7C15, 2**63
-_KNOWN_SHARE = 0.5  # of the candidates that the world must know for a step to count
+_TRUSTED_SHARE = 0.5  # of the candidates that must be within `trust` for a move to count
 
 
-def by_episode(verb: Callable[[slice, torch.Generator], State], seeds: Sequence[int]) -> State:
-    """`verb(entries, rng)` for all episodes at once; where it draws chance, for one after the other, each from the generator of
-    its seed: so a batch is planned as its episodes alone would be."""
-    rng = make_rng(seeds[0])
-    before = rng.get_state()
-    together = verb(slice(0, len(seeds)), rng)
-    if len(seeds) == 1 or torch.equal(before, rng.get_state()):
-        return together
-    return State.stack([verb(slice(at, at + 1), make_rng(seed)) for at, seed in enumerate(seeds)])
+class EpisodeSeeds:
+    """Runs a verb of a world on a batch of episodes so that each draws as it would alone, from a generator of its own seed.
+
+    A verb that draws nothing runs once on the whole batch; one that draws runs episode by episode. Which of both holds is found
+    out on the first episode and remembered by the verb's name.
+    """
+
+    def __init__(self) -> None:
+        self._draws: dict[str, bool] = {}
+
+    def run(self, name: str, verb: Callable[[slice, torch.Generator], State], seeds: Sequence[int]) -> State:
+        """verb(entries, rng) on all episodes."""
+        count, singles = len(seeds), list[State]()
+        if count == 1:
+            return verb(slice(0, 1), make_rng(seeds[0]))
+        if name not in self._draws:
+            singles.append(self._call(name, verb, slice(0, 1), seeds[0]))
+        if not self._draws[name]:
+            whole = self._call(name, verb, slice(0, count), seeds[0])
+            if not self._draws[name]:
+                return whole
+        singles += [verb(slice(at, at + 1), make_rng(seeds[at])) for at in range(len(singles), count)]
+        return State.stack(singles)
+
+    def _call(self, name: str, verb: Callable[[slice, torch.Generator], State], entries: slice, seed: int) -> State:
+        rng = make_rng(seed)
+        before = rng.get_state()
+        state = verb(entries, rng)
+        self._draws[name] = not torch.equal(before, rng.get_state())
+        return state
 
 
 def later(seed: int, count: int) -> int:
@@ -36,32 +57,31 @@ def later(seed: int, count: int) -> int:
 
 @dataclass
 class PlanningProblem:
-    """B episodes that stand in `state` (batch B), from where plans of `horizon` moves are sought, each held for `block` steps.
+    """B episodes in `state` (batch B), for which plans of `horizon` moves are sought, each move held for `block` steps.
 
-    goal:  channel -> [B, ...]; seeds: one an episode. trust: the world's channel `uncertainty` up to which a step counts.
-    `known` [B] says how many moves of the horizon count: those before half of the candidates first leave what the world
-    knows, and at least one; the same for all of a round, so that no plan gains by flying into the unknown. It only falls; where
-    it fell in the last evaluation (`shortened` [B]), earlier costs were of longer plans. `spent` counts the steps that were
-    imagined for each episode.
+    `trusted_moves` [B]: the moves of the horizon that count. The horizon ends where half of the candidates of a round exceed
+    `trust`, but not before the first move; it is the same for all candidates, so that no plan gains by leaving the known. It
+    only shrinks. Where it shrank in the last evaluation (`shortened` [B]), earlier costs do not compare.
     """
 
     world: World
     moves: Moves
     cost: Cost
     state: State
-    goal: Observation
-    seeds: list[int]
-    horizon: int
-    block: int = 1
-    trust: float | None = None
-    spent: int = 0
+    goal: Observation  # channel -> [B, ...]
+    seeds: list[int]  # one an episode
+    horizon: int  # moves
+    block: int = 1  # steps
+    trust: float | None = None  # largest value of the channel `uncertainty` that counts as known
+    episode_seeds: EpisodeSeeds = field(default_factory=EpisodeSeeds)
+    imagined_steps: int = 0  # so far, of each episode
 
     def __post_init__(self):
-        self.known = torch.full((self.batch,), self.horizon)
+        self.trusted_moves = torch.full((self.batch,), self.horizon)
         self.shortened = torch.zeros(self.batch, dtype=torch.bool)
-        more = ("done",) if self.cost.until_done and "done" in self.world.spec.channels else ()
-        doubt = ("uncertainty",) if self.trust is not None else ()
-        self._channels = tuple(dict.fromkeys((*self.cost.channels, *more, *doubt)))
+        done = ("done",) if self.cost.until_done and "done" in self.world.spec.channels else ()
+        uncertainty = ("uncertainty",) if self.trust is not None else ()
+        self._channels = tuple(dict.fromkeys((*self.cost.channels, *done, *uncertainty)))
         leap = self.world.spec.leap
         self._leaps = bool(leap) and self.block % leap == 0 and self.cost.over == "last" and self._channels == (LATENT,)
         self._count = 0
@@ -70,60 +90,65 @@ class PlanningProblem:
     def batch(self) -> int:
         return len(self.seeds)
 
-    def evaluate(self, codes: torch.Tensor, settled: bool = False) -> torch.Tensor:
-        """Plans [B, N, H, D] -> what each costs, [B, N]; inf where that is no finite number. `settled`: `known` stays."""
-        candidates, before = codes.shape[1], self.known
+    def evaluate(self, codes: torch.Tensor, fixed_horizon: bool = False) -> torch.Tensor:
+        """The costs [B, N] of plans [B, N, H, D]; inf for one that is not finite. fixed_horizon: `trusted_moves` stays."""
+        candidates, before = codes.shape[1], self.trusted_moves
         state = self.state.fork(candidates)
         total = alive = None
         for move in range(int(before.max())):
-            state, step, alive, sure = self.move(state, codes[:, :, move], alive, candidates)
-            if move and sure is not None and not settled:
-                self.shorten(move, sure)
-            new = self.cost.added(total, step)
-            total = new if total is None else torch.where((move < self.known)[:, None], new, total)
-            if not bool((self.known > move + 1).any()):
+            state, step, alive, trusted = self.move(state, codes[:, :, move], alive, candidates)
+            if move and trusted is not None and not fixed_horizon:
+                self.shorten(move, trusted)
+            new = self.cost.accumulate(total, step)
+            total = new if total is None else torch.where((move < self.trusted_moves)[:, None], new, total)
+            if not bool((self.trusted_moves > move + 1).any()):
                 break
-        self.shortened = self.known < before
+        self.shortened = self.trusted_moves < before
         assert total is not None
         return torch.where(torch.isfinite(total), total, torch.inf)
 
-    def shorten(self, move: int, sure: torch.Tensor) -> None:
-        """Ends the horizon before a move after which the world knows a share `sure` [B] of the candidates."""
-        self.known = torch.where((self.known > move) & (sure < _KNOWN_SHARE), move, self.known)
+    def shorten(self, move: int, trusted: torch.Tensor) -> None:
+        """Ends the horizon before `move` where too small a share `trusted` [B] of the candidates is known after it."""
+        ends = (self.trusted_moves > move) & (trusted < _TRUSTED_SHARE)
+        self.trusted_moves = torch.where(ends, move, self.trusted_moves)
 
     def move(
         self, state: State, codes: torch.Tensor, alive: torch.Tensor | None, candidates: int
     ) -> tuple[State, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """One move [B, N, D] of candidates that are stepped together: the state, the move's cost [B, N], who has not ended
-        [B, N], and the share [B] of candidates that the world still knows. `alive`: who had not ended before."""
+        """One move [B, N, D] of all candidates: the state, the move's cost [B, N], which of them have not ended [B, N], and the
+        share [B] within `trust`. `alive`: which had not ended before."""
         actions = self.moves.actions(codes).flatten(0, 1).to(state.device)
-        total = sure = None
+        total = trusted = None
         if self._leaps:
-            held = actions[:, None].expand(-1, self.block, *actions.shape[1:])
-            self._count, self.spent = self._count + 1, self.spent + candidates * (self.block // self.world.spec.leap)
+            held, leaps = (
+                actions[:, None].expand(-1, self.block, *actions.shape[1:]),
+                self.block // self.world.spec.leap,
+            )
+            self._count, self.imagined_steps = self._count + 1, self.imagined_steps + candidates * leaps
             state = advanced(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
-            flat = self.world.render(state, self._channels)
-            seen = {name: tensor.unflatten(0, (-1, candidates)) for name, tensor in flat.items()}
-            return state, self.cost.of_step(seen, self.goal).cpu(), alive, None
+            return state, self.cost.step_cost(self._render(state, candidates), self.goal).cpu(), alive, None
         for _ in range(self.block):
-            state = self._imagined(state, actions, candidates)
-            flat = self.world.render(state, self._channels)
-            seen = {name: tensor.unflatten(0, (-1, candidates)) for name, tensor in flat.items()}
-            step = self.cost.of_step(seen, self.goal).cpu()
+            state = self._imagine(state, actions, candidates)
+            seen = self._render(state, candidates)
+            step = self.cost.step_cost(seen, self.goal).cpu()
             if "done" in seen and self.cost.until_done:
                 step = step if alive is None else torch.where(alive, step, 0.0)
                 going = ~seen["done"].cpu()
                 alive = going if alive is None else alive & going
             if self.trust is not None:
-                sure = (seen["uncertainty"].cpu() <= self.trust).float().mean(1)
-            total = self.cost.added(total, step)
+                trusted = (seen["uncertainty"].cpu() <= self.trust).float().mean(1)
+            total = self.cost.accumulate(total, step)
         assert total is not None
-        return state, total, alive, sure
+        return state, total, alive, trusted
 
-    def _imagined(self, state: State, actions: torch.Tensor, candidates: int) -> State:
+    def _render(self, state: State, candidates: int) -> Observation:
+        """channel -> [B, N, ...]."""
+        flat = self.world.render(state, self._channels)
+        return {name: tensor.unflatten(0, (-1, candidates)) for name, tensor in flat.items()}
+
+    def _imagine(self, state: State, actions: torch.Tensor, candidates: int) -> State:
         self._count += 1
-        self.spent += candidates
-        seeds = [later(seed, self._count) for seed in self.seeds]
+        self.imagined_steps += candidates
 
         def step(entries: slice, rng: torch.Generator) -> State:
             rows = slice(entries.start * candidates, entries.stop * candidates)
@@ -131,13 +156,13 @@ class PlanningProblem:
                 return self.world.imagine(state, actions, rng)
             return self.world.imagine(state.at(rows), actions[rows], rng)
 
-        return by_episode(step, seeds)
+        return self.episode_seeds.run("imagine", step, [later(seed, self._count) for seed in self.seeds])
 
 
-def check_some(cost: torch.Tensor, task: PlanningProblem) -> None:
-    """PlanningError where an episode's candidates [B, N] have no finite cost between them: nothing is chosen by chance."""
+def check_finite_costs(cost: torch.Tensor, problem: PlanningProblem) -> None:
+    """PlanningError where no candidate of an episode [B, N] has a finite cost: an action is never chosen at random."""
     if not bool(torch.isfinite(cost).any(1).all()):
         raise PlanningError(
-            f"none of {cost.shape[1]:,} plans in {task.world.spec.name} has a cost that is a finite number "
-            f"({', '.join(task.cost.channels)}): the world's predictions are broken here, and no action is chosen by chance."
+            f"none of {cost.shape[1]:,} plans in {problem.world.spec.name} has a finite cost "
+            f"({', '.join(problem.cost.channels)}): the world's predictions are broken here, so no action is chosen."
         )

@@ -1,4 +1,4 @@
-"""Searches for good plans: CEM, iCEM, MPPI, random shooting, gradient descent, and a beam over choices."""
+"""Searches for cheap plans: CEM, iCEM, MPPI, random shooting, gradient descent, and a beam search over discrete actions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ...core import chance
 from ...core.errors import PlanningError
 from ...core.state import State
 from .moves import ContinuousMoves, coloured
-from .problem import PlanningProblem, check_some
+from .problem import PlanningProblem, check_finite_costs
 
-_MOST_ROUNDS = 10_000  # of a search by the clock
-_RATE = 0.1  # of Adam, in codes
-_TREE, _WHITE = 1 << 20, 0.0
+_MAX_ROUNDS = 10_000  # of a search with a time budget
+_LEARNING_RATE = 0.1  # of Adam, in codes
+_TREE_STREAM, _WHITE = 1 << 20, 0.0
 
 Kind = Literal["cem", "icem", "mppi", "gradient", "tree", "random"]
 
@@ -63,7 +63,7 @@ class SearchConfig:
     def __post_init__(self):
         counts = (self.samples, self.iterations, self.horizon, self.block, self.replan, self.elites)
         if min(counts) < 0 or self.samples == 1:
-            raise PlanningError("samples are 2 or more; iterations, horizon, block and replan 1 or more.")
+            raise PlanningError("samples must be 2 or more; iterations, horizon, block and replan 1 or more.")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise PlanningError(f"a budget is a time above 0 ms; got {self.budget_ms:g}.")
 
@@ -81,35 +81,39 @@ class SearchConfig:
         )
 
     @property
-    def best(self) -> int:
-        """How many elites."""
+    def elite_count(self) -> int:
         return min(self.elites or max(2, self.samples // 8), self.samples)
 
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What a search may begin with: the belief [B, H, D, K] and the best plan [B, H, D] of the decision before, moved on, and
-    plans [B, M, H, D] that a policy proposes. None for none."""
+    """What a search starts from; None for nothing."""
 
-    belief: torch.Tensor | None = None
-    plan: torch.Tensor | None = None
-    proposed: torch.Tensor | None = None
+    belief: torch.Tensor | None = None  # [B, H, D, K], of the decision before, shifted
+    plan: torch.Tensor | None = None  # [B, H, D], the best of the decision before, shifted
+    proposed: torch.Tensor | None = None  # [B, M, H, D], of a policy
+
+    def plans(self) -> list[torch.Tensor]:
+        """Plans to evaluate in the first round, [B, M, H, D] each."""
+        return [each for each in (None if self.plan is None else self.plan[:, None], self.proposed) if each is not None]
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """plan [B, H, D] and its cost [B]; the belief that the next decision may begin with, and plans of the last round
-    [B, M, H, D] for people to see: its best, its median and its worst, as far as there are so many."""
+    """The best plans, and what the next decision may start from."""
 
-    plan: torch.Tensor
-    cost: torch.Tensor
-    belief: torch.Tensor
-    considered: torch.Tensor
+    plan: torch.Tensor  # [B, H, D]
+    cost: torch.Tensor  # [B]
+    belief: torch.Tensor  # [B, H, D, K]
+    considered: (
+        torch.Tensor
+    )  # [B, M, H, D]: the best, the median and the worst plan of the last round, if there are as many
 
 
-def search(task: PlanningProblem, config: SearchConfig, hints: WarmStart | None = None) -> SearchResult:
-    """The best plan found. PlanningError where no candidate of an episode has a finite cost, or the search does not suit."""
-    return _SEARCHES[config.search](task, config.filled(), hints or WarmStart())
+def search(problem: PlanningProblem, config: SearchConfig, start: WarmStart | None = None) -> SearchResult:
+    """The best plan of each episode. PlanningError if all candidates of an episode have infinite cost, or the search does not
+    suit the actions."""
+    return _SEARCHES[config.search](problem, config.filled(), start or WarmStart())
 
 
 def _rounds(config: SearchConfig) -> Iterator[int]:
@@ -117,136 +121,133 @@ def _rounds(config: SearchConfig) -> Iterator[int]:
         yield from range(config.iterations)
         return
     end = time.perf_counter() + config.budget_ms / 1e3
-    for number in range(_MOST_ROUNDS):
+    for number in range(_MAX_ROUNDS):
         if number and time.perf_counter() >= end:
             return
         yield number
 
 
-def _sampled(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
-    """CEM, iCEM and MPPI. The plan is iCEM's best of all, and of the others the last mean, if that has a cost."""
-    moves, seeds, icem = task.moves, torch.tensor(task.seeds), config.search == "icem"
-    prior = moves.first(task.batch, task.horizon, config.spread)
-    belief = prior if hints.belief is None else moves.reopened(hints.belief, config.spread)
-    first = [each for each in (_single(hints.plan), hints.proposed) if each is not None]
+def _search_by_sampling(problem: PlanningProblem, config: SearchConfig, start: WarmStart) -> SearchResult:
+    """CEM, iCEM and MPPI. iCEM returns the best plan of all rounds, the others the last mean if its cost is finite."""
+    moves, seeds, icem = problem.moves, torch.tensor(problem.seeds), config.search == "icem"
+    belief = _initial(problem, config) if start.belief is None else moves.widen(start.belief, config.spread)
     best = _Best()
-    elites = codes = torch.zeros(task.batch, 0, task.horizon, moves.size)
+    elites = codes = torch.zeros(problem.batch, 0, problem.horizon, moves.size)
     for number in _rounds(config):
-        fewer = max(2 * config.best, int(config.samples * config.decay**-number)) if icem else config.samples
+        fewer = max(2 * config.elite_count, int(config.samples * config.decay**-number)) if icem else config.samples
         count = min(config.samples, fewer)
-        noise = coloured(seeds, count, task.horizon, moves.size, config.colour if icem else _WHITE, number)
-        kept = [elites[:, : max(1, int(config.keep * config.best))], moves.best_of(belief)[:, None]]
-        given = first if not number else kept if icem else []
-        codes = torch.cat([*given, moves.draw(belief, noise)], 1)[:, : max(count, sum(each.shape[1] for each in given))]
-        costs = task.evaluate(codes)
-        check_some(costs, task)
+        noise = coloured(seeds, count, problem.horizon, moves.size, config.colour if icem else _WHITE, number)
+        kept = [elites[:, : max(1, int(config.keep * config.elite_count))], moves.mode(belief)[:, None]]
+        given = start.plans() if not number else kept if icem else []
+        codes = torch.cat([*given, moves.sample(belief, noise)], 1)[
+            :, : max(count, sum(each.shape[1] for each in given))
+        ]
+        costs = problem.evaluate(codes)
+        check_finite_costs(costs, problem)
         order = costs.argsort(dim=1, stable=True)
         codes, costs = _picked(codes, order), costs.gather(1, order)
-        elites = codes[:, : config.best]
-        best.look(codes[:, 0], costs[:, 0], task.shortened)
-        weights = _weights(costs[:, : config.best], config.temperature if config.search == "mppi" else None)
-        belief = config.momentum * belief + (1 - config.momentum) * moves.fitted(elites, weights)
+        elites = codes[:, : config.elite_count]
+        best.update(codes[:, 0], costs[:, 0], problem.shortened)
+        weights = _weights(costs[:, : config.elite_count], config.temperature if config.search == "mppi" else None)
+        belief = config.momentum * belief + (1 - config.momentum) * moves.fit(elites, weights)
     if not icem:
-        mean = moves.best_of(belief)
-        cost = task.evaluate(mean[:, None], settled=True)[:, 0]
+        mean = moves.mode(belief)
+        cost = problem.evaluate(mean[:, None], fixed_horizon=True)[:, 0]
         best = _Best(*best.where(torch.isfinite(cost), mean, cost))
     return SearchResult(best.codes, best.costs, belief, _some(codes))
 
 
-def _random(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
-    """The best of evenly drawn plans, and of those that were given."""
-    moves, seeds, best = task.moves, torch.tensor(task.seeds), _Best()
-    first = [each for each in (_single(hints.plan), hints.proposed) if each is not None]
+def _search_at_random(problem: PlanningProblem, config: SearchConfig, start: WarmStart) -> SearchResult:
+    """The best of uniformly drawn plans, and of those of the warm start."""
+    moves, seeds, best = problem.moves, torch.tensor(problem.seeds), _Best()
     codes = torch.zeros(0)
     for number in _rounds(config):
-        noise = coloured(seeds, config.samples, task.horizon, moves.size, _WHITE, number)
-        codes = torch.cat([*(first if not number else []), moves.uniform(noise)], 1)
-        costs = task.evaluate(codes)
+        noise = coloured(seeds, config.samples, problem.horizon, moves.size, _WHITE, number)
+        codes = torch.cat([*(start.plans() if not number else []), moves.uniform(noise)], 1)
+        costs = problem.evaluate(codes)
         order = costs.argsort(dim=1, stable=True)
         codes = _picked(codes, order)
-        best.look(codes[:, 0], costs.gather(1, order)[:, 0], task.shortened)
-    check_some(best.costs[:, None], task)
-    return SearchResult(best.codes, best.costs, _prior(task, config), _some(codes))
+        best.update(codes[:, 0], costs.gather(1, order)[:, 0], problem.shortened)
+    check_finite_costs(best.costs[:, None], problem)
+    return SearchResult(best.codes, best.costs, _initial(problem, config), _some(codes))
 
 
-def _gradient(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
-    """Adam (Kingma & Ba 2015) on all candidates at once, kept within the limits; the best that was ever evaluated."""
-    moves, spec, best = task.moves, task.world.spec, _Best()
+def _search_by_gradient(problem: PlanningProblem, config: SearchConfig, start: WarmStart) -> SearchResult:
+    """Adam (Kingma & Ba 2015) on all candidates at once, within the limits; the best plan of all rounds."""
+    moves, spec, best = problem.moves, problem.world.spec, _Best()
     if not isinstance(moves, ContinuousMoves):
-        raise PlanningError(f"the actions of {spec.name} are choices, which have no gradient; use icem, cem or tree.")
+        raise PlanningError(f"the actions of {spec.name} are discrete and have no gradient; use icem, cem or tree.")
     if not spec.differentiable:
         raise PlanningError(f"no gradients flow through {spec.name} (Spec.differentiable); use icem, cem or mppi.")
-    noise = coloured(
-        torch.tensor(task.seeds), config.samples, task.horizon, moves.size, config.colour, 0
-    )  # one start each
-    given = [each for each in (_single(hints.plan), hints.proposed) if each is not None]
-    codes = torch.cat([*given, moves.draw(_prior(task, config), noise)], 1)[:, : config.samples]
+    noise = coloured(torch.tensor(problem.seeds), config.samples, problem.horizon, moves.size, config.colour, 0)
+    codes = torch.cat([*start.plans(), moves.sample(_initial(problem, config), noise)], 1)[:, : config.samples]
     with torch.inference_mode(False), torch.enable_grad():
-        task.state, codes = _plain(task.state), codes.clone().requires_grad_()
+        problem.state, codes = _without_inference(problem.state), codes.clone().requires_grad_()
         first, second, taken = torch.zeros_like(codes), torch.zeros_like(codes), 0
         costs = torch.zeros(0)
         for _ in _rounds(config):
-            costs = task.evaluate(codes)
-            check_some(costs, task)
+            costs = problem.evaluate(codes)
+            check_finite_costs(costs, problem)
             least, which = costs.detach().min(1)
-            best.look(_picked(codes.detach(), which[:, None])[:, 0].clone(), least, task.shortened)
+            best.update(_picked(codes.detach(), which[:, None])[:, 0].clone(), least, problem.shortened)
             (slope,) = torch.autograd.grad(costs[torch.isfinite(costs)].sum(), codes)
             slope, taken = torch.nan_to_num(slope, 0.0, 0.0, 0.0), taken + 1
             first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope.square()
             descent = first / (1 - 0.9**taken) / ((second / (1 - 0.999**taken)).sqrt() + 1e-8)
-            codes = (codes.detach() - _RATE * descent).clamp(-1, 1).requires_grad_()
+            codes = (codes.detach() - _LEARNING_RATE * descent).clamp(-1, 1).requires_grad_()
     order = costs.detach().argsort(dim=1, stable=True)
-    return SearchResult(best.codes, best.costs, _prior(task, config), _some(_picked(codes.detach(), order)))
+    return SearchResult(best.codes, best.costs, _initial(problem, config), _some(_picked(codes.detach(), order)))
 
 
-def _tree(task: PlanningProblem, config: SearchConfig, hints: WarmStart) -> SearchResult:
-    """A beam: each depth tries every move from the cheapest states so far, equals counted once, ties broken by the seed."""
-    every = task.moves.all()
-    width = max(1, config.samples * config.iterations // len(every))
-    state, paths = task.state, torch.zeros(task.batch, 1, 0, task.moves.size)
+def _search_tree(problem: PlanningProblem, config: SearchConfig, start: WarmStart) -> SearchResult:
+    """Beam search: each depth tries every move from the cheapest states; equal states are merged, the seed breaks ties."""
+    branches = problem.moves.all()
+    width = max(1, config.samples * config.iterations // len(branches))
+    state, paths = problem.state, torch.zeros(problem.batch, 1, 0, problem.moves.size)
     total = alive = None
     result = _Best()
-    for depth in range(task.horizon):
-        beam, grown = paths.shape[1], paths.shape[1] * len(every)
+    for depth in range(problem.horizon):
+        beam, grown = paths.shape[1], paths.shape[1] * len(branches)
         tried = torch.cat(
             [
-                paths.repeat_interleave(len(every), 1),
-                every.repeat(beam, 1)[None, :, None].expand(task.batch, -1, -1, -1),
+                paths.repeat_interleave(len(branches), 1),
+                branches.repeat(beam, 1)[None, :, None].expand(problem.batch, -1, -1, -1),
             ],
             2,
         )
-        before = None if total is None else total.repeat_interleave(len(every), 1)
-        going = None if alive is None else alive.repeat_interleave(len(every), 1)
-        state, step, going, sure = task.move(state.fork(len(every)), tried[:, :, -1], going, grown)
-        costs = task.cost.added(before, step)
+        before = None if total is None else total.repeat_interleave(len(branches), 1)
+        going = None if alive is None else alive.repeat_interleave(len(branches), 1)
+        state, step, going, trusted = problem.move(state.fork(len(branches)), tried[:, :, -1], going, grown)
+        costs = problem.cost.accumulate(before, step)
         costs = torch.where(torch.isfinite(costs), costs, torch.inf)
-        check_some(costs, task)
-        if sure is not None and depth:
-            task.shorten(depth, sure)
-        tie = chance.uniform(torch.tensor(task.seeds), (grown,), _TREE + depth)
+        check_finite_costs(costs, problem)
+        if trusted is not None and depth:
+            problem.shorten(depth, trusted)
+        tie = chance.uniform(torch.tensor(problem.seeds), (grown,), _TREE_STREAM + depth)
         order = _order(state, costs, tie, width)
-        rows = (order + torch.arange(task.batch)[:, None] * grown).flatten()
+        rows = (order + torch.arange(problem.batch)[:, None] * grown).flatten()
         state, total = state.at(rows.to(state.device)), costs.gather(1, order)
         alive = None if going is None else going.gather(1, order)
         paths = _picked(tried, order)
-        rest = torch.cat(
-            [paths[:, 0], paths[:, 0, -1:].expand(-1, task.horizon - depth - 1, -1)], 1
-        )  # what is left repeats
-        result = _Best(*(result if depth else _Best(rest, total[:, 0])).where(task.known > depth, rest, total[:, 0]))
-        if not bool((task.known > depth + 1).any()):
+        repeated = paths[:, 0, -1:].expand(-1, problem.horizon - depth - 1, -1)
+        plan = torch.cat([paths[:, 0], repeated], 1)  # the last move fills the horizon
+        result = _Best(
+            *(result if depth else _Best(plan, total[:, 0])).where(problem.trusted_moves > depth, plan, total[:, 0])
+        )
+        if not bool((problem.trusted_moves > depth + 1).any()):
             break
-    if hints.plan is not None:  # what was meant before stays, unless there is better
-        before = _Best(hints.plan, task.evaluate(hints.plan[:, None], settled=True)[:, 0])
-        before.look(result.codes, result.costs)
+    if start.plan is not None:  # the previous plan stays unless a better one was found
+        before = _Best(start.plan, problem.evaluate(start.plan[:, None], fixed_horizon=True)[:, 0])
+        before.update(result.codes, result.costs)
         result = before
-    whole = paths.shape[2] == task.horizon
+    whole = paths.shape[2] == problem.horizon
     return SearchResult(
-        result.codes, result.costs, _prior(task, config), _some(paths) if whole else result.codes[:, None]
+        result.codes, result.costs, _initial(problem, config), _some(paths) if whole else result.codes[:, None]
     )
 
 
 def _order(state: State, costs: torch.Tensor, tie: torch.Tensor, width: int) -> torch.Tensor:
-    """The candidates [B, <= width] to go on from, the cheapest first: of equal states one; padded with what is left over."""
+    """Indices [B, <= width] of the candidates to expand, cheapest first: one of equal states, then duplicates as padding."""
     batch, count = costs.shape
     marks = _fingerprints(state).view(batch, count)
     rows = []
@@ -261,7 +262,7 @@ def _order(state: State, costs: torch.Tensor, tie: torch.Tensor, width: int) -> 
 
 
 def _fingerprints(state: State) -> torch.Tensor:
-    """A number [B] by which equal states are known: a fixed random projection of all that is in them."""
+    """A hash [B] of each state: a fixed pseudo-random projection of all of its tensors."""
     total = torch.zeros(state.batch, dtype=torch.float64)
     for number, name in enumerate(sorted(state)):
         flat = state[name].detach().cpu().double().reshape(state.batch, -1)
@@ -276,58 +277,54 @@ class _Best:
     def __init__(self, codes: torch.Tensor | None = None, costs: torch.Tensor | None = None):
         self.codes, self.costs = torch.zeros(0) if codes is None else codes, torch.zeros(0) if costs is None else costs
 
-    def look(self, codes: torch.Tensor, costs: torch.Tensor, anew: torch.Tensor | None = None) -> None:
-        """Keeps what is cheaper; where `anew`, what was before no longer compares."""
+    def update(self, codes: torch.Tensor, costs: torch.Tensor, reset: torch.Tensor | None = None) -> None:
+        """Keeps the cheaper plan; where `reset` [B], the new one in any case."""
         if not len(self.costs):
             self.codes, self.costs = codes, costs
             return
         cheaper = costs < self.costs
-        self.codes, self.costs = self.where(cheaper if anew is None else cheaper | anew, codes, costs)
+        self.codes, self.costs = self.where(cheaper if reset is None else cheaper | reset, codes, costs)
 
     def where(self, which: torch.Tensor, codes: torch.Tensor, costs: torch.Tensor):
         return torch.where(which[:, None, None], codes, self.codes), torch.where(which, costs, self.costs)
 
 
 def _weights(costs: torch.Tensor, temperature: float | None) -> torch.Tensor:
-    """Of the elites' costs [B, E], ascending; those that are no number weigh nothing."""
-    sound = torch.isfinite(costs)
+    """Weights of the elites from their costs [B, E], ascending; 0 for costs that are not finite."""
+    valid = torch.isfinite(costs)
     if temperature is None:
-        return sound.float() / sound.sum(1, keepdim=True)
-    away = torch.where(sound, costs - costs[:, :1], torch.inf)
-    reach = torch.where(sound, away, 0.0).amax(1, keepdim=True).clamp_min(1e-12)
-    return torch.softmax(-away / (temperature * reach), 1)
+        return valid.float() / valid.sum(1, keepdim=True)
+    regret = torch.where(valid, costs - costs[:, :1], torch.inf)
+    span = torch.where(valid, regret, 0.0).amax(1, keepdim=True).clamp_min(1e-12)
+    return torch.softmax(-regret / (temperature * span), 1)
 
 
 def _some(codes: torch.Tensor) -> torch.Tensor:
-    """Of plans [B, N, H, D], the best first, the best, the median and the worst."""
+    """The best, the median and the worst of plans [B, N, H, D] in order of cost."""
     return codes[:, sorted({0, codes.shape[1] // 2, codes.shape[1] - 1})]
 
 
-def _single(plan: torch.Tensor | None) -> torch.Tensor | None:
-    return None if plan is None else plan[:, None]
-
-
-def _prior(task: PlanningProblem, config: SearchConfig) -> torch.Tensor:
-    return task.moves.first(task.batch, task.horizon, config.spread)
+def _initial(problem: PlanningProblem, config: SearchConfig) -> torch.Tensor:
+    return problem.moves.initial(problem.batch, problem.horizon, config.spread)
 
 
 def _picked(codes: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
-    """The plans [B, M, H, D] in the order [B, N] of their numbers."""
+    """Plans [B, M, H, D] at indices [B, N]."""
     return codes.gather(1, order[..., None, None].expand(-1, -1, *codes.shape[2:]))
 
 
-def _plain(state: State) -> State:
-    """The state, out of inference mode."""
+def _without_inference(state: State) -> State:
+    """The state as tensors that gradients may flow through."""
     if not any(tensor.is_inference() for tensor in state.values()):
         return state
     return State({name: tensor.clone() for name, tensor in state.items()}, state.arenas)
 
 
 _SEARCHES: dict[str, Callable[[PlanningProblem, SearchConfig, WarmStart], SearchResult]] = {
-    "cem": _sampled,
-    "icem": _sampled,
-    "mppi": _sampled,
-    "gradient": _gradient,
-    "tree": _tree,
-    "random": _random,
+    "cem": _search_by_sampling,
+    "icem": _search_by_sampling,
+    "mppi": _search_by_sampling,
+    "gradient": _search_by_gradient,
+    "tree": _search_tree,
+    "random": _search_at_random,
 }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...act.actor import RUN
+from ...act.actor import RUN_SUBFOLDER
 from ...act.distributions import SquashedGaussian
 from ...act.goal_network import GoalActor, GoalConfig, GoalNetwork
 from ...core.errors import TrainingError
@@ -69,14 +69,14 @@ def train_goals(
     card = {"what": f"A goal-conditioned policy in the latents of {world.spec.name}", "learned_in": name}
 
     def save() -> None:
-        GoalActor(network, world.spec, card=card).save(Path(out) / RUN)
+        GoalActor(network, world.spec, card=card).save(Path(out) / RUN_SUBFOLDER)
 
     try:
         trainer.train(save)
     finally:
         save()
     explained = _explained(network, held if len(held.rows) else seen)
-    return {**trainer.summary, **card, "action_explained": explained, "policy": str(Path(out) / RUN)}
+    return {**trainer.summary, **card, "action_explained": explained, "policy": str(Path(out) / RUN_SUBFOLDER)}
 
 
 def _opened(world: World, recording: str | Path, report: Report) -> Recording:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import torch
 
-from ...act.actor import RUN, Actor
+from ...act.actor import RUN_SUBFOLDER, Actor
 from ...act.actor_network import ActorConfig, ActorNetwork
 from ...core.errors import ChannelError, TrainingError
 from ...core.spec import BUTTONS, CHOICE, Spec
@@ -144,14 +144,14 @@ def train_policy(
     trainer.limit_s = 60 * minutes
 
     def save() -> None:
-        Actor(actor, spec, card=_card(trainer, name, spec, config)).save(out / RUN)
+        Actor(actor, spec, card=_card(trainer, name, spec, config)).save(out / RUN_SUBFOLDER)
 
     try:
         trainer.train(save)
     finally:
         save()
     grown = {} if growth is None else {"ranges_grown_to": round(float(growth.scale), 2)}
-    return {**trainer.summary, **_card(trainer, name, spec, config), **grown, "policy": str(out / RUN)}
+    return {**trainer.summary, **_card(trainer, name, spec, config), **grown, "policy": str(out / RUN_SUBFOLDER)}
 
 
 def seen_unless_said(spec: Spec) -> tuple[str, ...]:
