@@ -18,24 +18,34 @@ if TYPE_CHECKING:
     from .core.env import as_env
     from .library import as_sb3, load, load_policy, worlds
     from .workflows.collect import CollectConfig, CollectResult, collect
+    from .workflows.evaluate import EvaluateConfig, EvaluateResult, evaluate
     from .workflows.learn import LearnConfig, LearnResult, learn
     from .workflows.opening import ControlsConfig, EnvironmentConfig
+    from .workflows.plan import plan
+    from .workflows.plan_result import PlanResult
+    from .workflows.plan_study import PlanConfig
     from .workflows.practise import PractiseConfig, PractiseResult, practise
     from .workflows.score import ScoreConfig, ScoreResult, score
     from .workflows.train import TrainResult, train_latent, train_video
     from .workflows.train_policy import TrainPolicyConfig, TrainPolicyResult, train_policy
+    from .workflows.transfer import TransferConfig, TransferResult, transfer
 
 _NAMES = {
     ".core": ("Spec", "State", "World", "check_world", "make_rng", "rollout"),
     ".core.env": ("as_env",),
     ".library": ("as_sb3", "load", "load_policy", "worlds"),
     ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
+    ".workflows.evaluate": ("EvaluateConfig", "EvaluateResult", "evaluate"),
     ".workflows.learn": ("LearnConfig", "LearnResult"),
     ".workflows.opening": ("ControlsConfig", "EnvironmentConfig"),
+    ".workflows.plan": ("plan",),
+    ".workflows.plan_result": ("PlanResult",),
+    ".workflows.plan_study": ("PlanConfig",),
     ".workflows.practise": ("PractiseConfig", "PractiseResult", "practise"),
     ".workflows.score": ("ScoreConfig", "ScoreResult", "score"),
     ".workflows.train": ("TrainResult", "train_latent", "train_video"),
     ".workflows.train_policy": ("TrainPolicyConfig", "TrainPolicyResult", "train_policy"),
+    ".workflows.transfer": ("TransferConfig", "TransferResult", "transfer"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [*_HOME, "__version__", "learn"]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -10,11 +10,10 @@ from tests.act.tiny_worlds import Point
 from tests.worlds.test_latent import CHOICES, STEERING, made
 
 from terrella.act.goal_network import GoalActor, GoalConfig, GoalNetwork
-from terrella.act.planning import ActionModel, CostModel, Planner, SearchConfig, SuccessCriterion, distance_to
-from terrella.cli.planning import _Case
-from terrella.cli.searching import Searching
+from terrella.act.planning import ActionModel, CostModel, Planner, SearchConfig, distance_to
 from terrella.core import make_rng
 from terrella.core.errors import PlanningError
+from terrella.workflows.plan_study import PlanConfig, planner_of
 
 SEEN = {"sees_vectors": False, "vectors": ()}
 
@@ -86,10 +85,8 @@ def test_the_command_leaps_too_unless_it_is_told_when_to_trust():
     world.spec = replace(world.spec, card={"uncertainty": {"sure": 0.1, "invents": 0.5}})
     world.leap, inner = lambda *given: leapt.append(1) or inner(*given), world.leap
     for trust in (None, 0.5):
-        searching = Searching(SearchConfig("cem", 4, 2, 3, 2, trust=trust), cost="last")
-        planner = _Case(world, world, {"rgb": info(1)["goal"][0, 0]}, SuccessCriterion(), searching, 1, 1, 0).planner(
-            searching.search
-        )
+        config = PlanConfig(search=SearchConfig("cem", 4, 2, 3, 2, trust=trust), cost="last")
+        planner = planner_of(world, {"rgb": info(1)["goal"][0, 0]}, config, config.search)
         leapt.clear()
         planner.act({"rgb": info(1)["pixels"][0, :1]}, planner.begin(1, rng), rng)
         assert bool(leapt) == (trust is None)

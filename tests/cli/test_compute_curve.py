@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 
 from terrella.act.planning import PlayedEpisode, PlayResult, SearchConfig
-from terrella.cli.compute_curve import Point, helped, less
 from terrella.measure.statistics import wilson
+from terrella.workflows.compute_curve import CurvePoint, conclusion, halved
 
 PLAIN = SearchConfig(samples=16).filled()
 
 
 def test_plans_and_milliseconds_are_halved_and_two_plans_are_the_fewest():
-    assert [one.samples for one in less(PLAIN)] == [2, 4, 8]
-    assert [one.samples for one in less(SearchConfig().filled())] == [4, 8, 16, 32]
-    by_the_clock = less(SearchConfig(budget_ms=40).filled())
+    assert [one.samples for one in halved(PLAIN)] == [2, 4, 8]
+    assert [one.samples for one in halved(SearchConfig().filled())] == [4, 8, 16, 32]
+    by_the_clock = halved(SearchConfig(budget_ms=40).filled())
     assert [one.budget_ms for one in by_the_clock] == [2.5, 5, 10, 20] and {one.samples for one in by_the_clock} == {64}
 
 
@@ -33,10 +33,10 @@ def test_plans_and_milliseconds_are_halved_and_two_plans_are_the_fewest():
 )
 def test_whether_it_helped_is_told_with_its_plateau(reached, said):
     points = [
-        Point(searching, 10.0 * searching.samples, wilson(count, 20), _played(count))
-        for searching, count in zip([*less(PLAIN), PLAIN], reached)
+        CurvePoint(searching, 10.0 * searching.samples, wilson(count, 20), _played(count))
+        for searching, count in zip([*halved(PLAIN), PLAIN], reached)
     ]
-    assert said in helped(points, "success", 0)
+    assert said in conclusion(points, "success", 0)
 
 
 def _played(reached: int) -> PlayResult:

@@ -7,9 +7,10 @@ import json
 import pytest
 from tests.cli.tiny import NAME
 
+import terrella
 from terrella.act.paired_evaluation import PairedEvaluation
 from terrella.cli import main
-from terrella.cli.evaluate import labels_of
+from terrella.workflows.evaluate import labels_of
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
 QUICK = ["--steps", "24", "--episodes", "6"]
@@ -94,3 +95,11 @@ def test_names_are_short_as_long_as_they_differ():
     labels = labels_of(names)
     assert labels["a/one.py:left"] == "left" and labels["b/two.py:left@0.5"] == "left@0.5"
     assert labels["runs/actor/"] == "runs/actor/" and labels["constant:-1"] == "constant:-1"
+
+
+def test_evaluating_from_python(tmp_path):
+    config = terrella.EvaluateConfig(real=BLIND, episodes=3, steps=24, out=tmp_path)
+    result = terrella.evaluate(["constant:2", "constant:0"], BLIND, config)
+    assert result.scores.rows["constant:2"]["real"].value >= result.scores.rows["constant:0"]["real"].value
+    assert result.names["constant:0"] == "constant:0" and result.summary().endswith(f"the page: {result.page}")
+    json.dumps(result.to_json(), allow_nan=False)

@@ -7,6 +7,8 @@ import json
 import pytest
 from tests.cli.tiny import NAME
 
+import terrella
+from terrella.act.planning import Planner, SearchConfig
 from terrella.cli import main
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
@@ -109,3 +111,39 @@ def test_an_end_that_is_all_that_counts_is_gone_to_before_the_next_plan(capsys, 
     assert planned(capsys, *words, "--cost", "last", "--out", str(tmp_path / "a"))["replan"] == 4
     assert planned(capsys, *words, "--cost", "last", "--replan", "2", "--out", str(tmp_path / "b"))["replan"] == 2
     assert planned(capsys, *words, "--out", str(tmp_path / "c"))["replan"] == 1
+
+
+def test_a_plan_that_is_stopped_keeps_the_episodes_that_are_done(capsys, tmp_path, monkeypatch):
+    act, calls = Planner.act, []
+
+    def stopped(planner, *given):
+        calls.append(1)
+        if len(calls) > 10:
+            raise KeyboardInterrupt
+        return act(planner, *given)
+
+    monkeypatch.setattr(Planner, "act", stopped)
+    words = [BLIND, "--goal", "observation=20", "--within", "0.001", "--search", "tree", *QUICK]
+    assert main(["plan", *words, "--out", str(tmp_path)]) == 130
+    result = json.loads(capsys.readouterr().out)
+    whole = json.loads((tmp_path / "plan.json").read_text())
+    assert (
+        result["stopped"]
+        and result["random"] == {}
+        and "of 4 episodes are done" in (tmp_path / "plan.html").read_text()
+    )
+    assert 0 < len(whole["played"]) < 4 and all(one["success"] for one in whole["played"])
+    calls[:] = [1] * 10
+    assert main(["plan", *words, "--out", str(tmp_path / "none")]) == 130
+    assert "before the first episode" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
+def test_planning_from_python(tmp_path):
+    lines = []
+    search = SearchConfig("tree", samples=6, iterations=2, horizon=4)
+    config = terrella.PlanConfig("observation=20", within=0.001, search=search, episodes=2, steps=24, out=tmp_path)
+    result = terrella.plan(BLIND, config, progress=lines.append)
+    assert result.planner["success"].value == 1 and len(result.episodes) == 2 and result.page.is_file()
+    assert result.summary().startswith("reached in 100%") and result.settings["replan"] == 1
+    assert "No film: the environment shows no pictures." in lines
+    json.dumps(result.to_json(), allow_nan=False)

@@ -20,7 +20,7 @@ def ran(capsys, *words) -> tuple[int, str, str]:
 
 @pytest.fixture
 def few(monkeypatch):
-    from terrella.cli import transfer_arms
+    from terrella.workflows import transfer_arms
 
     monkeypatch.setattr(transfer_arms, "FITTED", 10)
     monkeypatch.setattr(transfer_arms, "GATHER", 2)
@@ -60,7 +60,7 @@ def test_a_pair_is_carried_over_and_goes_on_where_it_was(tmp_path, capsys, few):
 def test_what_one_installation_began_another_continues(tmp_path, capsys, few, monkeypatch):
     import shutil
 
-    from terrella.cli import transfer
+    from terrella.workflows import transfer
 
     words = ["transfer", "--practice", 1, "--episodes", 2, "--seeds", 1, "--out", tmp_path / "t", "--json"]
     arms = ["--arms", "nominal"]
@@ -99,7 +99,7 @@ HOLD = '<custom><text name="terrella.task" data="hold"/><numeric name="terrella.
 
 def own_arm(folder, name, *changes: tuple[str, str]):
     """A file of somebody's own arm that tells its task."""
-    from terrella.cli.transfer import BUNDLED
+    from terrella.workflows.transfer import BUNDLED
 
     text = (BUNDLED / "arm.xml").read_text().replace("<worldbody>", f"{HOLD}<worldbody>")
     for before, after in changes:
@@ -141,10 +141,10 @@ def test_an_unknown_parameter_of_the_gap_is_named(tmp_path, capsys):
 
 
 def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeypatch):
-    from terrella.cli import transfer_look
     from terrella.core.errors import TerrellaError
     from terrella.core.world import make_rng
     from terrella.library import load
+    from terrella.workflows import transfer_camera
 
     try:
         seen = load("mujoco:arm", size=(8, 8))
@@ -152,7 +152,7 @@ def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeyp
     except TerrellaError as error:
         pytest.skip(str(error))
     for name, value in {"LABELLED": 64, "UNLABELLED": 64, "STEPS": 3}.items():
-        monkeypatch.setattr(transfer_look, name, value)
+        monkeypatch.setattr(transfer_camera, name, value)
     words = ("transfer", "--practice", 1, "--episodes", 4, "--seeds", 1, "--out", tmp_path / "t", "--json")
     plain = json.loads(ran(capsys, *words, "--arms", "nominal")[1])
     code, out, _ = ran(capsys, *words, "--arms", "nominal", "--camera")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -40,11 +41,11 @@ def test_identification_finds_what_differs(pair):
 
 
 def test_a_residual_of_few_episodes_puts_others_right(pair, tmp_path):
-    from terrella.cli.transfer_arms import fitted
     from terrella.sim.corrected import residuals
+    from terrella.workflows.transfer_arms import fit_residual
 
     sim, trials = pair
-    model = fitted(sim, trials[:5], tmp_path / "run", 0)
+    model = fit_residual(sim, trials[:5], tmp_path / "run", 0)
     inputs, targets = residuals(sim, trials[5:])
     left = (model.residual.found(inputs) - targets).square().mean(0)
     assert (left < 0.25 * targets.square().mean(0)).all()
@@ -52,15 +53,15 @@ def test_a_residual_of_few_episodes_puts_others_right(pair, tmp_path):
 
 
 def test_play_is_learned_from_few_episodes(tmp_path):
-    from terrella.cli.transfer_arms import fitted
     from terrella.sim.corrected import residuals
     from terrella.sim.randomised import Distribution, Randomised
     from terrella.sim.trials import collect
+    from terrella.workflows.transfer_arms import fit_residual
 
     sim = load("mujoco:arm", cameras=(), threads=1)
     real = Randomised(sim, {"backlash": Distribution("constant", (0.1,))})
     trials = collect(real, Random(sim.spec, (1, 9)), 8, 3)
-    model = fitted(sim, trials[:6], tmp_path / "run", 0)
+    model = fit_residual(sim, trials[:6], tmp_path / "run", 0)
     inputs, targets = residuals(sim, trials[6:])
     left = (model.residual.found(inputs) - targets).square().mean(0)
     assert (left < 0.3 * targets.square().mean(0)).all()  # without the bank of play operators 0.57 to 0.85
@@ -79,7 +80,20 @@ def test_without_a_residual_a_corrected_world_is_the_world(pair):
 
 
 def test_joints_that_are_no_numbers_are_refused():
-    from terrella.sim.trials import inner
+    from terrella.sim.trials import fitted_simulator
 
     with pytest.raises(TerrellaError, match="moves freely"):
-        inner(load("mujoco:ant", cameras=()))
+        fitted_simulator(load("mujoco:ant", cameras=()))
+
+
+def test_the_simulator_inside_all_wrappers_is_seen_and_no_other_attribute(pair):
+    from terrella.sim.corrected import Corrected, Residual
+    from terrella.sim.randomised import Distribution, Randomised
+    from terrella.sim.trials import fitted_simulator
+
+    sim, _ = pair
+    wrapped = Randomised(Corrected(sim, Residual(2, 2)), {"delay": Distribution("constant", (1.0,))})
+    assert fitted_simulator(wrapped) is sim
+    other = SimpleNamespace(world=sim, spec=sim.spec)
+    with pytest.raises(TerrellaError, match="is no simulator of MuJoCo"):
+        fitted_simulator(other)

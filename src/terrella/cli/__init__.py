@@ -22,11 +22,11 @@ DESCRIPTION = "Learn a world from recordings, step inside it, and measure how fa
 COMMANDS = {
     "learn": ("learn:learn", "record an environment, train a world on it and score it, in one go"),
     "play": ("play:play", "play a world in the browser"),
-    "plan": ("planning:plan", "plan in a world, act in the real environment"),
-    "evaluate": ("evaluate:evaluate", "evaluate policies in a world and in the real environment"),
-    "transfer": ("transfer:transfer", "transfer policies to a real robot that differs, and measure which methods help"),
+    "plan": ("studies:plan", "plan in a world, act in the real environment"),
+    "evaluate": ("studies:evaluate", "evaluate policies in a world and in the real environment"),
+    "transfer": ("studies:transfer", "transfer policies to a real robot that differs, and measure which methods help"),
     "bench acceleration": (
-        "acceleration:acceleration",
+        "studies:acceleration",
         "how much faster than real time a world imagines, beside MuJoCo",
     ),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),

@@ -59,7 +59,7 @@ def play(
     from ..core.errors import TerrellaError
     from ..serve import ServeConfig, serve
     from ..serve.guard import is_loopback
-    from .driving import Driving
+    from ..workflows.page_agents import PageAgents
 
     if policy is not None and agent:
         raise TerrellaError("--policy and --agent both say who drives; give one of them.")
@@ -86,7 +86,7 @@ def play(
         layout, folder = Layout.of(worlds[0].spec), record
         sink = lambda: Recorder(folder, keeper.with_keys(layout), "play")  # noqa: E731
     names = [world.spec.name for world in worlds]
-    driver: Any = Driving(worlds[0], worlds[1] if compare else None, agent, agent_ms).agents()
+    driver: Any = PageAgents(worlds[0], worlds[1] if compare else None, agent, agent_ms).agents()
     if policy is not None:
         from ..act.explorer import Explorer
         from ..core.policy import Random

@@ -17,6 +17,7 @@ from ..core.state import State
 from ..core.world import make_rng
 from .mujoco_world import MujocoWorld
 from .trials import PAST, PLAYS, Trials, driven, idle, placed
+from .wrapper import WorldWrapper
 
 MEMBERS, HIDDEN = 4, 64
 _PAST = "corrected.past"
@@ -83,7 +84,7 @@ def residuals(world: MujocoWorld, trials: Trials) -> tuple[torch.Tensor, torch.T
     return inputs_of(qpos, qvel, drives), torch.cat(away, 1).float()
 
 
-class Corrected:
+class Corrected(WorldWrapper[MujocoWorld]):
     """`Corrected(world, residual)`: the same world, each step of which is put right. Its state also holds the last drives."""
 
     def __init__(self, world: MujocoWorld, residual: Residual):
@@ -116,6 +117,3 @@ class Corrected:
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         return self.world.render(state, channels)
-
-    def close(self) -> None:
-        self.world.close()

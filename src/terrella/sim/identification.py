@@ -8,7 +8,7 @@ import torch
 
 from ..core.world import make_rng
 from .randomised import DELAY, Distribution, Randomised
-from .trials import PAST, Trials, inner, placed
+from .trials import PAST, Trials, fitted_simulator, placed
 
 CANDIDATES, KEPT, ROUNDS = 48, 8, 12  # of the cross-entropy method (Rubinstein 1999)
 WINDOWS, STEPS = 32, 8  # stretches of the trials, and steps of each, that candidates are held to
@@ -75,7 +75,7 @@ def _errors(world: Randomised, trials: Trials, rows: torch.Tensor, values: torch
     state = world.drawn_as(world.start(len(each), make_rng(0)), each)
     past = trials.past()[episode, first]
     state = placed(world, state, past[:, -PAST:], trials.qpos[episode, first], trials.qvel[episode, first])
-    body, error, rng = inner(world).body, torch.zeros(len(each), dtype=torch.float64), make_rng(0)
+    body, error, rng = fitted_simulator(world).body, torch.zeros(len(each), dtype=torch.float64), make_rng(0)
     of_qpos, of_qvel = (seen[:, :-1][trials.known].std(0).clamp_min(1e-6) for seen in (trials.qpos, trials.qvel))
     steps = min(STEPS, trials.known.shape[1])
     for step in range(steps):

@@ -10,11 +10,12 @@ import torch
 from ..core.errors import TerrellaError
 from ..core.state import State
 from ..core.world import World
+from .wrapper import WorldWrapper
 
 GOAL, SEEN = "goal", "perceived.goal"
 
 
-class Perceived:
+class Perceived(WorldWrapper[World]):
     """`Perceived(world, encoder)`: of a world whose states keep a `goal` [B, n] and which shows `camera`.
 
     encoder: pictures uint8 [B, H, W, 3] -> goals [B, n], float32, in the goal's units. One picture is taken when an episode
@@ -54,11 +55,6 @@ class Perceived:
         if told:
             seen |= self.world.render(state.replace(**{GOAL: state[SEEN]}), told)
         return {name: seen[name] for name in channels}
-
-    def close(self) -> None:
-        close = getattr(self.world, "close", None)
-        if close is not None:
-            close()
 
     def _looked(self, state: State) -> State:
         if GOAL not in state:

@@ -20,6 +20,7 @@ from ..core.spec import Spec, dtype_of, kind_of, neutral_action
 from ..core.state import State
 from ..core.world import World
 from ..similar import did_you_mean
+from .wrapper import WorldWrapper
 
 PARAMETERS = "parameters"  # the channel of what an episode drew
 DELAY, BACKLASH, NOISE, MOST_DELAY = "delay", "backlash", "noise.", 50
@@ -115,7 +116,7 @@ def _distribution(name: str, told: Any) -> Distribution:
     return found
 
 
-class Randomised:
+class Randomised(WorldWrapper[World]):
     """`Randomised(world, {"friction": Distribution("uniform", (0.4, 1.25))})`: each start draws values of its own.
 
     Of a world that has `parameters` and the methods `varying(names)` and `adjusted(state, values)`, as MujocoWorld, any of them; of
@@ -190,11 +191,6 @@ class Randomised:
         if PARAMETERS in channels:
             seen[PARAMETERS] = state[f"{_HELD}drawn"].float()
         return {name: seen[name] for name in channels}
-
-    def close(self) -> None:
-        close = getattr(self.world, "close", None)
-        if close is not None:
-            close()
 
     def drawn_as(self, state: State, drawn: torch.Tensor) -> State:
         """The state with values [B, n] drawn for the parameters, in their order; what was asked of late axes is forgotten."""

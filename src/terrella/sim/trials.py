@@ -13,6 +13,7 @@ from ..core.spec import Spec, neutral_action
 from ..core.state import State
 from ..core.world import World, make_rng
 from .mujoco_world import MujocoWorld
+from .wrapper import unwrapped
 
 PAST = 4  # actions before a row, which tell what is late
 PLAYS = (1 / 32, 1 / 16, 1 / 8, 1 / 4)  # in units of actions: what a drive with so much play would follow
@@ -75,16 +76,22 @@ def idle(spec: Spec, count: int) -> torch.Tensor:
     return torch.from_numpy(neutral_action(spec)).float().expand(count, -1)
 
 
-def inner(world: World) -> MujocoWorld:
-    """The simulator inside; TerrellaError where there is none whose joints are numbers that can be subtracted."""
-    found = getattr(world, "world", world)
-    if not isinstance(found, MujocoWorld):
+def simulator_of(world: World) -> MujocoWorld:
+    """The MuJoCo simulator inside all wrappers; TerrellaError where there is none."""
+    simulator = unwrapped(world)
+    if not isinstance(simulator, MujocoWorld):
         raise TerrellaError(f"{world.spec.name} is no simulator of MuJoCo; give mujoco:NAME or mujoco:FILE.xml.")
-    if found.file.nq != found.file.nv:
+    return simulator
+
+
+def fitted_simulator(world: World) -> MujocoWorld:
+    """The simulator inside, to which models can be fitted; TerrellaError where its joints cannot be subtracted."""
+    simulator = simulator_of(world)
+    if simulator.file.nq != simulator.file.nv:
         raise TerrellaError(
             f"{world.spec.name} has a joint that moves freely or a ball; its model can be fitted to hinges and slides alone."
         )
-    return found
+    return simulator
 
 
 def placed(world: World, state: State, past: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> State:
@@ -92,5 +99,5 @@ def placed(world: World, state: State, past: torch.Tensor, qpos: torch.Tensor, q
     rng = make_rng(0)
     for step in range(past.shape[1]):
         state = world.imagine(state, past[:, step], rng)
-    held = dict(inner(world).replaced(state, state, qpos, qvel).items())
+    held = dict(fitted_simulator(world).replaced(state, state, qpos, qvel).items())
     return state.replace(**{**held, "done": torch.zeros_like(held["done"])})

@@ -29,3 +29,9 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table_lines(heads: list[str], rows: list[list[str]]) -> list[str]:
+    """Rows of text under their heads, in columns."""
+    widths = [max(len(row[at]) for row in [heads, *rows]) for at in range(len(heads))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in [heads, *rows]]

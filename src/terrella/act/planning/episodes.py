@@ -88,6 +88,14 @@ class PlaySettings:
     keep_episodes: int = 0  # of how many episodes, from the first on
 
 
+class PlayInterrupted(KeyboardInterrupt):
+    """Ctrl-C while episodes are played; `done` holds those that were over."""
+
+    def __init__(self, done: PlayResult):
+        super().__init__()
+        self.done = done
+
+
 def play(
     world: World,
     policy: Policy,
@@ -100,7 +108,7 @@ def play(
 
     The same seed gives the same starts whatever the policy, so that two policies can be compared in pairs. If states are values,
     all episodes are played at once, else one after the other. progress(done, episodes) is called after each batch.
-    PlanningError if nearly every start already succeeds.
+    PlanningError if nearly every start already succeeds; PlayInterrupted on Ctrl-C.
     """
     criterion, spec, starts = settings.criterion, world.spec, make_rng(seed)
     played, skipped = list[PlayedEpisode](), 0
@@ -119,7 +127,10 @@ def play(
                 continue
             state = state.at((~succeeded).nonzero()[:, 0]) if succeeded.any() else state
         kept = replace(settings, keep_episodes=max(0, settings.keep_episodes - len(played)))
-        played += play_from(world, state, policy, kept, seed + 1 + len(played) + skipped)
+        try:
+            played += play_from(world, state, policy, kept, seed + 1 + len(played) + skipped)
+        except PlayInterrupted as stop:
+            raise PlayInterrupted(PlayResult(played + stop.done.episodes, skipped)) from None
         if progress:
             progress(len(played), episodes)
     return PlayResult(played, skipped)
@@ -153,24 +164,28 @@ class _Batch:
         seen = self.world.render(state, self.channels)
         for episode, away in zip(episodes, criterion.distance(self.world, seen).tolist() if criterion.goal else []):
             episode.nearest = away
-        for _ in range(self.settings.steps):
-            self._keep(episodes, going, state)
-            began = time.perf_counter()
-            action, memory = act(self.policy, seen, memory, state.batch, self.world.spec, action_rng)
-            ms = 1e3 * (time.perf_counter() - began) / len(going)
-            for entry, number in enumerate(going):
-                _add_action(episodes[number], action[entry], ms, memory, entry)
-            state = self.world.imagine(state, action, world_rng)
-            seen = self.world.render(state, self.channels)
-            over = self._add_outcome(episodes, going, seen)
-            if over.any():
-                self._keep(episodes, [number if ends else -1 for number, ends in zip(going, over.tolist())], state)
-                if over.all():
-                    return episodes
-                rows = (~over).nonzero()[:, 0]
-                going = [going[entry] for entry in rows.tolist()]
-                state, memory = state.at(rows.to(state.device)), _memory_at(memory, rows)
-                seen = {name: value[rows.to(value.device)] for name, value in seen.items()}
+        try:
+            for _ in range(self.settings.steps):
+                self._keep(episodes, going, state)
+                began = time.perf_counter()
+                action, memory = act(self.policy, seen, memory, state.batch, self.world.spec, action_rng)
+                ms = 1e3 * (time.perf_counter() - began) / len(going)
+                for entry, number in enumerate(going):
+                    _add_action(episodes[number], action[entry], ms, memory, entry)
+                state = self.world.imagine(state, action, world_rng)
+                seen = self.world.render(state, self.channels)
+                over = self._add_outcome(episodes, going, seen)
+                if over.any():
+                    self._keep(episodes, [number if ends else -1 for number, ends in zip(going, over.tolist())], state)
+                    if over.all():
+                        return episodes
+                    rows = (~over).nonzero()[:, 0]
+                    going = [going[entry] for entry in rows.tolist()]
+                    state, memory = state.at(rows.to(state.device)), _memory_at(memory, rows)
+                    seen = {name: value[rows.to(value.device)] for name, value in seen.items()}
+        except KeyboardInterrupt:
+            done = [episode for number, episode in enumerate(episodes) if number not in going]
+            raise PlayInterrupted(PlayResult(done, 0)) from None
         self._keep(episodes, going, state)
         return episodes
 

@@ -24,41 +24,42 @@ Kind = Literal["cem", "icem", "mppi", "gradient", "tree", "random"]
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How a planner searches for plans, and how much of a plan it executes. A count of 0 takes its default (see `filled`)."""
+    """How a planner searches for plans, and how much of a plan it executes. Counts of 0 take a default."""
 
+    # The search method. icem: CEM with coloured noise and kept elites (Pinneri et al. 2020). cem: the cross-entropy method
+    # (Rubinstein 1999, as in PETS). mppi: Williams et al. 2017, over elites as in TD-MPC2. gradient: Adam on the actions, in
+    # differentiable worlds. tree: beam search, for discrete actions. random: random shooting.
     search: Kind = "icem"
-    """icem: CEM with coloured noise and kept elites (Pinneri et al. 2020); cem (Rubinstein 1999, as in PETS); mppi (Williams et
-    al. 2017, over elites as in TD-MPC2); gradient: Adam on the actions of a differentiable world; tree: beam search over
-    discrete actions; random: random shooting."""
     samples: int = 0
-    """Candidate plans per round; 0: 64, or 32 to walk to a place. A tree tries samples x iterations moves at each depth."""
+    """Candidate plans per round. 0: 64, or 32 to walk to a place. A tree expands samples x iterations moves per depth."""
     iterations: int = 0
-    """Rounds per decision; 0: 5, or 1 to walk to a place."""
+    """Rounds per decision. 0: 5, or 1 to walk to a place."""
     horizon: int = 0
-    """Moves per plan; 0: 12, or 4 to walk to a place."""
+    """Moves per plan. 0: 12, or 4 to walk to a place."""
     block: int = 0
-    """Environment steps for which each move is held; 0: 1, or those of 0.115 s to walk to a place."""
+    """Environment steps for which each move is held. 0: 1, or 0.115 s of them to walk to a place."""
     replan: int = 0
-    """Moves that are executed before the next plan is made; 0: 1, or the whole plan if only the end of the horizon counts."""
+    """Moves that are executed before the next plan is made. 0: 1, or the whole plan with the cost `last`."""
+    # Milliseconds per decision, in place of `iterations`; at least one round is done. Results then depend on the speed of the
+    # machine: the same seed need not give the same plan.
     budget_ms: float | None = None
-    """Search for this many milliseconds per decision, at least one round, in place of `iterations`. The same seed may then give
-    another plan on a slower machine."""
+    # Plans are cut short at the step where half of the candidates exceed this value of the world's channel `uncertainty`. None:
+    # never; `terrella plan` then takes the value from which the world invents, if the world declares one.
     trust: float | None = None
-    """A plan is cut where half of the candidates pass this value of the world's channel `uncertainty`; None: never."""
     elites: int = 0
-    """The best candidates of a round, to which the next round is fitted; 0: an eighth of the samples."""
+    """Best candidates of a round, to which the sampling distribution is fitted. 0: an eighth of the samples."""
     spread: float = 0.5
     """Initial standard deviation of an action axis, as a share of half its range."""
     momentum: float = 0.1
-    """Share of the sampling distribution that is kept from round to round."""
+    """Weight of the old sampling distribution when it is fitted to the elites."""
     colour: float = 2.0
-    """Exponent of icem's coloured noise."""
+    """Exponent of the power spectrum of icem's noise: 0 is white, 2 is red."""
     keep: float = 0.3
     """Share of icem's elites that are tried again in the next round."""
     decay: float = 1.25
     """Factor by which icem's samples shrink per round."""
     temperature: float = 0.5
-    """Of mppi's weights, as a share of the range of the elites' costs."""
+    """Temperature of mppi, as a share of the range of the elites' costs."""
 
     def __post_init__(self):
         counts = (self.samples, self.iterations, self.horizon, self.block, self.replan, self.elites)

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from terrella.act.planning import Navigator, budget, searches
-from terrella.cli.driving import Driving
 from terrella.core.errors import TerrellaError
 from terrella.core.world import make_rng
 from terrella.serve.protocol import Goal
 from terrella.serve.timeline import Timeline
+from terrella.workflows.page_agents import PageAgents
 
 from .mapped import Mapped
 from .panorama import Panorama
@@ -43,17 +43,17 @@ def driven(timeline: Timeline, steps: int) -> Timeline:
 
 
 def test_where_plans_bring_reward_a_planner_drives_and_gains():
-    agents = Driving(Panorama(), budget_ms=PATIENT_MS).agents()
+    agents = PageAgents(Panorama(), budget_ms=PATIENT_MS).agents()
     assert agents.make({}).name == "a planner for reward" and agents.pictures
-    timeline = Timeline([Panorama()], 0, policy=Driving(Panorama(), budget_ms=5.0, name="plan").agents())
+    timeline = Timeline([Panorama()], 0, policy=PageAgents(Panorama(), budget_ms=5.0, name="plan").agents())
     timeline.driver.let(True)
     assert driven(timeline, 20).shown.episode_return > 10
 
 
 def test_where_all_plans_bring_the_same_the_explorer_drives():
-    agents = Driving(Dull(), budget_ms=PATIENT_MS).agents()
+    agents = PageAgents(Dull(), budget_ms=PATIENT_MS).agents()
     assert agents.make({}).name == "the explorer" and agents.make({}).futures is None
-    assert Driving(Dull(), name="plan", budget_ms=PATIENT_MS).make({}).name == "a planner for reward", (
+    assert PageAgents(Dull(), name="plan", budget_ms=PATIENT_MS).make({}).name == "a planner for reward", (
         "asked for by name"
     )
 
@@ -61,7 +61,7 @@ def test_where_all_plans_bring_the_same_the_explorer_drives():
 def test_a_walker_goes_to_a_place_and_shows_what_it_considers():
     world = Mapped()
     world.start(1, make_rng(0))
-    agents = Driving(world, budget_ms=5.0).agents()
+    agents = PageAgents(world, budget_ms=5.0).agents()
     assert agents.places
     agent = agents.make({"pose": torch.tensor([[1.0, 0.0, *[torch.nan] * 5]])})
     assert isinstance(agent.policy, Navigator) and agent.unit == "m"
@@ -77,7 +77,7 @@ def test_a_walker_goes_to_a_place_and_shows_what_it_considers():
 
 def test_a_picture_that_is_remembered_is_gone_back_to_with_its_heading():
     world = Mapped()
-    agents = Driving(world, budget_ms=5.0).agents()
+    agents = PageAgents(world, budget_ms=5.0).agents()
     timeline = Timeline([world], 0, policy=agents)
     seen = world.render(timeline._states[0], world.spec.recorded)
     agent = agents.make(seen)
@@ -98,22 +98,22 @@ def test_a_lone_picture_is_walked_to_where_the_world_tells_its_place():
             return super().observe(known if set(observation) == {"rgb"} else observation, prior, rng)
 
     world = Told()
-    policy = Driving(world, budget_ms=5.0).make({"rgb": torch.zeros(1, 48, 64, 3, dtype=torch.uint8)}).policy
+    policy = PageAgents(world, budget_ms=5.0).make({"rgb": torch.zeros(1, 48, 64, 3, dtype=torch.uint8)}).policy
     assert isinstance(policy, Navigator) and policy.place.tolist() == [1.5, 0.0] and policy.heading is not None
 
 
 def test_a_game_that_cannot_be_copied_takes_no_goals():
-    driving = Driving(Panorama(forkable=False))
+    driving = PageAgents(Panorama(forkable=False))
     agents = driving.agents()
     assert not agents.places and not agents.pictures and agents.make({}).name == "the explorer"
     with pytest.raises(TerrellaError, match="neither be copied nor was learned"):
         agents.make({"pose": torch.zeros(1, 7)})
     with pytest.raises(TerrellaError, match="cannot be planned in for reward"):
-        Driving(Panorama(forkable=False), name="plan").make({})
+        PageAgents(Panorama(forkable=False), name="plan").make({})
 
 
 def test_beside_a_game_it_plans_in_the_dream():
-    driving = Driving(Panorama(forkable=False), Panorama(), budget_ms=PATIENT_MS)
+    driving = PageAgents(Panorama(forkable=False), Panorama(), budget_ms=PATIENT_MS)
     agent = driving.agents().make({})
     assert agent.name == "a planner for reward"
     timeline = Timeline([driving.played, driving.learned], 0, policy=driving.agents())
@@ -126,7 +126,7 @@ def test_beside_a_game_it_plans_in_the_dream():
     "name", ["idle", "random", "plan:samples=4,iterations=1,horizon=3", "plan:samples=4,horizon=3@0.2"]
 )
 def test_an_agent_is_named_as_policies_are(name):
-    timeline = Timeline([Panorama()], 0, policy=Driving(Panorama(), name=name).agents())
+    timeline = Timeline([Panorama()], 0, policy=PageAgents(Panorama(), name=name).agents())
     timeline.driver.let(True)
     driven(timeline, 3)
     assert timeline.driver.on and timeline.driver.name == name and timeline.driver.notice == ""
@@ -135,4 +135,4 @@ def test_an_agent_is_named_as_policies_are(name):
 
 def test_an_agent_of_no_known_name_is_refused_at_once():
     with pytest.raises(TerrellaError, match="no policy 'explorre'"):
-        Driving(Panorama(), name="explorre").agents()
+        PageAgents(Panorama(), name="explorre").agents()

@@ -1,4 +1,4 @@
-"""Who drives on the page when a person lets it: an agent by its name, or the one that suits the world."""
+"""The agent that acts on the page instead of a person: by its name, or the one that suits the world."""
 
 from __future__ import annotations
 
@@ -30,25 +30,28 @@ from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
 from ..serve.agent import Agent, Agents, Futures
-from .goals import placed, state_channel
+from .goals import state_channel, with_estimated_pose
 
-_REPLAN_S = 0.06  # of world time, in which a plan is acted on before the next is made
-_NEAR = 0.05  # of a range, within which a goal is reached
-_SHOWN = ("pose", "places")  # beside what a planner's world observes: what ways are found by
+_REPLAN_S = 0.06  # world time for which a plan is executed before the next is made
+_NEAR = 0.05  # share of a range within which a goal is reached
+_SHOWN = ("pose", "places")  # channels by which routes are planned, beside those that a planner's world observes
 
 
 @dataclass(frozen=True)
-class Driving:
-    """played: the world on the page; learned: the one to plan in where that is another (--compare); name: the agent's, "" for the
-    one that suits; budget_ms: what a decision may take."""
+class PageAgents:
+    """Makes the agents of a page."""
 
     played: World
+    """The world on the page."""
     learned: World | None = None
+    """The world to plan in, where that is another (--compare)."""
     name: str = ""
+    """The agent's name; "" for the one that suits the world."""
     budget_ms: float = 30.0
+    """Time per decision."""
 
     def agents(self) -> Agents:
-        """For the page; what is wrong with the name is said now."""
+        """The agents for the page. TerrellaError for a name that does not fit."""
         if self.name not in ("", "plan"):
             self.make({})
         spec = self.played.spec
@@ -56,16 +59,16 @@ class Driving:
         return Agents(self.make, places, pictures=self.world is not None and "rgb" in spec.channels)
 
     def make(self, goal: Observation) -> Agent:
-        """The agent that drives, to a goal or, with {}, as its name says."""
+        """The agent to a goal or, for {}, the one of the name."""
         if goal:
             return self._seeking(goal)
         if self.name == "":
             return self._planning(always=False) or Agent("the explorer", Explorer(self.played.spec))
         if self.name == "plan":
-            found = self._planning(always=True)
-            if found is None:
+            agent = self._planning(always=True)
+            if agent is None:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
-            return found
+            return agent
         policy = library.load_policy(self.name, self.played.spec, self.world)
         plans = policy.policy if isinstance(policy, NoisyPolicy) else policy
         if isinstance(plans, Planner):
@@ -77,14 +80,13 @@ class Driving:
 
     @cached_property
     def world(self) -> World | None:
-        """In which futures are imagined: the world that is played itself, from where it stands, or the one beside it. None for a
-        game that can neither be copied nor was learned."""
+        """The world to plan in: the one beside, or the one on the page. None where that can neither be copied nor was learned."""
         if self.learned is not None:
             return self.learned
         return FullyObserved(self.played, here=True) if self.played.spec.forkable else None
 
     def see(self, state: State) -> Observation:
-        """What a planner is shown of a state of the world that is played."""
+        """The observation for a planner, of a state of the world on the page."""
         if self.learned is None and self.world is not None:
             spec = self.world.spec
             return self.world.render(state, [*spec.observes, *(name for name in _SHOWN if name in spec.channels)])
@@ -95,7 +97,7 @@ class Driving:
     # -- agents -------------------------------------------------------------------------------------------------------
 
     def _planning(self, always: bool) -> Agent | None:
-        """A planner for reward; unless `always`, None where that takes too long here, or where all plans bring the same."""
+        """A planner for reward. Unless `always`, None where a search takes too long here, or all plans have the same return."""
         world = self.world
         if world is None or "reward" not in world.spec.channels:
             return None
@@ -108,7 +110,7 @@ class Driving:
         return Agent("a planner for reward", planner, self.see, futures=self._futures(planner))
 
     def _futures(self, planner: Planner) -> Callable[[Any], Futures] | None:
-        """How a planner's memory becomes pictures, where its world shows any."""
+        """Pictures of the futures in a planner's memory, where its world renders any."""
         if "rgb" not in planner.world.spec.channels:
             return None
         world, cost, block = planner.world, planner.cost, planner.config.block
@@ -121,11 +123,11 @@ class Driving:
             raise PlanningError(
                 f"{self.played.spec.name} can neither be copied nor was learned: nobody can plan in it."
             )
-        goal = placed(goal, self.learned or self.played)
+        goal = with_estimated_pose(goal, self.learned or self.played)
         if "pose" in goal and "pose" in self.played.spec.channels:
             return self._walking(world, goal["pose"][0])
-        source, told = self.learned or self.played, [name for name in goal if name == _vector(self.played.spec)]
-        aim = {name: goal[name] for name in (told or ["rgb"])}
+        source, vectors = self.learned or self.played, [name for name in goal if name == _vector(self.played.spec)]
+        aim = {name: goal[name] for name in (vectors or ["rgb"])}
         whole = {name: goal[name] for name in source.spec.observes if name in goal}
         latent = "latent" in source.spec.channels and set(whole) == set(source.spec.observes) and whole
         cost = distance_to(source, whole) if latent else distance_to(world, aim, latent=False)
@@ -139,7 +141,7 @@ class Driving:
         return Agent(name, planner, self.see, away, _NEAR, futures=self._futures(planner))
 
     def _walking(self, world: World, pose: torch.Tensor) -> Agent:
-        """Who walks to a pose [7], of which NaN may be any."""
+        """A walker to a pose [7]; NaN matches any value."""
         goal = Destination(pose)
         cost = goal.cost(world)
         block = max(1, round(STRIDE_S / world.spec.dt_s))
@@ -154,12 +156,12 @@ class Driving:
         return Agent("a walker", goal.navigator(planner), self.see, away, goal.near_m, "m", shown)
 
     def _first(self, world: World) -> State:
-        """A state in which episodes begin, to time the world with."""
+        """A start state, to time the world with."""
         return world.start(1, make_rng(0))
 
 
 def _vector(spec: Spec) -> str:
-    """The channel of the state in numbers; "" where there is none."""
+    """The channel that holds the state as a vector; "" where there is none."""
     try:
         return state_channel(spec)
     except PlanningError:

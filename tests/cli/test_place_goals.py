@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 from tests.serve.mapped import Mapped
 from tests.serve.panorama import Panorama
 
 from terrella.act.planning import Planner, SearchConfig
-from terrella.cli.walking import Walks, search_of, views_of
+from terrella.act.planning.routes import NoRoute
 from terrella.core.errors import ObservationError, PlanningError
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
 from terrella.data import record
+from terrella.workflows import plan_study
+from terrella.workflows.place_goals import PlaceGoals, views_of, walking_defaults
+from terrella.workflows.plan import plan
+from terrella.workflows.plan_study import PlanConfig
 
 ANY = [torch.nan] * 5
 
@@ -49,20 +55,38 @@ def test_views_of_a_recording_are_goals_where_the_world_has_been(tmp_path):
         views_of(str(folder), {}, Panorama(), Panorama().spec)
 
 
-def test_each_episode_walks_to_a_view_that_is_far_enough_from_its_start():
+def test_each_episode_places_to_a_view_that_is_far_enough_from_its_start():
     world = Mapped()
     views = torch.tensor([[x, 0.0, *ANY] for x in (0.1, 0.2, 1.2, 1.3)])
-    walks, goals = Walks(views, apart_m=1.0, within_m=0.5), []
+    places, goals = PlaceGoals(views, apart_m=1.0, within_m=0.5), []
 
     def walker(goal):
         goals.append(goal)
-        config = SearchConfig(samples=8).filled(**search_of(world.spec))
+        config = SearchConfig(samples=8).filled(**walking_defaults(world.spec))
         return goal.navigator(Planner(world, goal.cost(world), config))
 
-    played = walks.played(world, walker, 3, 60, 0, world.spec.observes, ("pose",), lambda done, total: None)
-    again = walks.played(world, lambda goal: Random(world.spec), 3, 5, 0, (), (), lambda done, total: None)
+    played = places.play(world, walker, 3, 60, 0, world.spec.observes, ("pose",), lambda done, total: None)
+    again = places.play(world, lambda goal: Random(world.spec), 3, 5, 0, (), (), lambda done, total: None)
     assert [one.success for one in played.episodes] == [True] * 3 and len(again.episodes) == 3
     assert all(goal.place[0] > 1 for goal in goals)
     assert [bool(one.seen) for one in played.episodes] == [True, False, False], "one is filmed"
     with pytest.raises(PlanningError, match="no view of that recording is 9 m"):
-        Walks(views, 9.0, 0.5).played(world, walker, 1, 5, 0, (), (), lambda done, total: None)
+        PlaceGoals(views, 9.0, 0.5).play(world, walker, 1, 5, 0, (), (), lambda done, total: None)
+
+
+class Lost(Random):
+    """Knows no way anywhere."""
+
+    def act(self, observation, memory, rng):
+        raise NoRoute("no way is known")
+
+
+def test_recorded_views_of_which_none_has_a_way_are_reported(tmp_path, monkeypatch):
+    world, folder = Mapped(), tmp_path / "views"
+    record(world, Random(world.spec, (4, 8)), folder, 60, make_rng(0))
+    monkeypatch.setattr(plan_study, "load_named", lambda *given, **named: world)
+    monkeypatch.setattr(plan_study, "walker", lambda world, search, goal: Lost(world.spec))
+    config = PlanConfig(goal=str(folder), apart=0.6, episodes=2, steps=3, out=tmp_path / "plan")
+    result = plan("mapped", config)
+    assert "to 2 of the goals no way was known" in result.lines and result.film is None and not result.curve
+    assert [one["steps"] for one in json.loads((tmp_path / "plan" / "plan.json").read_text())["played"]] == [0, 0]

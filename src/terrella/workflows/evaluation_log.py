@@ -1,4 +1,4 @@
-"""What was judged so far, kept in evaluate.json: stopped at any time, the same command goes on."""
+"""The episodes of an evaluation so far, kept in evaluate.json, so that a stopped evaluation continues."""
 
 from __future__ import annotations
 
@@ -24,30 +24,26 @@ _DIGITS = 6
 
 
 def fingerprint(source: str | Path) -> int | None:
-    """Changes with the weights in a folder, or with the file of a policy of one's own; None for what has no file. Names of keys
-    and the like, which a page may rewrite, do not count, nor what a training keeps to go on."""
+    """A checksum of the weights in a folder, or of the file of a user's own policy; None where there is no file. The names of keys,
+    which a page may rewrite, do not count, nor what a training run keeps to resume."""
     text = str(source).rpartition("@")[0] if not Path(source).exists() and "@" in str(source) else str(source)
-    path = Path(text)
+    path, module = Path(text), text.rpartition(":")[0]
+    files: list[Path | None] = []
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*.safetensors") if not file.name.startswith("resume-"))
-    else:
-        module, _, _ = text.rpartition(":")
-        files = (
-            [Path(module)]
-            if module.endswith(".py")
-            else [_origin(module)]
-            if module.replace(".", "").isidentifier()
-            else []
-        )
-    found = None
+        files += sorted(file for file in path.rglob("*.safetensors") if not file.name.startswith("resume-"))
+    elif module.endswith(".py"):
+        files.append(Path(module))
+    elif module.replace(".", "").isidentifier():
+        files.append(_origin(module))
+    checksum = None
     for file in files:
         if file is not None and file.is_file():
-            found = zlib.crc32(file.read_bytes(), found or 0)
-    return found
+            checksum = zlib.crc32(file.read_bytes(), checksum or 0)
+    return checksum
 
 
 def crc_of(file: str | None) -> int | None:
-    """Changes with what a file holds; None where there is none of this name."""
+    """The checksum of a file; None where there is none of this name."""
     return zlib.crc32(Path(file).read_bytes()) if file and Path(file).is_file() else None
 
 
@@ -59,32 +55,33 @@ def _origin(module: str) -> Path | None:
     return Path(spec.origin) if spec and spec.origin else None
 
 
-class JudgedLog:
-    """The file evaluate.json of a folder: what was asked, and the episodes of each policy.
+class EvaluationLog:
+    """The file evaluate.json of a folder: the settings, and the episodes of each policy.
 
-    asked: the settings, which must not change once something was judged. marks: policy -> its fingerprint; where it has changed,
-    the policy is judged anew.
+    settings:     must not change once something was played.
+    fingerprints: policy -> the checksum of its weights or source; a policy whose checksum has changed is played again.
     """
 
-    def __init__(self, folder: Path, asked: Mapping[str, Any], marks: Mapping[str, int | None]):
-        self.file, self.asked, self.marks = folder / "evaluate.json", dict(asked), marks
+    def __init__(self, folder: Path, settings: Mapping[str, Any], fingerprints: Mapping[str, int | None]):
+        self.file, self.settings, self.fingerprints = folder / "evaluate.json", dict(settings), fingerprints
         self._played: dict[str, dict[str, Any]] = {}
         self._saved = time.monotonic()
         if self.file.exists():
-            self._go_on()
+            self._resume()
         elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise TerrellaError(f"{folder} holds something else than an evaluation; give another --out.")
 
     def count(self, name: str) -> int:
-        """The episodes that are known of a policy."""
+        """The number of episodes that are known of a policy."""
         return len(self._played[name]["arms"][DREAM][RETURN]) if name in self._played else 0
 
     def has(self, name: str, count: int) -> bool:
         return self.count(name) >= count
 
     def add(self, name: str, first: int, chunk: Chunk) -> None:
-        """The episodes from number `first` on; what was known from there on is forgotten."""
-        known = self._played.setdefault(name, {"mark": self.marks.get(name), "skipped": {}, "arms": {}, "followed": {}})
+        """Adds the episodes from number `first` on, in place of any that were known from there on."""
+        new = {"mark": self.fingerprints.get(name), "skipped": {}, "arms": {}, "followed": {}}
+        known = self._played.setdefault(name, new)
         known["skipped"][str(first // CHUNK)] = chunk.skipped
         for arm, episodes in ((REAL, chunk.real), (DREAM, chunk.dream), (CONTROL, chunk.control)):
             if episodes:
@@ -92,7 +89,7 @@ class JudgedLog:
                 for measure, values in _measured(episodes).items():
                     measures[measure] = [*measures.get(measure, [])[:first], *values]
         for channel, curve in chunk.open_loop_errors.items():
-            known["followed"][channel] = [_sound(value) for value in curve.double().nanmean(0).tolist()]
+            known["followed"][channel] = [_rounded(value) for value in curve.double().nanmean(0).tolist()]
         if time.monotonic() - self._saved > SAVED_EVERY_S:
             self.save()
 
@@ -108,54 +105,54 @@ class JudgedLog:
             for arm, measures in arms.items()
         }
 
-    def followed(self, name: str) -> dict[str, list[float]]:
-        """channel -> error by step, the mean over episodes."""
+    def open_loop_errors(self, name: str) -> dict[str, list[float]]:
+        """channel -> error of the dream by step under the real actions, the mean over episodes."""
         curves = self._played[name]["followed"]
         return {channel: [math.nan if value is None else value for value in curve] for channel, curve in curves.items()}
 
     def skipped(self, names: Iterable[str]) -> int:
-        """Starts that were left out; the same for all policies."""
+        """The number of starts that were left out as solved; the same for all policies."""
         return max(sum(self._played[name]["skipped"].values()) for name in names)
 
-    def save(self, found: Mapping[str, Any] | None = None) -> None:
-        """Writes what is known; `found`: what came of it, once all is judged. Nothing where nothing was judged."""
+    def save(self, result: Mapping[str, Any] | None = None) -> None:
+        """Writes the episodes and, once all are played, the result. Writes nothing where nothing was played."""
         self._saved = time.monotonic()
         if self._played:
-            write_json(self.file, {**(found or {}), "asked": self.asked, "played": self._played})
+            write_json(self.file, {**(result or {}), "asked": self.settings, "played": self._played})
 
-    def _go_on(self) -> None:
+    def _resume(self) -> None:
         try:
             kept = json.loads(self.file.read_text(encoding="utf-8"))
-            asked, played = dict(kept["asked"]), dict(kept["played"])
+            before, played = dict(kept["asked"]), dict(kept["played"])
             counts = [len(known["arms"][DREAM][RETURN]) + len(known["followed"]) for known in played.values()]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise TerrellaError(f"{self.file} is damaged ({error}); give another --out.") from error
         if not counts:
             return
-        other = [name for name in self.asked if asked.get(name) != self.asked[name]]
+        other = [name for name in self.settings if before.get(name) != self.settings[name]]
         if other == ["world"]:
             raise TerrellaError(
-                f"{self.file.parent} judged policies in this world before it was trained on: give another --out."
+                f"{self.file.parent} evaluated policies in this world before it was trained on: give another --out."
             )
         if other:
-            words = "; ".join(f"{name} {asked.get(name)}, not {self.asked[name]}" for name in other if name != "world")
+            changed = (f"{name} {before.get(name)}, not {self.settings[name]}" for name in other if name != "world")
             raise TerrellaError(
-                f"{self.file.parent} was begun with other settings ({words}); repeat them, or give another --out."
+                f"{self.file.parent} was begun with other settings ({'; '.join(changed)}); repeat them, or give another --out."
             )
         self._played = {
             name: known
             for name, known in played.items()
-            if known.get("mark") == self.marks.get(name, known.get("mark"))
+            if known.get("mark") == self.fingerprints.get(name, known.get("mark"))
         }
 
 
 def _measured(episodes: list[PlayedEpisode]) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {RETURN: [episode.reward for episode in episodes]}
-    found["steps"] = [episode.steps for episode in episodes]
+    values: dict[str, list[Any]] = {RETURN: [episode.reward for episode in episodes]}
+    values["steps"] = [episode.steps for episode in episodes]
     if episodes[0].success is not None:
-        found[SUCCESS] = [bool(episode.success) for episode in episodes]
-    return found
+        values[SUCCESS] = [bool(episode.success) for episode in episodes]
+    return values
 
 
-def _sound(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
     return round(value, _DIGITS) if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Goals as a person writes them: a picture's file, numbers, CHANNEL=VALUE, or the word reward."""
+"""Goals as a person writes them: a picture file, numbers, CHANNEL=VALUE, or the word reward."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 
 from ..core.errors import ObservationError, PlanningError, TerrellaError
 from ..core.spec import Spec, kind_of
@@ -14,12 +15,12 @@ from ..core.world import Observation, World, make_rng
 
 REWARD = "reward"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
-_ANY = ("_", "any", "nan")
-_SCALARS = ("reward", "done", "uncertainty", "truncated")
+_WILDCARDS = ("_", "any", "nan")
+_NO_STATE = ("reward", "done", "uncertainty", "truncated", "snapshot", "latent", "instruction")
 
 
 def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
-    """What `--goal` means in a world: {} for "reward", else channel -> value. Raises a sentence for what is no goal there."""
+    """The goal that `text` describes: {} for "reward", else channel -> value [*shape]. TerrellaError where it does not fit."""
     if text == REWARD:
         return {}
     name, equals, value = text.partition("=")
@@ -34,8 +35,8 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
     return {channel: _value(text, channel, spec)}
 
 
-def placed(goal: Observation, world: World) -> Observation:
-    """A lone picture [1, ...] with the pose from which the world believes it to be taken, where it can say that; else the goal."""
+def with_estimated_pose(goal: Observation, world: World) -> Observation:
+    """A goal that is one picture [1, ...], with the pose where the world localises it; any other goal as it is."""
     if set(goal) != {"rgb"} or not {"rgb", "pose"} <= set(world.spec.channels):
         return goal
     try:
@@ -45,20 +46,17 @@ def placed(goal: Observation, world: World) -> Observation:
 
 
 def state_channel(spec: Spec) -> str:
-    """The channel of a world's state in numbers, by which a goal is told; PlanningError where it has none."""
+    """The channel that holds the state as a vector: `observation`, or the first vector. PlanningError where there is none."""
     vectors = [
-        name
-        for name, space in spec.channels.items()
-        if len(space.shape or ()) == 1 and kind_of(name) not in ("snapshot", "latent", "instruction", *_SCALARS)
+        name for name, space in spec.channels.items() if len(space.shape or ()) == 1 and kind_of(name) not in _NO_STATE
     ]
-    first = "observation" if "observation" in vectors else vectors[0] if vectors else ""
-    if not first:
+    if not vectors:
         raise PlanningError(f"{spec.name} has no state of numbers; its channels are {', '.join(spec.channels)}.")
-    return first
+    return "observation" if "observation" in vectors else vectors[0]
 
 
 def _value(text: str, name: str, spec: Spec) -> torch.Tensor:
-    """Numbers with commas (_ for any), a .npy or .json file, or a picture's file."""
+    """The value of a channel: numbers with commas (_ matches any), a .npy or .json file, or a picture file."""
     path = Path(text)
     if text.lower().endswith(_PICTURES):
         return _picture(path, spec, name)
@@ -69,12 +67,12 @@ def _value(text: str, name: str, spec: Spec) -> torch.Tensor:
             array = np.asarray(json.loads(path.read_text(encoding="utf-8")), np.float64)
         else:
             words = [word.strip() for word in text.strip("[]() ").split(",")]
-            array = np.array([np.nan if word in _ANY else float(word) for word in words])
+            array = np.array([np.nan if word in _WILDCARDS else float(word) for word in words])
     except FileNotFoundError as error:
         raise TerrellaError(f"there is no file {text}.") from error
     except (ValueError, OSError) as error:
         raise TerrellaError(
-            f"'{text}' is no goal: give a picture's file, numbers as in 0.5,_,0 (_ for any), CHANNEL=VALUE, or reward."
+            f"'{text}' is no goal: give a picture file, numbers as in 0.5,_,0 (_ matches any), CHANNEL=VALUE, or reward."
         ) from error
     shape = tuple(spec.channels[name].shape or ())
     array = array.reshape(()) if array.size == 1 and shape == () else array
@@ -86,8 +84,6 @@ def _value(text: str, name: str, spec: Spec) -> torch.Tensor:
 
 
 def _picture(path: Path, spec: Spec, name: str) -> torch.Tensor:
-    from PIL import Image, UnidentifiedImageError
-
     try:
         with Image.open(path) as image:
             array = np.asarray(image.convert("RGB"))
@@ -98,6 +94,6 @@ def _picture(path: Path, spec: Spec, name: str) -> torch.Tensor:
     shape = tuple(spec.channels[name].shape or ())
     if array.shape != shape:
         raise ObservationError(
-            f"{path} is a picture of {array.shape[0]} x {array.shape[1]} pixels, where {spec.name} sees {shape[0]} x {shape[1]}."
+            f"{path} has {array.shape[0]} x {array.shape[1]} pixels, where {spec.name} sees {shape[0]} x {shape[1]}."
         )
     return torch.from_numpy(array.copy())

@@ -1,0 +1,64 @@
+"""The commands `plan`, `evaluate`, `transfer` and `bench acceleration`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ..workflows.acceleration import AccelerationConfig, measure_acceleration
+from ..workflows.evaluate import EvaluateConfig
+from ..workflows.evaluate import evaluate as run_evaluate
+from ..workflows.plan import plan as run_plan
+from ..workflows.plan_study import PlanConfig
+from ..workflows.transfer import TransferConfig
+from ..workflows.transfer import transfer as run_transfer
+from .say import Json, say, show
+
+Inside = Annotated[str, arg(name="in", help="The world to evaluate them in: a name of `terrella list`, or a path.")]
+STOPPED = 130
+
+
+def plan(world: Positional[str], config: PlanConfig, json: Json = False) -> int:
+    """Plan in a world, act in the real environment, and report how often that reached the goal, beside acting at random.
+
+    A folder receives a page, a film of dream and reality side by side, and all figures. Ctrl-C keeps the episodes that are done.
+
+    Args:
+        world: The world to plan in: a name of `terrella list`, the path of a checkpoint, or a simulator (gym:CartPole-v1).
+    """
+    outcome = run_plan(world, config, progress=say)
+    show(outcome, json)
+    return STOPPED if outcome.stopped else 0
+
+
+def evaluate(policies: Positional[tuple[str, ...]], inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
+    """Evaluate policies in a world and in the real environment, from the same starts: does the world rank them as reality does?
+
+    A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
+
+    Args:
+        policies: random, idle, explorer, constant:VALUE, plan, plan:samples=16,horizon=12, the folder of a learned policy, or
+            MODULE:NAME or FILE.py:NAME of your own. NAME@0.3 takes a random action with probability 0.3.
+    """
+    show(run_evaluate(policies, inside, config, progress=say), json)
+
+
+def transfer(config: TransferConfig, json: Json = False) -> None:
+    """Carry policies from a simulator over to a "real" robot that differs, and measure what helps: domain randomisation, system
+    identification, or a model of a few real episodes.
+
+    A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
+    """
+    show(run_transfer(config, progress=say), json)
+
+
+def acceleration(world: Positional[str], config: AccelerationConfig, json: Json = False) -> None:
+    """Time how fast a world imagines with a new random action at each control step, beside a simulator of the same task.
+
+    Reports imagined seconds per second, joules, the usable horizon, and how much return a policy retains that trained in the world.
+
+    Args:
+        world: A learned world, or a simulator: a name of `terrella list`, or a path.
+    """
+    show(measure_acceleration(world, config, progress=say), json)

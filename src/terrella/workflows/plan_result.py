@@ -1,0 +1,200 @@
+"""The result of `plan`: figures of the episodes, sentences about them, a page, and a film of dream and reality side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..act.planning import PlayedEpisode, PlayResult, distance
+from ..core.files import write_json
+from ..core.world import make_rng
+from ..measure.plan_page import compute_chart, film, film_strip, plan_page
+from ..measure.statistics import Figure
+from .compute_curve import CurvePoint, conclusion, figures_of, gain
+from .plan_study import PlanStudy
+from .real_environment import comparable_channels
+from .results import jsonable
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """How often planning reached the goal, beside acting at random from the same starts."""
+
+    lines: tuple[str, ...]
+    """Sentences for people, the verdict first."""
+    settings: Mapping[str, Any]
+    """World, goal, search and episodes, with their defaults filled in."""
+    planner: Mapping[str, Figure]
+    """success (where it is judged), return, steps, `ms a decision` and `steps imagined`."""
+    random: Mapping[str, Figure]
+    """The same of random actions; empty if it was stopped before."""
+    difference: Mapping[str, Figure]
+    """Success or return of the planner less that of random actions, start by start."""
+    curve: tuple[CurvePoint, ...]
+    """The planner with ever more compute."""
+    episodes: tuple[PlayedEpisode, ...]
+    """The planner's episodes."""
+    divergence: Mapping[str, Sequence[float]]
+    """channel -> distance of the dream from reality, by step of the filmed episode."""
+    page: Path
+    film: Path | None
+    stopped: bool = False
+    """Whether Ctrl-C ended it early."""
+
+    def to_json(self) -> dict[str, Any]:
+        return jsonable(
+            {
+                **self.settings,
+                "planner": _plain(self.planner),
+                "random": _plain(self.random),
+                "difference": _plain(self.difference),
+                "curve": [
+                    {
+                        "with": point.label,
+                        "imagined": point.imagined,
+                        **_plain(figures_of(point.played, self.settings["seed"])),
+                    }
+                    for point in self.curve
+                ],
+                "stopped": self.stopped,
+                "page": self.page,
+                "film": self.film or "",
+            }
+        )
+
+    def summary(self) -> str:
+        return "\n".join([*self.lines, f"the page: {self.page}"])
+
+
+def save_result(
+    study: PlanStudy,
+    played: PlayResult,
+    floor: PlayResult | None,
+    points: Sequence[CurvePoint],
+    settings: Mapping[str, Any],
+    folder: Path,
+    stopped: bool,
+) -> PlanResult:
+    """Writes the page, the film and plan.json."""
+    seed = study.config.seed
+    planner, random = figures_of(played, seed), {} if floor is None else figures_of(floor, seed)
+    measure = "success" if "success" in planner else "return"
+    lines = _lines(study, played, planner, random, points)
+    if stopped:
+        lines.append(f"stopped: {len(played.episodes)} of {study.config.episodes} episodes are done")
+    folder.mkdir(parents=True, exist_ok=True)
+    seen = None if stopped else next((one for one in played.episodes if one.seen), None)
+    divergence, strip, name = ({}, None, "") if seen is None else _film(study, seen, folder)
+    curve = [(point.imagined, point.score) for point in points]
+    chart = compute_chart(curve, random[measure], measure) if curve else ""
+    arms = {"planner": planner, **({"random": random} if random else {})}
+    page = plan_page(f"{settings['world']}: {settings['goal']}", lines, arms, chart, strip, name, settings)
+    (folder / "plan.html").write_text(page, encoding="utf-8")
+    result = PlanResult(
+        tuple(lines),
+        settings,
+        planner,
+        random,
+        {} if floor is None else {measure: gain(played, floor, measure, seed)},
+        tuple(points),
+        tuple(played.episodes),
+        divergence,
+        folder / "plan.html",
+        folder / name if name else None,
+        stopped,
+    )
+    episodes = [_episode(episode) for episode in played.episodes]
+    write_json(folder / "plan.json", jsonable({**result.to_json(), "divergence": divergence, "played": episodes}))
+    return result
+
+
+def _lines(
+    study: PlanStudy,
+    played: PlayResult,
+    planner: Mapping[str, Figure],
+    random: Mapping[str, Figure],
+    points: Sequence[CurvePoint],
+) -> list[str]:
+    """The outcome, for people."""
+    lines, count = [], len(played.episodes)
+    if "success" in planner:
+        beside = f"; at random {_share(random['success'])}" if random else ""
+        lines.append(f"reached in {_share(planner['success'])} of {count} episodes{beside}")
+    if "reward" in study.real.spec.channels or not lines:
+        beside = f"; at random {random['return']}" if random else ""
+        lines.append(f"return {planner['return']}{beside}")
+    if unreachable := sum(not one.steps for one in played.episodes):
+        lines.append(f"to {unreachable} of the goals no way was known")
+    if ms := planner.get("ms a decision"):
+        imagined = f" for {planner['steps imagined'].value:,.0f} imagined steps" if "steps imagined" in planner else ""
+        lines.append(f"a decision takes {ms.value:.0f} ms (95% within {ms.high:.0f}){imagined}")
+    if played.skipped:
+        lines.append(f"{played.skipped} starts were already solved and left out")
+    if (study.goal or study.places) and planner.get("success") and not planner["success"].value:
+        lines.append(_never_reached(study, played.episodes))
+    measure = "success" if "success" in planner else "return"
+    lines += [f"{point.imagined:>10,.0f} imagined steps, {point.label}: {measure} {point.score}" for point in points]
+    if len(points) > 1:
+        lines.append(conclusion(points, measure, study.config.seed))
+    if study.search.budget_ms is not None:
+        lines.append("planned by the clock: another run may differ")
+    return lines
+
+
+def _never_reached(study: PlanStudy, episodes: Sequence[PlayedEpisode]) -> str:
+    nearest, best = min(one.nearest for one in episodes), min(one.best_cost for one in episodes)
+    measured = study.criterion.goal or study.places
+    away = f"; the nearest that it came is {nearest:.3g} (asked: {study.within:g})" if measured else ""
+    cost = f"; the best plan in the world cost {best:.3g}" if math.isfinite(best) else ""
+    return f"the goal was never reached{away}{cost}: it may be impossible"
+
+
+def _share(figure: Figure) -> str:
+    return f"{figure.value:.0%} [{figure.low:.0%}, {figure.high:.0%}]"
+
+
+def _plain(figures: Mapping[str, Figure]) -> dict[str, object]:
+    return {name: asdict(figure) for name, figure in figures.items()}
+
+
+def _episode(episode: PlayedEpisode) -> dict[str, object]:
+    facts = {"steps": episode.steps, "return": episode.reward, "success": episode.success, "nearest": episode.nearest}
+    return {**facts, "ended": episode.ended, "best_cost": episode.best_cost}
+
+
+@torch.no_grad()
+def _film(
+    study: PlanStudy, episode: PlayedEpisode, folder: Path
+) -> tuple[dict[str, list[float]], Image.Image | None, str]:
+    """The dream of an episode, from its first observation under its actions: the divergence in each channel, a strip of dream and
+    reality, and the name of the film, "" where there are no pictures."""
+    seen, names = episode.seen, comparable_channels(study.world.spec, study.real.spec)
+    shown = tuple(name for name in (*names, *study.pictures) if name in study.world.spec.channels)
+    rng, dream = make_rng(study.config.seed), []
+    state = study.world.observe({name: seen[0][name][None] for name in study.sees}, None, rng)
+    for action in [*episode.actions, None]:
+        dream.append({name: value[0].cpu() for name, value in study.world.render(state, shown).items()})
+        state = state if action is None else study.world.imagine(state, action[None], rng)
+    divergence = {}
+    for name in names:
+        one, other = (torch.stack([frame[name] for frame in frames]) for frames in (seen, dream))
+        divergence[name] = distance(study.real.spec, {name: one}, {name: other}).tolist()
+    if "rgb" not in seen[0]:
+        study.progress("No film: the environment shows no pictures.")
+        return divergence, None, ""
+    rows = {"reality": torch.stack([frame["rgb"] for frame in seen]).numpy()}
+    if "rgb" in shown:
+        height, width = rows["reality"].shape[1:3]
+        frames = [Image.fromarray(frame["rgb"].numpy()).resize((width, height)) for frame in dream]
+        rows["dream"] = np.stack([np.asarray(frame) for frame in frames])
+    first = next(iter(sorted(names, key=lambda name: name == "rgb")), "")
+    curve = divergence[first] if first else [0.0] * len(seen)
+    film(folder / "plan.mp4", rows, curve, f"divergence in {first}" if first else "", 1 / study.real.spec.dt_s)
+    return divergence, film_strip(rows), "plan.mp4"
