@@ -30,8 +30,10 @@ OPTIONS = {
     "--pictures --policy --port --randomise --seed --size --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth",
-    "plan": "--adapter --agent --apart --block --budget-ms --cost --device --episodes --fps --goal --horizon --iterations --json "
-    "--no-curve --out --proposal --randomise --real --replan --samples --search --seed --size --steps --success --trust --within",
+    "plan": "--adapter --agent --apart --block --budget-ms --colour "
+    "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
+    "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
+    "--seed --size --spread --steps --success --temperature --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",
