@@ -16,6 +16,9 @@ from .version import __version__
 if TYPE_CHECKING:
     from .core import Spec, State, World, check_world, make_rng, rollout
     from .core.env import as_env
+    from .learn.recipes.latent import LatentTraining
+    from .learn.recipes.policy import Practice
+    from .learn.recipes.video import TrainConfig
     from .library import as_sb3, load, load_policy, worlds
     from .workflows.collect import CollectConfig, CollectResult, collect
     from .workflows.evaluate import EvaluateConfig, EvaluateResult, evaluate
@@ -33,6 +36,9 @@ if TYPE_CHECKING:
 _NAMES = {
     ".core": ("Spec", "State", "World", "check_world", "make_rng", "rollout"),
     ".core.env": ("as_env",),
+    ".learn.recipes.latent": ("LatentTraining",),
+    ".learn.recipes.policy": ("Practice",),
+    ".learn.recipes.video": ("TrainConfig",),
     ".library": ("as_sb3", "load", "load_policy", "worlds"),
     ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
     ".workflows.evaluate": ("EvaluateConfig", "EvaluateResult", "evaluate"),

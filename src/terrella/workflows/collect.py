@@ -110,14 +110,14 @@ class CollectResult:
         return "\n".join(f"{name}: {value}" for name, value in {"dataset": self.dataset, **self.facts}.items())
 
 
-def collect(world: str, config: CollectConfig, *, progress: Progress = silent) -> CollectResult:
+def collect(world: str | Path, config: CollectConfig, *, progress: Progress = silent) -> CollectResult:
     """Records episodes of any world: an environment (gym:CartPole-v1, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or a learned world.
 
     Continues an unfinished recording in the same folder. TerrellaError or DatasetError for what cannot be recorded.
     """
     config.check()
     rgb, policy = config.pictures != "none", config.policy or "explorer"
-    make = partial(_open_player, world, config.controls, config.environment, rgb, policy)
+    make = partial(_open_player, str(world), config.controls, config.environment, rgb, policy)
     opened, make_policy = make()
     for line in describe(opened.spec):
         progress(line)
@@ -179,7 +179,7 @@ def _collect_by_workers(
 ) -> CollectResult:
     pool = RayWorkers if config.on == "ray" else LocalWorkers
     workers = pool(1 if config.workers is None else config.workers)
-    layout, out = replace(Layout.of(world.spec), pictures=pictures), config.out
+    layout, out = replace(Layout.of(world.spec), pictures=pictures), Path(config.out)
     upto = None if config.episodes is not None else FRAMES if config.frames is None else config.frames
     try:
         with stage("recording", progress) as report:
@@ -194,7 +194,7 @@ def _record(
     world: World, config: RecordConfig, frames: int, pictures: Stored, policy: Policy | None, progress: Progress
 ) -> CollectResult:
     """Records one player: a person, a policy or the explorer."""
-    layout, out = replace(Layout.of(world.spec), pictures=pictures), config.out
+    layout, out = replace(Layout.of(world.spec), pictures=pictures), Path(config.out)
     facts: dict[str, object] = {}
     with _live_log(config.live_mcap, layout, world.spec.name, facts, progress) as live:
         if config.human:

@@ -96,7 +96,7 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     check_budget(config.minutes, config.frames)
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed}
     settings |= asdict(config.environment) | asdict(config.controls)
-    schedule = LearnSchedule(config.out or folder_for(environment), settings, config.minutes)
+    schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes)
     if SCORING in schedule.facts:
         progress(f"{schedule.folder} is finished; --minutes with more than {config.minutes:g} trains it on.")
     else:

@@ -100,7 +100,7 @@ def practise(
     if config.frames < FEWEST_FRAMES:
         raise TerrellaError(f"--practise needs --frames of {FEWEST_FRAMES:,} or more.")
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed, **asdict(config.environment)}
-    rounds = _Rounds(config.out or folder_for(environment), settings, config.minutes)
+    rounds = _Rounds(Path(config.out or folder_for(environment)), settings, config.minutes)
     done = rounds.resume()
     real = _open(environment, config.environment)
     if "reward" not in real.spec.channels:

@@ -102,21 +102,21 @@ class ScoreResult:
         return "\n".join([*verdict(self.card), *_figures(self.card), f"the page: {self.files[1]}"])
 
 
-def score(world: str, config: ScoreConfig, *, progress: Progress = silent) -> ScoreResult:
+def score(world: str | Path, config: ScoreConfig, *, progress: Progress = silent) -> ScoreResult:
     """Compares a world's predictions with a recording: pictures, states, poses, rewards, memory, speed.
 
     world: what `terrella.worlds()` lists, or the path of a checkpoint. Figures are kept in the folder as they come; the same call
     continues where it was stopped. TerrellaError or DatasetError for what cannot be scored.
     """
-    exam_config = config.exam
-    arms, closing = arms_of(world, config.device, config.fast, config.quick, progress)
+    exam_config, name = config.exam, str(world)
+    arms, closing = arms_of(name, config.device, config.fast, config.quick, progress)
     clips = config.clips if config.clips is not None else QUICK_CLIPS if config.quick else 50
     drift = 0 if config.quick and config.drift is None else config.drift
     request = ExamRequest(arms, closing, config.data, config.new, config.fresh, clips, drift, config.seed)
     exam, identity = exam_of(request, exam_config, progress)
     identity += f" fast={config.fast} device={device_of(config.device)}"
     with stage("scoring", progress) as report:
-        card, files = write_card(world, exam, identity, config.out, report)
+        card, files = write_card(name, exam, identity, Path(config.out), report)
     return ScoreResult(card, tuple(files))
 
 

@@ -101,13 +101,13 @@ class PolicyTrial:
         return {"verdict": self.verdict, **{name: asdict(figure) for name, figure in self.figures.items()}}
 
 
-def train_policy(world: str, config: TrainPolicyConfig, *, progress: Progress = silent) -> TrainPolicyResult:
+def train_policy(world: str | Path, config: TrainPolicyConfig, *, progress: Progress = silent) -> TrainPolicyResult:
     """Trains a policy on imagined rollouts of a world, hundreds at once, and tries it in the real environment.
 
     world: a name that `terrella.worlds()` lists, the path of a checkpoint or a run, or a simulator (gym:ID). The same call
     continues where an earlier one was stopped. TerrellaError for what cannot be practised.
     """
-    environment = config.environment
+    environment, world, out = config.environment, str(world), Path(config.out)
     if config.episodes < 1:
         raise TerrellaError("--episodes is a whole number from 1 up.")
     if config.grow and environment.randomise is None:
@@ -121,13 +121,11 @@ def train_policy(world: str, config: TrainPolicyConfig, *, progress: Progress = 
         check_alike(inside.spec, outside.spec)
     growing = cast(Scaled, inside) if config.grow else None
     with stage("practising", progress) as report:
-        facts = recipe.train_policy(
-            inside, world, config.out, config.practice, report, config.recording, growing=growing
-        )
+        facts = recipe.train_policy(inside, world, out, config.practice, report, config.recording, growing=growing)
     if outside is None:
         return TrainPolicyResult(world, facts, None)
     return TrainPolicyResult(
-        world, facts, try_policy(config.out, inside, outside, config.episodes, config.practice.seed, progress)
+        world, facts, try_policy(out, inside, outside, config.episodes, config.practice.seed, progress)
     )
 
 
