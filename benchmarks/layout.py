@@ -20,7 +20,7 @@ from terrella.space.fitting import decibels
 from terrella.space.layout import build, parse_text
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.solids import Solids
-from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
+from terrella.worlds.splat import BUTTONS, SolidBoxes, SplatConfig, SplatWorld
 
 TEXT = (
     "a long room with two pillars and a red door, two windows and stairs, and a library with a sofa, a table, four chairs, "
@@ -63,7 +63,7 @@ def main() -> None:
     known = torch.ones(len(place.gaussians), dtype=torch.uint8)
     world = SplatWorld(
         "built", place.gaussians, known, starts, SplatConfig(size=(96, 128), body=BODY), objects=place.objects,
-        solids=place.solids, bodies=place.bodies,
+        solids=SolidBoxes(place.solids, place.bodies),
     )  # fmt: skip
     agreement(world, heard.layout.rooms, given.walks)
     walks(world, given.walks, given.steps)

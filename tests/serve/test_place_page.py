@@ -20,7 +20,7 @@ from terrella.space.edits import edited
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import rasterise
 from terrella.workflows.splat_places import compared_scene, unedited_scene
-from terrella.worlds.splat import SplatConfig, SplatWorld
+from terrella.worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import checked_edits, merging, read_edits, save_splat, write_edits
 
 from ..space.test_fitting import LENS, SIZE, room
@@ -59,7 +59,7 @@ def world(count: int) -> SplatWorld:
 
 def walled_by(full: SplatWorld, boxes: torch.Tensor) -> SplatWorld:
     """A world with known walls."""
-    return SplatWorld("walls", full.gaussians, full.provenance, full.starts, full.config, solids=boxes)
+    return SplatWorld("walls", full.gaussians, full.provenance, full.starts, full.config, solids=SolidBoxes.of(boxes))
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from terrella.space.edits import edited
 from terrella.space.occupancy import Walker
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
-from terrella.worlds.splat import SplatConfig, SplatWorld
+from terrella.worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import other_of, read_edits, save_splat, source_of
 
 from ..space.test_raster import cloud
@@ -33,7 +33,7 @@ def made(path, degree=0, seed=0, objects=2, boxes=True) -> SplatWorld:
     world = SplatWorld(
         path.name, scene, (torch.arange(60) % 3 == 0).to(torch.uint8), planar_pose(ONE, 0 * ONE, 1.6 * ONE, 0 * ONE),
         SplatConfig(LENS, SIZE), {"objects": [f"{path.name} {one}" for one in range(objects)]},
-        (torch.arange(60) % (objects + 1)).int(), solids,
+        (torch.arange(60) % (objects + 1)).int(), SolidBoxes.of(solids),
     )  # fmt: skip
     save_splat(world, path)
     return world

@@ -24,7 +24,7 @@ from ..space.occupancy import Walker
 from ..space.raster import Gaussians
 from ..space.raster.move import turned
 from ..worlds.additions import INVENTED, OBSERVED
-from ..worlds.splat import SplatConfig, SplatWorld
+from ..worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from ..worlds.splat_folder import save_splat, world_of
 from .progress import Progress, silent, stage
 from .splat_places import SpaceResult, page_scene
@@ -153,7 +153,7 @@ def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildS
     origin = torch.full((len(place.gaussians),), provenance, dtype=torch.uint8)
     world = SplatWorld(
         parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,
-        place.solids, place.bodies,
+        SolidBoxes(place.solids, place.bodies),
     )  # fmt: skip
     save_splat(world, out)
     replace_whole(out / LAYOUT_FILE, lambda file: file.write_text(json.dumps(parsed.document, indent=1) + "\n"))
@@ -168,7 +168,7 @@ def _of_triangles(
     splats, objects, solids = of_triangles(scene, gaussians)
     names = list(scene.names)
     card = {"file": file.name, "objects": names}
-    save_splat(world_of(splats, file.stem, card, _splat_config(size, WALKER), objects, solids), out)
+    save_splat(world_of(splats, file.stem, card, _splat_config(size, WALKER), objects, SolidBoxes.of(solids)), out)
     facts: Mapping[str, Any] = {
         "world": str(out), "gaussians": len(splats), "triangles": len(scene.corners), "objects": names,
         "lights": len(scene.lights), "boxes": None if solids is None else len(solids),

@@ -69,7 +69,7 @@ def save_world(
     about = _described(KIND, VERSION, world.about, parts) | ({} if card is None else {"card": dict(card)})
     try:
         if remembered is None:
-            memory = _remembered(world.scene, quality)
+            memory = PACKED[world.scene.kind](world.scene, quality)
         else:
             memory = data_file(remembered, "memory").read_bytes()
         write_world(path, about, weights, memory)
@@ -271,7 +271,7 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
     return FrameHistory(config, begun, remembered.get("over"))
 
 
-# By part and kind: its settings, and how it is made of them, its weights and what is remembered.
+# By part and kind: its settings, and how it is made from them, its weights and the memory.
 KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(restored(Motion(config), weights)))},
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
@@ -286,22 +286,23 @@ KINDS: dict[str, dict[str, tuple[type, Make]]] = {
 }
 
 
-# By kind of a latent world's network: its settings, and how it is made of them.
+# By kind of a latent world's network: its settings, and how it is made from them.
 NETWORKS: dict[str, tuple[type, Callable[[Any], LatentNetwork]]] = {LatentNetwork.kind: (LatentConfig, LatentNetwork)}
 
 
-def _remembered(scene: Any, quality: int) -> dict[str, torch.Tensor]:
-    """What a scene remembers, packed."""
-    if isinstance(scene, KeyframeScene):
-        parts = {"memory": scene.recorded, "starts": scene.starts}
-        return {f"{name}.{key}": value for name, keys in parts.items() for key, value in _pack(keys, quality).items()}
-    starts: Any = scene.starts
-    assert isinstance(scene, FrameHistory)
-    packed = {
-        f"starts.{key}": value for key, value in _pack_frames(starts.frames.flatten(0, 1), max(quality, 99)).items()
-    }
-    packed |= {f"starts.{name}": getattr(starts, name) for name in ("actions", "vitals", "known")}
-    return {**packed, "over": scene.over}
+def _packed_places(scene: KeyframeScene, quality: int) -> dict[str, torch.Tensor]:
+    parts = {"memory": scene.recorded, "starts": scene.starts}
+    return {f"{name}.{key}": value for name, keys in parts.items() for key, value in _pack(keys, quality).items()}
+
+
+def _packed_frames(scene: FrameHistory, quality: int) -> dict[str, torch.Tensor]:
+    starts = _pack_frames(scene.starts.frames.flatten(0, 1), max(quality, 99))
+    starts |= {name: getattr(scene.starts, name) for name in ("actions", "vitals", "known")}
+    return {**{f"starts.{name}": value for name, value in starts.items()}, "over": scene.over}
+
+
+# By kind of scene: what it remembers, as tensors for a file.
+PACKED: dict[str, Callable[[Any, int], Tensors]] = {"keyframes": _packed_places, "history": _packed_frames}
 
 
 def _below(tensors: Tensors, name: str) -> dict[str, torch.Tensor]:

@@ -6,6 +6,8 @@ B is the batch, H x W the size of a frame, A the numbers of an encoded action. A
 which is falsy and adds nothing to a state.
 """
 
+# the methods of a Protocol are their docstrings
+# pyright: reportReturnType=false
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -64,7 +66,6 @@ class WorldPart(Protocol):
 
     def to(self, device: Any) -> Any:
         """The part on another device."""
-        ...
 
 
 @runtime_checkable
@@ -77,16 +78,13 @@ class Body(WorldPart, Protocol):
     def channels(self) -> Channels: ...
     def observe(self, prior: State | None, evidence: Evidence) -> Tensors:
         """The body where the evidence puts it; without a prior it stands still."""
-        ...
 
     def step(self, state: State, actions: torch.Tensor, walls: Walls, levels: torch.Tensor) -> Tensors:
         """One step on. actions [B, history + 1, A], the newest last; levels [K, 3]: recorded places in metres, whose height a
         body follows on stairs."""
-        ...
 
     def ends(self, after: State, action: torch.Tensor) -> torch.Tensor:
         """bool [B]: whether the episode ends where the action [B, A] led."""
-        ...
 
 
 @runtime_checkable
@@ -105,40 +103,31 @@ class Scene(WorldPart, Protocol):
 
     def with_memory(self, recorded: Any = None, budget_mb: float | None = None) -> Self:
         """With other recorded keyframes, or another budget in MiB for an episode's own."""
-        ...
 
     def channels(self) -> Channels: ...
     def start(self, seeds: torch.Tensor) -> tuple[Evidence, torch.Tensor]:
         """Evidence of recorded starts, drawn by chance from the seeds [B]; which starts they are, int64 [B]."""
-        ...
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
         """The observation, checked and completed; ObservationError says what is wrong with it."""
-        ...
 
     def observe(self, prior: State | None, evidence: Evidence) -> State:
         """A state that has seen and remembers the picture of the evidence; of a new episode without a prior."""
-        ...
 
     def adopt(self, state: State) -> State:
         """The state with what it points at in this scene's arenas; ContractError for a state of another layout."""
-        ...
 
     def walls(self, state: State) -> tuple[State, Walls]:
         """The walls around; and the state, with those frames drawn in which walls had to be looked for."""
-        ...
 
     def look(self, state: State, before: State) -> Conditioning:
         """What is known of the view of `state`, whose frame is not yet drawn; `before` has the last frame."""
-        ...
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """`state` with the frame that was drawn from the conditioning, remembered if it shows something new."""
-        ...
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         """Those of the channels that are not state entries as they stand."""
-        ...
 
 
 @runtime_checkable
@@ -147,12 +136,10 @@ class Generator(WorldPart, Protocol):
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """The conditioning, with what the generator itself derives from it once a frame."""
-        ...
 
     def __call__(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """The clean frame [B, 4 or 5, H, W]: rgb in [-1, 1], depth code, and where things move the logit of a thing; of `noisy`
         [B, 4, H, W] at flow time [B] in 0..1."""
-        ...
 
 
 @runtime_checkable
@@ -162,7 +149,6 @@ class Objects(WorldPart, Protocol):
     def channels(self, size: tuple[int, int]) -> Channels: ...
     def start(self, pick: torch.Tensor, state: State) -> Tensors:
         """The objects of the starts `pick` [B], in place of the things in their pictures; empty where frames stay as they are."""
-        ...
 
     def observe(
         self,
@@ -172,19 +158,15 @@ class Objects(WorldPart, Protocol):
         camera: Intrinsics | None,
     ) -> Tensors:
         """The objects that the evidence shows."""
-        ...
 
     def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
         """The objects one step on, by chance from the seeds [B]."""
-        ...
 
     def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:
         """The walls, and the sides of objects that stop a body of this half width."""
-        ...
 
     def paint(self, state: State, frame: DrawnFrame, camera: Intrinsics | None) -> DrawnFrame:
         """The frame with the objects of the state in it."""
-        ...
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors: ...
 
@@ -198,14 +180,12 @@ class Outcome(WorldPart, Protocol):
     def channels(self) -> Channels: ...
     def observe(self, prior: State | None, evidence: Evidence, observation: Mapping[str, torch.Tensor]) -> Tensors:
         """An episode that goes on, with the vitals that are observed."""
-        ...
 
     def step(
         self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
     ) -> Tensors:
         """The outcome of the step by action [B, A]; ends [B]: whether the body says that the episode ends there. Frames are
         drawn only if they are read."""
-        ...
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors: ...
 
@@ -220,7 +200,6 @@ class Uncertainty(WorldPart, Protocol):
     ) -> torch.Tensor:
         """Expected mean absolute error of rgb, 0..1, float32 [B]. clean: the generator's frame; situation [B, S] and strange
         [B]: see uncertainty.py."""
-        ...
 
 
 class Absent:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
@@ -55,18 +55,30 @@ class SplatConfig:
     additions: int = 32768  # Gaussians that pictures may add to the place of an episode
 
 
+class SolidBoxes(NamedTuple):
+    """Boxes that stop bodies."""
+
+    boxes: torch.Tensor  # float32 [S, 6], low and high corners in metres
+    bodies: torch.Tensor  # int32 [S], the object that can be pushed of which each is a part; 0: it stays
+
+    @staticmethod
+    def of(boxes: torch.Tensor | None, bodies: torch.Tensor | None = None) -> SolidBoxes:
+        """Boxes that stay, unless `bodies` says otherwise; None: no boxes."""
+        boxes = torch.zeros(0, 6) if boxes is None else boxes
+        return SolidBoxes(boxes, torch.zeros(len(boxes), dtype=torch.int32) if bodies is None else bodies)
+
+
 @final
 class SplatWorld:
     """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
-    `objects`, int32 [N], says which object each belongs to (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies meet
-    `solids`, boxes float32 [S, 6] (low and high corners), where they are known, and else what the Gaussians fill. `bodies`, int32
-    [S], says of which object that can be pushed each solid is a part (0: it stays). Where MuJoCo is installed those are rigid
-    bodies, on which their Gaussians ride; the channel `bodies` [K, 7] has their poses, in the order of the objects.
+    `objects` int32 [N]: the object of each Gaussian (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies collide
+    with `solids`, or without any with what the Gaussians fill. Where MuJoCo is installed, objects that can be pushed are rigid
+    bodies that carry their Gaussians; the channel `bodies` [K, 7] has their poses, in the order of the objects.
 
-    rgb and depth (0 where nothing is) are drawn by `rasterise`; ids int32 [H, W] says which Gaussian counts most at a pixel (-1:
-    none), known [H, W] how much of it was observed, and uncertainty is the share of the picture that was not. A button that
-    goes UP lifts off; who comes DOWN to the floor walks again. `places` says where one can walk to (kind 4). What pictures
-    with depth show is fused into the place of that episode alone (space/fusing.py); floors and walls stay.
+    rgb and depth (0: nothing) are drawn by `rasterise`; ids int32 [H, W]: the Gaussian with the largest share of a pixel (-1:
+    none); known [H, W]: how much of a pixel was observed; uncertainty: the share of the picture that was not. UP lifts off;
+    DOWN to the floor walks again. `places`: where one can walk to (kind 4). Pictures with depth are fused into the place of
+    their episode alone (space/fusing.py); floors and walls stay.
     """
 
     def __init__(
@@ -78,14 +90,12 @@ class SplatWorld:
         config: SplatConfig | None = None,
         card: Mapping[str, Any] | None = None,
         objects: torch.Tensor | None = None,
-        solids: torch.Tensor | None = None,
-        bodies: torch.Tensor | None = None,
+        solids: SolidBoxes | None = None,
     ):
         self.name, self.gaussians, self.provenance, self.starts = name, gaussians, provenance, starts
         self.config, self.card = config or SplatConfig(), dict(card or {})
         self.objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
-        self.solids = torch.zeros(0, 6) if solids is None else solids
-        self.bodies = torch.zeros(len(self.solids), dtype=torch.int32) if bodies is None else bodies
+        self.solids, self.bodies = SolidBoxes.of(None) if solids is None else solids
         things = self.bodies.unique().tolist() if find_spec("mujoco") else []
         self.things = [number for number in things if number]  # the objects that are rigid bodies here
         self.added = Additions(gaussians, provenance, self.config.additions)

@@ -24,7 +24,7 @@ from ..space.occupancy import Walker
 from ..space.raster import Gaussians
 from .additions import INVENTED, OBSERVED
 from .checkpoint import WORLD_FILE, data_file, read_data, write_checkpoint
-from .splat import SplatConfig, SplatWorld
+from .splat import SolidBoxes, SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
 MOST_ADDITIONS = 10_000_000
@@ -95,7 +95,8 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         if bodies is not None and (solids is None or bodies.shape != solids.shape[:1]):
             raise ValueError("its bodies are not those of its solids")
         world = SplatWorld(
-            str(about["name"]), Gaussians(**tensors), provenance, starts, config, dict(about["card"]), objects, solids, bodies
+            str(about["name"]), Gaussians(**tensors), provenance, starts, config, dict(about["card"]), objects,
+            SolidBoxes.of(solids, bodies),
         )  # fmt: skip
         edits = read_edits(path) if edits is None else edits
         return _after(world, edits, other_of(path)) if edits else world
@@ -114,13 +115,13 @@ def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], Sp
         names = [*names, *[""] * lift][:lift] + one.object_names
     return SplatWorld(
         source.name, after.gaussians, provenance, source.starts, source.config, {**card, "objects": names} if merged else card,
-        after.objects, *_solids(source, edits, merged, after),
+        after.objects, _solids(source, edits, merged, after),
     )  # fmt: skip
 
 
 def _solids(
     source: SplatWorld, edits: Sequence[Edit], merged: Sequence[SplatWorld], after: Edited
-) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+) -> SolidBoxes | None:
     """Boxes and bodies after edits; None where edits moved what they describe, or a place has none: then Gaussians stop bodies."""
     solids, bodies = [source.solids], [source.bodies]
     for edit, one, lift in zip(merges(edits), merged, after.raised):
@@ -128,8 +129,8 @@ def _solids(
         solids.append(torch.zeros(0, 6) if boxes is None else boxes)
         bodies.append(torch.where(one.bodies > 0, one.bodies + lift, 0).int())
     if len(merged) < len(edits) or not all(len(part) for part in solids):
-        return None, None
-    return torch.cat(solids), torch.cat(bodies)
+        return None
+    return SolidBoxes(torch.cat(solids), torch.cat(bodies))
 
 
 def source_of(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld:
@@ -240,7 +241,7 @@ def world_of(
     card: dict[str, Any],
     config: SplatConfig,
     objects: torch.Tensor | None = None,
-    solids: torch.Tensor | None = None,
+    solids: SolidBoxes | None = None,
 ) -> SplatWorld:
     """A world of Gaussians that starts at the free place with a floor that is nearest to their middle, in eight directions."""
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
