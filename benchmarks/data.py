@@ -27,18 +27,18 @@ import pyarrow.parquet as pq
 from terrella.data import ClipCache, Layout, Recorder, Sensor
 from terrella.data.channels import ACTION, DONE, REWARD, RGB
 from terrella.data.training.cache import finish, new_arrays
-from terrella.data.training.clips import Clips
+from terrella.data.training.clips import Clips, ClipsConfig
 
 LENGTH, BATCH, FPS = 16, 32, 30
 
 OPEN = """
 import json, resource, sys, time
 from terrella.data import ClipCache, Dataset
-from terrella.data.training.clips import Clips
+from terrella.data.training.clips import Clips, ClipsConfig
 def anonymous_mib():
     return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1]) / 1024
 root, warm = sys.argv[1:]
-list(Clips(ClipCache.open(warm), 4, ("action",), 4))
+list(Clips(ClipCache.open(warm), ClipsConfig(4, ("action",), 4)))
 before = anonymous_mib()
 begun = time.perf_counter()
 dataset = Dataset(root)
@@ -49,7 +49,7 @@ dataset_mib = anonymous_mib() - before
 cache = ClipCache.open(dataset)
 before = anonymous_mib()
 begun = time.perf_counter()
-clips = Clips(ClipCache(cache.path), 16, ("action", "row"), 32)
+clips = Clips(ClipCache(cache.path), ClipsConfig(16, ("action", "row"), 32))
 next(iter(clips))
 clips_s = time.perf_counter() - begun
 for count, batch in enumerate(clips.forever()):
@@ -64,10 +64,10 @@ print(json.dumps({
 OURS = """
 import json, sys, time
 import numpy as np
-from terrella.data.training.clips import Clips
+from terrella.data.training.clips import Clips, ClipsConfig
 root, length, batch, workers, count, size, keep, as_float = sys.argv[1:]
 length, batch, workers, count, size = int(length), int(batch), int(workers), int(count), json.loads(size)
-clips = Clips(root, length, ("rgb", "action", "row"), batch, size, workers=workers, torch=True, seed=1)
+clips = Clips(root, ClipsConfig(length, ("rgb", "action", "row"), batch, size, workers=workers, torch=True, seed=1))
 batches = clips.forever()
 first = next(batches)
 pictures = first["rgb"].float()
@@ -77,7 +77,7 @@ for _ in range(count):
     if as_float == "1":
         pictures.copy_(one["rgb"]).mul_(1 / 255)
 took = time.perf_counter() - begun
-again = Clips(root, length, ("rgb", "row"), batch, size, seed=1)
+again = Clips(root, ClipsConfig(length, ("rgb", "row"), batch, size, seed=1))
 rows = [b["row"][:, 0].tolist() for b, _ in zip(again.forever(), range(count + 1))]
 np.savez(keep, rows=np.concatenate(rows), rgb=first["rgb"].numpy())
 print(json.dumps({"frames_per_s": count * batch * length / took}))
@@ -137,7 +137,7 @@ def reading(folder: Path, rounds: int) -> list[dict]:
         cache = noise(folder / f"noise-{pixels}", pixels, rows)
         speed: dict[int, list[float]] = {1: [], 2: []}
         for _, workers in itertools.product(range(rounds), speed):
-            batches = Clips(cache, LENGTH, ("rgb", "action"), BATCH, workers=workers).forever()
+            batches = Clips(cache, ClipsConfig(LENGTH, ("rgb", "action"), BATCH, workers=workers)).forever()
             for _ in range(rows // (LENGTH * BATCH)):  # every page of the cache is mapped
                 next(batches)
             count, begun = 0, time.perf_counter()

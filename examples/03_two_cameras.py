@@ -20,7 +20,7 @@ import terrella
 from terrella.core import Camera
 from terrella.core.policy import Random
 from terrella.core.spec import POSE, POSE_UNIT
-from terrella.data import Dataset, record
+from terrella.data import Dataset, RecordOptions, record
 from terrella.sim.gymnasium import Adapter, Channel
 
 SIZE, FOV_DEGREES, ROOM_M = (96, 128), 74.0, 4.0
@@ -118,7 +118,14 @@ gymnasium.register("TwoCameras-v0", TwoCameras)
 
 def main(out: Path = Path("recordings/two-cameras"), frames: int = 200) -> dict[str, object]:
     world = terrella.load("gym:TwoCameras-v0", forkable=False)
-    record(world, Random(world.spec, (5, 15)), out, frames, terrella.make_rng(0), max_episode_steps=100)
+    record(
+        world,
+        Random(world.spec, (5, 15)),
+        out,
+        frames,
+        terrella.make_rng(0),
+        options=RecordOptions(max_episode_steps=100),
+    )
     world.close()
     dataset = Dataset(out)
     print(f"{dataset.length} rows in {out}, cameras {', '.join(dataset.cameras)}")

@@ -14,7 +14,7 @@ from terrella import library
 from terrella.cli import main
 from terrella.core import Spec, State, make_rng
 from terrella.core.policy import Random
-from terrella.data import Layout, Recorder, record
+from terrella.data import Layout, Recorder, RecordOptions, record
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.score import arms_of
 
@@ -321,7 +321,14 @@ class Rig:
 
 def test_two_cameras_axes_and_poses_are_scored_from_what_was_recorded(tmp_path, monkeypatch, capsys):
     rig = Rig()
-    record(rig, Random(rig.spec, (3, 9)), tmp_path / "set", 200, make_rng(0), max_episode_steps=50, pictures="png")
+    record(
+        rig,
+        Random(rig.spec, (3, 9)),
+        tmp_path / "set",
+        200,
+        make_rng(0),
+        options=RecordOptions(max_episode_steps=50, pictures="png"),
+    )
     monkeypatch.setattr(library, "load", lambda name, **options: Rig())
     given = ["score", "rig", "--data", str(tmp_path / "set"), "--out", str(tmp_path / "out"), "--fresh", "--quick"]
     assert main([*given, "--horizons", "1", "8", "16", "--json"]) == 0

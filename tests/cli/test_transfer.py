@@ -166,11 +166,13 @@ def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeyp
 def test_a_recording_stands_for_reality(tmp_path, capsys, few):
     from terrella.core import make_rng
     from terrella.core.policy import Random
-    from terrella.data import record
+    from terrella.data import RecordOptions, record
     from terrella.library import load
 
     real = load("mujoco:arm-real", cameras=())
-    record(real, Random(real.spec, (1, 9)), tmp_path / "set", 120, make_rng(0), max_episode_steps=30)
+    record(
+        real, Random(real.spec, (1, 9)), tmp_path / "set", 120, make_rng(0), options=RecordOptions(max_episode_steps=30)
+    )
     words = ("transfer", "--real", tmp_path / "set", "--real-episodes", 2, "--out", tmp_path / "t", "--json")
     code, out, _ = ran(capsys, *words)
     told = json.loads(out)
@@ -186,7 +188,7 @@ def test_a_recording_stands_for_reality(tmp_path, capsys, few):
         tmp_path / "other",
         120,
         make_rng(0),
-        max_episode_steps=30,
+        options=RecordOptions(max_episode_steps=30),
     )
     code, _, err = ran(capsys, "transfer", "--real", tmp_path / "other", *words[3:])
     assert code == 2 and "other settings" in err  # the folder's residual is of the first recording

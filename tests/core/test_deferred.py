@@ -171,3 +171,9 @@ def test_what_another_thread_computes_meanwhile_keeps_its_rows(monkeypatch):
     for _ in range(8):
         arena.keep({"v": torch.full((1,), -1.0).double()})
     assert arena.read("v")[kept["rows"]].tolist() == [[8.0]]
+
+
+def test_the_device_of_a_state_whose_tensors_are_all_deferred_is_that_of_its_plan():
+    before = State({"place": torch.zeros(2, 3, device="meta")})
+    late = State({}, deferred=Deferred(["frame"], Step(lambda state, now: {"frame": state["place"] + 1}, before, {})))
+    assert late.device.type == late.at(0).device.type == late["frame"].device.type == "meta"

@@ -16,10 +16,10 @@ def _recorded(tmp_path_factory) -> Path:
     from corridor import Corridor, keys
 
     from terrella.core import make_rng
-    from terrella.data import record
+    from terrella.data import RecordOptions, record
 
     root = tmp_path_factory.mktemp("recorded") / "corridor"
-    record(Corridor(), keys, root, frames=100, rng=make_rng(0), max_episode_steps=29)
+    record(Corridor(), keys, root, frames=100, rng=make_rng(0), options=RecordOptions(max_episode_steps=29))
     return root
 
 

@@ -11,7 +11,7 @@ from layouts import layout_of
 
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Dataset, Recorder, record, split
+from terrella.data import ClipCache, Dataset, Recorder, RecordOptions, record, split
 from terrella.data.training import cache
 from terrella.data.training.cache import shrink
 
@@ -39,7 +39,7 @@ def test_it_is_built_once_and_again_when_the_recording_grows(recording, monkeypa
     monkeypatch.setattr(cache, "_build", None)  # a second build would fail
     assert ClipCache.open(recording, (24, 32)).path == first.path
     monkeypatch.undo()
-    record(Corridor(), keys, recording, frames=130, rng=make_rng(0), max_episode_steps=29)
+    record(Corridor(), keys, recording, frames=130, rng=make_rng(0), options=RecordOptions(max_episode_steps=29))
     grown = ClipCache.open(recording, (24, 32))
     assert grown.length == 130 and grown.path != first.path
     assert first.rgb[99].shape == (24, 32, 3) and not first.path.exists()  # what is mapped stays readable

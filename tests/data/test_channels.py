@@ -20,7 +20,7 @@ from terrella.care import doctor
 from terrella.core import Camera, Spec, check_world, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.policy import Replay
-from terrella.data import ClipCache, Clips, Dataset, Layout, Recorder, check_game, record
+from terrella.data import ClipCache, Clips, ClipsConfig, Dataset, Layout, Recorder, RecordOptions, check_game, record
 from terrella.data.channels import channel_of, feature_of, features_of
 
 STEPS = 7
@@ -29,7 +29,14 @@ STEPS = 7
 def recorded(root, pictures="png", world=None) -> Dataset:
     world = world or TwoCameras()
     actions = torch.linspace(-1, 1, 2 * STEPS).reshape(STEPS, 1, 2)
-    record(world, Replay(actions), root, STEPS + 1, make_rng(0), task="lift the red cup", pictures=pictures)
+    record(
+        world,
+        Replay(actions),
+        root,
+        STEPS + 1,
+        make_rng(0),
+        options=RecordOptions(task="lift the red cup", pictures=pictures),
+    )
     return Dataset(root)
 
 
@@ -111,7 +118,7 @@ def test_old_recordings_of_objects_are_read_by_their_name_of_now(tmp_path):
     for name in ("objects", "observation.objects", "observation.cast"):
         assert dataset.episode(0, [name])[name][5].max() == 5
     assert np.array_equal(ClipCache.open(dataset, (8, 8)).further["objects"][:, 0, 0], np.arange(6))
-    assert next(iter(Clips(dataset, 2, ("objects",), 2, (8, 8))))["objects"].shape == (2, 2, 2, 4)
+    assert next(iter(Clips(dataset, ClipsConfig(2, ("objects",), 2, (8, 8)))))["objects"].shape == (2, 2, 2, 4)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +170,7 @@ def test_clips_of_any_channel(tmp_path):
         "action",
         "observation",
     )
-    batch = next(iter(Clips(dataset, 3, channels, 2, (8, 16), shuffle=False)))
+    batch = next(iter(Clips(dataset, ClipsConfig(3, channels, 2, (8, 16), shuffle=False))))
     assert batch["rgb.wrist"].shape == (2, 3, 8, 16, 3) and batch["depth.wrist"].shape == (2, 3, 4, 6)
     assert batch["voxels"].shape == (2, 3, 2, 3, 4, 2) and batch["state"].shape == (2, 3, 3)
     assert batch["instruction"].shape == (2, 3, 5)  # the recorded channel, not the embedding of the task
@@ -188,7 +195,7 @@ assert doctor(root) == []
 write_source(open_source(root), out + "/converted", "mcap")
 write_source(open_source(out + "/converted"), out + "/back")
 assert len(Dataset(out + "/back").episodes) == 4
-next(iter(Clips(root, 4, ("rgb", "action", "instruction"), 2, (12, 16))))
+next(iter(Clips(root, ClipsConfig(4, ("rgb", "action", "instruction"), 2, (12, 16)))))
 try:
     terrella.data.record
 except ImportError as error:

@@ -16,7 +16,7 @@ from terrella.data import ClipCache, Dataset, Layout, Recorder
 from terrella.data.channels import RGB
 from terrella.data.source import Sensor
 from terrella.data.training.cache import finish, new_arrays
-from terrella.data.training.clips import Clips
+from terrella.data.training.clips import Clips, ClipsConfig
 from terrella.data.training.order import shuffled
 
 KINDS = {
@@ -90,7 +90,7 @@ def test_each_start_comes_once_an_epoch_and_no_clip_leaves_its_episode(small, da
     batch, seed = data.draw(st.integers(1, 7)), data.draw(st.integers(0, 100))
     picked = data.draw(st.sampled_from([None, [0, 3], [5, 3, 1]]))  # episode 3 is long enough for any of these
     options = {"seed": seed, "stride": stride, "episodes": picked, "drop_last": False, "shuffle": seed % 5 > 0}
-    clips = Clips(small, length, ("rgb", "action", "row", "episode"), batch, **options)
+    clips = Clips(small, ClipsConfig(length, ("rgb", "action", "row", "episode"), batch, **options))
     for epoch in range(2):
         found = list(clips)
         assert len(found) == -(-len(np.concatenate([b["row"] for b in found])) // batch) and clips.epoch == epoch + 1
@@ -112,7 +112,7 @@ def test_each_start_comes_once_an_epoch_and_no_clip_leaves_its_episode(small, da
 @pytest.mark.parametrize("workers", [0, 1, 3])
 def test_it_goes_on_after_any_batch_with_any_number_of_workers(small, workers):
     def made(count):
-        return Clips(small, 3, ("rgb", "row"), 4, seed=7, workers=count)
+        return Clips(small, ClipsConfig(3, ("rgb", "row"), 4, seed=7, workers=count))
 
     clips, states, seen = made(workers), [], []
     states.append(clips.state())
@@ -133,12 +133,12 @@ def test_it_goes_on_after_any_batch_with_any_number_of_workers(small, workers):
 
 
 def test_a_state_of_other_clips_is_refused(small, tmp_path):
-    state = Clips(small, 3, ("row",), 4).state()
+    state = Clips(small, ClipsConfig(3, ("row",), 4)).state()
     for other, word in (
-        (Clips(small, 3, ("row",), 4, seed=1), "seed=0"),
-        (Clips(small, 2, ("row",), 4), "length=3"),
-        (Clips(small, 3, ("row",), 4, episodes=[0, 3]), "clips="),
-        (Clips(cache_of(tmp_path, np.array([3, 7, 0, 12, 5, 1])), 3, ("row",), 4), "episodes="),
+        (Clips(small, ClipsConfig(3, ("row",), 4, seed=1)), "seed=0"),
+        (Clips(small, ClipsConfig(2, ("row",), 4)), "length=3"),
+        (Clips(small, ClipsConfig(3, ("row",), 4, episodes=[0, 3])), "clips="),
+        (Clips(cache_of(tmp_path, np.array([3, 7, 0, 12, 5, 1])), ClipsConfig(3, ("row",), 4)), "episodes="),
     ):
         with pytest.raises(DatasetError, match=word):
             other.resume(state)
@@ -150,13 +150,13 @@ def test_a_state_of_other_clips_is_refused(small, tmp_path):
         {**state, "of": 3},
     ):
         with pytest.raises(DatasetError, match="state"):
-            Clips(small, 3, ("row",), 4).resume(wrong)
+            Clips(small, ClipsConfig(3, ("row",), 4)).resume(wrong)
 
 
 @pytest.mark.parametrize(("world_size", "drop_last"), [(1, True), (2, False), (3, False), (3, True)])
 def test_ranks_share_an_epoch_among_them(small, world_size, drop_last):
     options = {"seed": 3, "drop_last": drop_last, "world_size": world_size}
-    ranks = [list(Clips(small, 2, ("row",), 2, rank=rank, **options)) for rank in range(world_size)]
+    ranks = [list(Clips(small, ClipsConfig(2, ("row",), 2, rank=rank, **options))) for rank in range(world_size)]
     rows = [row for batches in ranks for batch in batches for row in batch["row"][:, 0].tolist()]
     everything = [row for start, stop in small.episodes for row in range(start, stop - 1)]
     assert len(rows) == len(set(rows)) and set(rows) <= set(everything)
@@ -167,7 +167,7 @@ def test_ranks_share_an_epoch_among_them(small, world_size, drop_last):
 
 
 def test_a_batch_is_kept_for_as_long_as_anything_refers_to_it(small):
-    clips = Clips(small, 2, ("rgb", "row"), 2, workers=2)
+    clips = Clips(small, ClipsConfig(2, ("rgb", "row"), 2, workers=2))
     kept = [(batch["row"].copy(), batch["rgb"][1, 1:].reshape(-1)[::2]) for batch in clips]  # a view of a view
     for row, view in kept:
         want = np.repeat((row[1, 1:] % 251).astype(np.uint8), 18)[::2]
@@ -176,7 +176,7 @@ def test_a_batch_is_kept_for_as_long_as_anything_refers_to_it(small):
 
 def test_memory_is_used_again_when_nothing_refers_to_it(small):
     places = set()
-    for count, batch in enumerate(Clips(small, 2, ("rgb",), 2).forever()):
+    for count, batch in enumerate(Clips(small, ClipsConfig(2, ("rgb",), 2)).forever()):
         places.add(batch["rgb"].ctypes.data)
         del batch
         if count == 50:
@@ -185,7 +185,9 @@ def test_memory_is_used_again_when_nothing_refers_to_it(small):
 
 
 def test_torch_tensors_lie_over_the_same_memory(small):
-    plain, tensors = (next(iter(Clips(small, 2, ("rgb", "action", "done"), 4, torch=wrap))) for wrap in (False, True))
+    plain, tensors = (
+        next(iter(Clips(small, ClipsConfig(2, ("rgb", "action", "done"), 4, torch=wrap)))) for wrap in (False, True)
+    )
     assert all(
         isinstance(value, torch.Tensor) and np.array_equal(value, plain[name]) for name, value in tensors.items()
     )
@@ -193,7 +195,9 @@ def test_torch_tensors_lie_over_the_same_memory(small):
 
 
 def test_it_reads_a_recording_as_the_cache_shows_it(recording):
-    clips = Clips(recording, 5, ("rgb", "depth", "pose", "action", "action_valid", "row"), 8, (24, 32), workers=2)
+    clips = Clips(
+        recording, ClipsConfig(5, ("rgb", "depth", "pose", "action", "action_valid", "row"), 8, (24, 32), workers=2)
+    )
     cache = ClipCache.open(Dataset(recording), (24, 32))
     for batch in clips:
         for name in ("rgb", "depth", "pose", "action", "action_valid"):
@@ -211,7 +215,7 @@ def test_further_cameras_and_sensors_are_channels_by_their_keys(tmp_path):
             grey = {RGB: np.full((16, 32, 3), 10 * i, np.uint8), left: np.full((16, 32, 3), 200 - 10 * i, np.uint8)}
             recorder.add_row({**grey, state: np.full(3, i), far: np.full((4, 4), i), "action": np.array([i])})
     assert left not in ClipCache.open(tmp_path, (8, 8)).arrays
-    batch = next(iter(Clips(tmp_path, 4, (RGB, "rgb", left, state, far, "row"), 3, (8, 8))))
+    batch = next(iter(Clips(tmp_path, ClipsConfig(4, (RGB, "rgb", left, state, far, "row"), 3, (8, 8)))))
     rows = batch["row"]
     assert np.array_equal(batch["rgb"], batch[RGB]) and batch[left].shape == (3, 4, 8, 8, 3)
     assert np.abs(batch["rgb"].mean((2, 3, 4)) - 10 * rows).max() < 3
@@ -245,7 +249,7 @@ def test_what_cannot_be_is_said(small):
         ({"workers": -1}, "workers=-1"),
     ):
         with pytest.raises(DatasetError, match=word):
-            Clips(small, **{"length": 2, "batch": 2, **options})
+            Clips(small, ClipsConfig(**{"length": 2, "batch": 2, **options}))
 
 
 def test_a_broken_cache_is_said(tmp_path):
@@ -260,7 +264,7 @@ def test_opening_takes_no_more_memory_for_a_longer_recording(tmp_path):
     for rows in (1_000, 1_000_000):
         cache = cache_of(tmp_path / str(rows), np.full(10, rows // 10), {"action": (np.dtype(np.float32), (1,))})
         tracemalloc.start()
-        clips = Clips(ClipCache(cache.path), 16, ("action",), 32)
+        clips = Clips(ClipCache(cache.path), ClipsConfig(16, ("action",), 32))
         next(iter(clips))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()

@@ -30,7 +30,7 @@ def never(tmp_path_factory) -> Dataset:
 
 
 def gathered(root, workers, open=opened, **more) -> Dataset:
-    collect(open, opened()[0], root, make_rng(3), workers, episodes=COUNT, **more)
+    collect(Job.of(open, opened()[0].spec, make_rng(3)), root, workers, episodes=COUNT, **more)
     return Dataset(root)
 
 

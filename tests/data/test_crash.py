@@ -19,7 +19,7 @@ from layouts import layout_of
 from terrella.care import doctor
 from terrella.core import files, make_rng
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Dataset, Recorder, record
+from terrella.data import ClipCache, Dataset, Recorder, RecordOptions, record
 
 LAYOUT = layout_of(10, ("go",), rgb=(16, 16), pose=True)
 
@@ -70,10 +70,12 @@ def test_kill_9_loses_at_most_the_episode_in_flight(tmp_path, rows):
     assert before.length == 30 * len(before.episodes) >= rows // 30 * 30
     kept = [before.episode(i) for i in range(len(before.episodes))]
     goal = before.length + 60
-    record(Corridor(), keys, root, frames=goal, rng=make_rng(3), max_episode_steps=29)
+    record(Corridor(), keys, root, frames=goal, rng=make_rng(3), options=RecordOptions(max_episode_steps=29))
     after = Dataset(root)
     assert after.length == goal and doctor(root) == []
-    record(Corridor(), keys, tmp_path / "never", frames=goal, rng=make_rng(3), max_episode_steps=29)
+    record(
+        Corridor(), keys, tmp_path / "never", frames=goal, rng=make_rng(3), options=RecordOptions(max_episode_steps=29)
+    )
     for i, episode in enumerate(Dataset(tmp_path / "never").episodes):  # as if it had not been killed
         never, found = Dataset(tmp_path / "never").episode(episode.number), after.episode(i)
         assert all(np.array_equal(never[name], found[name]) for name in never)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from layouts import layout_of
 
 from terrella.core.instruction import INSTRUCTION_SIZE, embed, embed_all
-from terrella.data import ClipCache, Clips, Dataset, Recorder
+from terrella.data import ClipCache, Clips, ClipsConfig, Dataset, Recorder
 
 
 @given(st.text(max_size=40))
@@ -40,7 +40,9 @@ def test_every_row_of_a_batch_says_what_it_is_about(tmp_path):
     cache = ClipCache.open(tmp_path / "recording", (8, 8))
     assert cache.task is not None and [cache.tasks[number] for number in cache.task] == expected
     for source in (str(tmp_path / "recording"), f"file://{tmp_path}/recording"):
-        clips = Clips(source, 3, ("row", "task", "instruction", "action"), 4, (8, 8), cache_dir=tmp_path / "cache")
+        clips = Clips(
+            source, ClipsConfig(3, ("row", "task", "instruction", "action"), 4, (8, 8), cache_dir=tmp_path / "cache")
+        )
         for batch in clips:
             assert batch["instruction"].shape == (4, 3, INSTRUCTION_SIZE)
             texts = [expected[row] for row in batch["row"].reshape(-1)]

@@ -21,7 +21,7 @@ import pytest
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset
 from terrella.data.storage.remote import Files, LocalFiles, _let_go, open_files
-from terrella.data.training.clips import Clips
+from terrella.data.training.clips import Clips, ClipsConfig
 from terrella.data.training.windows import _Belt
 
 MEMORY = fsspec.filesystem("memory")
@@ -248,12 +248,12 @@ CHANNELS = ("rgb", "depth", "pose", "action", "episode", "row")
 
 def streaming(far, tmp_path, budget_bytes=400_000, **options) -> Clips:
     options = {"batch": 4, "size": (12, 16), "drop_last": False, "cache_dir": tmp_path / "cache", **options}
-    return Clips(far, 5, CHANNELS, budget_bytes=budget_bytes, **options)
+    return Clips(far, ClipsConfig(5, CHANNELS, budget_bytes=budget_bytes, **options))
 
 
 @pytest.mark.parametrize("budget_bytes", [1 << 30, 200_000, 100_000])  # one window; some; episodes cut
 def test_its_clips_are_those_of_the_clip_cache(far, recording, tmp_path, budget_bytes):
-    near = Clips(recording, 5, CHANNELS, 4, (12, 16), drop_last=False, shuffle=False)
+    near = Clips(recording, ClipsConfig(5, CHANNELS, 4, (12, 16), drop_last=False, shuffle=False))
     want = {
         int(row[0]): {name: batch[name][i] for name in CHANNELS} for batch in near for i, row in enumerate(batch["row"])
     }

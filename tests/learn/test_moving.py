@@ -14,7 +14,7 @@ from tests.data.corridor import DEPTH, Corridor
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError, TrainingError
-from terrella.data import ClipCache, record
+from terrella.data import ClipCache, RecordOptions, record
 from terrella.learn import moving_batches
 from terrella.learn.moving_batches import mirrored, moving_batch, other_side
 from terrella.learn.recipes.parts import ObjectsTraining, train_objects
@@ -88,7 +88,7 @@ class Peopled(Haunted):
 def peopled(tmp_path_factory):
     """A world learned of the same, and its recording."""
     folder, world = tmp_path_factory.mktemp("peopled"), Peopled()
-    record(world, Explorer(world.spec), folder / "set", 300, make_rng(0), max_episode_steps=80)
+    record(world, Explorer(world.spec), folder / "set", 300, make_rng(0), options=RecordOptions(max_episode_steps=80))
     train_video(folder / "set", folder / "run", replace(CONFIG, objects_steps=20), lambda *told: None)
     return load_world(folder / "run" / "world"), folder
 
@@ -97,7 +97,7 @@ def peopled(tmp_path_factory):
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("moving") / "set"
     world = Haunted()
-    record(world, Explorer(world.spec), folder, 300, make_rng(0), max_episode_steps=80)
+    record(world, Explorer(world.spec), folder, 300, make_rng(0), options=RecordOptions(max_episode_steps=80))
     return folder
 
 

@@ -16,7 +16,7 @@ from tests.learn.test_moving import Haunted
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.data import Recorder, record
+from terrella.data import Recorder, RecordOptions, record
 from terrella.learn.objectives import distillation
 from terrella.learn.objectives.distillation import Matching, drawn
 from terrella.learn.objectives.dreams import Rollouts, beginnings
@@ -51,7 +51,7 @@ DREAMS = DreamsConfig(steps=2, horizon=3, batch=2)
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("post") / "set"
     world = Corridor()
-    record(world, Explorer(world.spec), folder, 240, make_rng(0), max_episode_steps=80)
+    record(world, Explorer(world.spec), folder, 240, make_rng(0), options=RecordOptions(max_episode_steps=80))
     return folder
 
 
@@ -73,7 +73,7 @@ def places(recording, tmp_path_factory):
 def haunted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("haunted") / "set"
     world = Haunted()
-    record(world, Explorer(world.spec), folder, 240, make_rng(0), max_episode_steps=80)
+    record(world, Explorer(world.spec), folder, 240, make_rng(0), options=RecordOptions(max_episode_steps=80))
     return folder
 
 

@@ -18,7 +18,7 @@ from terrella.act import Explorer
 from terrella.core import Spec, check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.core.spec import Camera
-from terrella.data import ClipCache, Dataset, Layout, Recorder, record
+from terrella.data import ClipCache, Dataset, Layout, Recorder, RecordOptions, record
 from terrella.learn.batches import Batch, varied
 from terrella.learn.feeds import frames_feed
 from terrella.learn.recipes import video
@@ -43,7 +43,7 @@ CONFIG = TrainConfig(
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learn") / "set"
     world = Corridor()
-    record(world, Explorer(world.spec), folder, 360, make_rng(0), max_episode_steps=120)
+    record(world, Explorer(world.spec), folder, 360, make_rng(0), options=RecordOptions(max_episode_steps=120))
     return folder
 
 

@@ -15,7 +15,7 @@ from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.data import ClipCache, Dataset, Recorder, record, split
+from terrella.data import ClipCache, Dataset, Recorder, RecordOptions, record, split
 from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative
 from terrella.learn.objectives.uncertainty import ARMS, Dreamt, Rollout, answers, calibrate, dream, fit, pooled
 from terrella.learn.recipes.parts import EstimatorTraining, SensesConfig, train_estimator, train_uncertainty
@@ -46,7 +46,7 @@ BARE = TrainConfig(
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("senses") / "set"
     world = Corridor()
-    record(world, Explorer(world.spec), folder, 360, make_rng(0), max_episode_steps=120)
+    record(world, Explorer(world.spec), folder, 360, make_rng(0), options=RecordOptions(max_episode_steps=120))
     return folder
 
 

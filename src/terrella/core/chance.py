@@ -11,6 +11,8 @@ from collections.abc import Sequence
 
 import torch
 
+from .kernels_numba import halves
+
 GOLDEN, FIRST, SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15  # of splitmix64, as signed 64 bit
 
 
@@ -50,8 +52,6 @@ def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor,
     """The upper and the lower half of `count` hashes of each seed, as float32 [B, count] in [0, 1), multiples of 2**-24."""
     if seeds.device.type != "cpu":
         return _halves_slowly(seeds, count, stream)
-    from .kernels_numba import halves  # numba takes half a second to import
-
     high, low = torch.empty(2, len(seeds), count).unbind(0)
     halves(seeds.contiguous().numpy(), stream, high.numpy(), low.numpy())
     return high, low

@@ -1,8 +1,9 @@
-"""Deferred tensors of a state: computed when one is first read, once, however long the chain of steps behind it is.
+"""Deferred tensors of a state: computed once, when one of them is first read.
 
-A `Step` gives tensors from an earlier state (whose own may wait, too) and from tensors at hand. Picking entries of a state
-that waits (`at`, `fork`, `put`, `where`, `stack`) makes a `Pick`, which computes only the entries that are asked for. Both
-are pure: what they give does not depend on when it is read.
+A plan says how: a `Step` computes them from an earlier state (which may have deferred tensors itself) and from tensors at
+hand; a `Pick` takes batch entries of several states and computes no others; `Ready` takes batch entries of values that
+exist. `State.at`, `fork`, `put`, `where` and `stack` make Picks. The result of a plan does not depend on when it is read.
+A chain of plans of any length is computed without recursion.
 """
 
 from __future__ import annotations
@@ -10,63 +11,100 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 
+from .arena import Arena
 from .errors import ContractError
 
-if TYPE_CHECKING:
-    from .arena import Arena
-    from .state import State
+Tensors = Mapping[str, torch.Tensor]
+
+
+class Source(Protocol):
+    """The part of a State that plans read."""
+
+    @property
+    def batch(self) -> int: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    @property
+    def arenas(self) -> Mapping[str, Arena]: ...
+
+    @property
+    def deferred(self) -> Deferred | None: ...
+
+    def __getitem__(self, name: str, /) -> torch.Tensor: ...
+
+    def at(self, index: torch.Tensor) -> Source: ...
+
+    def narrowed(self, rows: torch.Tensor) -> Source: ...
 
 
 @dataclass(frozen=True)
 class Step:
-    """Tensors that `run(before, now)` gives: of an earlier State and of tensors `now` [B, ...] of the same batch."""
+    """Tensors computed by `run(before, now)` from an earlier State and from tensors `now` [B, ...] of the same batch."""
 
-    run: Callable[[State, Mapping[str, torch.Tensor]], Mapping[str, torch.Tensor]]
-    before: State
-    now: Mapping[str, torch.Tensor]
+    run: Callable[[Any, Tensors], Tensors]
+    before: Source
+    now: Tensors
 
     @property
     def batch(self) -> int:
         return self.before.batch
 
     @property
-    def sources(self) -> tuple[State, ...]:
+    def device(self) -> torch.device:
+        return self.before.device
+
+    @property
+    def arenas(self) -> Mapping[str, Arena]:
+        return self.before.arenas
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
         return (self.before,)
 
-    def ready(self) -> Step:
-        """The same; a step needs its earlier state whole."""
+    def narrowed(self) -> Step:
+        """The step itself: it needs all of its earlier state."""
         return self
 
     def at(self, rows: torch.Tensor) -> Step:
-        """The entries `rows` alone."""
+        """The plan for the batch entries `rows` alone."""
         return Step(self.run, self.before.at(rows), {name: tensor[rows] for name, tensor in self.now.items()})
 
-    def found(self, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
-        """The tensors; nothing that they need waits any more."""
-        found = dict(self.run(self.before, self.now))
-        if set(found) != set(names) or any(len(tensor) != self.batch for tensor in found.values()):
-            shapes = {name: tuple(tensor.shape) for name, tensor in found.items()}
+    def compute(self, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
+        """The tensors; the sources must have no deferred tensors left."""
+        values = dict(self.run(self.before, self.now))
+        if set(values) != set(names) or any(len(tensor) != self.batch for tensor in values.values()):
+            shapes = {name: tuple(tensor.shape) for name, tensor in values.items()}
             raise ValueError(f"a deferred step owes {names} of batch {self.batch}; it gave {shapes}")
-        return found
+        return values
 
 
 @dataclass(frozen=True)
 class Pick:
-    """The entries `index` [n] of several states, counted through all of them one after the other."""
+    """The batch entries `index` [n] of several states, which are counted one after the other."""
 
-    sources: tuple[State, ...]
+    sources: tuple[Source, ...]
     index: torch.Tensor
 
     @property
     def batch(self) -> int:
         return len(self.index)
 
-    def ready(self) -> Pick:
-        """The same of sources that hold no more than the picked entries."""
+    @property
+    def device(self) -> torch.device:
+        return self.index.device
+
+    @property
+    def arenas(self) -> Mapping[str, Arena]:
+        return self.sources[0].arenas
+
+    def narrowed(self) -> Pick:
+        """The same pick from sources that hold only the picked entries."""
         index, kept, low, start = self.index.new_zeros(self.batch), [], 0, 0
         for source in self.sources:
             mine = (self.index >= low) & (self.index < low + source.batch)
@@ -76,17 +114,17 @@ class Pick:
                 index[mine] = start + place
                 start += len(rows)
                 kept.append(source if len(rows) == source.batch else source.narrowed(rows))
-        if not kept:  # nothing is picked: one entry says what shapes nothing has
+        if not kept:  # nothing is picked: one entry still gives the shapes
             some = next((source for source in self.sources if source.batch), self.sources[0])
             kept.append(some if some.batch < 2 else some.narrowed(index.new_zeros(1)))
         return Pick(tuple(kept), index)
 
     def at(self, rows: torch.Tensor) -> Pick:
-        """The entries `rows` alone."""
+        """The plan for the batch entries `rows` alone."""
         return Pick(self.sources, self.index[rows])
 
-    def found(self, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
-        """The tensors; nothing that they need waits any more."""
+    def compute(self, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
+        """The tensors; the sources must have no deferred tensors left."""
         if not len(self.index):
             return {name: self.sources[0][name][:0] for name in names}
         kinds = {name: {tuple(source[name].shape[1:]) for source in self.sources} for name in names}
@@ -97,65 +135,88 @@ class Pick:
         return {name: torch.cat([source[name] for source in self.sources])[self.index] for name in names}
 
 
-class Deferred:
-    """The tensors `names` of a state, by a plan: Deferred(("rgb",), Step(draw, before, {"seed": seeds})).
+@dataclass(frozen=True)
+class Ready:
+    """The batch entries `index` [n] of values [B, ...] that exist; `arenas` are those that the values point into."""
 
-    They are computed with the gradient mode in which this was made; then what they were made of is let go.
+    values: Tensors
+    arenas: Mapping[str, Arena]
+    index: torch.Tensor
+    sources: tuple[Source, ...] = ()
+
+    @property
+    def batch(self) -> int:
+        return len(self.index)
+
+    @property
+    def device(self) -> torch.device:
+        return self.index.device
+
+    def narrowed(self) -> Ready:
+        """The plan itself: it has no sources."""
+        return self
+
+    def at(self, rows: torch.Tensor) -> Ready:
+        """The plan for the batch entries `rows` alone."""
+        return Ready(self.values, self.arenas, self.index[rows])
+
+    def compute(self, names: tuple[str, ...]) -> dict[str, torch.Tensor]:
+        """The tensors."""
+        return {name: self.values[name][self.index] for name in names}
+
+
+class Deferred:
+    """The tensors `names` of a state and the plan that computes them: Deferred(("rgb",), Step(draw, before, now)).
+
+    They are computed under the gradient mode in which this object was made; then the plan is released. Thread-safe.
     """
 
-    def __init__(self, names: Iterable[str], plan: Step | Pick):
-        self.names, self.batch = tuple(names), plan.batch
-        self._plan: Step | Pick | None = plan
+    def __init__(self, names: Iterable[str], plan: Step | Pick | Ready):
+        self.names, self.batch, self.device = tuple(names), plan.batch, plan.device
+        self._plan: Step | Pick | Ready | None = plan
         self._values: dict[str, torch.Tensor] | None = None
         self._lock = threading.Lock()
         self._modes = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
-        waiting = [waits.length for source in plan.sources if (waits := source.deferred) is not None]
-        self.length = 1 + max(waiting, default=0)  # of the chain behind it, at most
+        lengths = [earlier.length for source in plan.sources if (earlier := source.deferred) is not None]
+        self.length = 1 + max(lengths, default=0)  # most plans in the chain that ends here
 
     @property
     def done(self) -> bool:
+        """Whether the tensors have been computed."""
         return self._values is not None
 
     def values(self) -> dict[str, torch.Tensor]:
-        """The tensors by name, [B, ...]; what they follow from is computed first, the oldest first."""
+        """The tensors by name, [B, ...]; computes the chain behind them first, oldest first."""
         stack = [] if self.done else [self]
         while stack:
-            waiting = stack[-1]._waits_for()
-            if waiting:
-                stack += waiting
+            if earlier := stack[-1]._uncomputed_sources():
+                stack += earlier
             else:
                 stack.pop()._compute()
         assert self._values is not None
         return self._values
 
     def at(self, rows: torch.Tensor, arenas: Mapping[str, Arena]) -> Deferred:
-        """The entries `rows` alone, without the work for the others; arenas: those that the tensors point into."""
+        """The batch entries `rows`, computed without the others; `arenas` are those that the tensors point into."""
         with self._lock:
             plan = self._plan
         if plan is None:  # another thread has computed it meanwhile
-            plan = Pick((_whole(self.values(), arenas),), torch.arange(self.batch, device=rows.device))
+            plan = Ready(self.values(), arenas, torch.arange(self.batch, device=rows.device))
         return Deferred(self.names, plan.at(rows))
 
-    def _waits_for(self) -> list[Deferred]:
-        """What has to be computed before this."""
+    def _uncomputed_sources(self) -> list[Deferred]:
         with self._lock:
             if self._plan is None:
                 return []
-            self._plan = self._plan.ready()
-            return [waits for source in self._plan.sources if (waits := source.deferred) is not None]
+            self._plan = self._plan.narrowed()
+            return [earlier for source in self._plan.sources if (earlier := source.deferred) is not None]
 
     def _compute(self) -> None:
         with self._lock, torch.inference_mode(self._modes[0]), torch.set_grad_enabled(self._modes[1]):
             if self._plan is None:
                 return
-            found = self._plan.found(self.names)
-            for name, arena in self._plan.sources[0].arenas.items():
-                if name in found:
-                    arena.hold(found[name])
-            self._values, self._plan, self.length = found, None, 0
-
-
-def _whole(values: Mapping[str, torch.Tensor], arenas: Mapping[str, Arena]) -> State:
-    from .state import State
-
-    return State(values, arenas)
+            values = self._plan.compute(self.names)
+            for name, arena in self._plan.arenas.items():
+                if name in values:
+                    arena.hold(values[name])
+            self._values, self._plan, self.length = values, None, 0

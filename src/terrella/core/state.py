@@ -94,7 +94,7 @@ class State(Mapping):
 
     @property
     def device(self) -> torch.device:
-        return next((tensor.device for tensor in self._tensors.values()), torch.device("cpu"))
+        return next(iter(self._tensors.values())).device if self._tensors else self._deferred.device
 
     @property
     def arenas(self) -> Mapping[str, Arena]:

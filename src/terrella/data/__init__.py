@@ -1,6 +1,6 @@
 """Recordings: LeRobot v3.0 reader and crash-safe writer, the recorder, clips for training.
 
-Nothing here needs torch but `record`, which is fetched when it is first used.
+Nothing here needs torch but `record` and its options, which are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -8,27 +8,29 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .channels import check_game
 from .coverage import Coverage, coverage
 from .dataset import Dataset
 from .format import Layout
+from .game import check_game
 from .meta import Episode
 from .recorder import Recorder
 from .source import Readings, Sensor, Source, Take
 from .training.cache import ClipCache, split
-from .training.clips import Clips
+from .training.clips import Clips, ClipsConfig
 
 if TYPE_CHECKING:
-    from .recording import record
+    from .recording import RecordOptions, record
 
 __all__ = [
     "ClipCache",
     "Clips",
+    "ClipsConfig",
     "Coverage",
     "Dataset",
     "Episode",
     "Layout",
     "Readings",
+    "RecordOptions",
     "Recorder",
     "Sensor",
     "Source",
@@ -41,6 +43,6 @@ __all__ = [
 
 
 def __getattr__(name: str):
-    if name != "record":
+    if name not in ("RecordOptions", "record"):
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return import_module(f"{__name__}.recording").record
+    return getattr(import_module(f"{__name__}.recording"), name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -12,9 +12,6 @@ from gymnasium import spaces
 from ..core.errors import DatasetError, TerrellaError
 from ..core.spec import Camera, Spec, dtype_of, kind_of, shape_of
 from .source import Sensor
-
-if TYPE_CHECKING:
-    from .dataset import Dataset
 
 RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
 ACTION, REWARD, DONE = "action", "next.reward", "next.done"
@@ -151,34 +148,6 @@ def facts_of(spec: Spec) -> dict[str, object]:
         "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
         **limits,
     }
-
-
-def check_game(dataset: Dataset, spec: Spec) -> str:
-    """DatasetError in one sentence where the recording cannot be of the world's game: it has no actions or others, or no pictures
-    for a world that observes them. Gives a sentence where it fits but is said to be of another game, else ""."""
-    about: dict[str, Any] = dataset.world
-    mine: dict[str, Any] = facts_of(spec)
-    named = set(map(str, about.get("action_names") or ()))
-    game, learned = about.get("name"), spec.card.get("game")
-    limits = [name for name in ("action_low", "action_high", "discrete") if name in about and name in mine]
-    theirs, ours, why = about.get("action_space") or ", ".join(dataset.action_names), spec.action, ""
-    if not dataset.has("action"):
-        why = "holds no actions"
-    elif len(dataset.action_names) != int(np.prod(shape_of(spec.action))):
-        why = f"has the actions {', '.join(dataset.action_names)}, which are not those of {spec.name} ({ours})"
-    elif any(
-        np.shape(about[name]) != np.shape(mine[name]) or not np.allclose(about[name], mine[name]) for name in limits
-    ):
-        why = f"has actions in {theirs}, which are not those of {spec.name} ({ours})"
-    elif named and spec.action_names and (learned is None or game != learned) and named.isdisjoint(spec.action_names):
-        why = f"has the actions {', '.join(sorted(named))}, which are not those of {spec.name} ({', '.join(spec.action_names)})"
-    elif "rgb" in spec.observes and not dataset.has("rgb"):
-        why = f"holds no pictures, which {spec.name} observes"
-    if why:
-        raise DatasetError(f"{dataset.root} {why}: score and train a world on recordings of its own game.")
-    return (
-        f"{dataset.root} is of {game}; {spec.name} learned {learned}." if game and learned and game != learned else ""
-    )
 
 
 def _camera_json(camera: Camera) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""collect: many workers play the episodes of one recording; each is committed once, in order, whatever becomes of the workers."""
+"""collect: many workers play the episodes of one recording; each is committed once, in order, even if workers die."""
 
 from __future__ import annotations
 
@@ -19,36 +19,48 @@ import torch
 
 from ..core.errors import DatasetError, TerrellaError
 from ..core.policy import Policy
+from ..core.spec import Spec
 from ..core.world import World, make_rng
 from .format import Layout
 from .recorder import Recorder
 from .recording import LONGEST, base_of, play_episode, seed_of
 from .staged import Parcel
 
-AHEAD = 3  # episodes for each worker that may wait for an earlier one
+AHEAD = 3  # finished episodes a worker that may wait for an earlier one
 PATIENCE_S = 1.0
-MOST_DEATHS = 3  # workers that one episode may cost
+MOST_DEATHS = 3  # workers that may die in one episode
 Open = Callable[[], tuple[World, Callable[[], Policy]]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker is sent. open: gives the world, and what makes the policy of an episode; base: of the seeds; steps: of an
-    episode at most."""
+    """What workers are to record; it is sent to them, so it must be picklable."""
 
     open: Open
+    """Opens the world; gives it and a function that makes the policy of an episode."""
     layout: Layout
+    """Sensors and rate of the recording."""
     task: str
+    """The instruction of every episode."""
     base: int
+    """The number from which the seeds of all episodes follow."""
     steps: int
-    scratch: str | None = None  # a folder for what is not finished, which whoever sends the job removes
+    """Steps after which an episode is cut off."""
+    scratch: str | None = None
+    """A folder for unfinished episodes, which its sender removes; None makes one."""
+
+    @staticmethod
+    def of(open: Open, spec: Spec, rng: torch.Generator, layout: Layout | None = None) -> Job:
+        """A job for the world that `open` opens and `spec` describes."""
+        task, steps = f"explore {spec.name}", spec.max_episode_steps or LONGEST
+        return Job(open, layout or Layout.of(spec), task, base_of(rng), steps)
 
 
 class Player:
     """Plays episodes of a job by their numbers; the world is opened once."""
 
     def __init__(self, job: Job, label: str = ""):
-        """label: of a folder among temporary files that is this player's alone; it clears what one of that name left who died."""
+        """label: names this player's own temporary folder, which is cleared of what a dead player of that name left."""
         self._job, self._opened = job, None
         if label:
             self._folder = Path(tempfile.gettempdir()) / f"terrella-{label}"
@@ -58,7 +70,7 @@ class Player:
             self._folder = Path(tempfile.mkdtemp(prefix="terrella-", dir=job.scratch))
 
     def clear(self) -> None:
-        """Removes what it keeps on disk; it plays no more."""
+        """Removes the files of this player, which plays no more."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def play(self, number: int) -> Parcel | str:
@@ -77,8 +89,8 @@ class Player:
 
 
 class Workers(Protocol):
-    """Who plays: `ask` never waits, `answers` waits for one or more. A worker that dies is replaced, and what it was asked for is
-    played again."""
+    """The processes that play. `ask` never waits, `answers` waits for one episode or more. A worker that dies is replaced,
+    and its episode is played again."""
 
     size: int
 
@@ -92,44 +104,32 @@ class Workers(Protocol):
 
 
 def collect(
-    open: Open,
-    world: World,
+    job: Job,
     root: str | Path,
-    rng: torch.Generator,
     workers: Workers,
     episodes: int | None = None,
     frames: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    layout: Layout | None = None,
 ) -> Recorder:
-    """Records whole episodes, up to the limit of `world` or LONGEST steps, until `root` holds `episodes`, or `frames` or more (what
-    an earlier run left there counts).
+    """Records whole episodes until `root` holds `episodes` episodes, or `frames` rows or more. Those of an earlier run count.
 
-    `open` is sent to the workers (it must be picklable), and opens the same world there. Episodes are committed in the order of
-    their numbers and each is made of the seed and its number alone: the recording is the same with any number of workers, however
-    often it was stopped. Of a policy that does not learn `record` makes the same, but for the last episode, which it may cut.
-    Returns the closed recorder.
-    DatasetError as Recorder raises it; TerrellaError for what goes wrong in a world, or where an episode ends its worker
-    each time; what was committed before is safe.
+    Episodes are committed in the order of their numbers, and each follows from the seed and its number alone. So the
+    recording is the same with any number of workers and however often it was stopped. With a policy that does not learn,
+    `record` gives the same recording, but may cut the last episode. Returns the closed recorder.
+    DatasetError as Recorder raises it; TerrellaError for a fault of the world, or where an episode ends its worker each
+    time. Episodes committed before are safe.
     """
     if (episodes is None) == (frames is None) or (episodes or frames or 0) < 1:
         raise DatasetError("say how much to record: a number of episodes, or of frames, from 1 up.")
-    layout, task = layout or Layout.of(world.spec), f"explore {world.spec.name}"
-    job = Job(open, layout, task, base_of(rng), world.spec.max_episode_steps or LONGEST)
-    with Recorder(root, layout, task, "discard") as recorder:
+    with Recorder(root, job.layout, job.task, "discard") as recorder:
 
         def missing() -> bool:
             return recorder.episodes < episodes if episodes is not None else recorder.rows < (frames or 0)
 
         if missing():
             with _at_work(workers, job):
-                _gather(
-                    recorder,
-                    workers,
-                    episodes,
-                    missing,
-                    progress and (lambda: _told(progress, recorder, episodes, frames)),
-                )
+                report = progress and (lambda: _report(progress, recorder, episodes, frames))
+                _gather(recorder, workers, episodes, missing, report)
     return recorder
 
 
@@ -140,23 +140,25 @@ def _gather(
     missing: Callable[[], bool],
     report: Callable[[], None] | None,
 ) -> None:
-    asked, done = recorder.episodes, dict[int, Parcel]()
+    next_number, done = recorder.episodes, dict[int, Parcel]()
     while missing():
         upto = recorder.episodes + AHEAD * workers.size
-        for number in range(asked, upto if episodes is None else min(upto, episodes)):
+        for number in range(next_number, upto if episodes is None else min(upto, episodes)):
             workers.ask(number)
-            asked = number + 1
-        for number, found in workers.answers():
-            if isinstance(found, str):
-                raise TerrellaError(f"{found.rstrip('.')}. {recorder.episodes:,} episodes are safe in {recorder.root}.")
-            done[number] = found
+            next_number = number + 1
+        for number, answer in workers.answers():
+            if isinstance(answer, str):
+                raise TerrellaError(
+                    f"{answer.rstrip('.')}. {recorder.episodes:,} episodes are safe in {recorder.root}."
+                )
+            done[number] = answer
         while missing() and recorder.episodes in done:
             recorder.put_episode(done.pop(recorder.episodes))
             if report:
                 report()
 
 
-def _told(progress: Callable[[int, int], None], recorder: Recorder, episodes: int | None, frames: int | None) -> None:
+def _report(progress: Callable[[int, int], None], recorder: Recorder, episodes: int | None, frames: int | None) -> None:
     progress(*((recorder.rows, frames) if frames is not None else (recorder.episodes, episodes or 0)))
 
 
@@ -194,23 +196,23 @@ class LocalWorkers:
         self._hand_out()
 
     def answers(self) -> list[tuple[int, Parcel | str]]:
-        found = []
-        while not found:
+        answers = []
+        while not answers:
             self._hand_out()
             for pipe in wait(list(self._busy)):
                 assert isinstance(pipe, Connection)
                 number = self._busy.pop(pipe)
                 try:
-                    found.append((number, pipe.recv()))
+                    answers.append((number, pipe.recv()))
                     self._idle.append(pipe)
                 except (EOFError, OSError):
-                    found += self._died(pipe, number)
-        return found
+                    answers += self._died(pipe, number)
+        return answers
 
     def close(self) -> None:
         for pipe in [*self._idle, *self._busy]:
             pipe.close()
-        until = time.monotonic() + PATIENCE_S  # who waits for work ends by itself, and its world with it
+        until = time.monotonic() + PATIENCE_S  # a process that waits for work ends by itself
         for process in self._processes:
             process.join(max(0.0, until - time.monotonic()))
             process.kill()
@@ -226,7 +228,7 @@ class LocalWorkers:
         while self._waiting and self._idle:
             pipe, number = self._idle.pop(), self._waiting.popleft()
             self._busy[pipe] = number
-            with suppress(OSError):  # it has died: `answers` will see
+            with suppress(OSError):  # it has died: `answers` will notice
                 pipe.send(number)
 
     def _died(self, pipe: Connection, number: int) -> list[tuple[int, str]]:
@@ -252,7 +254,7 @@ class LocalWorkers:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Processes that begin here do not hear Ctrl-C, which is for this one."""
+    """Processes started in here ignore Ctrl-C, which is for this one."""
     try:
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     except ValueError:  # not in the main thread

@@ -69,7 +69,7 @@ class Dataset:
         self.sensors = sensors_of(self.features, read_sensors(self.root, self.about, "sensors"))
         self.streams = read_sensors(self.root, self.about, "streams")
         videos = [name for name, sensor in self.sensors.items() if self.features[name]["dtype"] == "video"]
-        self.episodes: EpisodeTable = read_episodes(self, videos, count)
+        self.episodes: EpisodeTable = read_episodes(self.root, self.files, self.info, videos, count)
         self._look_for_depth()
         self.cameras = tuple(name for name, sensor in self.sensors.items() if sensor.kind == "image")
         self.rgb_key = RGB if RGB in self.cameras else (self.cameras[0] if self.cameras else None)

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -85,9 +84,6 @@ def sentences(path: Path) -> dict[int, str]:
         raise ValueError("it numbers its tasks by what is no number")
     return {number: str(text) for number, text in zip(numbers, table[texts].to_pylist())}
 
-
-if TYPE_CHECKING:
-    from .dataset import Dataset
 
 MOST = 20_000_000  # episodes; more is damage
 OPTIONAL = ("tasks", "start_ns", "counts")  # columns of meta/episodes that a stranger's recording may lack
@@ -177,17 +173,18 @@ class EpisodeTable(Sequence[Episode]):
         return np.searchsorted(self.stops, rows, side="right")
 
 
-def read_episodes(dataset: Dataset, cameras: Sequence[str], count: int) -> EpisodeTable:
-    """The first `count` episodes of meta/episodes; what a killed recorder left beyond them is not looked at.
+def read_episodes(
+    root: Path, files: LocalFiles | Files, info: Mapping, cameras: Sequence[str], count: int
+) -> EpisodeTable:
+    """The first `count` episodes of meta/episodes; rows that a killed recorder left after them are ignored.
 
-    cameras: features that are kept as video.
+    info: meta/info.json. cameras: the features that are stored as video.
     """
-    root = dataset.root
     if count > MOST:
         raise DatasetError(
             f"{root} claims {count:,} episodes, more than can be meant; restore meta/info.json from a copy."
         )
-    parts = _read_parts(dataset, cameras, count)
+    parts = _read_parts(files, cameras, count)
     try:
         table = pa.concat_tables(parts, promote_options="default") if parts else _nothing(columns_of(cameras))
         number = _whole(table, "episode_index")
@@ -195,9 +192,9 @@ def read_episodes(dataset: Dataset, cameras: Sequence[str], count: int) -> Episo
         table = table.take(pa.array(first[: min(count, len(first))])).combine_chunks()
         if len(table) != count or not np.array_equal(_whole(table, "episode_index"), np.arange(count)):
             raise ValueError(f"it does not list the {count} episodes of info.json")
-        data_path = str(dataset.info.get("data_path") or DATA_PATH)
-        video_path = str(dataset.info.get("video_path") or VIDEO_PATH)
-        return EpisodeTable(table, data_path, video_path, cameras, dataset.fps)
+        data_path = str(info.get("data_path") or DATA_PATH)
+        video_path = str(info.get("video_path") or VIDEO_PATH)
+        return EpisodeTable(table, data_path, video_path, cameras, float(info["fps"]))
     except (ValueError, TypeError, KeyError, pa.ArrowException) as error:
         raise DatasetError(f"{root}/meta/episodes is damaged ({error}); restore it from a copy.") from error
 
@@ -217,15 +214,15 @@ def read_part(path: Path, cameras: Sequence[str], most_rows: int, more: Sequence
     return table
 
 
-def _read_parts(dataset: Dataset, cameras: Sequence[str], count: int, attempts: int = 3) -> list[pa.Table]:
+def _read_parts(files: LocalFiles | Files, cameras: Sequence[str], count: int, attempts: int = 3) -> list[pa.Table]:
     """The tables of meta/episodes; listed anew where a recorder has just made one of many."""
     parts = []
-    for name in dataset.files.list("meta/episodes", ".parquet"):
+    for name in files.list("meta/episodes", ".parquet"):
         try:
-            parts.append(read_part(dataset.files.local(name), cameras, count + 10_000))
+            parts.append(read_part(files.local(name), cameras, count + 10_000))
         except DatasetError:
-            if attempts > 1 and not dataset.files.exists(name):
-                return _read_parts(dataset, cameras, count, attempts - 1)
+            if attempts > 1 and not files.exists(name):
+                return _read_parts(files, cameras, count, attempts - 1)
             raise
     return parts
 

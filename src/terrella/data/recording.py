@@ -1,9 +1,9 @@
-"""record: drives any World with a policy and keeps what happens as a recording."""
+"""record: steps any World under a policy and records what is observed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,23 @@ from ..core.world import Observation, World, make_rng
 from .format import Layout
 from .recorder import Recorder, Watch
 
-LONGEST = 1050  # steps of an episode in worlds that have no limit
+LONGEST = 1050  # steps after which episodes of worlds without a limit are cut off
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """How `record` records."""
+
+    fps: float | None = None
+    """Rows a second that the recording states; None takes one over the world's step."""
+    max_episode_steps: int | None = None
+    """Steps after which an episode is cut off; None takes the world's own limit, or LONGEST."""
+    task: str | None = None
+    """The instruction of every episode; None makes one of the world's name."""
+    pictures: Literal["video", "png"] = "video"
+    """How pictures are stored."""
+    live: Watch | None = None
+    """A viewer that is sent every row while it is recorded."""
 
 
 def record(
@@ -26,32 +42,29 @@ def record(
     frames: int,
     rng: torch.Generator,
     progress: Callable[[int, int], None] | None = None,
-    fps: float | None = None,
-    max_episode_steps: int | None = None,
-    task: str | None = None,
-    live: Watch | None = None,
-    pictures: Literal["video", "png"] = "video",
     enough: Callable[[], bool] = lambda: False,
+    options: RecordOptions = RecordOptions(),
 ) -> Recorder:
-    """Records until `root` holds `frames` rows (those of an earlier run count), or until it is `enough`, one world step a row.
+    """Steps `world` under `policy` and records one row a step, until `root` holds `frames` rows or `enough()` is true.
 
-    An episode ends at `done` or after `max_episode_steps`, by default the world's own limit, or LONGEST.
-    Each episode has a generator of its own, drawn from `rng`'s
-    seed and the episode's number, so that a run that was killed and started again with the same seed records the same
-    as one that was not. `progress(rows, frames)` is called after each row; `live` is logged to; `pictures` as in Layout.
-    Returns the closed recorder (its rows and episodes can be read). DatasetError as Recorder raises it; what was
-    committed before is safe.
+    Rows of an earlier run count. An episode ends at `done` or at its step limit. Its seed follows from `rng` and from its
+    number, so a run that was killed and started again with the same seed gives the same recording as one that was not.
+    `progress(rows, frames)` is called after each row. Returns the closed recorder (its rows and episodes can be read).
+    DatasetError as Recorder raises it; episodes committed before are safe.
     """
     if frames < 2:
         raise DatasetError(f"{frames} frames are no recording: an episode has 2 rows or more; ask for more frames.")
+    max_episode_steps = options.max_episode_steps
     if max_episode_steps is None:
         max_episode_steps = world.spec.max_episode_steps or LONGEST
     if max_episode_steps < 1:
         raise DatasetError(f"episodes of {max_episode_steps} steps are none; ask for one step or more.")
-    layout = replace(Layout.of(world.spec, fps), pictures=pictures)
+    layout = replace(Layout.of(world.spec, options.fps), pictures=options.pictures)
     base = base_of(rng)
-    task = task or f"explore {world.spec.name}"
-    with Recorder(root, layout, task, "discard", live) as recorder:  # what was interrupted, the seed makes again
+    task = options.task or f"explore {world.spec.name}"
+    with Recorder(
+        root, layout, task, "discard", options.live
+    ) as recorder:  # the seed gives an interrupted episode again
 
         def stop() -> bool:
             if progress:
@@ -66,12 +79,12 @@ def record(
 
 
 def base_of(rng: torch.Generator) -> int:
-    """The number from which the seeds of a recording's episodes come."""
+    """The number from which the seeds of all episodes of a recording follow."""
     return int(torch.randint(2**62, (1,), generator=rng).item())
 
 
 def seed_of(base: int, episode: int) -> int:
-    """The seed of an episode, by its number alone: whoever plays it, and after whatever, plays the same."""
+    """The seed of an episode, which depends on its number alone: not on the worker or the episodes before."""
     return int(np.random.SeedSequence([base, episode]).generate_state(1, np.uint64)[0] >> 2)
 
 
@@ -84,7 +97,7 @@ def play_episode(
     steps: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Adds the rows of one episode of at most `steps` to `recorder`, without ending it there. `stop()` is asked after each row."""
+    """Adds the rows of one episode of at most `steps` steps to `recorder` and leaves it open. `stop()` is called after each row."""
     channels = [name for name in world.spec.recorded if name not in ("reward", "done")]
     follow = [name for name in world.spec.channels if name in ("reward", "done")]
     state, memory = world.start(1, rng), policy.begin(1, rng)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ..core.errors import DatasetError
-from ..data import Clips
+from ..data import Clips, ClipsConfig
 from ..space.keyframes import Keyframes
 from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
@@ -79,4 +79,7 @@ def clips_of(
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
     channels = ("rgb", "action", *("instruction",) * ("task" in recording.cache.arrays))
-    return Clips(recording.cache, length, channels, size, config.size, seed=seed, drop_last=drop_last, episodes=whole)
+    return Clips(
+        recording.cache,
+        ClipsConfig(length, channels, size, config.size, seed=seed, drop_last=drop_last, episodes=whole),
+    )

@@ -18,7 +18,8 @@ from ..core.files import write_json
 from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data import Dataset
-from ..data.channels import check_game, facts_of
+from ..data.channels import facts_of
+from ..data.game import check_game
 from ..measure.statistics import Figure, mean_interval
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld

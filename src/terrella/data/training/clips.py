@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,76 +19,99 @@ from ...core.instruction import embed_all
 from ..dataset import Dataset
 from ..storage.remote import Files
 from .cache import INSTRUCTION, ClipCache, Kinds, array_for, further_cameras
-from .order import Plan, Starts, chosen, copy_rows
+from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 from .windows import Windows
 
 Fill = Callable[[int, int, Mapping[str, np.ndarray]], None]
 _PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64), ())}  # any recording has these
 
 
+@dataclass(frozen=True)
+class ClipsConfig:
+    """Which clips to read, in which batches."""
+
+    length: int
+    """Rows of a clip."""
+    channels: Sequence[str] = ("rgb", "action")
+    """Channels to read, see `Clips`."""
+    batch: int = 16
+    """Clips in a batch."""
+    size: tuple[int, int] = (96, 128)
+    """Height and width of the pictures, pixels; a ClipCache has its own."""
+    stride: int = 1
+    """Rows from one row of a clip to the next."""
+    episodes: Sequence[int] | None = None
+    """Numbers of the episodes to read; None reads all of them."""
+    seed: int = 0
+    """Seed of the order, which (seed, epoch) alone decide."""
+    shuffle: bool = True
+    """Whether to shuffle the clips of an epoch."""
+    drop_last: bool = True
+    """Whether to leave out the clips of an epoch that do not fill a batch."""
+    workers: int = 0
+    """Threads that copy batches ahead, from one memory-mapped cache; their number does not change the order."""
+    rank: int = 0
+    """This process, of `world_size` that share each epoch."""
+    world_size: int = 1
+    """Processes that share each epoch."""
+    torch: bool = False
+    """Whether batches hold torch tensors instead of numpy arrays, over the same memory."""
+    budget_bytes: int = 8 << 30
+    """For a URL, bytes that may be kept on this machine: half for files on the disk, a quarter for each of two windows in
+    memory (one is read while the next is fetched). Windows come in shuffled order; clips are shuffled within a window."""
+    cache_dir: str | Path | None = None
+    """For a URL, the folder for its files; None takes one under $XDG_CACHE_HOME/terrella."""
+
+    def __post_init__(self):
+        if isinstance(self.channels, str) or not self.channels:
+            raise DatasetError(
+                f"channels={self.channels!r} must be names in a sequence, ('rgb', 'action') for example."
+            )
+        if self.workers < 0:
+            raise DatasetError(f"workers={self.workers} is negative; 0 copies each batch when it is asked for.")
+
+    @property
+    def order(self) -> ClipOrder:
+        """The part that decides which clips make which batch."""
+        return ClipOrder(
+            self.length, self.stride, self.batch, self.seed, self.shuffle, self.drop_last, self.rank, self.world_size
+        )
+
+
 class Clips:
     """Batches of clips of `length` rows, `stride` rows apart, in an order that (seed, epoch) alone decides.
 
-        clips = Clips("recordings/doom", length=16, channels=("rgb", "action"), batch=32)
+        clips = Clips("recordings/doom", ClipsConfig(length=16, channels=("rgb", "action"), batch=32))
         for batch in clips:                      # the rest of this epoch; the next loop is the next epoch
             batch["rgb"]                         # uint8 [32, 16, 96, 128, 3]
             saved = clips.state()                # JSON; Clips(...).resume(saved) goes on with the batch after this one
 
-    A clip never crosses an episode, and each row at which one may begin is visited once an epoch. Channels are those of
-    the recorded world ("rgb", "rgb.wrist", "depth", "pose", "health", …), the arrays of the ClipCache (action,
-    action_valid, reward, done, or a vector by its key); "task" (int64, its place in `tasks`) and "instruction" (float32 [D],
-    its embedding); and "episode" and "row" (int64) for where a frame is from. A batch is yours for as long as you hold on
-    to it or to a view of it; only then is its memory used for another.
+    A clip never crosses an episode, and an epoch visits every row at which a clip can start once. Channels are those of
+    the recorded world ("rgb", "rgb.wrist", "depth", "pose", "health", …); the arrays of the ClipCache ("action",
+    "action_valid", "reward", "done", or a vector by its key); "task" (int64, index into `tasks`) and "instruction" (float32
+    [D], its embedding); and "episode" and "row" (int64) of each frame. The memory of a batch is reused once neither the
+    batch nor a view of it is referenced any more.
 
-    source:    a Dataset, a ClipCache, a folder, or a URL (hf://…, s3://…, file://…). What is far is read in windows.
-    batch:     clips in a batch. With `drop_last` clips that fill no batch are left out of the epoch.
-    size:      (height, width) of rgb; a ClipCache has its own.
-    episodes:  numbers of the episodes to read; None: all of them.
-    workers:   threads that copy batches ahead, sharing one memory-mapped cache; they never change the order.
-    rank:      of `world_size` processes, each of which gets its share of every epoch.
-    torch:     batches of torch tensors over the same memory.
-    budget_bytes: for a URL, how much may be kept on this machine: half for files on the disk, a quarter for each of two
-               windows in memory (one is read while the next is fetched). Windows follow one another in shuffled order,
-               and clips are shuffled within their window.
-    cache_dir: for a URL, where its files are kept (default: under $XDG_CACHE_HOME/terrella).
+    source:    a Dataset, a ClipCache, a folder, or a URL (hf://…, s3://…, file://…); remote recordings are read in windows.
     progress:  `progress(done, total)` counts episodes while the cache is built.
     """
 
     def __init__(
         self,
         source: Dataset | ClipCache | str | Path,
-        length: int,
-        channels: Sequence[str] = ("rgb", "action"),
-        batch: int = 16,
-        size: tuple[int, int] = (96, 128),
-        *,
-        seed: int = 0,
-        stride: int = 1,
-        episodes: Sequence[int] | None = None,
-        shuffle: bool = True,
-        drop_last: bool = True,
-        workers: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
-        torch: bool = False,
-        budget_bytes: int = 8 << 30,
-        cache_dir: str | Path | None = None,
+        config: ClipsConfig,
         progress: Callable[[int, int], None] | None = None,
     ):
-        if isinstance(channels, str) or not channels:
-            raise DatasetError(f"channels={channels!r} must be names in a sequence, ('rgb', 'action') for example.")
-        if workers < 0:
-            raise DatasetError(f"workers={workers} is negative; 0 copies each batch when it is asked for.")
-        plan = Plan(length, stride, batch, seed, shuffle, drop_last, rank, world_size)
-        self._plan, self._workers, self._torch, self._memory = plan, workers, torch, _Memory()
+        order, channels, budget = config.order, config.channels, config.budget_bytes
+        self._order, self._workers, self._torch, self._memory = order, config.workers, config.torch, _Memory()
         if isinstance(source, str | Path):
-            source = Dataset(_files(source, cache_dir, budget_bytes))
+            source = Dataset(_files(source, config.cache_dir, budget))
         if isinstance(source, Dataset) and isinstance(source.files, Files):
-            self._shelf: _Whole | Windows = Windows(source, plan, channels, size, episodes, budget_bytes // 4)
+            self._shelf: _Whole | Windows = Windows(source, order, channels, config.size, config.episodes, budget // 4)
         else:
             if isinstance(source, Dataset):
-                source = ClipCache.open(source, size, progress, further_cameras(source, channels), budget_bytes)
-            self._shelf = _Whole(source, plan, episodes)
+                source = ClipCache.open(source, config.size, progress, further_cameras(source, channels), budget)
+            self._shelf = _Whole(source, order, config.episodes)
         self._keys, self._kinds = self._chosen(channels)
         self._meanings = embed_all(self.tasks)
         self._epoch, self._next = 0, 0
@@ -151,8 +175,8 @@ class Clips:
         found = self._shelf.batches(epoch)
         if not found:
             raise DatasetError(
-                f"{self._shelf.facts()['clips']} clips of {self._plan.length} rows make no batch of {self._plan.batch} "
-                f"for each of {self._plan.world_size} ranks; ask for fewer or shorter clips, or for drop_last=False (and where "
+                f"{self._shelf.facts()['clips']} clips of {self._order.length} rows make no batch of {self._order.batch} "
+                f"for each of {self._order.world_size} ranks; ask for fewer or shorter clips, or for drop_last=False (and where "
                 "it is read in windows, which are dealt to the ranks, for a smaller budget_bytes)."
             )
         return found
@@ -187,8 +211,8 @@ class Clips:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _make(self, fill: Fill, epoch: int, number: int) -> dict[str, np.ndarray]:
-        clips = min(self._plan.batch, self._shelf.clips(epoch) - number * self._plan.batch)
-        kinds, length = self._kinds.items(), self._plan.length
+        clips = min(self._order.batch, self._shelf.clips(epoch) - number * self._order.batch)
+        kinds, length = self._kinds.items(), self._order.length
         arrays = {name: self._memory.empty((clips, length, *shape), dtype) for name, (dtype, shape) in kinds}
         fill(epoch, number, arrays)
         return {name: self._meant(name, arrays[key]) for name, key in self._keys.items()}
@@ -212,33 +236,33 @@ class _Whole:
     this rank's; while `reading` is entered, `fill(epoch, batch, arrays)` works from batch `first` of the first epoch on.
     """
 
-    def __init__(self, cache: ClipCache, plan: Plan, episodes: Sequence[int] | None):
-        self._plan = plan
+    def __init__(self, cache: ClipCache, order: ClipOrder, episodes: Sequence[int] | None):
+        self._order = order
         self._arrays = {name: np.asarray(array) for name, array in cache.arrays.items()}
         self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
         self.keys, self.tasks = cache.keys, cache.tasks
-        self._episodes = chosen(episodes, len(cache.episodes))
+        self._episodes = episodes_to_read(episodes, len(cache.episodes))
         first, stop = cache.ranges[slice(None) if episodes is None else self._episodes].T
-        self._counts = np.maximum(stop - first - plan.span + 1, 0)
-        self._starts = Starts.of(first, self._counts)
+        self._counts = np.maximum(stop - first - order.span + 1, 0)
+        self._starts = ClipStarts.of(first, self._counts)
 
     def facts(self) -> dict:
-        return self._plan.facts(self._counts)
+        return self._order.facts(self._counts)
 
     def clips(self, epoch: int) -> int:
-        return -(-(self._starts.count - self._plan.rank) // self._plan.world_size)
+        return -(-(self._starts.count - self._order.rank) // self._order.world_size)
 
     def batches(self, epoch: int) -> int:
-        return self._plan.batches(self.clips(epoch), self._starts.count // self._plan.world_size)
+        return self._order.batches(self.clips(epoch), self._starts.count // self._order.world_size)
 
     def reading(self, epochs: range, first: int) -> AbstractContextManager[Fill]:
         return nullcontext(self._fill)
 
     def _fill(self, epoch: int, number: int, arrays: Mapping[str, np.ndarray]) -> None:
         clips = len(next(iter(arrays.values())))
-        places = (number * self._plan.batch + np.arange(clips)) * self._plan.world_size + self._plan.rank
-        stretch, first = self._starts.at(self._plan.order(places, self._starts.count, epoch))
-        copy_rows(self._arrays, self._plan.rows(first), 0, self._episodes[stretch], arrays)
+        places = (number * self._order.batch + np.arange(clips)) * self._order.world_size + self._order.rank
+        stretch, first = self._starts.at(self._order.order(places, self._starts.count, epoch))
+        copy_rows(self._arrays, self._order.rows(first), 0, self._episodes[stretch], arrays)
 
 
 class _Memory:

@@ -45,7 +45,7 @@ def _mixed(x: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Starts:
+class ClipStarts:
     """Every place where a clip may begin, numbered 0 .. count - 1 without a list of them.
 
     first:  int64 [E], the first row of each stretch of rows; before: int64 [E + 1], clips before each stretch.
@@ -55,9 +55,9 @@ class Starts:
     before: np.ndarray
 
     @staticmethod
-    def of(first: np.ndarray, counts: np.ndarray) -> Starts:
+    def of(first: np.ndarray, counts: np.ndarray) -> ClipStarts:
         """`counts[i]` clips begin at rows first[i], first[i] + 1, …"""
-        return Starts(np.asarray(first, np.int64), np.append(0, np.cumsum(counts, dtype=np.int64)))
+        return ClipStarts(np.asarray(first, np.int64), np.append(0, np.cumsum(counts, dtype=np.int64)))
 
     @property
     def count(self) -> int:
@@ -70,8 +70,8 @@ class Starts:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Which clips a reader gives, and in which order; see `Clips` for what each means."""
+class ClipOrder:
+    """Which clips a reader gives, and in which order; `ClipsConfig` explains each attribute."""
 
     length: int
     stride: int = 1
@@ -132,7 +132,7 @@ def copy_rows(
             np.take(source[name], rows, axis=0, out=out, mode="clip")  # "raise" would copy twice
 
 
-def chosen(episodes: Sequence[int] | None, count: int) -> np.ndarray:
+def episodes_to_read(episodes: Sequence[int] | None, count: int) -> np.ndarray:
     """int64: the numbers of the episodes to read, ascending; None: all `count`."""
     if episodes is None:
         return np.arange(count)

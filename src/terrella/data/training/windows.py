@@ -15,7 +15,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ..dataset import Dataset
 from .cache import Kinds, array_for, bytes_a_row, fill_episode, further_cameras, keys_of, kinds_of
-from .order import Plan, Starts, chosen, copy_rows
+from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 
 _FILES, _CLIPS = 1, 2  # which of an epoch's shuffles
 
@@ -32,7 +32,7 @@ class Windows:
     def __init__(
         self,
         dataset: Dataset,
-        plan: Plan,
+        order: ClipOrder,
         channels: Sequence[str],
         size: tuple[int, int],
         episodes: Sequence[int] | None,
@@ -42,15 +42,15 @@ class Windows:
         wanted = [array_for(name, there, self.keys) for name in channels]
         self.kinds: Kinds = {key: there[key] for key in wanted if key is not None} or there
         self.window_rows = window_bytes // bytes_a_row(self.kinds)
-        if self.window_rows < plan.span:
+        if self.window_rows < order.span:
             raise DatasetError(
                 f"a window of {max(0, self.window_rows)} rows holds no clip of {plan.span}; allow more bytes, smaller "
                 "pictures or shorter clips."
             )
-        self.dataset, self.size, self.plan, self.tasks = dataset, size, plan, dataset.tasks
-        self._numbers = chosen(episodes, len(dataset.episodes))
+        self.dataset, self.size, self.order, self.tasks = dataset, size, plan, dataset.tasks
+        self._numbers = episodes_to_read(episodes, len(dataset.episodes))
         lengths = (dataset.episodes.stops - dataset.episodes.starts)[self._numbers]
-        self._counts = np.maximum(lengths - plan.span + 1, 0)
+        self._counts = np.maximum(lengths - order.span + 1, 0)
         files = [self.files_of(int(number)) for number in self._numbers]
         self._shard = np.cumsum([before != after for before, after in zip([(), *files], files)], dtype=np.int64) - 1
         self.epoch = functools.lru_cache(4)(self._epoch)
@@ -63,13 +63,13 @@ class Windows:
         return (episode.data, *films)
 
     def facts(self) -> dict:
-        return self.plan.facts(self._counts) | {"window_rows": self.window_rows}
+        return self.order.facts(self._counts) | {"window_rows": self.window_rows}
 
     def clips(self, epoch: int) -> int:
-        return int(self.epoch(epoch).of_ranks[self.plan.rank])
+        return int(self.epoch(epoch).of_ranks[self.order.rank])
 
     def batches(self, epoch: int) -> int:
-        return self.plan.batches(self.clips(epoch), int(self.epoch(epoch).of_ranks.min()))
+        return self.order.batches(self.clips(epoch), int(self.epoch(epoch).of_ranks.min()))
 
     @contextmanager
     def reading(self, epochs: range, first: int) -> Iterator:
@@ -82,28 +82,28 @@ class Windows:
     def _epoch(self, epoch: int) -> _Epoch:
         shards = int(self._shard[-1]) + 1 if len(self._shard) else 0
         turn = np.empty(shards, np.int64)
-        turn[self.plan.order(np.arange(shards), shards, epoch, _FILES)] = np.arange(shards)
-        windows: list[list[Piece]] = []
+        turn[self.order.order(np.arange(shards), shards, epoch, _FILES)] = np.arange(shards)
+        windows: list[list[ClipRun]] = []
         room = 0
         for i in np.argsort(turn[self._shard], kind="stable").tolist():
             left, at = int(self._counts[i]), 0
             while left:
-                rows = left + self.plan.span - 1
+                rows = left + self.order.span - 1
                 if room < min(rows, self.window_rows):  # what fits into a window is not cut
                     windows.append([])
                     room = self.window_rows
-                clips = min(left, room - self.plan.span + 1)
-                windows[-1].append(Piece(int(self._numbers[i]), at, clips))
-                left, at, room = left - clips, at + clips, room - clips - self.plan.span + 1
+                clips = min(left, room - self.order.span + 1)
+                windows[-1].append(ClipRun(int(self._numbers[i]), at, clips))
+                left, at, room = left - clips, at + clips, room - clips - self.order.span + 1
         counts = np.array([sum(piece.clips for piece in window) for window in windows], np.int64)
-        ranks = range(self.plan.world_size)
-        of_ranks = np.array([counts[rank :: self.plan.world_size].sum() for rank in ranks])
-        mine = list(range(self.plan.rank, len(windows), self.plan.world_size))
+        ranks = range(self.order.world_size)
+        of_ranks = np.array([counts[rank :: self.order.world_size].sum() for rank in ranks])
+        mine = list(range(self.order.rank, len(windows), self.order.world_size))
         return _Epoch([windows[i] for i in mine], mine, np.append(0, np.cumsum(counts[mine])), of_ranks)
 
 
 @dataclass(frozen=True)
-class Piece:
+class ClipRun:
     """`clips` clips of an episode, of which the first begins at its row `first`."""
 
     episode: int
@@ -115,7 +115,7 @@ class Piece:
 class _Epoch:
     """This rank's windows: their pieces, their numbers among all ranks', and clips before each; clips of every rank."""
 
-    windows: list[list[Piece]]
+    windows: list[list[ClipRun]]
     numbers: list[int]
     before: np.ndarray
     of_ranks: np.ndarray
@@ -126,7 +126,7 @@ class _Window:
     """Rows of several pieces one after another; row r of piece i is row r + shift[i] of the dataset."""
 
     arrays: dict[str, np.ndarray]
-    starts: Starts
+    starts: ClipStarts
     shift: np.ndarray
     episode: np.ndarray
 
@@ -206,7 +206,7 @@ class _Belt:
                 self._error = error
                 self._changed.notify_all()
 
-    def _made(self, pieces: list[Piece]) -> _Window:
+    def _made(self, pieces: list[ClipRun]) -> _Window:
         counts = np.array([piece.clips for piece in pieces])
         rows = counts + self._plan.span - 1
         at = np.cumsum(rows) - rows
@@ -221,7 +221,7 @@ class _Belt:
         episode = np.array([piece.episode for piece in pieces])
         first = np.array([piece.first for piece in pieces])
         shift = self._windows.dataset.episodes.starts[episode] + first - at
-        return _Window(arrays, Starts.of(at, counts), shift, episode)
+        return _Window(arrays, ClipStarts.of(at, counts), shift, episode)
 
     def _load(self, piece: Piece, arrays: Mapping[str, np.ndarray], at: int, rows: int) -> None:
         dataset = self._windows.dataset

@@ -14,7 +14,7 @@ import torch
 
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
-from ...data import Clips, Dataset
+from ...data import Clips, ClipsConfig, Dataset
 from ...worlds.checkpoint import WORLD_FILE
 from ...worlds.folder import save_latent, with_kept
 from ...worlds.latent import LatentWorld
@@ -239,7 +239,10 @@ class _Learned:
         batch = config.batch or (32 if self.sees_pictures else 128)
         names = [name for name in ("action", "reward", "done") if getattr(recording.cache, name) is not None]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
-        clips = Clips(recording.cache, config.history + steps, names, batch, seed=config.seed, episodes=recording.seen)
+        clips = Clips(
+            recording.cache,
+            ClipsConfig(config.history + steps, names, batch, seed=config.seed, episodes=recording.seen),
+        )
         make = lambda found, now: latent_clips(found, self.controls, self.network.config, now.device)  # noqa: E731
         objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps)
         total = config.steps or (2500 if self.sees_pictures else 4000)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...core.errors import DatasetError, TrainingError
-from ...data import ClipCache, Clips
+from ...data import ClipCache, Clips, ClipsConfig
 from ..feeds import Streamed
 from ..objectives.latent_actions import Codes
 from ..objectives.latent_model import LatentModel
@@ -71,7 +71,8 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
     model = LatentModel(config.codes, config.stride, config.size, device)
     objective = Codes(model, config.learning_rate)
     clips = Clips(
-        recording.cache, 2, ("rgb",), config.batch, stride=config.stride, seed=config.seed, episodes=recording.seen
+        recording.cache,
+        ClipsConfig(2, ("rgb",), config.batch, stride=config.stride, seed=config.seed, episodes=recording.seen),
     )
     trainer = Trainer(run, STAGE, Streamed(clips, lambda found, now: found["rgb"]), objective, config.steps)
 
