@@ -44,10 +44,10 @@ class Windows:
         self.window_rows = window_bytes // bytes_a_row(self.kinds)
         if self.window_rows < order.span:
             raise DatasetError(
-                f"a window of {max(0, self.window_rows)} rows holds no clip of {plan.span}; allow more bytes, smaller "
+                f"a window of {max(0, self.window_rows)} rows holds no clip of {order.span}; allow more bytes, smaller "
                 "pictures or shorter clips."
             )
-        self.dataset, self.size, self.order, self.tasks = dataset, size, plan, dataset.tasks
+        self.dataset, self.size, self.order, self.tasks = dataset, size, order, dataset.tasks
         self._numbers = episodes_to_read(episodes, len(dataset.episodes))
         lengths = (dataset.episodes.stops - dataset.episodes.starts)[self._numbers]
         self._counts = np.maximum(lengths - order.span + 1, 0)
@@ -223,7 +223,7 @@ class _Belt:
         shift = self._windows.dataset.episodes.starts[episode] + first - at
         return _Window(arrays, ClipStarts.of(at, counts), shift, episode)
 
-    def _load(self, piece: Piece, arrays: Mapping[str, np.ndarray], at: int, rows: int) -> None:
+    def _load(self, piece: ClipRun, arrays: Mapping[str, np.ndarray], at: int, rows: int) -> None:
         dataset = self._windows.dataset
         with dataset.files.holding(*self._windows.files_of(piece.episode)):
             fill_episode(dataset, piece.episode, self._windows.size, arrays, at, piece.first, rows)
