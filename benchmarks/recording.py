@@ -19,7 +19,7 @@ import numpy as np
 
 from terrella.data import Dataset, Layout, Recorder, Sensor
 from terrella.data.channels import ACTION, DEPTH, DONE, POSE_NAMES, REWARD, RGB, STATE
-from terrella.data.storage.films import reel
+from terrella.data.storage.films import read_packets
 
 
 def _layout(fps: float, actions: int, *seen: Sensor) -> Layout:
@@ -76,7 +76,9 @@ def pictures(height: int, width: int) -> list[np.ndarray]:
 def told(recorder: Recorder, given: int) -> dict:
     """What the folder holds against what was given, counted in the files themselves."""
     dataset = Dataset(recorder.root)
-    films = sum(reel(dataset.files.local(e.videos[dataset.rgb_key].file), dataset.fps).count for e in dataset.episodes)
+    films = sum(
+        read_packets(dataset.files.local(e.videos[dataset.rgb_key].file), dataset.fps).count for e in dataset.episodes
+    )
     pressure = recorder.pressure
     return {
         "given": given,

@@ -10,7 +10,7 @@ from corridor import BUTTONS, Corridor, keys
 from layouts import layout_of
 
 from terrella.care import doctor
-from terrella.care.alignment import Run, judge
+from terrella.care.alignment import EpisodeMotion, judge_alignment
 from terrella.core import make_rng
 from terrella.data import Recorder
 
@@ -90,8 +90,8 @@ def _best(body: Body, shift: int, seed: int, episodes: int = 8) -> int:
     rng, runs = np.random.default_rng(seed), []
     for _ in range(episodes):
         action, state = body(rng)
-        runs.append(Run(np.roll(action, shift, 0), np.diff(state, axis=0), state))
-    verdict = judge(runs, FPS)
+        runs.append(EpisodeMotion(np.roll(action, shift, 0), np.diff(state, axis=0), state))
+    verdict = judge_alignment(runs, FPS)
     return 0 if verdict is None else verdict.best
 
 
@@ -113,10 +113,13 @@ def test_positions_given_late_are_found(shift):
 
 def test_too_little_tells_nothing():
     rng = np.random.default_rng(0)
-    assert judge([], FPS) is None
-    assert judge([Run(rng.normal(size=(5, 2)), rng.normal(size=(4, 2)), np.zeros((5, 0)))] * 20, FPS) is None
-    still = Run(np.ones((100, 2)), np.zeros((99, 2)), np.zeros((100, 2)))
-    assert judge([still] * 10, FPS) is None
+    assert judge_alignment([], FPS) is None
+    assert (
+        judge_alignment([EpisodeMotion(rng.normal(size=(5, 2)), rng.normal(size=(4, 2)), np.zeros((5, 0)))] * 20, FPS)
+        is None
+    )
+    still = EpisodeMotion(np.ones((100, 2)), np.zeros((99, 2)), np.zeros((100, 2)))
+    assert judge_alignment([still] * 10, FPS) is None
 
 
 def _walked(root, shift: int, pose: bool) -> None:
@@ -145,6 +148,6 @@ def test_a_recording_says_how_late_its_actions_are(tmp_path, shift, pose):
         assert faults == []
         return
     way = "later" if shift > 0 else "earlier"
-    assert len(faults) == 1 and f"actions that stand {abs(shift)} rows {way}: they explain" in faults[0].what
+    assert len(faults) == 1 and f"by the actions {abs(shift)} rows {way}: they explain" in faults[0].what
     assert "of the state" in faults[0].what if pose else "of observation.images.rgb" in faults[0].what
     assert faults[0].mend.startswith(f"move the actions {abs(shift)} rows {'up' if shift > 0 else 'down'}")

@@ -121,7 +121,7 @@ FAULTS = {
     "empty video": (lambda root: (root / VIDEO).write_bytes(b""), VIDEO, 30, "truncated"),
     "short video": (_short_video, VIDEO, 51, "21 frames"),
     "missing column": (_without_column, DATA, 30, "'next.reward' is missing"),
-    "missing rows": (_without_rows, DATA, 40, "index is 42 where 40 is due"),
+    "missing rows": (_without_rows, DATA, 40, "index is 42 where 40 is expected"),
     "index gap": (lambda root: change(root, "index", lambda v: put(v, 7, 99)), DATA, 37, "index is 99"),
     "timestamps": (
         lambda root: change(root, "timestamp", lambda v: [2 * t for t in v]),
@@ -153,7 +153,7 @@ FAULTS = {
         None,
         "truncated",
     ),
-    "episode length": (lambda root: _episode(root, 1, "dataset_to_index", 58), DATA, 30, "30 rows here, 28 in"),
+    "episode length": (lambda root: _episode(root, 1, "dataset_to_index", 58), DATA, 30, "30 rows here, but 28 in"),
     "episode start": (
         lambda root: _episode(root, 1, "dataset_from_index", 31),
         "meta/episodes",
@@ -165,13 +165,13 @@ FAULTS = {
         lambda root: _episode(root, 1, "videos/observation.images.rgb/from_timestamp", 0.2),
         VIDEO,
         None,
-        "30 frames, episode 1 needs 37",
+        "30 frames, but episode 1 needs 37",
     ),
-    "small video": (small_video, VIDEO, 30, "24x32, info.json promises 48x64"),
+    "small video": (small_video, VIDEO, 30, "24x32, but info.json states 48x64"),
     "slow video": (_slow_video, VIDEO, None, "frames"),
     "spoilt frame": (_spoilt_frame, VIDEO, 30, "cannot be decoded"),
     "twin": (twin, DATA.replace("001", "002"), 60, "same actions and states as episode 1"),
-    "statistics": (_stats, "meta/stats.json", None, "action: mean .* is not that of the rows"),
+    "statistics": (_stats, "meta/stats.json", None, "action: mean .* differs from .*, computed from the rows"),
     "task": (lambda root: change(root, "task_index", lambda v: put(v, 9, 4)), DATA, 39, "task 4 is not in"),
     "stats": (lambda root: (root / "meta/stats.json").unlink(), "meta/stats.json", None, "missing"),
     "tasks": (lambda root: cut(root / "meta/tasks.parquet"), "meta/tasks.parquet", None, "truncated"),
@@ -221,7 +221,7 @@ def test_a_recording_in_progress_is_no_fault(tmp_path):
         assert being_written(tmp_path)
         found = examine(tmp_path)
         assert found.faults == [] and found.notes == [
-            "a recorder is writing to this folder right now; its episode in flight was not looked at"
+            "a recorder is writing to this folder now; the episode that it is recording was not examined"
         ]
     assert not being_written(tmp_path)
 
@@ -260,7 +260,7 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
     monkeypatch.undo()
     recorder._writer._lock.close()
     faults = doctor(recording)
-    left = [fault for fault in faults if "being committed when the recorder was killed" in fault.mend]
+    left = [fault for fault in faults if "recorder was killed while it committed" in fault.mend]
     assert all("interrupted episode" in f.what or f in left or "stats.json" in f.file for f in faults), faults
     assert any("interrupted episode" in fault.what for fault in faults)
     Recorder(recording, layout).close()
@@ -276,7 +276,7 @@ def test_one_number_that_never_changes_is_worth_a_note(tmp_path):
     found = examine(tmp_path)
     assert found.faults == []
     assert found.notes == [
-        "the observation.lamp is [0.5] in all 40 rows: a sensor that sees nothing, or was not plugged in?",
+        "the observation.lamp is [0.5] in all 40 rows: is the sensor covered, or not plugged in?",
         "action: turn never changes in 40 rows",
     ]
 

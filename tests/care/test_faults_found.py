@@ -98,12 +98,12 @@ def test_timestamps_alone_that_disagree_are_not_taken_for_the_fps(thirteen):
 def _slow_videos(root: Path) -> None:
     """Videos at half the rate: every second row has no frame."""
     for number, length in enumerate(LENGTHS):
-        pictures = list(mp4.frames(root / video(number), 0, length, 13))
+        pictures = list(mp4.decode_frames(root / video(number), 0, length, 13))
         writer = mp4.Mp4Writer(root / "growing.mp4", (32, 48), 6.5)
         for picture in pictures:
             writer.add(picture)
         writer.close()
-        mp4.finish(root / "growing.mp4", root / video(number))
+        mp4.finish_video(root / "growing.mp4", root / video(number))
         (root / "growing.mp4").unlink()
 
 
@@ -161,7 +161,7 @@ def test_exchanged_films_are_named_and_put_back(thirteen, tmp_path, one, two):
     _exchange(thirteen, video(one), video(two))
     faults = doctor(thirteen)
     assert {fault.file for fault in faults} == {video(one), video(two)}, faults
-    assert all("they were exchanged" in fault.what for fault in faults)
+    assert all("the two videos were exchanged" in fault.what for fault in faults)
     said = repair(thirteen, tmp_path / "out")
     assert any(f"shows episode {two}" in sentence for sentence in said)
     mended = Dataset(tmp_path / "out")
@@ -173,7 +173,7 @@ def test_exchanged_films_are_named_and_put_back(thirteen, tmp_path, one, two):
 def test_exchanged_films_of_other_lengths_are_named_first(thirteen, tmp_path):
     _exchange(thirteen, video(2), video(3))
     faults = doctor(thirteen)
-    assert "they were exchanged" in faults[0].what and any("needs 20" in fault.what for fault in faults)
+    assert "the two videos were exchanged" in faults[0].what and any("needs 20" in fault.what for fault in faults)
     repair(thirteen, tmp_path / "out")
     assert [episode.length for episode in Dataset(tmp_path / "out").episodes] == LENGTHS
 
@@ -195,7 +195,7 @@ def test_films_exchanged_between_cameras_are_named_and_put_back(tmp_path, episod
     for number in episodes:
         _exchange(tmp_path / "set", video(number), video(number, OTHER))
     faults = doctor(tmp_path / "set")
-    assert len(faults) == 2 * len(episodes) and all("they were exchanged" in fault.what for fault in faults)
+    assert len(faults) == 2 * len(episodes) and all("the two videos were exchanged" in fault.what for fault in faults)
     repair(tmp_path / "set", tmp_path / "out")
     for number, pictures in enumerate(before):
         assert np.array_equal(Dataset(tmp_path / "out").episode(number, [CAMERA])[CAMERA], pictures)

@@ -21,7 +21,7 @@ from layouts import layout_of
 from terrella.care import doctor, thrift
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Layout, Recorder
-from terrella.data.format import contained, fill
+from terrella.data.format import fill_template, path_inside
 from terrella.data.source import Sensor
 
 DATA, EPISODES = "data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-001.parquet"
@@ -291,7 +291,7 @@ TEMPLATES = [
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda text: repr(text)[:40])
 def test_templates_that_lead_out_of_the_dataset(recording, template):
     with pytest.raises(DatasetError):
-        fill(template, chunk_index=0, file_index=0, video_key="observation.images.rgb")
+        fill_template(template, chunk_index=0, file_index=0, video_key="observation.images.rgb")
     info(recording, data_path=template, video_path=template)
     told = look(recording)
     assert template == "" or refused(told, "open") or refused(told, "episode 0")  # "" is as if it were not there
@@ -362,7 +362,7 @@ def test_a_hugging_face_cache_is_read_through_its_links(recording, tmp_path):
     found = Dataset(snapshot).episode(1)
     assert all(np.array_equal(truth[name], found[name]) for name in truth)
     assert doctor(snapshot) == []
-    assert contained(snapshot, DATA) == snapshot / DATA
+    assert path_inside(snapshot, DATA) == snapshot / DATA
     (snapshot / DATA).unlink()
     (snapshot / DATA).symlink_to(recording / DATA)
     with pytest.raises(DatasetError, match="leads out"):

@@ -24,7 +24,7 @@ from terrella.care import doctor, repair
 from terrella.cli import main
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Recorder
-from terrella.data.storage.films import reel
+from terrella.data.storage.films import read_packets
 
 COUNTERS = ("index", "frame_index", "episode_index", "timestamp", "task_index")
 
@@ -108,7 +108,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], list[tuple[int, int, int]], str
     "counters": (lambda root: change(root, "index", lambda v: put(v, 7, 99)), ALL, "4 whole episodes"),
     "frame_index": (lambda root: change(root, "frame_index", lambda v: [0] * len(v)), ALL, "4 whole episodes"),
     "timestamps": (lambda root: change(root, "timestamp", lambda v: [2 * t for t in v]), ALL, "4 whole episodes"),
-    "a footer": (lambda root: cut(root / DATA, 0.9), ALL, "no footer that can be read: 30 rows"),
+    "a footer": (lambda root: cut(root / DATA, 0.9), ALL, "no readable footer: 30 rows"),
     "a table": (lambda root: cut(root / DATA, 0.1), WITHOUT, "episode 1: none of its 30 rows is kept"),
     "a table away": (_remove(DATA), WITHOUT, "episode 1: none of its 30 rows is kept"),
     "a video away": (_remove(VIDEO), WITHOUT, "episode 1: none of its 30 rows is kept"),
@@ -132,7 +132,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], list[tuple[int, int, int]], str
         WITHOUT,
         "have another size than the others",
     ),
-    "a shape in info.json": (_shape, ALL, "48x64, and so in info.json now"),
+    "a shape in info.json": (_shape, ALL, "48x64, which info.json now states"),
     "a camera's name": (_renamed, ALL, "kept"),
     "a copied file": (lambda root: shutil.copy(root / DATA, root / "data/chunk-000/file-004.parquet"), ALL, "4 whole"),
 }
@@ -148,11 +148,11 @@ def test_what_is_whole_is_kept_as_it_was(recording, sound, name, tmp_path):
 
 def test_packets_are_copied_without_encoding_anew(recording, tmp_path):
     repair(recording, tmp_path / "out")
-    before, after = reel(recording / VIDEO, 35), reel(tmp_path / "out" / VIDEO, 35)
+    before, after = read_packets(recording / VIDEO, 35), read_packets(tmp_path / "out" / VIDEO, 35)
     assert np.array_equal(before.digests, after.digests) and len(before.frames) == 30
     cut(recording / VIDEO)
     repair(recording, tmp_path / "again")
-    after = reel(tmp_path / "again" / VIDEO, 35)
+    after = read_packets(tmp_path / "again" / VIDEO, 35)
     assert np.array_equal(before.digests[: len(after.frames)], after.digests) and len(after.frames) == 8
 
 
@@ -169,7 +169,7 @@ def test_a_column_that_is_mostly_missing_is_no_reason_to_drop_rows(recording, so
     change(recording, "next.reward", lambda v: [float("nan")] * 20 + v[20:])
     said = repair(recording, tmp_path / "out")
     assert [episode.length for episode in Dataset(tmp_path / "out").episodes] == [30, 30, 30, 10]
-    assert any("next.reward is no finite number in 20 of 30 rows, which stay" in sentence for sentence in said)
+    assert any("next.reward is not finite in 20 of 30 rows, which are kept" in sentence for sentence in said)
 
 
 def test_twins_are_kept_both(recording, tmp_path):
@@ -248,7 +248,7 @@ def test_a_killed_strangers_recording_is_found_again_by_its_pages(recording, tmp
         Dataset(root).episode(0)
     assert {fault.file for fault in doctor(root)} == {"meta/episodes", "data/chunk-000/file-000.parquet"}
     said = check(root, tmp_path / "out", ALL, whole)
-    assert any("100 rows were found by its pages" in sentence for sentence in said)
+    assert any("100 rows were recovered from its pages" in sentence for sentence in said)
     assert any("4 episodes were found in the videos" in sentence for sentence in said)
 
 

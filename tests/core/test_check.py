@@ -216,7 +216,7 @@ class SharedWind(Walk):
         return after.replace(at=after["at"] + torch.randn(2, generator=rng) * ~state["done"][:, None])
 
 
-@broken("promises gradients")
+@broken("no gradient reaches")
 class FalsePromise(Walk):
     spec = replace(SPEC, differentiable=True)
 

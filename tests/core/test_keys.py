@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from terrella.core import Spec
 from terrella.core.errors import TerrellaError
-from terrella.core.keys import code_of, default_keys, told_keys, with_controls
+from terrella.core.keys import code_of, default_keys, parse_keys, with_controls
 from terrella.core.spec import can_idle, neutral_action
 
 ATARI = ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN", "UPRIGHT", "RIGHTFIRE")
@@ -42,7 +42,7 @@ def test_every_choice_has_a_key_though_none_has_a_name():
 
 def test_the_environments_own_table_is_understood():
     table = {"w": 1, (ord("d"),): 2, "wd": 3, None: 0, (1073741904,): 4, ("nonsense",): 5}
-    found = told_keys(table, spaces.Discrete(6))
+    found = parse_keys(table, spaces.Discrete(6))
     assert found == {"KeyW": [1.0], "KeyD": [2.0], "KeyD+KeyW": [3.0], "ArrowLeft": [4.0]}
     assert (
         code_of("space") == code_of(32) == "Space" and code_of("ShiftLeft") == "ShiftLeft" and code_of("7") == "Digit7"
@@ -69,7 +69,7 @@ def test_what_a_person_says_wins():
     [
         ({"keys": ["a:left"]}, "KEY=ACTION"),
         ({"keys": ["a=jump"]}, "its actions are left, right"),
-        ({"keys": ["hyper=left"]}, "is no key"),
+        ({"keys": ["hyper=left"]}, "is not a key"),
         ({"idle": "7"}, "is no action of toy"),
         ({"action_names": ["one"]}, "has 2 actions; 1 names"),
     ],

@@ -102,7 +102,7 @@ def test_a_checked_action_shares_no_memory_with_what_was_given():
 
 
 def test_an_unknown_kind_of_space_is_named():
-    with pytest.raises(ActionError, match="only Box, Discrete"):
+    with pytest.raises(ActionError, match="must be a Box, Discrete"):
         spec(spaces.Text(3)).sample_action(1, make_rng(0))
 
 

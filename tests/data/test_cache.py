@@ -13,7 +13,7 @@ from terrella.core import make_rng
 from terrella.core.errors import DatasetError
 from terrella.data import ClipCache, Dataset, Recorder, RecordOptions, record, split
 from terrella.data.training import cache
-from terrella.data.training.cache import shrink
+from terrella.data.training.cache import shrink_pictures
 
 
 def test_cache_equals_the_decoded_recording(recording):
@@ -23,7 +23,7 @@ def test_cache_equals_the_decoded_recording(recording):
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
     for number, (start, stop) in enumerate(clips.episodes):
         truth, rows = dataset.episode(number), slice(start, stop)
-        np.testing.assert_array_equal(clips.rgb[rows], shrink(truth["rgb"], (24, 32)))
+        np.testing.assert_array_equal(clips.rgb[rows], shrink_pictures(truth["rgb"], (24, 32)))
         np.testing.assert_array_equal(clips.depth[rows], truth["depth"].astype(np.float16))
         for name in ("pose", "action", "action_valid", "reward", "done"):
             np.testing.assert_array_equal(getattr(clips, name)[rows], truth[name])
@@ -88,7 +88,7 @@ def test_a_folder_that_cannot_be_written_keeps_its_cache_elsewhere(recording, tm
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 9), st.integers(1, 9))
 def test_shrink_is_the_mean_over_the_area_that_a_pixel_covers(height, width, to_height, to_width):
     pictures = np.random.default_rng(height * 10 + width).integers(0, 256, (2, height, width, 3), np.uint8)
-    found = shrink(pictures, (to_height, to_width))
+    found = shrink_pictures(pictures, (to_height, to_width))
     fine = pictures.repeat(to_height, 1).repeat(to_width, 2).astype(np.float64)  # the slow twin: on a common grid
     slow = fine.reshape(2, to_height, height, to_width, width, 3).mean((2, 4))
     assert found.shape == (2, to_height, to_width, 3)

@@ -187,7 +187,7 @@ class Block:
 sys.meta_path.insert(0, Block())
 import terrella.data, terrella.exchange, terrella.care
 from terrella.care import doctor, repair
-from terrella.data import Clips, Dataset
+from terrella.data import Clips, ClipsConfig, Dataset
 from terrella.exchange.convert import open_source, write_source
 root, out = sys.argv[1:]
 assert Dataset(root).episode(0)["rgb"].shape[0] == 30

@@ -17,7 +17,7 @@ from terrella.data.channels import RGB
 from terrella.data.source import Sensor
 from terrella.data.training.cache import finish, new_arrays
 from terrella.data.training.clips import Clips, ClipsConfig
-from terrella.data.training.order import shuffled
+from terrella.data.training.order import shuffled_numbers
 
 KINDS = {
     "rgb": (np.dtype(np.uint8), (2, 3, 3)),
@@ -50,10 +50,10 @@ def same(a, b) -> bool:
 def test_a_shuffle_is_a_permutation_of_any_count():
     for count in range(200):
         for seed in range(3):
-            found = shuffled(np.arange(count), count, seed, 5)
+            found = shuffled_numbers(np.arange(count), count, seed, 5)
             assert np.array_equal(np.sort(found), np.arange(count))
-            assert np.array_equal(found[::-1], shuffled(np.arange(count)[::-1], count, seed, 5))
-    assert not np.array_equal(shuffled(np.arange(50), 50, 0), shuffled(np.arange(50), 50, 1))
+            assert np.array_equal(found[::-1], shuffled_numbers(np.arange(count)[::-1], count, seed, 5))
+    assert not np.array_equal(shuffled_numbers(np.arange(50), 50, 0), shuffled_numbers(np.arange(50), 50, 1))
 
 
 @given(
@@ -61,7 +61,7 @@ def test_a_shuffle_is_a_permutation_of_any_count():
 )
 def test_a_shuffle_of_any_size_gives_each_place_its_own(count, places, seed):
     places = np.unique(np.array(places) % count)
-    found = shuffled(places, count, seed)
+    found = shuffled_numbers(places, count, seed)
     assert len(np.unique(found)) == len(places) and found.min() >= 0 and found.max() < count
 
 
@@ -70,14 +70,14 @@ def test_every_number_comes_to_every_place_equally_often(count):
     trials = 3000
     seen = np.zeros((count, count))
     for key in range(trials):
-        seen[np.arange(count), shuffled(np.arange(count), count, key)] += 1
+        seen[np.arange(count), shuffled_numbers(np.arange(count), count, key)] += 1
     spread = np.sqrt(trials / count * (1 - 1 / count))
     assert np.abs(seen - trials / count).max() < 4.5 * spread
 
 
 def test_a_shuffle_of_a_thousand_million_needs_no_memory():
     tracemalloc.start()
-    shuffled(np.arange(64), 10**9, 1)
+    shuffled_numbers(np.arange(64), 10**9, 1)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50_000

@@ -13,7 +13,7 @@ from tests.learn.stopping import goes_on_exactly, quiet
 import terrella
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.core.rollouts import advanced
+from terrella.core.rollouts import advance
 from terrella.data import Recorder
 from terrella.learn.latent_validation import effective_rank, encoded, folded, linear_probe
 from terrella.learn.objectives.latent_prediction import sigreg
@@ -82,7 +82,7 @@ def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
     rows = data.within(2, 5, acted=True)
     state = folded(world, data, rows, 2)
     acts = torch.stack([data.played(world.spec, rows + step) for step in range(5)], 1)
-    ended = advanced(world, state, acts, make_rng(0))["window"][:, -1]
+    ended = advance(world, state, acts, make_rng(0))["window"][:, -1]
     truth = encoded(world, data, rows + 5)
     error, still = ((found - truth).square().mean() for found in (ended, state["window"][:, -1]))
     assert error < 0.6 * still

@@ -11,7 +11,7 @@ import torch
 import terrella
 from terrella.core import check_world, make_rng, rollout
 from terrella.core.errors import ActionError, CheckpointError, ObservationError
-from terrella.core.rollouts import advanced
+from terrella.core.rollouts import advance
 from terrella.worlds.controls import AXES, CHOICE, Controls
 from terrella.worlds.folder import load_latent, load_world, save_keys, save_latent
 from terrella.worlds.latent import LatentWorld
@@ -168,7 +168,7 @@ def test_a_leap_is_of_its_own_episode_keeps_the_last_actions_and_leaves_what_is_
     assert torch.equal(after["window"][2], state["window"][2]) and (after["window"][0] != state["window"][0]).any()
     kept = world.controls.encode(actions[0])[2 - min(2, history - 1) :]
     assert torch.allclose(after["actions"][0, -len(kept) :] if len(kept) else kept, kept)
-    whole = advanced(world, state, torch.cat([actions, actions, actions[:, :1]], 1), rng)
+    whole = advance(world, state, torch.cat([actions, actions, actions[:, :1]], 1), rng)
     slow = world.imagine(world.leap(after, actions, rng), actions[:, 0], rng)
     assert torch.equal(whole["window"], slow["window"])
 

@@ -1,8 +1,9 @@
-"""Which shift of the actions best explains the motion: a test of recordings in which actions and rows slipped apart.
+"""Which shift of the actions best explains the motion: finds recordings whose actions stand in the wrong rows.
 
-Motion i is what happened between rows i and i + 1. For each shift s, motion i is regressed (ridge, over half of the
-stretches) on action i + s compared with what is known without it: the motion before, and the state; the gain is the share of
-what is left unexplained there that the action explains on the other half. A sound recording gains most at 0.
+Motion i is what happened between rows i and i + 1. A baseline predicts motion i by ridge regression from the motion before
+and the state. For each shift s, a second regression takes action i + s as well. Both are fitted on one half of the
+stretches and tested on the other. The gain of s is the share of the baseline's squared error that the action removes. In
+a correct recording shift 0 has the largest gain.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FARTHEST = 8  # rows; shifts looked at on either side
-_STRETCH = 48  # rows that are judged together
+FARTHEST = 8  # largest shift that is tried, rows
+_STRETCH = 48  # rows of a stretch
 _RIDGE = 1e-6
-_FEWEST = 6  # stretches that must agree
-_FEWEST_ROWS = 120  # in all of them
-_LEAST_GAIN = 0.1  # of what is unexplained
-_LEAST_CUT = 0.15  # by which the better shift must lower what stays unexplained
-_AGREE = 0.75  # share of the stretches that prefer the better shift
-_LAG_S = 0.35  # a body that is given positions follows them with such a delay
+_FEWEST = 6  # stretches that a verdict needs
+_FEWEST_ROWS = 120  # rows that a verdict needs
+_LEAST_GAIN = 0.1  # least gain of the better shift
+_LEAST_CUT = 0.15  # share by which the better shift must lower the remaining error
+_AGREE = 0.75  # share of the stretches that must prefer the better shift
+_LAG_S = 0.35  # delay, in seconds, with which a body follows position commands
 
 
 @dataclass(frozen=True)
-class Run:
-    """One episode: action float64 [T, A]; motion [T - 1, M], of what happened after each row; state [T, S], S may be 0."""
+class EpisodeMotion:
+    """One episode: action float64 [T, A]; motion [T - 1, M] after each row; state [T, S], where S may be 0."""
 
     action: np.ndarray
     motion: np.ndarray
@@ -33,18 +34,18 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """gains: shift -> share of the motion left unexplained without actions that they explain; best: shift, 0 where sound."""
+class AlignmentVerdict:
+    """The result of the test."""
 
-    best: int
-    gains: dict[int, float]
-    stretches: int
-    agree: float
-    follows: bool
+    best: int  # shift that explains the motion best, rows; 0 where no other is clearly better
+    gains: dict[int, float]  # shift -> gain
+    stretches: int  # stretches tested
+    agree: float  # share of them that prefer `best`
+    follows: bool  # whether actions are positions that the state follows
 
 
-def judge(runs: Sequence[Run], fps: float) -> Verdict | None:
-    """None where the runs do not tell: too few, or nothing of the motion is explained by actions at any shift."""
+def judge_alignment(runs: Sequence[EpisodeMotion], fps: float) -> AlignmentVerdict | None:
+    """Tests the episodes; None where they are too few, or no shift of the actions explains any motion."""
     parts = _stretches(runs)
     if len(parts) < _FEWEST or sum(len(part.motion) - 2 * FARTHEST for part in parts) < _FEWEST_ROWS:
         return None
@@ -52,24 +53,24 @@ def judge(runs: Sequence[Run], fps: float) -> Verdict | None:
         left, base = _left(parts)  # [parts, shifts, targets], [parts, targets]
     total, total_base = left.sum(0), base.sum(0)
     most = (1 - total / np.maximum(total_base, 1e-12)).max(0)
-    stated = most > max(_LEAST_GAIN, 0.5 * most.max(initial=0))  # what actions do not move would only blur the rest
+    stated = most > max(_LEAST_GAIN, 0.5 * most.max(initial=0))  # targets that no action moves would only add noise
     stated &= total_base > 1e-9 * sum(len(part.motion) for part in parts)
     if not stated.any():
         return None
-    share = left[:, :, stated] / np.maximum(total_base[stated], 1e-12)  # each target counts alike
+    share = left[:, :, stated] / np.maximum(total_base[stated], 1e-12)  # each target has the same weight
     gains = 1 - share.sum(0).mean(-1)
     shifts = range(-FARTHEST, FARTHEST + 1)
     best = int(np.argmax(gains))
     each = share.mean(-1)
     agree = float((each[:, best] < each[:, FARTHEST]).mean())
-    found = best - FARTHEST
+    shift = best - FARTHEST
     with np.errstate(all="ignore"):
         follows = _follows(runs)
         reacts = not follows and _reacts(parts)
-    lags = follows and -max(2, _LAG_S * fps) <= found < 0
-    if not _clear(gains, best, agree) or lags or (reacts and found > 0):
-        found = 0
-    return Verdict(found, dict(zip(shifts, map(float, gains))), len(parts), agree, follows)
+    lags = follows and -max(2, _LAG_S * fps) <= shift < 0
+    if not _clear(gains, best, agree) or lags or (reacts and shift > 0):
+        shift = 0
+    return AlignmentVerdict(shift, dict(zip(shifts, map(float, gains))), len(parts), agree, follows)
 
 
 def _clear(gains: np.ndarray, best: int, agree: float) -> bool:
@@ -80,8 +81,8 @@ def _clear(gains: np.ndarray, best: int, agree: float) -> bool:
     return gains[best] >= _LEAST_GAIN and cut >= _LEAST_CUT and agree >= _AGREE
 
 
-def _follows(runs: Sequence[Run]) -> bool:
-    """Whether actions are positions that the state takes, at once or later: each number of them is like some number of it."""
+def _follows(runs: Sequence[EpisodeMotion]) -> bool:
+    """Whether actions are positions that the state takes now or later: each correlates with some number of the state."""
     near = []
     moves = np.concatenate([run.action for run in runs]).std(0) > 1e-9
     for later in range(0, FARTHEST + 1, 2):
@@ -94,8 +95,8 @@ def _follows(runs: Sequence[Run]) -> bool:
     return bool(near) and bool(moves.any()) and float(np.median(np.max(near, 0))) > 0.8
 
 
-def _reacts(runs: Sequence[Run]) -> bool:
-    """Whether actions are mostly computed from the state of their row: then they tell of motion that they did not cause."""
+def _reacts(runs: Sequence[EpisodeMotion]) -> bool:
+    """Whether actions are mostly a function of the state in their row; then they predict motion that they did not cause."""
     if not runs[0].state.shape[1]:
         return False
     states = [np.hstack([state, np.ones((len(state), 1))]) for state in _standard([run.state for run in runs])]
@@ -105,8 +106,8 @@ def _reacts(runs: Sequence[Run]) -> bool:
     return left < 0.3 * sum((action**2).sum() for action in actions)
 
 
-def _stretches(runs: Sequence[Run]) -> list[Run]:
-    found = []
+def _stretches(runs: Sequence[EpisodeMotion]) -> list[EpisodeMotion]:
+    stretches = []
     for run in runs:
         rows = min(len(run.action), len(run.motion) + 1)
         pieces = max(1, round((rows - 2 * FARTHEST) / _STRETCH))
@@ -114,11 +115,13 @@ def _stretches(runs: Sequence[Run]) -> list[Run]:
         for begin, end in zip(edges, edges[1:]):
             if end - begin >= 8:
                 keep = slice(begin - FARTHEST, end + FARTHEST + 1)
-                found.append(Run(run.action[keep], run.motion[begin - FARTHEST : end + FARTHEST], run.state[keep]))
-    return found
+                stretches.append(
+                    EpisodeMotion(run.action[keep], run.motion[begin - FARTHEST : end + FARTHEST], run.state[keep])
+                )
+    return stretches
 
 
-def _left(parts: list[Run]) -> tuple[np.ndarray, np.ndarray]:
+def _left(parts: list[EpisodeMotion]) -> tuple[np.ndarray, np.ndarray]:
     """Squared error of each stretch and target: [parts, shifts, targets] with actions, [parts, targets] without."""
     far = FARTHEST
     actions = _standard([part.action for part in parts])
@@ -140,18 +143,18 @@ def _left(parts: list[Run]) -> tuple[np.ndarray, np.ndarray]:
 
 def _errors(inputs: list[np.ndarray], targets: list[np.ndarray], folds: list[np.ndarray]) -> list[np.ndarray]:
     """Squared error of each stretch, [targets] each, by a ridge regression over the other fold."""
-    found: list[np.ndarray] = [np.zeros(0)] * len(inputs)
+    errors: list[np.ndarray] = [np.zeros(0)] * len(inputs)
     for test in folds:
         x = np.concatenate([inputs[i] for i in np.flatnonzero(~test)])
         y = np.concatenate([targets[i] for i in np.flatnonzero(~test)])
         weights = np.linalg.solve(x.T @ x + _RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y)
         for i in np.flatnonzero(test):
-            found[i] = ((targets[i] - inputs[i] @ weights) ** 2).sum(0)
-    return found
+            errors[i] = ((targets[i] - inputs[i] @ weights) ** 2).sum(0)
+    return errors
 
 
-def _tamed(motion: np.ndarray, parts: list[Run]) -> np.ndarray:
-    """Without leaps (a reset, an angle that wraps) that would outweigh all else."""
+def _tamed(motion: np.ndarray, parts: list[EpisodeMotion]) -> np.ndarray:
+    """Clips jumps (a reset, an angle that wraps), which would dominate the regression."""
     every = np.concatenate([part.motion for part in parts])
     low, high = np.percentile(every, [1, 99], axis=0)
     return motion.clip(low - (high - low), high + (high - low))

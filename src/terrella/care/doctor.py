@@ -1,4 +1,4 @@
-"""doctor: examines a recording, ours or a stranger's, however damaged, and names each fault with its place and its mend."""
+"""doctor: examines any LeRobot v3 recording, however damaged; names each fault, its place and how to mend it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 from ..core.errors import DatasetError
 from ..data.format import INFO, STATS
 from ..data.storage import journal, mp4
-from .film_checks import Shown, examine_films, same
-from .motion_checks import misaligned
-from .row_checks import Rows, constants, examine_rows, frozen, statistics
+from .film_checks import FilmFacts, equal_digests, examine_films
+from .motion_checks import check_alignment
+from .row_checks import RowFacts, check_statistics, constant_columns, examine_rows, frozen_states
 from .streams import examine_streams
 from .survey import FROM_ROWS, LEFTOVER, RESTORE, Fault, Survey, survey
 
-__all__ = ["Fault", "Findings", "doctor", "examine"]
+__all__ = ["Fault", "Examination", "doctor", "examine"]
 
 _STAGING = ".staging/rows.log"
 _TWINS = "leave one of them out of training: --repair keeps both"
@@ -25,26 +25,24 @@ _EXAMPLES = 3  # places of a kind of fault that a report names
 
 
 @dataclass(frozen=True)
-class Findings:
-    """What an examination found.
-
-    faults: what is wrong, likely causes before what follows from them. notes: sentences worth reading that are no
-    faults: numbers that never change, a recorder at work.
-    """
+class Examination:
+    """The result of an examination."""
 
     faults: list[Fault]
+    """What is wrong; likely causes come before their consequences."""
     notes: list[str]
+    """Sentences about what is unusual but no fault: numbers that never change, a recorder at work."""
 
     @property
     def groups(self) -> list[list[Fault]]:
-        """The faults by kind, likely causes first: of one kind is what says the same but for the numbers."""
+        """The faults by kind, likely causes first. Faults of one kind differ in their numbers alone."""
         kinds: dict[tuple[str, str], list[Fault]] = {}
         for fault in self.faults:
             kinds.setdefault((_kind(fault.what), _kind(fault.mend)), []).append(fault)
         return list(kinds.values())
 
     def facts(self) -> dict[str, object]:
-        """All of it as JSON values; `kinds` are the groups of faults, likely causes first."""
+        """The result as JSON values; `kinds` are the groups of faults."""
         kinds = [{**asdict(faults[0]), "count": len(faults)} for faults in self.groups]
         return {"faults": [asdict(fault) for fault in self.faults], "kinds": kinds, "notes": self.notes}
 
@@ -54,39 +52,40 @@ class Findings:
         kinds = f" of {len(groups)} kinds" if 1 < len(groups) < count else ""
         lines = [f"{name}: {f'{count} fault' if count else 'sound, no fault'}{'s' * (count > 1)}{kinds}"]
         lines += [
-            f"{'likeliest cause: ' * (at == 0 and len(groups) > 1)}{_told(group)}" for at, group in enumerate(groups)
+            f"{'likeliest cause: ' * (at == 0 and len(groups) > 1)}{_describe(group)}"
+            for at, group in enumerate(groups)
         ]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
 def doctor(root: str | Path) -> list[Fault]:
-    """All faults of a LeRobot v3.0 recording, [] where it is sound. DatasetError where there is no dataset to examine."""
+    """All faults of a LeRobot v3.0 recording, [] where it has none. DatasetError where there is no dataset to examine."""
     return examine(root).faults
 
 
-def examine(root: str | Path) -> Findings:
-    """Faults and notes. Every row is read once; of videos the packets, and of each episode some frames."""
-    found = survey(root)
-    busy = being_written(found.root)
-    rows, shown = Rows(), Shown()
-    found, faults = _without_leftovers(found, busy)
-    faults = [*found.faults, *faults, *_counts(found, busy)]
-    faults += examine_rows(found, rows, busy)
-    faults += examine_films(found, shown, busy)
-    faults += examine_streams(found, busy)
-    faults += [] if busy else statistics(found, rows)  # it may be that of an episode more
-    faults += _duplicates(found, rows, shown)
-    still, notes = constants(found, rows)
-    faults += [*still, *frozen(found, rows, shown.static), *misaligned(found, rows, shown)]
+def examine(root: str | Path) -> Examination:
+    """Faults and notes. Reads every row once, the packets of every video, and some frames of each episode."""
+    folder = survey(root)
+    busy = being_written(folder.root)
+    rows, shown = RowFacts(), FilmFacts()
+    folder, faults = _without_leftovers(folder, busy)
+    faults = [*folder.faults, *faults, *_counts(folder, busy)]
+    faults += examine_rows(folder, rows, busy)
+    faults += examine_films(folder, shown, busy)
+    faults += examine_streams(folder, busy)
+    faults += [] if busy else check_statistics(folder, rows)  # they may count the episode that is being committed
+    faults += _duplicates(folder, rows, shown)
+    still, notes = constant_columns(folder, rows)
+    faults += [*still, *frozen_states(folder, rows, shown.static), *check_alignment(folder, rows, shown)]
     if busy:
-        notes.append("a recorder is writing to this folder right now; its episode in flight was not looked at")
+        notes.append("a recorder is writing to this folder now; the episode that it is recording was not examined")
     else:
-        faults += _interrupted(found)
-    return Findings(sorted(faults, key=_rank), notes)
+        faults += _interrupted(folder)
+    return Examination(sorted(faults, key=_rank), notes)
 
 
 def _rank(fault: Fault) -> int:
-    """Likely causes are low: what one wrong number or one lost file explains comes after it."""
+    """Sorts likely causes first: 0 for what explains most other faults."""
     if fault.file == INFO:
         return 0 if fault.what.startswith("fps") else 5 if "counts" in fault.what else 1
     if "exchanged" in fault.what or fault.file == "videos":
@@ -98,8 +97,8 @@ def _rank(fault: Fault) -> int:
     return 4 if fault.mend == RESTORE else 6
 
 
-def _told(faults: list[Fault]) -> str:
-    """What is said of faults of one kind."""
+def _describe(faults: list[Fault]) -> str:
+    """The text of the faults of one kind."""
     first, more, others = faults[0], faults[1:_EXAMPLES], len(faults) - _EXAMPLES
     places = "; ".join([*map(_place, more), *([f"{others} more"] if others > 0 else [])])
     of_kind = f"\n    {len(faults)} of this kind, the others: {places}." if more else ""
@@ -129,74 +128,79 @@ def being_written(root: Path) -> bool:
 # -- counts ----------------------------------------------------------------------------------------------------------
 
 
-def _without_leftovers(found: Survey, busy: bool) -> tuple[Survey, list[Fault]]:
-    """Without the episodes of a killed commit: info.json, which is written last, counts neither them nor their rows."""
-    count, length = found.info.get("total_episodes"), found.info.get("total_frames")
-    beyond = [number for number in found.episodes if isinstance(count, int) and number >= count]
-    kept = {number: episode for number, episode in found.episodes.items() if number not in beyond}
+def _without_leftovers(folder: Survey, busy: bool) -> tuple[Survey, list[Fault]]:
+    """Leaves out the episodes of a killed commit, which info.json (written last) does not count."""
+    count, length = folder.info.get("total_episodes"), folder.info.get("total_frames")
+    beyond = [number for number in folder.episodes if isinstance(count, int) and number >= count]
+    kept = {number: episode for number, episode in folder.episodes.items() if number not in beyond}
     if not beyond or list(kept) != list(range(int(str(count)))) or max([0, *(e.stop for e in kept.values())]) != length:
-        return found, []
-    what = f"it lists episode {beyond[0]} beyond the {count} of info.json"
-    return replace(found, episodes=kept), [] if busy else [Fault("meta/episodes", None, what, LEFTOVER)]
+        return folder, []
+    what = f"it lists episode {beyond[0]}, but info.json counts {count} episodes"
+    return replace(folder, episodes=kept), [] if busy else [Fault("meta/episodes", None, what, LEFTOVER)]
 
 
-def _counts(found: Survey, busy: bool) -> Iterator[Fault]:
+def _counts(folder: Survey, busy: bool) -> Iterator[Fault]:
     expected = 0
-    for number, episode in found.episodes.items():
-        if episode.start != expected and found.complete:
-            what = f"episode {number} starts at row {episode.start}, {expected} follows the one before"
+    for number, episode in folder.episodes.items():
+        if episode.start != expected and folder.complete:
+            what = f"episode {number} starts at row {episode.start}; after the episode before it, row {expected} comes next"
             yield Fault("meta/episodes", expected, what, FROM_ROWS)
         expected = episode.stop
-    if not found.info:
+    if not folder.info:
         return
-    count, length = found.info.get("total_episodes"), found.info.get("total_frames")
-    if found.complete and not busy:
+    count, length = folder.info.get("total_episodes"), folder.info.get("total_frames")
+    if folder.complete and not busy:
         before = -1
-        for number in found.episodes:
+        for number in folder.episodes:
             if number != before + 1:
                 lost = (
                     f"episode {before + 1} is" if number == before + 2 else f"episodes {before + 1} to {number - 1} are"
                 )
                 yield Fault("meta/episodes", None, f"{lost} not listed", FROM_ROWS)
             before = number
-        if count != len(found.episodes):
-            what = f"info.json counts {count} episodes, meta/episodes lists {len(found.episodes)}"
-            yield Fault(INFO, None, what, f"set total_episodes to {len(found.episodes)}, or let --repair count anew")
+        if count != len(folder.episodes):
+            what = f"info.json counts {count} episodes, but meta/episodes lists {len(folder.episodes)}"
+            yield Fault(
+                INFO,
+                None,
+                what,
+                f"set total_episodes to {len(folder.episodes)}, or use --repair, which counts them again",
+            )
         if length != expected:
-            what = f"info.json counts {length} rows, the episodes hold {expected}"
+            what = f"info.json counts {length} rows, but the episodes hold {expected}"
             yield Fault(INFO, None, what, f"set total_frames to {expected}")
     if not isinstance(count, int) or not isinstance(length, int):
-        yield Fault(INFO, None, "total_episodes or total_frames is no whole number", FROM_ROWS)
+        yield Fault(INFO, None, "total_episodes or total_frames is not a whole number", FROM_ROWS)
 
 
 # -- duplicates ------------------------------------------------------------------------------------------------------
 
 
-def _duplicates(found: Survey, rows: Rows, shown: Shown) -> Iterator[Fault]:
+def _duplicates(folder: Survey, rows: RowFacts, shown: FilmFacts) -> Iterator[Fault]:
     observed = any(
-        name.startswith("observation.") and f["dtype"] not in ("video", "image") for name, f in found.features.items()
+        name.startswith("observation.") and f["dtype"] not in ("video", "image") for name, f in folder.features.items()
     )
-    pictured = any(feature["dtype"] in ("video", "image") for feature in found.features.values())
+    pictured = any(feature["dtype"] in ("video", "image") for feature in folder.features.values())
     numbers = {
         number: seen.digest.hexdigest()
         for number, seen in rows.episodes.items()
         if seen.changes and seen.rows > 1 and (observed or not pictured)
     }
     known: set[int] = set()
-    for first, later in same(numbers):
+    for first, later in equal_digests(numbers):
         known.add(later)
         seen = rows.episodes[later]
         yield Fault(
             seen.file, seen.first, f"episode {later} has the same actions and states as episode {first}", _TWINS
         )
     pictures = {number: digest.hexdigest() for number, digest in shown.digests.items() if number not in shown.static}
-    stored = any(feature["dtype"] == "image" for feature in found.features.values())
+    stored = any(feature["dtype"] == "image" for feature in folder.features.values())
     if stored:
         pictures = {number: seen.pictures.hexdigest() for number, seen in rows.episodes.items() if seen.changes}
-    for first, later in same(pictures):
+    for first, later in equal_digests(pictures):
         if later not in known:
             seen = rows.episodes.get(later)
-            row = found.episodes[later].start if later in found.episodes else None
+            row = folder.episodes[later].start if later in folder.episodes else None
             file = seen.file if seen else "meta/episodes"
             yield Fault(file, row, f"episode {later} shows the same pictures as episode {first}", _TWINS)
 
@@ -204,26 +208,26 @@ def _duplicates(found: Survey, rows: Rows, shown: Shown) -> Iterator[Fault]:
 # -- an interrupted episode ------------------------------------------------------------------------------------------
 
 
-def _interrupted(found: Survey) -> Iterator[Fault]:
-    """What a killed recorder left: how many of its rows and frames are whole."""
-    if not (found.root / _STAGING).exists():
+def _interrupted(folder: Survey) -> Iterator[Fault]:
+    """The episode that a killed recorder left, with its number of whole rows and frames."""
+    if not (folder.root / _STAGING).exists():
         return
     about, rows, frames = {}, 0, {}
     try:
-        about = journal.about(found.path(_STAGING))
-        rows = sum(1 for number, _, _ in journal.readings(found.path(_STAGING)) if number == 0)
-        frames = {name: mp4.whole_fragments(found.path(f".staging/{name}.growing.mp4"))[1] for name in found.cameras}
+        about = journal.read_about(folder.path(_STAGING))
+        rows = sum(1 for number, _, _ in journal.read_records(folder.path(_STAGING)) if number == 0)
+        frames = {name: mp4.whole_fragments(folder.path(f".staging/{name}.growing.mp4"))[1] for name in folder.cameras}
     except (OSError, ValueError, RecursionError, DatasetError):
         rows = 0
-    if about and about.get("episode") != found.info.get("total_episodes") and found.info:
-        return  # it was killed after the episode was safe
+    if about and about.get("episode") != folder.info.get("total_episodes") and folder.info:
+        return  # the recorder was killed after the commit
     whole = min([rows, *frames.values()])
     if whole < 2:
-        what = "an interrupted episode lies here of which fewer than 2 rows are whole"
-        yield Fault(_STAGING, None, what, "record into the folder again, which clears it, or delete .staging")
+        what = "an interrupted episode lies here, with fewer than 2 whole rows"
+        yield Fault(_STAGING, None, what, "record into the folder again, which removes it, or delete .staging")
         return
     shown = "".join(f", {count} frames of {name}" for name, count in frames.items())
-    what = f"an interrupted episode lies here, not yet part of the recording: {rows} whole rows{shown}"
+    what = f"an interrupted episode lies here that is not part of the recording: {rows} whole rows{shown}"
     yield Fault(
-        _STAGING, None, what, f"record into the folder again, or use --repair: either keeps its first {whole} rows"
+        _STAGING, None, what, f"record into the folder again, or use --repair; both keep its first {whole} rows"
     )

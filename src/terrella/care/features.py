@@ -1,4 +1,4 @@
-"""Which features the tables and videos of a recording have, where meta/info.json does not say it or says it wrongly."""
+"""Features read from tables and videos, for recordings whose meta/info.json is missing or wrong."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ import pyarrow as pa
 from PIL import Image
 
 from ..core.errors import DatasetError
-from ..data.format import AUTOMATIC, PICTURE, TIME, Layout, contained, sensor_from_json
+from ..data.format import AUTOMATIC, PICTURE, TIME, Layout, path_inside, sensor_from_json
 from ..data.storage import mp4
 from ..data.storage.tables import open_parquet, read_whole
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, AttributeError, DatasetError)
 _UNREADABLE = (*BROKEN, av.FFmpegError, IndexError, Image.DecompressionBombError, Image.DecompressionBombWarning)
-_LOOKED_AT = 15  # videos of a camera that are asked for their size
+_LOOKED_AT = 15  # videos of a camera whose size is read
 _PIXELS = ["height", "width", "channels"]
 
 
 def features_without_info(
     root: Path, about: Mapping, data: list[str], films: list[str], video_path: str, fps: float
 ) -> dict[str, dict]:
-    """Without info.json: what meta/terrella.json, the tables and the videos tell."""
+    """The features of a recording without info.json, from meta/terrella.json, the tables and the videos."""
     form = next(schemas_of(root, data), None)
     try:
-        sensors = {name: sensor_from_json(name, said) for name, said in dict(about["sensors"]).items()}
+        sensors = {name: sensor_from_json(name, stated) for name, stated in dict(about["sensors"]).items()}
         pictures = "png" if form is not None and PICTURE in form.types else "video"
         return Layout(fps, sensors, clock=form is not None and TIME in form.names, pictures=pictures).features()
     except BROKEN:
@@ -38,80 +38,83 @@ def features_without_info(
 
 def features_of_files(root: Path, data: list[str], films: list[str], video_path: str) -> dict[str, dict]:
     """The features that the tables and videos have."""
-    found = {}
+    features = {}
     for part in next(schemas_of(root, data), ()):
-        found |= {part.name: feature} if (feature := _of_column(root, data, part)) else {}
+        features |= {part.name: feature} if (feature := _of_column(root, data, part)) else {}
     for name in sorted({camera for file in films if (camera := camera_of(file, video_path))}):
         size = film_size(root, films, video_path, name)
         if size:
-            found[name] = {"dtype": "video", "shape": [*size, 3], "names": _PIXELS}
-    ordered = [*(name for name in found if name not in AUTOMATIC), *(name for name in AUTOMATIC if name in found)]
-    return {name: found[name] for name in ordered}
+            features[name] = {"dtype": "video", "shape": [*size, 3], "names": _PIXELS}
+    ordered = [*(name for name in features if name not in AUTOMATIC), *(name for name in AUTOMATIC if name in features)]
+    return {name: features[name] for name in ordered}
 
 
 def mended_features(
-    root: Path, features: Mapping[str, dict], data: list[str], films: list[str], video_path: str, said: list[str]
+    root: Path, features: Mapping[str, dict], data: list[str], films: list[str], video_path: str, notes: list[str]
 ) -> dict[str, dict]:
-    """The features as the rows and videos have them; what info.json says otherwise is added to `said`."""
-    found = {name: dict(feature) for name, feature in features.items()}
+    """The features as rows and videos have them; each difference from info.json adds a sentence to `notes`."""
+    mended = {name: dict(feature) for name, feature in features.items()}
     forms = list(schemas_of(root, data))
     cameras = {camera for file in films if (camera := camera_of(file, video_path))}
-    if forms or cameras:  # else there is no episode yet: what is promised may still come
+    if forms or cameras:  # without an episode nothing contradicts info.json
         columns = {name for form in forms for name in form.names}
-        _swap(found, columns if forms else None, cameras, said)
-        if len(found) < len(features):
+        _swap(mended, columns if forms else None, cameras, notes)
+        if len(mended) < len(features):
             for name, feature in features_of_files(root, data, films, video_path).items():
-                if name not in found:
-                    said.append(f"'{name[:100]}' is in the files, though info.json does not say so, and kept")
-                    found[name] = feature
-    for name, feature in list(found.items()):
+                if name not in mended:
+                    notes.append(f"'{name[:100]}' is in the files but not in info.json, and is kept")
+                    mended[name] = feature
+    for name, feature in list(mended.items()):
         if feature["dtype"] == "video":
             size = film_size(root, films, video_path, name)
             if size and list(size) != feature["shape"][:2]:
-                said.append(f"the pictures of {name} are {size[0]}x{size[1]}, and so in info.json now")
-                found[name] = {**feature, "shape": [*size, 3]}
+                notes.append(f"the pictures of {name} are {size[0]}x{size[1]}, which info.json now states")
+                mended[name] = {**feature, "shape": [*size, 3]}
         elif feature["dtype"] != "image" and name not in AUTOMATIC:
             kinds = list(dict.fromkeys(form.field(name).type for form in forms if name in form.names))
             if len(kinds) == 1 and (changed := _retyped(feature, kinds[0])) != feature:
-                said.append(f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, and so in info.json now")
-                found[name] = changed
+                notes.append(
+                    f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, which info.json now states"
+                )
+                mended[name] = changed
     for name in AUTOMATIC:
-        found.setdefault(name, {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None})
-    return found
+        mended.setdefault(name, {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None})
+    return mended
 
 
-def _swap(features: dict[str, dict], columns: set[str] | None, cameras: set[str], said: list[str]) -> None:
-    """Takes away what no table and no video has."""
+def _swap(features: dict[str, dict], columns: set[str] | None, cameras: set[str], notes: list[str]) -> None:
+    """Removes features that no table and no video has."""
     for name, feature in list(features.items()):
-        there = cameras if feature["dtype"] == "video" else columns
-        if there is not None and name not in there and name not in AUTOMATIC:
-            said.append(f"no file has '{name[:100]}', which info.json promises: it is left out")
+        stored = cameras if feature["dtype"] == "video" else columns
+        if stored is not None and name not in stored and name not in AUTOMATIC:
+            notes.append(f"info.json names '{name[:100]}', but no file has it: it is left out")
             del features[name]
 
 
 def camera_of(file: str, video_path: str) -> str | None:
-    """The camera whose file it is, by the part of its path where the template has the camera's name."""
+    """The camera of a video file, read off its path by the template."""
     parts, pattern = file.split("/"), video_path.split("/")
     at = pattern.index("{video_key}") if "{video_key}" in pattern else None
     return parts[at] if at is not None and len(parts) == len(pattern) else None
 
 
 def film_size(root: Path, films: list[str], video_path: str, camera: str) -> tuple[int, int] | None:
-    """(height, width) of the camera's pictures, as most of some of its videos have it."""
+    """(height, width) of a camera's pictures: the most frequent of a sample of its videos."""
     files = [file for file in films if camera_of(file, video_path) == camera]
     sizes = [
-        _first([file], lambda file: _size(contained(root, file))) for file in files[:: max(1, len(files) // _LOOKED_AT)]
+        _first([file], lambda file: _size(path_inside(root, file)))
+        for file in files[:: max(1, len(files) // _LOOKED_AT)]
     ]
     return max(sizes, key=sizes.count, default=None)
 
 
 def _size(path: Path) -> tuple[int, int]:
-    with mp4.opened(path) as (_, stream):
+    with mp4.open_video(path) as (_, stream):
         return stream.height, stream.width
 
 
 def _first(files: Sequence[str], look: Callable[[str], Any]) -> Any:
-    """What `look` finds in the first file that can be read; None where none can."""
+    """`look` of the first file that can be read; None where none can."""
     for file in files:
         try:
             return look(file)
@@ -124,7 +127,7 @@ def schemas_of(root: Path, data: Sequence[str]) -> Iterator[pa.Schema]:
     """The Arrow schemas of the data files that can be opened."""
     for name in data:
         try:
-            with open_parquet(contained(root, name)) as file:
+            with open_parquet(path_inside(root, name)) as file:
                 yield file.schema_arrow
         except BROKEN:
             continue
@@ -154,11 +157,11 @@ def _dtype(kind: pa.DataType) -> str | None:
 
 
 def _of_column(root: Path, data: list[str], part: pa.Field) -> dict | None:
-    """The feature that a column holds; None where it is none."""
+    """The feature that a column holds; None for a type that is no feature."""
     kind, shape = _nested(part.type)
 
     def first(name: str):
-        return read_whole(contained(root, name), [part.name])[part.name][0].as_py()
+        return read_whole(path_inside(root, name), [part.name])[part.name][0].as_py()
 
     if pa.types.is_struct(kind):
         size = _first(data, lambda name: _picture_shape(first(name)["bytes"]))

@@ -1,4 +1,4 @@
-"""What a doctor finds in the videos: lengths against rows, pictures that are damaged, exchanged or none."""
+"""Faults of videos: wrong lengths, damaged frames, exchanged or missing files."""
 
 from __future__ import annotations
 
@@ -11,93 +11,93 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..data import stats
 from ..data.meta import Episode
-from ..data.staged import SAMPLE_EVERY, look
+from ..data.staged import SAMPLE_EVERY, picture_statistics
 from ..data.storage import mp4
-from ..data.storage.films import Reel, reel
+from ..data.storage.films import Packets, read_packets
 from .survey import LEFTOVER, RESTORE, Fault, Survey
 
-_SHORTEN = "let --repair keep the rows that the video shows"
-_EXCHANGE = "exchange the two videos, as --repair does"
-_SAMPLES, _OF_STRANGERS = 64, 24  # pictures of an episode that are looked at, at most
-_LIKE, _UNLIKE = 0.01, 0.06  # by so much of full brightness a look may, or must, differ from the statistics
-_BETTER = 3.0  # times closer that the statistics of another episode must be
-_USUAL, _FEW = 6.0, 4  # times the usual difference is no chance, where there are more episodes than a few
+_SHORTEN = "use --repair, which keeps the rows that the video shows"
+_EXCHANGE = "swap the two videos, as --repair does"
+_SAMPLES, _OF_STRANGERS = 64, 24  # most pictures of an episode that are decoded
+_LIKE, _UNLIKE = (
+    0.01,
+    0.06,
+)  # differences from the statistics, as a share of full brightness: below is equal, above is different
+_BETTER = 3.0  # another episode's statistics must be this many times closer
+_USUAL, _FEW = 6.0, 4  # multiple of the median difference that is no chance; episodes from which a median is taken
 
 Key = tuple[int, str]  # episode, camera
 
 
 @dataclass
-class Shown:
-    """What the videos show.
+class FilmFacts:
+    """What the videos show."""
 
-    digests: number of an episode -> what its pictures are; static: episodes whose pictures do not change;
-    looks: mean and deviation of each colour [6]; noise: by how much looks differ because few pictures were looked at;
-    exchanged: whose video shows the pictures of whom, where two were exchanged.
-    """
-
-    digests: dict[int, hashlib.blake2b] = field(default_factory=dict)
-    static: set[int] = field(default_factory=set)
-    looks: dict[Key, np.ndarray] = field(default_factory=dict)
-    noise: dict[Key, float] = field(default_factory=dict)
-    exchanged: dict[Key, Key] = field(default_factory=dict)
+    digests: dict[int, hashlib.blake2b] = field(default_factory=dict)  # episode -> digest of its packets
+    static: set[int] = field(default_factory=set)  # episodes whose pictures do not change
+    looks: dict[Key, np.ndarray] = field(default_factory=dict)  # mean and deviation of each colour [6]
+    noise: dict[Key, float] = field(default_factory=dict)  # sampling error of `looks`
+    exchanged: dict[Key, Key] = field(default_factory=dict)  # of swapped videos: key -> the key whose pictures it shows
 
 
-def examine_films(survey: Survey, shown: Shown, busy: bool) -> Iterator[Fault]:
-    """Every video that meta/episodes names: its packets are read, the first, the last and some more frames decoded."""
+def examine_films(survey: Survey, shown: FilmFacts, busy: bool) -> Iterator[Fault]:
+    """Checks every video that meta/episodes names: reads its packets, decodes its first, its last and some more frames."""
     named: dict[tuple[str, str], list[Episode]] = {}
     for episode in survey.episodes.values():
         for camera, film in episode.videos.items():
             named.setdefault((camera, film.file), []).append(episode)
-    there, moving = set(survey.films), set()
+    existing, moving = set(survey.films), set()
     for (camera, file), episodes in named.items():
-        if file in there:
+        if file in existing:
             yield from _film(survey, camera, file, episodes, shown, moving)
         else:
             yield from (Fault(file, episode.start, "the video is missing", RESTORE) for episode in episodes)
     shown.static -= moving
     yield from _looks(survey, shown)
     if survey.complete and not busy:
-        for file in sorted(there - {file for _, file in named}):
+        for file in sorted(existing - {file for _, file in named}):
             yield Fault(file, None, "no episode of info.json uses this file", LEFTOVER)
 
 
 def _film(
-    survey: Survey, camera: str, file: str, episodes: list[Episode], shown: Shown, moving: set[int]
+    survey: Survey, camera: str, file: str, episodes: list[Episode], shown: FilmFacts, moving: set[int]
 ) -> Iterator[Fault]:
     first = min(episode.start for episode in episodes)
     try:
-        found = reel(survey.path(file), survey.fps)
+        packets = read_packets(survey.path(file), survey.fps)
     except DatasetError:
         yield Fault(file, first, "the video is truncated or not mp4", RESTORE)
         return
-    count, needed = found.count, 0
+    count, needed = packets.count, 0
     for episode in sorted(episodes, key=lambda episode: episode.videos[camera].first):
         begin = episode.videos[camera].first
         end = begin + episode.length
         if begin < needed:
-            what = f"episode {episode.number} begins at frame {begin}, which the episode before it shows too"
-            yield Fault(file, episode.start, what, "let --repair count anew where the episodes lie in the video")
+            what = f"episode {episode.number} begins at frame {begin}, which belongs to the episode before it"
+            yield Fault(
+                file, episode.start, what, "use --repair, which computes again where the episodes lie in the video"
+            )
         needed = max(needed, end)
         if end > count:
-            what = f"the video has {count} frames, episode {episode.number} needs {end}"
+            what = f"the video has {count} frames, but episode {episode.number} needs {end}"
             yield Fault(file, episode.start + max(0, min(count - begin, episode.length - 1)), what, _SHORTEN)
         stop = min(end, count) if len(episodes) > 1 else count
         if episode.length and stop > begin:
-            yield from _decoded(survey, camera, episode, found, stop - begin, shown, moving)
-    if len(found.frames) > needed + (len(episodes) > 1):
-        what = f"the video has {len(found.frames)} frames, its episodes need {needed}"
-        yield Fault(file, first, what, "let --repair leave out the frames that belong to no row")
+            yield from _decoded(survey, camera, episode, packets, stop - begin, shown, moving)
+    if len(packets.frames) > needed + (len(episodes) > 1):
+        what = f"the video has {len(packets.frames)} frames, but its episodes need {needed}"
+        yield Fault(file, first, what, "use --repair, which leaves out the frames that belong to no row")
 
 
 def _decoded(
-    survey: Survey, camera: str, episode: Episode, found: Reel, count: int, shown: Shown, moving: set[int]
+    survey: Survey, camera: str, episode: Episode, packets: Packets, count: int, shown: FilmFacts, moving: set[int]
 ) -> Iterator[Fault]:
-    """Looks at some of the `count` pictures from the episode's first on."""
+    """Decodes some of the `count` pictures of an episode."""
     film, shape = episode.videos[camera], tuple(survey.features[camera]["shape"])
     path, seen, first = survey.path(film.file), [], None
-    inside = (found.frames >= film.first) & (found.frames < film.first + episode.length)
-    shown.digests.setdefault(episode.number, hashlib.blake2b(digest_size=16)).update(found.digests[inside].tobytes())
-    zeroed = np.sort(found.frames[inside & found.zeroed]) - film.first
+    inside = (packets.frames >= film.first) & (packets.frames < film.first + episode.length)
+    shown.digests.setdefault(episode.number, hashlib.blake2b(digest_size=16)).update(packets.digests[inside].tobytes())
+    zeroed = np.sort(packets.frames[inside & packets.zeroed]) - film.first
     if len(zeroed):
         what = f"{len(zeroed)} frames of episode {episode.number} were overwritten with zeros and cannot be decoded"
         yield Fault(film.file, episode.start + int(zeroed[0]), what, RESTORE)
@@ -113,13 +113,13 @@ def _decoded(
             return
         first = picture if first is None else first
         if picture.shape != shape:
-            what = f"its pictures are {picture.shape[0]}x{picture.shape[1]}, info.json promises {shape[0]}x{shape[1]}"
+            what = f"its pictures are {picture.shape[0]}x{picture.shape[1]}, but info.json states {shape[0]}x{shape[1]}"
             yield Fault(film.file, episode.start, what, "set the shape in info.json to that of the video")
             return
         if np.abs(picture.astype(np.int16) - first).max() >= 8:
             moving.add(episode.number)
         if not survey.ours or row % SAMPLE_EVERY == 0:
-            seen.append(look(picture))
+            seen.append(picture_statistics(picture))
     merged = stats.merge([{camera: each} for each in seen])[camera]
     shown.looks[episode.number, camera] = np.concatenate([merged["mean"].ravel(), merged["std"].ravel()])
     halves = [np.mean([each["mean"].ravel() for each in seen[at::2] or seen], 0) for at in (0, 1)]
@@ -127,26 +127,26 @@ def _decoded(
 
 
 def _sampled(survey: Survey, count: int) -> list[int]:
-    """Rows whose pictures are looked at: where our recorder looked for its statistics, else some; always first and last."""
+    """Rows whose pictures are decoded: the rows of our recorder's statistics, else a sample; always the first and the last."""
     if survey.ours:
         step = SAMPLE_EVERY * -(-count // (SAMPLE_EVERY * _SAMPLES))
         return sorted({*range(0, count, step), count - 1})
     return sorted({round(row) for row in np.linspace(0, count - 1, _OF_STRANGERS)})
 
 
-def _looks(survey: Survey, shown: Shown) -> Iterator[Fault]:
-    """The pictures against the statistics that meta/episodes keeps of them: exchanged, black or other ones are named."""
+def _looks(survey: Survey, shown: FilmFacts) -> Iterator[Fault]:
+    """Compares the pictures with their statistics in meta/episodes: finds videos that were swapped or replaced."""
     keys = [key for key in survey.looks if key in shown.looks]
     if not keys:
         return
     kept = np.stack([np.concatenate(survey.looks[key]) for key in keys])
-    there = np.stack([shown.looks[key] for key in keys])
-    for camera in {camera for _, camera in keys}:  # what coding does to all pictures alike
+    looks = np.stack([shown.looks[key] for key in keys])
+    for camera in {camera for _, camera in keys}:  # the change that video coding makes to all pictures
         mine = np.array([camera == of for _, of in keys])
-        usual = np.median(there[mine] - kept[mine], 0) if mine.sum() >= _FEW else np.zeros(6)
-        there[mine] -= np.where(np.abs(usual) <= _LIKE, usual, 0)
-    own, noise = _distance(there, kept), np.array([shown.noise[key] for key in keys])
-    shown.exchanged |= _exchanged(keys, there, kept, noise)
+        usual = np.median(looks[mine] - kept[mine], 0) if mine.sum() >= _FEW else np.zeros(6)
+        looks[mine] -= np.where(np.abs(usual) <= _LIKE, usual, 0)
+    own, noise = _distance(looks, kept), np.array([shown.noise[key] for key in keys])
+    shown.exchanged |= _exchanged(keys, looks, kept, noise)
     for i, key in enumerate(keys):
         number, camera = key
         episode = survey.episodes[number]
@@ -154,39 +154,39 @@ def _looks(survey: Survey, shown: Shown) -> Iterator[Fault]:
         if key in shown.exchanged:
             other, of = shown.exchanged[key]
             what = f"the video of episode {number} shows what episode {other} looked like{f' to {of}' * (of != camera)}"
-            yield Fault(file, episode.start, f"{what} when it was recorded: they were exchanged", _EXCHANGE)
+            yield Fault(file, episode.start, f"{what} when it was recorded: the two videos were exchanged", _EXCHANGE)
         elif own[i] > _UNLIKE + noise[i]:
             means = shown.looks[key][:3].mean(), kept[i, :3].mean()
-            what = f"the pictures of episode {number} are not those that were recorded"
-            what += f": their mean brightness is {means[0]:.0%}, in meta/episodes {means[1]:.0%}"
+            what = f"the pictures of episode {number} differ from those that were recorded"
+            what += f": their mean brightness is {means[0]:.0%}, and {means[1]:.0%} in meta/episodes"
             yield Fault(file, episode.start, what, "restore the video from a copy, or leave the episode out")
 
 
-def _exchanged(keys: list[Key], there: np.ndarray, kept: np.ndarray, noise: np.ndarray) -> dict[Key, Key]:
-    """Of episodes that look other than their statistics, those whose looks are one another's."""
-    own = _distance(there, kept)
+def _exchanged(keys: list[Key], looks: np.ndarray, kept: np.ndarray, noise: np.ndarray) -> dict[Key, Key]:
+    """Among the videos that differ from their statistics, those that match the statistics of one another."""
+    own = _distance(looks, kept)
     usual = _USUAL * float(np.median(own)) if len(keys) >= _FEW else 0.0
     suspects = np.flatnonzero(
         (own > np.maximum(_LIKE, np.maximum(noise, usual))) | (own > np.maximum(2 * _LIKE, noise))
     )
-    found: dict[Key, Key] = {}
+    exchanged: dict[Key, Key] = {}
     for i in suspects:
-        distance = _distance(there[i], kept[suspects])
+        distance = _distance(looks[i], kept[suspects])
         distance[suspects == i] = np.inf
         if len(suspects) > 1 and distance.min() * _BETTER < own[i]:
-            found[keys[i]] = keys[suspects[int(distance.argmin())]]
-    while lonely := [key for key, other in found.items() if other not in found]:
+            exchanged[keys[i]] = keys[suspects[int(distance.argmin())]]
+    while lonely := [key for key, other in exchanged.items() if other not in exchanged]:
         for key in lonely:
-            del found[key]
-    return found if len(set(found.values())) == len(found) else {}
+            del exchanged[key]
+    return exchanged if len(set(exchanged.values())) == len(exchanged) else {}
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The largest difference of two looks [..., 6]; deviations, which coding smooths, count half."""
+    """The largest difference of two looks [..., 6]; deviations count half, since coding smooths them."""
     return (np.abs(a - b) * np.array([1, 1, 1, 0.5, 0.5, 0.5])).max(-1)
 
 
-def same(seen: Mapping[int, str]) -> Iterator[tuple[int, int]]:
+def equal_digests(seen: Mapping[int, str]) -> Iterator[tuple[int, int]]:
     """(first, later) of the episodes that have the same digest."""
     first: dict[str, int] = {}
     for number, digest in seen.items():

@@ -85,7 +85,7 @@ _MOST_TRIED = 4096  # pages of a row group's first column
 Chunk = list[Page]
 
 
-def rebuild(path: Path, form: pa.Schema, features: Mapping[str, dict], target: Path) -> int:
+def rebuild_footer(path: Path, form: pa.Schema, features: Mapping[str, dict], target: Path) -> int:
     """Writes the row groups of `path` that are whole, of schema `form`, with a new footer to `target`; returns their rows.
 
     DatasetError where not one row group is whole.
@@ -124,29 +124,29 @@ def _values_of_a_row(path: str, features: Mapping[str, dict]) -> int:
 
 def _pages(file: BinaryIO) -> list[Page]:
     """All pages from the start on, up to the first that is cut or is none."""
-    size, at, found = file.seek(0, 2), 4, []
-    while at < size and len(found) < _MOST_PAGES:
+    size, at, pages = file.seek(0, 2), 4, []
+    while at < size and len(pages) < _MOST_PAGES:
         try:
             page = page_at(file, at)
         except (ValueError, IndexError):
             break
         if page.end > size or page.kind not in (DATA, DATA_V2, DICTIONARY) or page.end == at:
             break
-        found.append(page)
+        pages.append(page)
         at = page.end
-    return found
+    return pages
 
 
 def _groups(pages: list[Page], each: list[int]) -> list[list[Chunk]]:
     """The pages as row groups of one chunk for each column, up to the last group that is whole."""
-    found, at = [], 0
+    groups, at = [], 0
     while at < len(pages):
         group = _group(pages, at, each)
         if group is None:
             break
-        found.append(group)
+        groups.append(group)
         at += sum(map(len, group))
-    return found
+    return groups
 
 
 def _group(pages: list[Page], at: int, each: list[int]) -> list[Chunk] | None:
@@ -162,7 +162,7 @@ def _group(pages: list[Page], at: int, each: list[int]) -> list[Chunk] | None:
 
 
 def _chunks(pages: list[Page], at: int, rows: int, each: list[int]) -> list[Chunk] | None:
-    found = []
+    chunks = []
     for values in each:
         chunk, left = [], rows * values
         while left > 0:
@@ -173,8 +173,8 @@ def _chunks(pages: list[Page], at: int, rows: int, each: list[int]) -> list[Chun
             at += 1
         if left:
             return None
-        found.append(chunk)
-    return found
+        chunks.append(chunk)
+    return chunks
 
 
 def _rows(group: list[Chunk], each: list[int]) -> int:

@@ -1,4 +1,4 @@
-"""pieces: which rows of a damaged recording are whole, as runs that follow one another without a gap."""
+"""pieces: the whole rows of a damaged recording, as runs without a gap."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from ..data.features import decoded
+from ..data.features import decode_picture
 from ..data.format import AUTOMATIC, to_numpy
-from ..data.storage.tables import BROKEN, damaged, open_parquet
+from ..data.storage.tables import BROKEN, damaged_table, open_parquet
 from .survey import Survey
 
-_BATCH = 64 << 20  # bytes that one piece of numbers may take
-_TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
-_LARGEST, _REPEATED = 4 << 30, 256 << 20  # bytes that a row group may unpack to, and where texts may repeat one another
-_A_BYTE = 4  # of such texts and pictures, for each byte of a larger file
+_BATCH = 64 << 20  # bytes of one batch of numbers
+_TEXTS = 16  # rows of texts or pictures in a batch; their length is not known before
+_LARGEST = 4 << 30  # most bytes of numbers that a row group may unpack to
+_REPEATED = 256 << 20  # the same of texts and pictures, which compress without limit
+_A_BYTE = 4  # unpacked bytes of texts and pictures allowed for each byte of a larger file
 
 
-def batches(
+def read_batches(
     path: Path, features: Mapping[str, dict], columns: Sequence[str]
 ) -> Iterator[tuple[int, int, pa.Table | DatasetError]]:
-    """(first row, rows, table) of a data file piece after piece, the largest of some megabytes; DatasetError where it is broken.
+    """(first row, rows, table) of a data file, batch by batch of some megabytes; DatasetError where the file is broken.
 
-    A piece that cannot be read is given as the error itself, and reading goes on with the next row group.
+    A batch that cannot be read is given as the error itself, and reading goes on with the next row group.
     """
     texts = any(features[name]["dtype"] in ("image", "string") for name in columns)
     wide = 8 + sum(16 * math.prod(features[name]["shape"]) for name in columns if features[name]["dtype"] != "image")
@@ -37,7 +38,7 @@ def batches(
         few = max(_REPEATED, _A_BYTE * path.stat().st_size)
         step, most = (_TEXTS, few) if texts else (max(1, _BATCH // wide), _LARGEST)
     except BROKEN as error:
-        raise damaged(path, error) from error
+        raise damaged_table(path, error) from error
     with file:
         at = 0
         for number in range(file.num_row_groups):
@@ -53,53 +54,48 @@ def batches(
                 if done < rows:
                     raise ValueError(f"{rows - done} rows are missing")
             except BROKEN as error:
-                yield at + done, max(0, rows - done), damaged(path, error)
+                yield at + done, max(0, rows - done), damaged_table(path, error)
             at += rows
 
 
-_MOST_LOST = 10_000_000  # rows that cannot be read at a stretch; more is damage
+_MOST_LOST = 10_000_000  # most unreadable rows in one batch; a larger claim is damage
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Rows of one episode that are whole and follow one another.
+class WholeRows:
+    """Consecutive whole rows of one episode."""
 
-    number: of the episode, as the rows have it; file: where they lie (`path`, or a rebuilt copy of it); row: the first
-    one's place there; frame: the first one's place in the episode; task: of each row; whole: whether these are all rows
-    that the episode is said to have.
-    """
-
-    number: int
-    file: str
-    path: Path
-    row: int
-    frame: int
-    task: np.ndarray
-    whole: bool = False
+    number: int  # of the episode, as stored in the rows
+    file: str  # data file, relative to the dataset
+    path: Path  # that file, or a rebuilt copy of it
+    row: int  # place of the first row in the file
+    frame: int  # place of the first row in the episode
+    task: np.ndarray  # task_index of each row
+    whole: bool = False  # whether meta/episodes lists no further rows of the episode
 
     @property
     def count(self) -> int:
         return len(self.task)
 
-    def part(self, begin: int, end: int) -> Piece:
-        """Rows begin to end of it."""
+    def part(self, begin: int, end: int) -> WholeRows:
+        """Its rows [begin, end)."""
         whole = self.whole and (begin, end) == (0, self.count)
         return replace(self, row=self.row + begin, frame=self.frame + begin, task=self.task[begin:end], whole=whole)
 
 
 @dataclass
 class Table:
-    """The counters of one data file's rows; good: which of them can be read and are finite numbers."""
+    """The counters of the rows of one data file; good: rows that can be read and hold finite numbers."""
 
     file: str
     path: Path
     columns: dict[str, np.ndarray]
     good: np.ndarray
-    missing: dict[str, np.ndarray]  # column -> rows in which it is no finite number
+    missing: dict[str, np.ndarray]  # column -> rows in which it is not finite
 
 
 def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dict]) -> Table:
-    """Reads all columns of a data file, keeps the counters; DatasetError where the file as a whole cannot be read."""
+    """Reads all columns of a data file and keeps its counters; DatasetError where the file cannot be opened."""
     stored = [name for name, feature in features.items() if feature["dtype"] != "video"]
     floats = [name for name in stored if features[name]["dtype"].startswith("float") and name != "timestamp"]
     with open_parquet(path) as opened:
@@ -109,34 +105,36 @@ def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dic
     parts: dict[str, list[np.ndarray]] = {name: [np.zeros(0)] for name in AUTOMATIC}
     missing: dict[str, list[np.ndarray]] = {name: [np.zeros(0, bool)] for name in floats}
     good = [np.zeros(0, bool)]
-    for _, count, table in batches(path, features, [name for name in stored if name in names]):
+    for _, count, table in read_batches(path, features, [name for name in stored if name in names]):
         if isinstance(table, DatasetError) and count > _MOST_LOST:
-            raise table  # who claims so many rows has none
-        found, whole = ({}, np.zeros(count, bool)) if isinstance(table, DatasetError) else _numbers_of(table, features)
+            raise table  # a batch that claims more rows has none
+        columns, whole = (
+            ({}, np.zeros(count, bool)) if isinstance(table, DatasetError) else _numbers_of(table, features)
+        )
         good.append(whole)
         for name, some in parts.items():
-            some.append(found[name].reshape(-1).astype(np.float64) if name in found else np.full(count, np.nan))
+            some.append(columns[name].reshape(-1).astype(np.float64) if name in columns else np.full(count, np.nan))
         for name, some in missing.items():
             some.append(np.zeros(count, bool))
-            if name in found:
-                some[-1] |= ~np.isfinite(found[name].reshape(count, -1)).all(1)
+            if name in columns:
+                some[-1] |= ~np.isfinite(columns[name].reshape(count, -1)).all(1)
     joined, bad = ({name: np.concatenate(some) for name, some in kind.items()} for kind in (parts, missing))
     return Table(file, path, joined, np.concatenate(good), bad)
 
 
 def _numbers_of(table: pa.Table, features: Mapping[str, dict]) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """(columns of numbers, bool [n]: the rows of which all columns can be read)."""
-    found, whole = {}, np.ones(len(table), bool)
+    columns, whole = {}, np.ones(len(table), bool)
     for name in table.column_names:
         shape = tuple(features[name]["shape"])
         try:
             if features[name]["dtype"] == "image":
                 whole &= whole_pictures(table[name], shape)
             else:
-                found[name] = to_numpy(table[name], shape)
+                columns[name] = to_numpy(table[name], shape)
         except (ValueError, TypeError, NotImplementedError):
             whole[:] = False
-    return found, whole
+    return columns, whole
 
 
 def whole_pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarray:
@@ -144,13 +142,13 @@ def whole_pictures(column: pa.ChunkedArray, shape: tuple[int, ...]) -> np.ndarra
     good = np.zeros(len(column), bool)
     for i, picture in enumerate(column):
         with suppress(DatasetError):
-            decoded(picture.as_py(), shape, "the camera")
+            decode_picture(picture.as_py(), shape, "the camera")
             good[i] = True
     return good
 
 
-def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[Piece]:
-    """The whole pieces of a file's rows, episode after episode as they lie there."""
+def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[WholeRows]:
+    """The whole rows of a file, episode after episode in the order of the file."""
     numbers = _numbers(survey, table)
     for number in dict.fromkeys(numbers[numbers >= 0].tolist()):
         rows = np.flatnonzero(numbers == number)
@@ -163,22 +161,22 @@ def pieces_of(survey: Survey, table: Table, notes: list[str]) -> Iterator[Piece]
         for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(rows)]):
             if good[begin] and frames[begin] >= 0:
                 whole = frames[begin] == 0 and end - begin == (len(rows) if length is None else length)
-                yield Piece(
+                yield WholeRows(
                     int(number), table.file, table.path, int(rows[begin]), int(frames[begin]), task[begin:end], whole
                 )
 
 
 def _numbers(survey: Survey, table: Table) -> np.ndarray:
-    """int64: the episode of each row; where the column is missing, that to which alone the file belongs; else -1."""
-    found = table.columns["episode_index"]
+    """int64: the episode of each row; without the column, the only episode that lists this file, else -1."""
+    numbers = table.columns["episode_index"]
     here = [episode.number for episode in survey.episodes.values() if episode.data == table.file]
-    if np.isnan(found).all() and len(here) == 1:
-        return np.full(len(found), here[0], np.int64)
-    return np.where(np.isfinite(found) & (np.abs(found) < 2**53), found, -1).astype(np.int64)
+    if np.isnan(numbers).all() and len(here) == 1:
+        return np.full(len(numbers), here[0], np.int64)
+    return np.where(np.isfinite(numbers) & (np.abs(numbers) < 2**53), numbers, -1).astype(np.int64)
 
 
 def _frames(survey: Survey, table: Table, rows: np.ndarray, start: int | None) -> np.ndarray:
-    """int64: each row's place in its episode: what most of frame_index, index, timestamp and the order of the rows say."""
+    """int64: each row's place in its episode, by majority of frame_index, index, timestamp and the order of the rows."""
     frame, index = table.columns["frame_index"][rows], table.columns["index"][rows]
     time = np.round(table.columns["timestamp"][rows] * survey.fps)
     if start is None:
@@ -187,25 +185,25 @@ def _frames(survey: Survey, table: Table, rows: np.ndarray, start: int | None) -
         start = int(values[counts.argmax()]) if len(values) else 0
     votes = np.stack([frame, index - start, time])
     votes = np.where(np.isfinite(votes) & (np.abs(votes) < 2**53), votes, -1).astype(np.int64)
-    if (votes == np.arange(len(rows))).sum(0).min(initial=3) >= 2:  # as it should be
+    if (votes == np.arange(len(rows))).sum(0).min(initial=3) >= 2:  # as in an undamaged recording
         return np.arange(len(rows))
-    found, due = np.empty(len(rows), np.int64), 0
-    for i, said in enumerate(votes.T):
-        choices = [int(vote) for vote in said if vote >= 0]
+    frames, due = np.empty(len(rows), np.int64), 0
+    for i, stated in enumerate(votes.T):
+        choices = [int(vote) for vote in stated if vote >= 0]
         best = max([*choices, due], key=lambda at: (choices.count(at) + (at == due), at == due))
-        found[i] = best
+        frames[i] = best
         due = best + 1
-    return found
+    return frames
 
 
 def _unmeasured(table: Table, rows: np.ndarray, number: int, notes: list[str]) -> np.ndarray:
-    """Rows with a number that is not finite, where most rows of the episode have one; a column that mostly has none stays."""
+    """Rows with a number that is not finite, in columns that are finite in most rows of the episode."""
     bad = np.zeros(len(rows), bool)
     for name, missing in table.missing.items():
         here = missing[rows]
         if here.mean() > 0.5:
             notes.append(
-                f"episode {number}: {name} is no finite number in {int(here.sum())} of {len(rows)} rows, which stay as they are"
+                f"episode {number}: {name} is not finite in {int(here.sum())} of {len(rows)} rows, which are kept"
             )
         else:
             bad |= here
@@ -213,28 +211,28 @@ def _unmeasured(table: Table, rows: np.ndarray, number: int, notes: list[str]) -
 
 
 class RowReader:
-    """Rows of data files as columns; going on in order reads each file once."""
+    """Rows of data files as columns; reading in order reads each file once."""
 
     def __init__(self, features: Mapping[str, dict]):
         self._features = features
         self._columns = [name for name, feature in features.items() if feature["dtype"] != "video"]
         self._path: Path | None = None
 
-    def columns(self, piece: Piece) -> Iterator[dict[str, np.ndarray]]:
+    def columns(self, piece: WholeRows) -> Iterator[dict[str, np.ndarray]]:
         """The piece's columns, some hundred rows at a time; pictures as their bytes."""
         begin, end = piece.row, piece.row + piece.count
         if self._path != piece.path or begin < self._at:
             self._path, self._at = piece.path, 0
             with open_parquet(piece.path) as opened:
-                there = set(opened.schema_arrow.names)
-            wanted = [name for name in self._columns if name in there]
-            self._run = batches(piece.path, self._features, wanted)
+                existing = set(opened.schema_arrow.names)
+            wanted = [name for name in self._columns if name in existing]
+            self._run = read_batches(piece.path, self._features, wanted)
             self._table: pa.Table | None = None
         while begin < end:
             if self._table is None or begin >= self._at + len(self._table):
                 self._at, _, table = next(self._run, (end, 0, None))
                 if table is None:
-                    raise DatasetError(f"{piece.path} has changed while it was read; leave it alone and try again.")
+                    raise DatasetError(f"{piece.path} changed while it was read; try again when nothing writes to it.")
                 self._table = None if isinstance(table, DatasetError) else table
                 continue
             upto = min(end, self._at + len(self._table), begin + 256)
@@ -242,35 +240,35 @@ class RowReader:
             begin = upto
 
     def _arrays(self, table: pa.Table) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
         for name in table.column_names:
             feature = self._features[name]
             if feature["dtype"] == "image":
                 column = np.empty(len(table), object)
                 column[:] = [(value or {}).get("bytes") for value in table[name].to_pylist()]
-                found[name] = column
+                arrays[name] = column
             else:
-                found[name] = to_numpy(table[name], tuple(feature["shape"]))
-        return found
+                arrays[name] = to_numpy(table[name], tuple(feature["shape"]))
+        return arrays
 
 
-def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+def true_runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """(begin, end) of each stretch in which the mask is True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2])]
 
 
-def uncovered(pieces: Sequence[Piece]) -> Iterator[Piece]:
-    """The pieces without rows that one before them has too: a file may have been copied."""
+def without_overlaps(pieces: Sequence[WholeRows]) -> Iterator[WholeRows]:
+    """The pieces without rows that an earlier piece has too (of a copied file)."""
     taken: dict[int, set[int]] = {}
     for piece in pieces:
         seen = taken.setdefault(piece.number, set())
         mask = np.array([frame not in seen for frame in range(piece.frame, piece.frame + piece.count)], bool)
-        for begin, end in runs(mask):
+        for begin, end in true_runs(mask):
             yield piece.part(begin, end)
         seen.update(range(piece.frame, piece.frame + piece.count))
 
 
-def short(error: BaseException) -> str:
-    """What an error says, without its advice."""
+def message_of(error: BaseException) -> str:
+    """The first sentence of an error, without its advice."""
     return (str(error).splitlines() or [type(error).__name__])[0].split(";")[0][:300]

@@ -1,4 +1,4 @@
-"""repair: writes a mended copy of a damaged recording that keeps every whole row; the original is not touched."""
+"""repair: writes a mended copy of a damaged recording that keeps every whole row; the original does not change."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ import pyarrow as pa
 from ..core import files
 from ..core.errors import DatasetError
 from ..data import stats
-from ..data.features import decoded, sensors_of
-from ..data.format import ACTION_VALID, AUTOMATIC, INFO, TIME, Layout, schema, tidy
-from ..data.source import follows, is_action
-from ..data.staged import LOG, Staged, look, sampled
+from ..data.features import decode_picture, sensors_of
+from ..data.format import ACTION_VALID, AUTOMATIC, INFO, TIME, Layout, schema, whole_rate
+from ..data.source import is_action, is_outcome
+from ..data.staged import LOG, Staged, picture_statistics, sampled_statistics
 from ..data.storage import mp4
-from ..data.storage.films import cut, whole_frames
+from ..data.storage.films import cut_video, whole_frames
 from ..data.storage.tables import read_json
-from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh
+from ..data.writer import ROWS_PER_GROUP, Draft, Writer, fresh_folder
 from .features import BROKEN, mended_features, schemas_of
 from .footage import Footage
-from .footers import rebuild
-from .pieces import Piece, RowReader, Table, pieces_of, read_table, runs, short, uncovered
-from .streams import StreamMender, possible
+from .footers import rebuild_footer
+from .pieces import RowReader, Table, WholeRows, message_of, pieces_of, read_table, true_runs, without_overlaps
+from .streams import StreamMender, can_be_stored
 from .survey import Survey, cameras_of, survey
 
 _REBUILT = ".rebuilt"  # data files with new footers, while they are read
 _INTERRUPTED = ".interrupted"  # the episode in flight, while it is read
-_MOST_PIECES = 8  # episodes that a repair may make on top of two of each without asking
+_MOST_PIECES = 8  # a repair that makes more episodes than two of each plus this many asks first
 
 
 @dataclass(frozen=True)
@@ -51,53 +51,57 @@ def repair(
     progress: Callable[[int, int], None] | None = None,
     allow_loss: bool | Callable[[str], bool] = False,
 ) -> list[str]:
-    """Writes a sound copy of what is whole in `root` to `out`; returns, in sentences, what was done.
+    """Writes a valid copy of all that is whole in `root` to `out`; returns sentences that say what was done.
 
-    Whole episodes are carried over bit for bit: their rows' values, their streams, their videos' packets. Of a damaged
-    one every row is kept that all its cameras still show; where rows are missing in the middle, or one holds a number
-    that is not finite (in a column that mostly does), the episode is split there. Counters, timestamps, statistics and
-    all of meta/ are made anew from the rows; an interrupted episode of a killed recorder is made an episode. `keep`: only
-    the episodes of these numbers. `progress(pieces, of)` is called after each piece of rows is written. `allow_loss`: what
-    is done where most rows would be lost or episodes be cut to many pieces: True goes on, a function is asked with a
-    sentence, and without either DatasetError is raised and nothing is written. DatasetError, too, where `root` holds
-    nothing whole, or `out` is in use, or the disk is full. However it ends, `out` is whole or not there.
+    Whole episodes are copied bit for bit: the values of rows, the streams, the packets of videos. A damaged episode keeps
+    every row that all its cameras show. It is split where rows are missing, or where a number is not finite in a column
+    that is finite in most rows. Counters, timestamps, statistics and all of meta/ are computed from the rows. The
+    unfinished episode of a killed recorder becomes an episode.
+
+    keep:       numbers of the episodes to copy; None copies all.
+    progress:   `progress(done, total)` is called after each piece of rows.
+    allow_loss: what to do where most rows would be lost, or episodes cut to many pieces: True goes on; a function is
+                given a sentence and returns whether to go on; False raises DatasetError.
+
+    DatasetError, too, where `root` holds nothing whole, `out` is not empty, or the disk is full. Whatever happens, `out`
+    is complete or does not exist.
     """
     root, out = Path(root), Path(out)
-    found = survey(root)
+    source = survey(root)
     if out.resolve() == root.resolve() or root.resolve() in out.resolve().parents:
         raise DatasetError(f"the mended copy cannot lie in {root} itself; choose another folder for it.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} is not empty; choose another folder for the mended copy.")
     with files.creating(out) as staged:
-        return _Mender(found, staged, keep, progress, allow_loss).mend()
+        return _Mender(source, staged, keep, progress, allow_loss).mend()
 
 
 class _Mender:
-    """One repair: what was said, and of each episode which rows were kept (as runs of frames) and why others were not."""
+    """One repair: its notes, and for each episode the rows kept (as runs of frames) and why others were not."""
 
-    def __init__(self, found: Survey, out: Path, keep: Collection[int] | None, progress, allow_loss):
-        self.found, self.out, self.only, self.progress, self.allow_loss = found, out, keep, progress, allow_loss
-        self.said: list[str] = []
+    def __init__(self, source: Survey, out: Path, keep: Collection[int] | None, progress, allow_loss):
+        self.source, self.out, self.only, self.progress, self.allow_loss = source, out, keep, progress, allow_loss
+        self.notes: list[str] = []
         self.kept: dict[int, list[tuple[int, int]]] = {}
         self.why: dict[int, str] = {}
 
     def mend(self) -> list[str]:
-        found = self.found
-        self.staged = _staged(found) if self.only is None else None
+        source = self.source
+        self.staged = _staged(source) if self.only is None else None
         self._features()
-        self.streams = {name: sensor for name, sensor in found.streams.items() if possible(sensor)}
-        self.said += [
-            f"stream {name!r:.100} is none that can be kept" for name in found.streams if name not in self.streams
-        ]
+        self.streams = {name: sensor for name, sensor in source.streams.items() if can_be_stored(sensor)}
+        self.notes += [f"stream {name!r:.100} cannot be stored" for name in source.streams if name not in self.streams]
         pieces = self._pieces()
         if not pieces and self.staged is None:
-            raise DatasetError(f"nothing in {found.root} is whole; restore it from a copy.")
-        self.tasks = _sentences(found, pieces, self.said)
-        self.footage = Footage(found, cameras_of(self.features), pieces, self.said, self.why)
-        self._ask(pieces, [end - begin for piece in pieces for begin, end in runs(self.footage.shown(piece))])
+            raise DatasetError(f"nothing in {source.root} is whole; restore it from a copy.")
+        self.tasks = _sentences(source, pieces, self.notes)
+        self.footage = Footage(source, cameras_of(self.features), pieces, self.notes, self.why)
+        self._ask(pieces, [end - begin for piece in pieces for begin, end in true_runs(self.footage.shown(piece))])
         self.writer = Writer(self.out, self._layout())
         self.reader = RowReader(self.features)
-        self.stream_mender = StreamMender(found, self.features, self.streams, fresh(self.writer.staging), self.said)
+        self.stream_mender = StreamMender(
+            source, self.features, self.streams, fresh_folder(self.writer.staging), self.notes
+        )
         try:
             for done, piece in enumerate(pieces, 1):
                 self._put(piece)
@@ -109,33 +113,33 @@ class _Mender:
             self.writer.tidy(0)
             if not self.writer.episodes:
                 raise DatasetError(
-                    f"nothing of {found.root} could be kept: {'; '.join(self.said) or 'it has no rows'}."
+                    f"nothing of {source.root} could be kept: {'; '.join(self.notes) or 'it has no rows'}."
                 )
         finally:
             self.writer.close()
             for folder in (self.writer.staging, self.out / _REBUILT, self.out / _INTERRUPTED):
                 shutil.rmtree(folder, ignore_errors=True)
         self._keep_facts()
-        return self.said
+        return self.notes
 
     def _features(self) -> None:
-        """As the files have them; where fps was wrong, so it was perhaps in what is said of the videos."""
-        found = self.found
+        """Takes the features from the files, and corrects the rate in the facts of the videos."""
+        source = self.source
         self.features = mended_features(
-            found.root, found.features, found.data, found.films, found.video_path, self.said
+            source.root, source.features, source.data, source.films, source.video_path, self.notes
         )
-        self.said += [fault.what for fault in found.faults if fault.what.startswith("fps") and found.info]
+        self.notes += [fault.what for fault in source.faults if fault.what.startswith("fps") and source.info]
         for name, feature in self.features.items():
             if isinstance(feature.get("info"), dict) and "video.fps" in feature["info"]:
-                self.features[name] = {**feature, "info": {**feature["info"], "video.fps": found.fps}}
+                self.features[name] = {**feature, "info": {**feature["info"], "video.fps": source.fps}}
 
-    def _ask(self, pieces: list[Piece], kept: list[int]) -> None:
-        """Whether most rows may be lost, or episodes be cut to many pieces: lengths `kept` are left of `pieces`."""
+    def _ask(self, pieces: list[WholeRows], kept: list[int]) -> None:
+        """Asks whether to go on where most rows would be lost, or episodes cut to many pieces. kept: lengths left of `pieces`."""
         rows, of, episodes = sum(kept), sum(piece.count for piece in pieces), len({piece.number for piece in pieces})
         if not rows or self.allow_loss is True or (2 * rows >= of and len(kept) <= 2 * episodes + _MOST_PIECES):
             return
         why = next(iter(self.why.values()), "others are damaged")
-        sentence = f"of {of} rows in {episodes} episodes only {rows} would be kept, in {len(kept)} pieces ({why})"
+        sentence = f"only {rows} of {of} rows in {episodes} episodes would be kept, in {len(kept)} pieces ({why})"
         if not callable(self.allow_loss) or not self.allow_loss(f"{sentence}."):
             raise DatasetError(
                 f"{sentence}; mend what the doctor names first, or allow the loss (--yes, in Python allow_loss=True)."
@@ -143,136 +147,141 @@ class _Mender:
         self.allow_loss = True
 
     def _layout(self) -> Layout:
-        found, ours = self.found, ("version", "world", "sensors", "streams", "terminal")
+        source, ours = self.source, ("version", "world", "sensors", "streams", "terminal")
         return _SameLayout(
-            fps=tidy(found.fps),
-            sensors=sensors_of(self.features, found.known),
+            fps=whole_rate(source.fps),
+            sensors=sensors_of(self.features, source.known),
             streams=self.streams,
             clock=TIME in self.features,
             pictures="png" if any(feature["dtype"] == "image" for feature in self.features.values()) else "video",
-            robot=str(found.info.get("robot_type") or ("terrella" if found.ours else "")),
-            world=found.world,
-            facts={key: value for key, value in found.about.items() if key not in ours},
+            robot=str(source.info.get("robot_type") or ("terrella" if source.ours else "")),
+            world=source.world,
+            facts={key: value for key, value in source.about.items() if key not in ours},
             kept=self.features,
         )
 
     # -- which rows ---------------------------------------------------------------------------------------------
 
-    def _pieces(self) -> list[Piece]:
-        found, pieces = self.found, []
-        named = list(dict.fromkeys(episode.data for episode in found.episodes.values()))
-        for file in [*named, *(file for file in found.data if file not in set(named))]:
+    def _pieces(self) -> list[WholeRows]:
+        source, pieces = self.source, []
+        named = list(dict.fromkeys(episode.data for episode in source.episodes.values()))
+        for file in [*named, *(file for file in source.data if file not in set(named))]:
             try:
-                pieces += pieces_of(found, self._table(file), self.said)
+                pieces += pieces_of(source, self._table(file), self.notes)
             except BROKEN as error:
-                self.said.append(f"{file} cannot be read ({short(error)})")
-                for episode in found.episodes.values():
+                self.notes.append(f"{file} cannot be read ({message_of(error)})")
+                for episode in source.episodes.values():
                     if episode.data == file:
                         self.why[episode.number] = f"{file} cannot be read"
-        if self.staged is not None:  # of an episode whose commit was killed, the staging folder has all
+        if self.staged is not None:  # the staging folder has all of an episode whose commit was killed
             pieces = [piece for piece in pieces if piece.number < self.staged]
         order = {file: at for at, file in enumerate(named)}
         pieces.sort(key=lambda piece: (piece.number, order.get(piece.file, len(order)), piece.frame))
-        return [piece for piece in uncovered(pieces) if self.only is None or piece.number in self.only]
+        return [piece for piece in without_overlaps(pieces) if self.only is None or piece.number in self.only]
 
     def _table(self, file: str) -> Table:
-        """A data file's counters; where it has no footer any more, those of a copy with a new one."""
-        path = self.found.path(file)
+        """The counters of a data file; of a file without a footer, those of a copy with a new footer."""
+        path = self.source.path(file)
         if not path.is_file():
             raise DatasetError("the file is missing")
         try:
-            return read_table(self.found, file, path, self.features)
+            return read_table(self.source, file, path, self.features)
         except BROKEN as error:
             try:
                 copy = self.out / _REBUILT / file
-                form = next(schemas_of(self.found.root, self.found.data), None) or schema(self.features)
-                rows = rebuild(path, form, self.features, copy)
-                table = read_table(self.found, file, copy, self.features)
+                form = next(schemas_of(self.source.root, self.source.data), None) or schema(self.features)
+                rows = rebuild_footer(path, form, self.features, copy)
+                table = read_table(self.source, file, copy, self.features)
             except (DatasetError, ValueError, pa.ArrowException):
                 raise error from None
-            self.said.append(f"{file} has no footer that can be read: {rows} rows were found by its pages")
+            self.notes.append(f"{file} has no readable footer: {rows} rows were recovered from its pages")
             return table
 
     # -- one piece ----------------------------------------------------------------------------------------------
 
-    def _put(self, piece: Piece) -> None:
-        """Makes episodes of the rows of a piece that all cameras show."""
-        for begin, end in runs(self.footage.shown(piece)):
+    def _put(self, piece: WholeRows) -> None:
+        """Makes episodes of those rows of a piece that all cameras show."""
+        for begin, end in true_runs(self.footage.shown(piece)):
             part = piece.part(begin, end)
-            if not self._tried(part):  # a frame that is there cannot be decoded: all are tried
-                for a, b in runs(self.footage.shown(part, strict=True)):
+            if not self._tried(part):  # some frame cannot be decoded: try every one
+                for a, b in true_runs(self.footage.shown(part, strict=True)):
                     self._tried(part.part(a, b))
 
-    def _tried(self, piece: Piece) -> bool:
+    def _tried(self, piece: WholeRows) -> bool:
         try:
             draft, anew = self._draft(piece)
             self.writer.put(draft)
         except (DatasetError, ValueError, pa.ArrowException) as error:
-            self.why[piece.number] = short(error)
+            self.why[piece.number] = message_of(error)
             return False
         for camera in anew:
-            what = f"the video of {camera} from frame {piece.frame} on is encoded again, as no copy could begin there"
-            self.said.append(f"episode {piece.number}: {what}")
+            what = (
+                f"the video of {camera} from frame {piece.frame} on is encoded again, because a copy cannot begin there"
+            )
+            self.notes.append(f"episode {piece.number}: {what}")
         self.kept.setdefault(piece.number, []).append((piece.frame, piece.frame + piece.count))
         return True
 
-    def _draft(self, piece: Piece) -> tuple[Draft, list[str]]:
-        """(what the writer takes, cameras whose video was encoded again); DatasetError where a frame cannot be decoded."""
+    def _draft(self, piece: WholeRows) -> tuple[Draft, list[str]]:
+        """(draft for the writer, cameras whose video was encoded again); DatasetError where a frame cannot be decoded."""
         staging, videos, pictures, anew = self.writer.staging, {}, {}, []
         for camera in cameras_of(self.features):
             film, videos[camera] = self.footage.films[piece.number, camera], staging / f"{camera}.mp4"
-            opened = self.footage.reel(film.file)
+            opened = self.footage.read_packets(film.file)
             if opened is None:
                 raise DatasetError(f"{film.file} cannot be read")
-            first, path = film.first + piece.frame, self.found.path(film.file)
-            if not cut(path, first, piece.count, self.found.fps, videos[camera], opened):
+            first, path = film.first + piece.frame, self.source.path(film.file)
+            if not cut_video(path, first, piece.count, self.source.fps, videos[camera], opened):
                 anew.append(camera)
-            if not whole_frames(videos[camera], 0, piece.count, self.found.fps).all():
+            if not whole_frames(videos[camera], 0, piece.count, self.source.fps).all():
                 raise DatasetError(f"{film.file} has frames that cannot be decoded")
-            shown = mp4.Frames(videos[camera], 0, piece.count, self.found.fps)
+            shown = mp4.Frames(videos[camera], 0, piece.count, self.source.fps)
             if shown[0].shape != tuple(self.features[camera]["shape"]):
                 raise DatasetError(f"the pictures of {film.file} have another size than the others of {camera}")
-            pictures[camera] = sampled(shown)
-        listed = self.found.episodes.get(piece.number)
-        streams, films, shift = self.stream_mender.cut(piece)
+            pictures[camera] = sampled_statistics(shown)
+        listed = self.source.episodes.get(piece.number)
+        streams, films, shift = self.stream_mender.cut_streams(piece)
         start_ns = None if listed is None or listed.start_ns is None else listed.start_ns + round(shift * 1e9)
         only = {} if listed is None or len(listed.tasks) != 1 else dict.fromkeys(piece.task.tolist(), listed.tasks[0])
-        texts = {**self.tasks, **only, **self.found.tasks}
+        texts = {**self.tasks, **only, **self.source.tasks}
         tasks = [texts[int(task)] for task in piece.task]
         pictures |= self._image_statistics(piece)
         rows, counts = self._rows(piece, shift), self._counts(piece)
         return Draft(piece.count, rows, videos, pictures, tasks[0], streams, films, start_ns, tasks, counts), anew
 
-    def _image_statistics(self, piece: Piece) -> dict[str, stats.Summary]:
-        """Of pictures that the rows hold themselves, from some of them."""
+    def _image_statistics(self, piece: WholeRows) -> dict[str, stats.Summary]:
+        """Statistics of the pictures stored in rows, from a sample."""
         shapes = {name: tuple(f["shape"]) for name, f in self.features.items() if f["dtype"] == "image"}
         reader = RowReader({name: self.features[name] for name in shapes})
         return stats.merge(
-            {name: look(decoded({"bytes": columns[name][0]}, shape, name)) for name, shape in shapes.items()}
+            {
+                name: picture_statistics(decode_picture({"bytes": columns[name][0]}, shape, name))
+                for name, shape in shapes.items()
+            }
             for columns in (reader.columns(piece) if shapes else ())
         )
 
-    def _counts(self, piece: Piece) -> dict[str, int]:
+    def _counts(self, piece: WholeRows) -> dict[str, int]:
         """Sensor -> rows up to the last that has it, where that is not the piece's last."""
-        listed = self.found.episodes.get(piece.number)
+        listed = self.source.episodes.get(piece.number)
         known = None if listed is None else listed.counts
         if known is None:
             length = piece.frame + piece.count if listed is None else listed.length
-            ended = ACTION_VALID in self.features and self.found.about.get("terminal", True)
-            known = {name: length - 1 for name in self.features if follows(name)} if ended else {}
+            ended = ACTION_VALID in self.features and self.source.about.get("terminal", True)
+            known = {name: length - 1 for name in self.features if is_outcome(name)} if ended else {}
         kept = {
             name: min(max(0, count - piece.frame), piece.count)
             for name, count in known.items()
             if name in self.features
         }
         if listed is not None and piece.frame + piece.count < listed.length and ACTION_VALID in self.features:
-            reader = RowReader({ACTION_VALID: self.features[ACTION_VALID]})  # what comes after its last row is gone
+            reader = RowReader({ACTION_VALID: self.features[ACTION_VALID]})  # the result of its last action is lost
             acted = np.flatnonzero(np.concatenate([part[ACTION_VALID].reshape(-1) for part in reader.columns(piece)]))
             last = int(acted[-1]) + 1 if len(acted) else 0
             kept |= {name: min(kept.get(name, last), last) for name in self.features if is_action(name)}
         return {name: count for name, count in kept.items() if count != piece.count}
 
-    def _rows(self, piece: Piece, shift: float) -> Iterator[dict[str, np.ndarray]]:
+    def _rows(self, piece: WholeRows, shift: float) -> Iterator[dict[str, np.ndarray]]:
         if all(feature["dtype"] == "video" or name in AUTOMATIC for name, feature in self.features.items()):
             yield from ({} for _ in range(0, piece.count, ROWS_PER_GROUP))
             return
@@ -281,12 +290,12 @@ class _Mender:
                 columns[TIME] = columns[TIME] - shift
             yield {name: column for name, column in columns.items() if name not in AUTOMATIC}
 
-    def _summarise(self, pieces: list[Piece]) -> None:
+    def _summarise(self, pieces: list[WholeRows]) -> None:
         """Says which episodes are as they were, and which rows of the others are kept."""
         whole, rows = 0, 0
-        lengths = {number: episode.length for number, episode in self.found.episodes.items()}
+        lengths = {number: episode.length for number, episode in self.source.episodes.items()}
         for piece in pieces:
-            if piece.number not in self.found.episodes:
+            if piece.number not in self.source.episodes:
                 lengths[piece.number] = max(lengths.get(piece.number, 0), piece.frame + piece.count)
         for number, length in sorted(lengths.items()):
             kept = self.kept.get(number, [])
@@ -296,8 +305,8 @@ class _Mender:
                 spans = ", ".join(f"{begin} to {end - 1}" for begin, end in kept)
                 what = f"its rows {spans} of {length} are kept" if kept else f"none of its {length} rows is kept"
                 why = self.why.get(number, "others are missing, damaged or hold what is no finite number")
-                self.said.append(f"episode {number}: {what}{' as episodes of their own' * (len(kept) > 1)} ({why})")
-        self.said.insert(
+                self.notes.append(f"episode {number}: {what}{' as episodes of their own' * (len(kept) > 1)} ({why})")
+        self.notes.insert(
             0, f"{whole} whole episodes ({rows} rows) are carried over; counters, statistics and meta/ are made anew"
         )
 
@@ -307,33 +316,33 @@ class _Mender:
         """Makes an episode of what a killed recorder left in flight."""
         if self.staged is None:
             return
-        copy, source = fresh(self.out / _INTERRUPTED), self.found.root / ".staging"
+        copy, source = fresh_folder(self.out / _INTERRUPTED), self.source.root / ".staging"
         for file in source.iterdir():
             if file.name == LOG or file.name.endswith(".growing.mp4"):
-                shutil.copyfile(self.found.path(f".staging/{file.name}"), copy / file.name)
+                shutil.copyfile(self.source.path(f".staging/{file.name}"), copy / file.name)
         staged = Staged(copy)
         rows = staged.whole()
         if rows < 2:
-            self.said.append("the interrupted episode has fewer than 2 whole rows and is left out")
+            self.notes.append("the interrupted episode has fewer than 2 whole rows and is left out")
             return
         if not staged.fits(self.writer.layout):
-            self.said.append("the interrupted episode has other sensors than the rest and is left out")
+            self.notes.append("the interrupted episode has other sensors than the rest and is left out")
             return
         try:
             draft = staged.draft(rows, staged.start_ns if self.writer.layout.clock else None)
             streams = {name: readings for name, readings in draft.streams.items() if name in self.streams}
             self.writer.put(replace(draft, streams=streams))
-            self.said.append(f"the interrupted episode is recovered up to its last whole row: {rows} rows")
+            self.notes.append(f"the interrupted episode is recovered up to its last whole row: {rows} rows")
         except (DatasetError, ValueError, KeyError, pa.ArrowException) as error:
-            self.said.append(f"the interrupted episode cannot be recovered ({short(error)})")
+            self.notes.append(f"the interrupted episode cannot be recovered ({message_of(error)})")
 
     def _keep_facts(self) -> None:
         """What else meta/info.json said stays."""
         info = read_json(self.out / INFO)
-        if isinstance(info, dict) and self.found.info:
-            kept = {key: value for key, value in self.found.info.items() if key not in info}
-            if self.found.info.get("total_episodes") == info["total_episodes"] and "splits" in self.found.info:
-                kept["splits"] = self.found.info["splits"]
+        if isinstance(info, dict) and self.source.info:
+            kept = {key: value for key, value in self.source.info.items() if key not in info}
+            if self.source.info.get("total_episodes") == info["total_episodes"] and "splits" in self.source.info:
+                kept["splits"] = self.source.info["splits"]
             files.write_json(self.out / INFO, _finite({**info, **kept}))
 
 
@@ -346,28 +355,28 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _staged(found: Survey) -> int | None:
+def _staged(source: Survey) -> int | None:
     """The number of the interrupted episode in the staging folder; None where there is none that is not safe already."""
-    if not found.ours:
+    if not source.ours:
         return None
     try:
-        found.path(f".staging/{LOG}")
-        number = Staged(found.root / ".staging").number
+        source.path(f".staging/{LOG}")
+        number = Staged(source.root / ".staging").number
     except (OSError, ValueError, KeyError, TypeError, RecursionError, DatasetError):
         return None
-    total = found.info.get("total_episodes")
-    missing = number == total if isinstance(total, int) else number not in found.episodes
+    total = source.info.get("total_episodes")
+    missing = number == total if isinstance(total, int) else number not in source.episodes
     return number if missing else None
 
 
-def _sentences(found: Survey, pieces: list[Piece], said: list[str]) -> dict[int, str]:
+def _sentences(source: Survey, pieces: list[WholeRows], notes: list[str]) -> dict[int, str]:
     """task_index -> its sentence; where tasks.parquet is lost, by the episodes that have one task alone."""
-    tasks = dict(found.tasks)
+    tasks = dict(source.tasks)
     for piece in pieces:
-        listed = found.episodes.get(piece.number)
+        listed = source.episodes.get(piece.number)
         if listed and len(listed.tasks) == 1 and len(set(piece.task.tolist())) == 1:
             tasks.setdefault(int(piece.task[0]), listed.tasks[0])
     lost = sorted({int(task) for piece in pieces for task in piece.task} - set(tasks))
     if lost:
-        said.append(f"the sentences of {len(lost)} tasks are lost: they are called 'task {lost[0]}' and so on")
+        notes.append(f"the sentences of {len(lost)} tasks are lost: they are called 'task {lost[0]}' and so on")
     return tasks | {task: f"task {task}" for task in lost}

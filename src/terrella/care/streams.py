@@ -13,17 +13,17 @@ from ..data.format import TIME, stream_path
 from ..data.meta import Episode
 from ..data.source import Sensor
 from ..data.storage import mp4
-from ..data.storage.films import cut, reel, whole_frames
+from ..data.storage.films import cut_video, read_packets, whole_frames
 from ..data.storage.tables import read_whole
 from ..data.writer import NAME
 from .features import BROKEN
-from .pieces import Piece, RowReader, short
-from .survey import LEFTOVER, RESTORE, Fault, Survey, listed
+from .pieces import RowReader, WholeRows, message_of
+from .survey import LEFTOVER, RESTORE, Fault, Survey, list_files
 
 
 def examine_streams(survey: Survey, busy: bool) -> Iterator[Fault]:
     """Every stream of every episode: its times ascend, its values are of its shape, its film is as long as its times."""
-    files = set(listed(survey.root, "streams", ".parquet")) | set(listed(survey.root, "streams", ".mp4"))
+    files = set(list_files(survey.root, "streams", ".parquet")) | set(list_files(survey.root, "streams", ".mp4"))
     known: set[str] = set()
     for name, sensor in survey.streams.items():
         for episode in survey.episodes.values():
@@ -61,7 +61,7 @@ def _stream(survey: Survey, sensor: Sensor, episode: Episode, has_film: bool) ->
         return
     rate = sensor.rate_hz or survey.fps
     try:
-        packets = reel(survey.path(film), rate)
+        packets = read_packets(survey.path(film), rate)
     except DatasetError:
         yield Fault(film, episode.start, "the video is truncated or not mp4", RESTORE)
         return
@@ -81,29 +81,29 @@ def _stream(survey: Survey, sensor: Sensor, episode: Episode, has_film: bool) ->
 
 @dataclass(frozen=True)
 class StreamMender:
-    """Cuts streams to pieces of rows; films go to the folder `staging`, what was left out is added to `said`."""
+    """Cuts streams to pieces of rows; films go to the folder `staging`, what was left out is added to `notes`."""
 
     survey: Survey
     features: Mapping[str, dict]
     streams: Mapping[str, Sensor]
     staging: Path
-    said: list[str]
+    notes: list[str]
 
-    def cut(self, piece: Piece) -> tuple[dict, dict, float]:
+    def cut_streams(self, piece: WholeRows) -> tuple[dict, dict, float]:
         """(readings by stream, films by stream, seconds from the episode's time 0 to the piece's own)."""
         begin, end, shift = self._times(piece)
         return *self._streams(piece.number, begin, end, shift), shift
 
-    def _times(self, piece: Piece) -> tuple[float, float, float]:
+    def _times(self, piece: WholeRows) -> tuple[float, float, float]:
         """(begin, end, shift): true times between which streams belong to the piece, and its own time 0."""
         if piece.whole or not self.streams:
             return -np.inf, np.inf, 0.0
         fps = self.survey.fps
-        listed = self.survey.episodes.get(piece.number)
+        episode = self.survey.episodes.get(piece.number)
         time_s = piece.frame + np.arange(piece.count) / fps
         if TIME in self.features:
             time_s = np.concatenate([columns[TIME].reshape(-1) for columns in RowReader(self.features).columns(piece)])
-        first, last = piece.frame == 0, listed is not None and piece.frame + piece.count == listed.length
+        first, last = piece.frame == 0, episode is not None and piece.frame + piece.count == episode.length
         shift = 0.0 if first else float(time_s[0])
         return (-np.inf if first else float(time_s[0])), (np.inf if last else float(time_s[-1]) + 1 / fps), shift
 
@@ -125,28 +125,30 @@ class StreamMender:
                 else:
                     streams[name] = [(float(time_s[i] - shift), values[i]) for i in np.flatnonzero(keep)]
                 if not keep.all() and np.isinf(begin) and np.isinf(end):
-                    self.said.append(
+                    self.notes.append(
                         f"episode {number}: {int((~keep).sum())} readings of stream {name} were out of order and left out"
                     )
             except BROKEN as error:
-                self.said.append(f"episode {number}: stream {name} cannot be read ({short(error)}) and is left out")
+                self.notes.append(
+                    f"episode {number}: stream {name} cannot be read ({message_of(error)}) and is left out"
+                )
         return streams, films
 
     def _stream_film(self, name: str, sensor: Sensor, film: str, wanted: np.ndarray) -> np.ndarray:
         """Cuts the wanted frames out of a stream's film, up to the first that is damaged; returns which they are."""
         rate, path = sensor.rate_hz or self.survey.fps, self.survey.path(film)
-        opened = reel(path, rate)
+        opened = read_packets(path, rate)
         good = np.append(whole_frames(path, 0, opened.count, rate), False)
         follows_on = np.diff(wanted, prepend=wanted[:1] - 1) == 1
         bad = np.flatnonzero(~(good[wanted.clip(max=opened.count)] & follows_on))
-        there = wanted[: bad[0]] if len(bad) else wanted
-        if len(there):
+        usable = wanted[: bad[0]] if len(bad) else wanted
+        if len(usable):
             target = self.staging / f"stream-{name}.mp4"
-            cut(path, int(there[0]), len(there), rate, target, opened)
-        return there
+            cut_video(path, int(usable[0]), len(usable), rate, target, opened)
+        return usable
 
 
-def possible(sensor: Sensor) -> bool:
+def can_be_stored(sensor: Sensor) -> bool:
     """Whether a recording can hold the stream."""
     sizes = sensor.shape[1:] if sensor.kind == "points" else sensor.shape
     odd = sensor.kind == "image" and any(size % 2 for size in sensor.shape[:2])

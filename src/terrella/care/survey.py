@@ -1,4 +1,4 @@
-"""survey: what a LeRobot v3.0 folder says of itself, so that one broken file does not hide the others, and its true rate."""
+"""survey: reads the metadata of a LeRobot v3.0 folder file by file, so that one broken file does not hide the others."""
 
 from __future__ import annotations
 
@@ -14,7 +14,17 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..data.features import checked_features
-from ..data.format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, contained, fill, sensor_from_json, tidy
+from ..data.format import (
+    DATA_PATH,
+    INFO,
+    TASKS,
+    VIDEO_PATH,
+    WORLD,
+    fill_template,
+    path_inside,
+    sensor_from_json,
+    whole_rate,
+)
 from ..data.meta import MOST, OPTIONAL, Episode, EpisodeTable, read_part, sentences
 from ..data.source import Sensor
 from ..data.storage import mp4
@@ -23,14 +33,14 @@ from ..data.storage.tables import open_parquet, read_json, read_whole
 from .features import BROKEN, features_without_info
 
 _BROKEN = (OSError, pa.ArrowException, av.FFmpegError, ValueError, KeyError, TypeError, IndexError, DatasetError)
-_FILES = 8  # of each kind that are measured
+_FILES = 8  # files of a kind whose rate is measured
 _ROWS, _PACKETS = 20_000_000, 256
 _SAME = 5e-4  # relative; 29.97 and 30 differ by twice as much
-_UNEVEN = 0.05  # share by which a step may differ from the usual one
-_MOST = 2 / 3  # of the episodes, or of the videos, must agree
-RESTORE = "restore the file from a copy, or let --repair make a dataset of what is whole"
-LEFTOVER = "it was being committed when the recorder was killed: record into the folder again, or delete the file"
-FROM_ROWS = "let --repair make it anew from the rows"
+_UNEVEN = 0.05  # share by which a time step may differ from the median
+_MOST = 2 / 3  # share of the episodes, or videos, that must agree
+RESTORE = "restore the file from a copy, or use --repair, which keeps what is whole"
+LEFTOVER = "the recorder was killed while it committed this: record into the folder again, or delete the file"
+FROM_ROWS = "use --repair, which makes it from the rows"
 _LATEST_S = 1e12  # a video that begins later is damage
 
 Look = tuple[np.ndarray, np.ndarray]  # mean and deviation of each colour of an episode's pictures, float64 [3], in 0..1
@@ -38,28 +48,29 @@ Look = tuple[np.ndarray, np.ndarray]  # mean and deviation of each colour of an 
 
 @dataclass(frozen=True)
 class Fault:
-    """file: relative to the dataset; row: of the whole dataset, None where it concerns the file; what and mend: sentences."""
+    """One fault of a recording."""
 
-    file: str
-    row: int | None
-    what: str
-    mend: str
+    file: str  # relative to the dataset
+    row: int | None  # of the whole dataset; None for a fault of the file
+    what: str  # what is wrong, a sentence
+    mend: str  # how to mend it, a sentence
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the folder says.
+    """The metadata of a folder.
 
     info, about:  meta/info.json and meta/terrella.json; {} where they cannot be read.
-    features:     of info.json; where it cannot be read, as the recording's other files tell.
-    fps:          of info.json, or that of the rows and videos where they agree on another.
+    features:     of info.json; read from the other files where it cannot be read.
+    fps:          of info.json, or the rate of rows and videos where these agree on another.
     streams:      sensors with clocks of their own.
-    episodes:     by number, as meta/episodes lists them; complete says whether all of meta/episodes could be read.
-    looks:        (episode, camera) -> what its pictures looked like when its statistics were made.
-    tasks:        task_index -> its sentence.
-    video_path:   the template of its videos' names.
-    data, films:  the names of all data files and of all videos.
-    faults:       met on the way.
+    episodes:     by number, as meta/episodes lists them.
+    complete:     whether all of meta/episodes could be read.
+    looks:        (episode, camera) -> statistics of its pictures when they were recorded.
+    tasks:        task_index -> its text.
+    video_path:   template of the names of its videos.
+    data, films:  names of all data files and of all videos.
+    faults:       of these files.
     """
 
     root: Path
@@ -84,19 +95,19 @@ class Survey:
 
     @property
     def world(self) -> dict:
-        """What Terrella's recorder knew of the recorded world."""
+        """Facts of the recorded world, from meta/terrella.json."""
         return _mapping(self.about.get("world"))
 
     @property
     def known(self) -> dict[str, Sensor]:
-        """The sensors of the rows as meta/terrella.json tells; those that it tells wrongly are left out."""
-        found = {}
-        for name, said in _mapping(self.about.get("sensors")).items():
+        """The sensors of the rows in meta/terrella.json; invalid ones are left out."""
+        sensors = {}
+        for name, stated in _mapping(self.about.get("sensors")).items():
             try:
-                found[name] = sensor_from_json(name, said)
+                sensors[name] = sensor_from_json(name, stated)
             except BROKEN:
                 continue
-        return found
+        return sensors
 
     @property
     def ours(self) -> bool:
@@ -104,12 +115,12 @@ class Survey:
         return bool(self.about)
 
     def path(self, name: str) -> Path:
-        """Where a file of it lies; DatasetError where the name leads out of the folder."""
-        return contained(self.root, name)
+        """The path of a file; DatasetError where the name leads out of the folder."""
+        return path_inside(self.root, name)
 
 
 def survey(root: str | Path) -> Survey:
-    """DatasetError where `root` is no folder, or holds no LeRobot v3.0 dataset, however damaged."""
+    """Reads the metadata; DatasetError where `root` is no folder, or holds no LeRobot v3.0 dataset at all."""
     root = Path(root)
     if not root.is_dir():
         raise DatasetError(f"there is no dataset at {root}; name the folder that holds meta/, data/ and videos/.")
@@ -118,7 +129,7 @@ def survey(root: str | Path) -> Survey:
     about = read_object(root, WORLD, faults, RESTORE) if (root / WORLD).exists() else {}
     _only_v3(root, info)
     data_path, video_path = _templates(info, faults)
-    data, films = listed(root, _top(data_path), ".parquet"), listed(root, _top(video_path), ".mp4")
+    data, films = list_files(root, _top(data_path), ".parquet"), list_files(root, _top(video_path), ".mp4")
     if not (info or data or (root / ".staging").exists()):
         raise DatasetError(f"{root} is not a LeRobot v3 dataset: it has neither {INFO} nor data; name another folder.")
     streams = _streams(root, about, faults)
@@ -130,8 +141,8 @@ def survey(root: str | Path) -> Survey:
     looks: dict[tuple[int, str], Look] = {}
     for file, table in tables:
         try:
-            found = _episodes(table, file, cameras_of(features), fps, data_path, video_path, faults)
-            episodes = {**found, **episodes}
+            listed = _episodes(table, file, cameras_of(features), fps, data_path, video_path, faults)
+            episodes = {**listed, **episodes}
         except BROKEN as error:
             faults.append(Fault(file, None, _what(error, "table of episodes"), FROM_ROWS))
             complete = False
@@ -149,7 +160,7 @@ def cameras_of(features: Mapping[str, dict]) -> tuple[str, ...]:
     return tuple(name for name, feature in features.items() if feature["dtype"] == "video")
 
 
-def listed(root: Path, folder: str, suffix: str) -> list[str]:
+def list_files(root: Path, folder: str, suffix: str) -> list[str]:
     """Names of the files anywhere under a folder of the dataset, sorted."""
     return LocalFiles(root).list(folder, suffix)
 
@@ -162,12 +173,12 @@ def _mapping(value: object) -> dict:
 
 
 def read_object(root: Path, name: str, faults: list[Fault], mend: str) -> dict:
-    """A JSON object of the dataset; {} and a fault more where it cannot be read."""
+    """A JSON object of the dataset; where it cannot be read, {} and one more fault."""
     try:
-        found = read_json(contained(root, name))
-        if not isinstance(found, dict):
-            raise ValueError("it is no JSON object")
-        return found
+        value = read_json(path_inside(root, name))
+        if not isinstance(value, dict):
+            raise ValueError("it is not a JSON object")
+        return value
     except FileNotFoundError:
         faults.append(Fault(name, None, "the file is missing", mend))
     except (OSError, ValueError, DatasetError) as error:
@@ -185,16 +196,16 @@ def _only_v3(root: Path, info: Mapping[str, object]) -> None:
 
 
 def _templates(info: Mapping[str, object], faults: list[Fault]) -> tuple[str, str]:
-    found = []
+    templates = []
     for key, usual in (("data_path", DATA_PATH), ("video_path", VIDEO_PATH)):
         template = info.get(key) or usual
         try:
-            fill(str(template), video_key="camera", chunk_index=0, file_index=0)
+            fill_template(str(template), video_key="camera", chunk_index=0, file_index=0)
         except DatasetError as error:
             faults.append(Fault(INFO, None, f"{key}: {error}", f"set it to {usual}"))
             template = usual
-        found.append(str(template))
-    return found[0], found[1]
+        templates.append(str(template))
+    return templates[0], templates[1]
 
 
 def _top(template: str) -> str:
@@ -204,28 +215,28 @@ def _top(template: str) -> str:
 
 def _streams(root: Path, about: Mapping, faults: list[Fault]) -> dict[str, Sensor]:
     try:
-        found = {name: sensor_from_json(name, said) for name, said in dict(about.get("streams", {})).items()}
-        for name in found:
-            contained(root, f"streams/{name}")
+        sensors = {name: sensor_from_json(name, stated) for name, stated in dict(about.get("streams", {})).items()}
+        for name in sensors:
+            path_inside(root, f"streams/{name}")
             if "/" in name:
-                raise ValueError(f"'{name[:100]}' is no name")
-        if found or about:
-            return found
+                raise ValueError(f"'{name[:100]}' is not a valid name")
+        if sensors or about:
+            return sensors
     except BROKEN as error:
         faults.append(Fault(WORLD, None, f"its streams cannot be read ({error})", RESTORE))
-    found = {}
-    for file in listed(root, "streams", ".parquet"):  # each table keeps its sensor too
+    sensors = {}
+    for file in list_files(root, "streams", ".parquet"):  # each table keeps its sensor too
         name = file.split("/")[1]
-        if name not in found:
+        if name not in sensors:
             try:
-                with open_parquet(contained(root, file)) as table:
-                    found[name] = sensor_from_json(name, json.loads((table.schema_arrow.metadata or {})[b"sensor"]))
+                with open_parquet(path_inside(root, file)) as table:
+                    sensors[name] = sensor_from_json(name, json.loads((table.schema_arrow.metadata or {})[b"sensor"]))
             except (*BROKEN, RecursionError):
                 continue
-    if found:
-        what = f"it does not declare the streams {', '.join(found)}, which lie in streams/"
-        faults.append(Fault(WORLD, None, what, "let --repair declare them anew from their tables"))
-    return found
+    if sensors:
+        what = f"it does not declare the streams {', '.join(sensors)}, which lie in streams/"
+        faults.append(Fault(WORLD, None, what, "use --repair, which declares them from their tables"))
+    return sensors
 
 
 # -- features and rate -----------------------------------------------------------------------------------------------
@@ -242,7 +253,7 @@ def _features(info: Mapping, faults: list[Fault]) -> dict[str, dict] | None:
 
 
 def _fps(root: Path, info: Mapping, data: list[str], films: list[str], faults: list[Fault]) -> float:
-    """That of info.json, unless the timestamps of the rows agree on another, and no video contradicts them."""
+    """The rate in info.json, unless the timestamps of the rows agree on another and no video contradicts them."""
     declared = None
     try:
         declared = float(info["fps"]) if info else None
@@ -250,17 +261,19 @@ def _fps(root: Path, info: Mapping, data: list[str], films: list[str], faults: l
             what, declared = f"{declared:g} frames a second are not possible", None
             raise ValueError(what)
     except BROKEN as error:
-        faults.append(Fault(INFO, None, f"fps: {error}", "let --repair find it in the rows' timestamps"))
+        faults.append(
+            Fault(INFO, None, f"fps: {error}", "use --repair, which takes it from the timestamps of the rows")
+        )
     rows, shown = _rate_of_rows(root, data), _rate_of_films(root, films)
     if declared is None:
-        return tidy(rows or shown or 1.0)
+        return whole_rate(rows or shown or 1.0)
     if rows and not _same(rows, declared) and (shown is None or _same(shown, rows)):
         witnesses = "the timestamps of the rows and the videos run" if shown else "the timestamps of the rows run"
         what = f"fps is {declared:g}, but {witnesses} at {rows:g} frames per second"
         faults.append(Fault(INFO, None, what, f"set fps to {rows:g} there, as --repair does"))
-        return tidy(rows)
+        return whole_rate(rows)
     if shown and not _same(shown, declared):
-        what = f"the videos run at {shown:g} frames per second, {INFO} says {declared:g}"
+        what = f"the videos run at {shown:g} frames per second, but {INFO} says {declared:g}"
         mend = "restore the videos from a copy, or encode them again at that rate"
         faults.append(Fault("videos", None, what, mend))
     return declared
@@ -274,7 +287,7 @@ def _rate_of_rows(root: Path, data: Sequence[str]) -> float | None:
     rates: list[float | None] = []
     for name in _some(data):
         try:
-            table = read_whole(contained(root, name), ["timestamp"], _ROWS)
+            table = read_whole(path_inside(root, name), ["timestamp"], _ROWS)
             time_s = table["timestamp"].to_numpy().astype(np.float64)
             rates += [_even(each) for each in np.split(time_s, np.flatnonzero(~(np.diff(time_s) > 0)) + 1)[:1000]]
         except _BROKEN:
@@ -286,7 +299,7 @@ def _rate_of_films(root: Path, films: Sequence[str]) -> float | None:
     rates = []
     for name in _some(films):
         try:
-            with mp4.opened(contained(root, name)) as (container, stream):
+            with mp4.open_video(path_inside(root, name)) as (container, stream):
                 packets = (packet.pts for packet, _ in zip(container.demux(stream), range(_PACKETS)))
                 ticks = np.sort([pts for pts in packets if pts is not None])
                 rates.append(_even(ticks * float(stream.time_base or 0)))
@@ -300,7 +313,7 @@ def _some(names: Sequence[str]) -> Sequence[str]:
 
 
 def _even(time_s: np.ndarray) -> float | None:
-    """The rate of ascending times [n]; None where most of them are not evenly spaced."""
+    """The rate of ascending times [n], Hz; None where most are not evenly spaced."""
     steps = np.diff(time_s)
     if not len(steps) or not np.isfinite(steps).all() or np.median(steps) <= 0:
         return None
@@ -309,7 +322,7 @@ def _even(time_s: np.ndarray) -> float | None:
 
 
 def _shared(rates: list[float]) -> float | None:
-    """The rate that most have; whole where it is but for rounding."""
+    """The rate that most share, rounded to a whole number where it is close to one."""
     if not rates:
         return None
     middle = float(np.median(rates))
@@ -322,23 +335,23 @@ def _shared(rates: list[float]) -> float | None:
 
 
 def _what(error: Exception, kind: str) -> str:
-    return str(error).split(";")[0] if isinstance(error, DatasetError) else f"it is no {kind} ({error})"
+    return str(error).split(";")[0] if isinstance(error, DatasetError) else f"it is not a {kind} ({error})"
 
 
 def _episode_tables(
     root: Path, cameras: tuple[str, ...], empty: bool, faults: list[Fault]
 ) -> tuple[list[tuple[str, pa.Table]], bool]:
-    """(file, table) of those that can be read, and whether all can."""
+    """(file, table) of each table that can be read, and whether all can."""
     more = [*OPTIONAL, "length", *(f"stats/{name}/{key}" for name in cameras for key in ("mean", "std"))]
-    files, found = listed(root, "meta/episodes", ".parquet"), []
+    files, tables = list_files(root, "meta/episodes", ".parquet"), []
     if not files and not empty:
         faults.append(Fault("meta/episodes", None, "there is no table of episodes", FROM_ROWS))
     for file in files:
         try:
-            found.append((file, read_part(contained(root, file), cameras, MOST, more)))
+            tables.append((file, read_part(path_inside(root, file), cameras, MOST, more)))
         except BROKEN as error:
             faults.append(Fault(file, None, _what(error, "table of episodes"), FROM_ROWS))
-    return found, len(found) == len(files) and (bool(files) or empty)
+    return tables, len(tables) == len(files) and (bool(files) or empty)
 
 
 def _episodes(
@@ -350,43 +363,43 @@ def _episodes(
     video_path: str,
     faults: list[Fault],
 ) -> dict[int, Episode]:
-    found: dict[int, Episode] = {}
+    episodes: dict[int, Episode] = {}
     listed = EpisodeTable(table, data_path, video_path, cameras, fps)
     numbers = table["episode_index"].to_pylist()
     lengths = table["length"].to_pylist() if "length" in table.column_names else [None] * len(numbers)
     for episode, number, length in zip(listed, numbers, lengths):
         if number < 0 or any(film.first > _LATEST_S * fps for film in episode.videos.values()):
             raise ValueError(f"episode {number} is none that can be, or its video begins at no possible time")
-        found.setdefault(number, replace(episode, number=number))
+        episodes.setdefault(number, replace(episode, number=number))
         if length not in (None, episode.length):
-            what = f"episode {number} is said to have length {length}, but rows {episode.start} to {episode.stop - 1}"
-            mend = f"set its length to {episode.length}, or let --repair count anew"
+            what = f"episode {number} has length {length}, but rows {episode.start} to {episode.stop - 1}"
+            mend = f"set its length to {episode.length}, or use --repair, which counts again"
             faults.append(Fault(file, episode.start, what, mend))
-    return found
+    return episodes
 
 
 def _looks(table: pa.Table, cameras: tuple[str, ...]) -> dict[tuple[int, str], Look]:
-    found = {}
+    looks = {}
     for name in cameras:
         if f"stats/{name}/mean" in table.column_names and f"stats/{name}/std" in table.column_names:
             means, stds = (table[f"stats/{name}/{key}"].to_pylist() for key in ("mean", "std"))
             for number, mean, std in zip(table["episode_index"].to_pylist(), means, stds):
                 look = tuple(np.asarray(each, np.float64).reshape(-1) for each in (mean, std))
                 if all(each.shape == (3,) and np.isfinite(each).all() for each in look):
-                    found[number, name] = look
-    return found
+                    looks[number, name] = look
+    return looks
 
 
 def _tasks(root: Path, episodes: Mapping[int, Episode], count: object, faults: list[Fault]) -> dict[int, str]:
-    """`count`: of the episodes that are safe; the tasks of what a killed commit left beyond them are not missed."""
+    """task_index -> text. `count`: episodes in info.json; tasks of episodes after these (of a killed commit) may be missing."""
     try:
-        found = sentences(contained(root, TASKS))
+        tasks = sentences(path_inside(root, TASKS))
         safe = [episode for number, episode in episodes.items() if not isinstance(count, int) or number < count]
-        lost = sorted({task for episode in safe for task in episode.tasks} - set(found.values()))
+        lost = sorted({task for episode in safe for task in episode.tasks} - set(tasks.values()))
         if lost:
             faults.append(Fault(TASKS, None, f"it lacks the task '{lost[0][:100]}' of meta/episodes", RESTORE))
-        return found
+        return tasks
     except BROKEN as error:
-        mend = "let --repair make it anew from meta/episodes"
+        mend = "use --repair, which makes it from meta/episodes"
         faults.append(Fault(TASKS, None, _what(error, "table of tasks"), mend))
     return {}

@@ -13,7 +13,7 @@ Struct = dict[int, tuple[int, object]]
 
 def read_struct(data: bytes | memoryview, at: int = 0, depth: int = 0) -> tuple[Struct, int]:
     """The struct that begins at byte `at`, and the byte after it; ValueError or IndexError where there is none."""
-    found: Struct = {}
+    fields: Struct = {}
     field = 0
     while (head := data[at]) != 0:
         at += 1
@@ -24,13 +24,13 @@ def read_struct(data: bytes | memoryview, at: int = 0, depth: int = 0) -> tuple[
             field, at = _signed(data, at)
         if I16 <= kind <= I64:
             value, at = _signed(data, at)
-            found[field] = (kind, value)
+            fields[field] = (kind, value)
         elif kind in (TRUE, FALSE):
-            found[field] = (kind, kind == TRUE)
+            fields[field] = (kind, kind == TRUE)
         else:
             value, at = _read(kind, data, at, depth)
-            found[field] = (kind, value)
-    return found, at + 1
+            fields[field] = (kind, value)
+    return fields, at + 1
 
 
 def _read(kind: int, data: bytes | memoryview, at: int, depth: int) -> tuple[object, int]:

@@ -1,7 +1,7 @@
-"""Arena: large immutable rows that lie once in shared tensors; states hold row numbers, and rows that none holds are freed.
+"""Arena: shared storage of large immutable rows. States hold row numbers; rows that no state holds are reused.
 
-Row 0 is reserved: all zeros, "nothing". Rows are written once. Before an arena grows, it marks the rows that live pointer
-tensors hold (it keeps weak references to those) and takes the others again.
+Row 0 is reserved: it is all zeros and means "none". A row is written once. Before an arena grows, it marks the rows that
+living pointer tensors hold (by weak references to these) and frees the others.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Arena:
         self.device = torch.device(device)
         self._lock = threading.RLock()
         self._pointers: dict[int, weakref.ref[torch.Tensor]] = {}
-        # the rows that each thread kept last, which it may still be building a state of
+        # the rows that each thread wrote last: it may still be building a state of them
         self._newest = threading.local()
-        self._crowd = 1000  # pointers noted, above which the dead ones are dropped
+        self._crowd = 1000  # number of noted pointers above which dead ones are dropped
         with torch.inference_mode(False):
             self._rows = {name: self._blank(name, room) for name in self.parts}
             self._free = torch.arange(1, room)
@@ -37,24 +37,27 @@ class Arena:
 
     @property
     def capacity(self) -> int:
-        """Rows that there is room for before the arena grows."""
+        """Rows that fit before the arena grows."""
         return len(next(iter(self._rows.values())))
 
     @property
     def row_bytes(self) -> int:
+        """Bytes of one row."""
         return sum(dtype.itemsize * torch.Size(shape).numel() for dtype, shape in self.parts.values())
 
     def same_layout(self, other: Arena) -> bool:
+        """Whether another arena has the same parts."""
         return self.parts == other.parts
 
     def read(self, name: str) -> torch.Tensor:
-        """All rows of one part, [capacity, ...]; to be read only, at rows that a live pointer tensor holds."""
+        """All rows of one part, [capacity, ...]: read only, and only rows that a living pointer tensor holds."""
         return self._rows[name]
 
     def keep(self, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Writes n new rows, `values[name]` [n, ...] for every part; their numbers, int64 [n].
+        """Writes n new rows, `values[name]` [n, ...] for every part; returns their numbers, int64 [n].
 
-        They stay while this tensor or a held one (`hold`; a State holds its pointers) lives, and until this thread keeps again.
+        The rows last while the returned tensor or another held pointer (see `hold`; a State holds its pointers) lives, and
+        at least until this thread calls `keep` again. ContractError where the values do not fit the parts.
         """
         if set(values) != set(self.parts):
             raise ContractError(f"this arena keeps {', '.join(self.parts)}; got {', '.join(values)}.")
@@ -76,7 +79,7 @@ class Arena:
             return self.hold(rows)
 
     def hold(self, pointer: torch.Tensor) -> torch.Tensor:
-        """Takes note that `pointer`, int64 rows of any shape, holds its rows for as long as it lives; returns it."""
+        """Keeps the rows in `pointer` (int64 of any shape) for as long as that tensor lives; returns it."""
         with self._lock:
             self._pointers[id(pointer)] = weakref.ref(pointer)
             if len(self._pointers) > self._crowd:
@@ -84,7 +87,7 @@ class Arena:
         return pointer
 
     def used(self) -> torch.Tensor:
-        """Which rows live pointer tensors hold: bool [capacity]."""
+        """bool [capacity]: the rows that living pointer tensors hold."""
         marks = torch.zeros(self.capacity, dtype=torch.bool, device=self.device)
         with self._lock:
             for pointer in self._living():
@@ -93,7 +96,7 @@ class Arena:
         return marks
 
     def adopt(self, pointer: torch.Tensor, other: Arena) -> torch.Tensor:
-        """The same rows of `other` copied here: their new numbers, in the shape of `pointer`."""
+        """Copies the rows in `pointer` from another arena; returns their numbers here, in the shape of `pointer`."""
         if other is self:
             return pointer
         if not self.same_layout(other):
@@ -106,18 +109,18 @@ class Arena:
         return self.hold(torch.cat([new.new_zeros(1), new])[where.to(self.device)])
 
     def _living(self) -> list[torch.Tensor]:
-        """The pointer tensors that still live; the others are forgotten."""
-        found = [(key, ref, ref()) for key, ref in self._pointers.items()]
-        self._pointers = {key: ref for key, ref, pointer in found if pointer is not None}
+        """The pointer tensors that still live; drops the others."""
+        entries = [(key, ref, ref()) for key, ref in self._pointers.items()]
+        self._pointers = {key: ref for key, ref, pointer in entries if pointer is not None}
         self._crowd = 1000 + 2 * len(self._pointers)
-        return [pointer for _, _, pointer in found if pointer is not None]
+        return [pointer for _, _, pointer in entries if pointer is not None]
 
     def _sweep(self, count: int) -> None:
-        """Makes at least `count` rows free: those that no pointer holds; the arena grows where few are."""
+        """Frees the rows that no pointer holds; grows the arena where fewer than `count`, or few, are free."""
         marks = self.used().cpu()
         free = (~marks).nonzero()[:, 0]
         before = self.capacity
-        if len(free) < max(count, before // 4):  # else it would sweep again soon
+        if len(free) < max(count, before // 4):  # with few free rows it would sweep again soon
             more = max(before, count)
             for name, old in self._rows.items():
                 grown = self._blank(name, before + more)
@@ -128,13 +131,15 @@ class Arena:
 
     def _blank(self, name: str, rows: int) -> torch.Tensor:
         dtype, shape = self.parts[name]
-        blank = torch.empty((rows, *shape), dtype=dtype, device=self.device)  # it takes memory when it is written
+        blank = torch.empty(
+            (rows, *shape), dtype=dtype, device=self.device
+        )  # the system gives memory on the first write
         blank[:1] = 0
         return blank
 
 
 def _distinct(pointer: torch.Tensor) -> torch.Tensor:
-    """The tensor without the repetitions of an expanded axis."""
+    """The tensor without the repeats of expanded axes."""
     for axis, stride in enumerate(pointer.stride()):
         if stride == 0 and pointer.shape[axis] > 1:
             pointer = pointer.narrow(axis, 0, 1)

@@ -1,7 +1,7 @@
-"""Chance by counting: one seed per batch entry, from which any tensor of noise follows, on any device and in any batch.
+"""Counter-based random numbers: one seed for each batch entry gives the same noise on any device and in any batch.
 
-An entry's noise is a hash of (its seed, stream, position): splitmix64 (Steele, Lea & Flood 2014), as in the counter-based
-generators of Salmon et al. 2011. So a batch of B equals B singles, and a frame may be drawn long after its step.
+The noise of an entry is a hash of (seed, stream, position): splitmix64 (Steele, Lea & Flood 2014), used as a counter-based
+generator (Salmon et al. 2011). So a batch of B equals B singles, and a frame can be rendered long after its step.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ GOLDEN, FIRST, SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECC
 
 
 def seeds(batch: int, rng: torch.Generator, device: torch.device | str | None = None) -> torch.Tensor:
-    """One draw from `rng` for each entry: int64 [batch]. B at once equal B singles, one after the other."""
-    low, high, there = -(2**63), 2**63 - 1, rng.device
-    if there.type == "cpu":
+    """int64 [batch], one seed for each entry, drawn from `rng`. One call for B equals B calls for 1."""
+    low, high, on = -(2**63), 2**63 - 1, rng.device
+    if on.type == "cpu":
         drawn = torch.randint(low, high, (batch,), generator=rng)
-    else:  # there a batch is no sequence of singles
-        ones = [torch.randint(low, high, (1,), generator=rng, device=there) for _ in range(batch)]
-        drawn = torch.cat(ones) if ones else torch.zeros(0, dtype=torch.int64, device=there)
+    else:  # a CUDA generator gives other numbers in a batch than one by one
+        ones = [torch.randint(low, high, (1,), generator=rng, device=on) for _ in range(batch)]
+        drawn = torch.cat(ones) if ones else torch.zeros(0, dtype=torch.int64, device=on)
     return drawn if device is None else drawn.to(device)
 
 
 def uniform(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
-    """float32 [B, *shape] in [0, 1): one of 2**24 steps each; another `stream`, other numbers."""
+    """float32 [B, *shape], uniform in [0, 1), multiples of 2**-24. Each `stream` gives independent numbers."""
     return _halves(seeds, math.prod(shape), stream)[1].view(len(seeds), *shape)
 
 
 def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
-    """float32 [B, *shape], standard normal (Box and Muller 1958)."""
+    """float32 [B, *shape], standard normal (Box & Muller 1958)."""
     count = math.prod(shape)
     high, low = _halves(seeds, (count + 1) // 2, stream)
     radius, angle = high.add_(2.0**-25).log_().mul_(-2).sqrt_(), low.mul_(2 * math.pi)
@@ -42,7 +42,7 @@ def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> t
 
 
 def choice(seeds: torch.Tensor, probabilities: torch.Tensor, stream: int = 0) -> torch.Tensor:
-    """int64 [B, ...] drawn from `probabilities` [B, ..., K], which need not add up to 1; those of 0 are never drawn."""
+    """int64 [B, ...] drawn from `probabilities` [B, ..., K], which need not sum to 1; entries of 0 are never drawn."""
     sums = probabilities.double().cumsum(-1)
     point = uniform(seeds, probabilities.shape[1:-1], stream).double()[..., None] * sums[..., -1:]
     return (sums <= point).sum(-1).clamp_max(probabilities.shape[-1] - 1)
@@ -58,7 +58,7 @@ def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor,
 
 
 def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same as `_halves`, in plain tensor algebra; the way on a GPU."""
+    """The same as `_halves` in plain tensor algebra, for GPUs."""
     key = _hashed(seeds + _hashed(torch.full_like(seeds, stream)))[:, None]
     mixed = _hashed(key + torch.arange(count, device=seeds.device) * GOLDEN)
     high, low = (mixed >> 40) & 0xFFFFFF, (mixed >> 8) & 0xFFFFFF

@@ -1,4 +1,4 @@
-"""check_world: proves any World, ours or a stranger's, against the contract."""
+"""check_world: tests any World against the contract."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .spec import AXES, BUTTONS, MODES, Spec, dtype_of, kind_of, shape_of
 from .state import State
 from .world import Observation, World, make_rng
 
-# The kinds of channels whose meaning every tool knows: dtype, and number of axes of one entry.
+# Kinds of channels with a fixed meaning: dtype, and number of axes of one entry.
 _WELL_KNOWN = {
     "rgb": (np.uint8, 3),
     "depth": (np.float32, 2),
@@ -31,15 +31,15 @@ _WELL_KNOWN = {
 
 
 def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
-    """Runs every law; gives the names of those that held, raises ContractError at the first that does not.
+    """Tests every law of the contract; returns their names, or raises ContractError at the first that fails.
 
-    The laws begin several episodes, so a world that cannot fork is left at a place of its own. `steps` is the length
-    of an episode; laws about `done` are only proven where an episode gets there.
+    The tests start several episodes, so states that were made before are stale afterwards where the world cannot fork.
+    `steps` is the length of an episode; laws about `done` are tested only where an episode ends within it.
     """
     if not isinstance(world, World) or not isinstance(world.spec, Spec):
         raise ContractError("a World has `spec` (a terrella.Spec) and the verbs start, observe, imagine, render.")
     laws = [
-        _spec_is_sound,
+        _spec_is_valid,
         _starts_and_renders,
         _refuses_other_batches,
         _acts_deterministically,
@@ -99,7 +99,7 @@ def _check_observation(world: World, seen: Observation, channels: Sequence[str],
             _require(bool((lengths - 1).abs().max() < 1e-3), f"the quaternion of channel '{name}' must have length 1.")
 
 
-def _spec_is_sound(world: World, seed: int, steps: int) -> None:
+def _spec_is_valid(world: World, seed: int, steps: int) -> None:
     spec = world.spec
     _require(0 < spec.dt_s < float("inf"), "spec.dt_s must be positive seconds.")
     _require(bool(spec.channels), "a world renders at least one channel.")
@@ -115,16 +115,16 @@ def _spec_is_sound(world: World, seed: int, steps: int) -> None:
     twice = sorted(set(spec.observes) & set(spec.may_observe))
     _require(not twice, f"spec.may_observe names {twice}, which spec.observes names already.")
     _require(spec.max_batch is None or spec.max_batch >= 1, "spec.max_batch is None or at least 1.")
-    _cameras_are_sound(spec)
+    _cameras_are_valid(spec)
     _actions_have_a_meaning(spec)
 
 
-def _cameras_are_sound(spec: Spec) -> None:
+def _cameras_are_valid(spec: Spec) -> None:
     for name, camera in spec.cameras.items():
         pictures = name in spec.channels and kind_of(name) == "rgb"
         _require(pictures, f"spec.cameras names '{name}', which is no picture channel (rgb, rgb.wrist) of this world.")
-        sound = len(camera.intrinsics) == 4 and min(camera.intrinsics) > 0
-        _require(sound, f"the intrinsics of camera '{name}' are four positive numbers: fx/W, fy/H, cx/W, cy/H.")
+        valid = len(camera.intrinsics) == 4 and min(camera.intrinsics) > 0
+        _require(valid, f"the intrinsics of camera '{name}' are four positive numbers: fx/W, fy/H, cx/W, cy/H.")
         size = shape_of(spec.channels[name])[:2]
         _require(tuple(camera.size) == size, f"camera '{name}' has size {camera.size}, its pictures have {size}.")
         mounted = camera.pose is None or (camera.pose in spec.channels and kind_of(camera.pose) == "pose")
@@ -195,13 +195,13 @@ def _episode(world: World, seed: int, steps: int) -> list[Observation]:
 
 
 def _global_chance() -> tuple:
-    """Where the generators stand that belong to nobody."""
+    """The states of the global generators of torch, numpy and Python."""
     numpy_state = np.random.get_state(legacy=True)
     return torch.get_rng_state().tolist(), [np.asarray(part).tolist() for part in numpy_state], random.getstate()
 
 
 def _acts_deterministically(world: World, seed: int, steps: int) -> None:
-    _ = torch.rand(1), np.random.random(), random.random()  # moves them on, so that seeding one again shows
+    _ = torch.rand(1), np.random.random(), random.random()  # advances them, so that seeding one again is noticed
     chance = _global_chance()
     first, second = _episode(world, seed, steps), _episode(world, seed, steps)
     _require(all(_same(a, b) for a, b in zip(first, second, strict=True)), "the same seed must give the same episode.")
@@ -271,7 +271,7 @@ def _states_can_be_saved(world: World, seed: int, steps: int) -> None:
         state.save(Path(folder) / "state.safetensors")
         action = world.spec.sample_action(1, rng)
         expected = _copy(world.render(world.imagine(state, action, make_rng(seed + 1)), channels))
-        world.start(1, make_rng(seed + 2))  # a world that keeps the state anywhere but in the State has lost it now
+        world.start(1, make_rng(seed + 2))  # a world that keeps data outside of the State has lost it now
         device = next(iter(state.values())).device
         restored = State.load(Path(folder) / "state.safetensors").to(device)
     _require(_same(before, world.render(restored, channels)), "a saved and restored state must render the same.")
@@ -299,7 +299,7 @@ def _batches(world: World, seed: int, steps: int) -> None:
 
 
 def _close(one: torch.Tensor, other: torch.Tensor) -> bool:
-    """Equal but for what sums in another order may round otherwise."""
+    """Whether two tensors are equal up to rounding, as of sums in another order."""
     slack = 1.01 if one.dtype == torch.uint8 else 1e-3
     return torch.allclose(one.double(), other.double(), rtol=1e-3, atol=slack)
 
@@ -342,7 +342,7 @@ def _gradients_reach_the_action(world: World, seed: int, steps: int) -> None:
     state, action = world.start(1, rng), world.spec.sample_action(1, rng).float().requires_grad_()
     seen = world.render(world.imagine(state, action, rng), tuple(world.spec.channels))
     sums = [tensor.sum() for tensor in seen.values() if tensor.requires_grad]
-    message = "spec.differentiable promises gradients from a channel to the action, and none comes."
+    message = "spec.differentiable is True, but no gradient reaches the action from any channel."
     _require(bool(sums), message)
     (gradient,) = torch.autograd.grad(torch.stack(sums).sum(), action, allow_unused=True)
     _require(gradient is not None and bool(torch.isfinite(gradient).all()) and bool((gradient != 0).any()), message)

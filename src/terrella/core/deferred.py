@@ -21,7 +21,7 @@ from .errors import ContractError
 Tensors = Mapping[str, torch.Tensor]
 
 
-class Source(Protocol):
+class PlanSource(Protocol):
     """The part of a State that plans read."""
 
     @property
@@ -38,9 +38,9 @@ class Source(Protocol):
 
     def __getitem__(self, name: str, /) -> torch.Tensor: ...
 
-    def at(self, index: torch.Tensor) -> Source: ...
+    def at(self, index: torch.Tensor) -> PlanSource: ...
 
-    def narrowed(self, rows: torch.Tensor) -> Source: ...
+    def narrowed(self, rows: torch.Tensor) -> PlanSource: ...
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Step:
     """Tensors computed by `run(before, now)` from an earlier State and from tensors `now` [B, ...] of the same batch."""
 
     run: Callable[[Any, Tensors], Tensors]
-    before: Source
+    before: PlanSource
     now: Tensors
 
     @property
@@ -64,7 +64,7 @@ class Step:
         return self.before.arenas
 
     @property
-    def sources(self) -> tuple[Source, ...]:
+    def sources(self) -> tuple[PlanSource, ...]:
         return (self.before,)
 
     def narrowed(self) -> Step:
@@ -88,7 +88,7 @@ class Step:
 class Pick:
     """The batch entries `index` [n] of several states, which are counted one after the other."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[PlanSource, ...]
     index: torch.Tensor
 
     @property
@@ -142,7 +142,7 @@ class Ready:
     values: Tensors
     arenas: Mapping[str, Arena]
     index: torch.Tensor
-    sources: tuple[Source, ...] = ()
+    sources: tuple[PlanSource, ...] = ()
 
     @property
     def batch(self) -> int:

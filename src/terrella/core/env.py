@@ -1,4 +1,4 @@
-"""as_env: any World as a Gymnasium vector environment, for whatever library trains in those."""
+"""as_env: any World as a Gymnasium vector environment."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from .world import World, make_rng
 
 
 class WorldEnv(VectorEnv):
-    """`as_env(world)`: `num_envs` episodes of `world` side by side. Arrays lead with num_envs; the world is not closed with it.
+    """`as_env(world)`: `num_envs` parallel episodes of `world`. Arrays lead with num_envs. Closing it leaves the world open.
 
-    max_steps:      an episode is truncated after that many steps: the world's own time limit (Spec.max_episode_steps) unless
-                    it is given; math.inf for none.
-    observation:    a channel's name, whose arrays are the observations; or several names, for a dictionary of arrays.
-                    By default "observation" where the world has it, else "rgb".
-    seed:           of the first `reset()`; later resets go on from there unless they are given one.
-    autoreset_mode: as Gymnasium defines them. NEXT_STEP: the step after the end begins anew and ignores its action.
-                    SAME_STEP: the last observation is in infos["final_obs"], its infos in infos["final_info"].
+    max_steps:      steps after which an episode is truncated; None takes the world's limit (Spec.max_episode_steps),
+                    math.inf sets none.
+    observation:    one channel, whose arrays are the observations, or several, for a dictionary of arrays. None takes
+                    "observation" where the world has it, else "rgb".
+    seed:           of the first `reset()`; later resets without a seed continue its random numbers.
+    autoreset_mode: as in Gymnasium. NEXT_STEP: the step after an end starts a new episode and ignores its action.
+                    SAME_STEP: the last observation is infos["final_obs"], its infos are infos["final_info"].
                     DISABLED: call reset(options={"reset_mask": bool [num_envs]}).
 
-    Reward is the channel `reward` (0 where the world has none), terminated the channel `done`; where the state has `truncated`,
-    bool [num_envs], that says which of the done were cut off instead.
-    Raises ChannelError for unknown names, TerrellaError where the world cannot hold `num_envs` episodes.
+    The reward is the channel `reward` (0 without one); `terminated` is the channel `done`. Where the state has a tensor
+    `truncated` (bool [num_envs]), it says which of the done episodes were truncated instead.
+    ChannelError for unknown channels; TerrellaError where the world cannot hold `num_envs` episodes.
     """
 
     def __init__(
@@ -77,20 +77,20 @@ class WorldEnv(VectorEnv):
 
     @property
     def state(self) -> State:
-        """The world's state, batch entry i for environment i."""
+        """The state of the world; batch entry i is environment i."""
         if self._state is None:
             raise TerrellaError("the environment has not begun: call reset() first.")
         return self._state
 
     @torch.no_grad()
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """New episodes in all environments, or in those of options["reset_mask"]; `seed` restarts all chance."""
+        """Starts new episodes in all environments, or in those of options["reset_mask"]; `seed` seeds all randomness again."""
         super().reset(seed=seed)
         if seed is not None:
             self._rng = make_rng(seed)
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
-        sound = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
-        if not sound or not mask.any():
+        valid = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
+        if not valid or not mask.any():
             raise TerrellaError(
                 f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, one or more of them True."
             )
@@ -99,7 +99,7 @@ class WorldEnv(VectorEnv):
 
     @torch.no_grad()
     def step(self, actions):
-        """Observations, rewards float64, terminated, truncated, infos; each leads with num_envs."""
+        """Observations, rewards (float64), terminated, truncated, infos; arrays lead with num_envs."""
         state, actions = self.state, torch.as_tensor(np.asarray(actions))
         fresh = self._ended.copy()
         if fresh.any() and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -129,13 +129,13 @@ class WorldEnv(VectorEnv):
 
     @torch.no_grad()
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """One uint8 [H, W, 3] picture an environment; None for a world without `rgb`."""
+        """One picture, uint8 [H, W, 3], for each environment; None for a world without `rgb`."""
         if self.render_mode is None:
             return None
         return tuple(np.array(frame) for frame in self.world.render(self.state, ("rgb",))["rgb"].cpu().numpy())
 
     def _restart(self, state: State | None, mask: np.ndarray) -> None:
-        """Puts new starts into `state` where `mask`; where that is everywhere, no state is needed."""
+        """Replaces the entries `mask` of `state` by new episodes; `state` may be None where the mask is all True."""
         fresh = self.world.start(int(mask.sum()), self._rng)
         self._state = fresh if mask.all() else state.put(torch.from_numpy(np.flatnonzero(mask)), fresh)
         self._steps[mask], self._ended[mask] = 0, False

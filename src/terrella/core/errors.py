@@ -1,4 +1,4 @@
-"""Every error that Terrella raises on purpose: one sentence that says what is wrong and what to do."""
+"""The errors that Terrella raises on purpose. Each message is one sentence: what is wrong, and what to do."""
 
 
 class TerrellaError(Exception):
@@ -6,7 +6,7 @@ class TerrellaError(Exception):
 
 
 class ContractError(TerrellaError):
-    """A World broke the contract that `check_world` proves."""
+    """A World or a Policy broke its contract (`check_world` tests that of a World)."""
 
 
 class ActionError(TerrellaError):
@@ -14,7 +14,7 @@ class ActionError(TerrellaError):
 
 
 class ObservationError(TerrellaError):
-    """An observation lacks a channel that the world needs, or one has the wrong shape."""
+    """An observation lacks a required channel, or has one of the wrong shape."""
 
 
 class ChannelError(TerrellaError):
@@ -26,7 +26,7 @@ class PlanningError(TerrellaError):
 
 
 class StaleStateError(TerrellaError):
-    """A state of a world that cannot fork was used after the world had moved on."""
+    """A state was used after its world, which cannot fork, had moved on."""
 
 
 class DatasetError(TerrellaError):
@@ -34,7 +34,7 @@ class DatasetError(TerrellaError):
 
 
 class CheckpointError(TerrellaError):
-    """A checkpoint is missing, of another kind, or of a version this release does not read."""
+    """A checkpoint is missing, damaged, of another kind, or of a version that this release cannot read."""
 
 
 class TrainingError(TerrellaError):

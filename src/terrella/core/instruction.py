@@ -1,4 +1,4 @@
-"""Task texts as vectors: a fixed, learned-from-nothing embedding of any sentence, the channel `instruction`.
+"""Task texts as vectors: a fixed embedding of any sentence that needs no training, the channel `instruction`.
 
 Words and their letter trigrams are hashed to signed places of a short vector (Weinberger et al., "Feature Hashing for Large
 Scale Multitask Learning", 2009; Bojanowski et al., "Enriching Word Vectors with Subword Information", 2017), so that the
@@ -15,17 +15,17 @@ import numpy as np
 
 INSTRUCTION_SIZE = 64
 _WORD = re.compile(r"\w+")
-_PART = 0.4  # weight of a trigram beside a word's
+_PART = 0.4  # weight of a trigram; a word has 1
 
 
 def embed(text: str, size: int = INSTRUCTION_SIZE) -> np.ndarray:
-    """float32 [size], of length 1; zeros for a text without words. Case and punctuation do not count."""
-    found = np.zeros(size, np.float64)
+    """float32 [size], of length 1; zeros for a text without words. Ignores case and punctuation."""
+    vector = np.zeros(size, np.float64)
     for feature, weight in _features(text):
         mark = int.from_bytes(hashlib.blake2b(feature.encode(), digest_size=8).digest(), "little")
-        found[(mark >> 1) % size] += weight if mark & 1 else -weight
-    length = float(np.linalg.norm(found))
-    return (found / length if length else found).astype(np.float32)
+        vector[(mark >> 1) % size] += weight if mark & 1 else -weight
+    length = float(np.linalg.norm(vector))
+    return (vector / length if length else vector).astype(np.float32)
 
 
 def embed_all(texts: Iterable[str], size: int = INSTRUCTION_SIZE) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The keys of a keyboard for actions that have names, and what people say of keys, names and the action that rests."""
+"""Default keyboard keys for named actions, and a user's own keys, action names and idle action."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _WORDS = {
 }
 _SIDEWAYS = {"Up": "KeyW", "Down": "KeyS", "Left": "KeyA", "Right": "KeyD"}
 _STRAFES = {"strafe", "move", "step", "sidestep"}
-# Where the ways of one choice among several lie: by how many they are, the most usual place first.
+# Keys for a choice, by its number of values without the idle one; the preferred keys come first.
 _CLUSTERS = {
     1: (("Space",), ("KeyE",), ("KeyQ",), ("KeyX",), ("KeyZ",), ("KeyV",)),
     2: (("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"), ("KeyA", "KeyD"), ("KeyW", "KeyS"), ("KeyJ", "KeyL"),
@@ -45,7 +45,7 @@ _CLUSTERS = {
     4: tuple(tuple(one + way for way in ways) for one, ways in (
         ("Arrow", ("Up", "Right", "Down", "Left")), ("Key", "WDSA"), ("Key", "ILKJ"))),
 }  # fmt: skip
-_MANY = 10  # of a choice among more than that, as of an axis, only the ends have keys
+_MANY = 10  # of a choice with more values, only the two ends get keys
 _HINTS = (
     {"turn", "steer", "steering", "yaw", "rotate", "pan", "horizontal", "x", "strafe", "sideways"},
     {"move", "walk", "vertical", "y", "pitch", "tilt", "speed", "drive"},
@@ -55,57 +55,62 @@ _SPARE = (*(f"Digit{digit}" for digit in "1234567890"), *(f"Key{letter}" for let
 
 
 def code_of(key: str | int) -> str:
-    """The browser's code (KeyboardEvent.code) of a key: "a", "left", "space", 32 (as `ord` and pygame give them), or a code."""
+    """The browser's code (KeyboardEvent.code) of a key: a name ("a", "left", "space"), an `ord` or pygame number, or a code."""
     if isinstance(key, int | np.integer):
-        found = _PYGAME.get(int(key)) or (chr(key) if 0 <= key < 256 else "")
-        key = found
+        known = _PYGAME.get(int(key)) or (chr(key) if 0 <= key < 256 else "")
+        key = known
     if key.lower() in _CODES:
         return _CODES[key.lower()]
     if len(key) == 1 and key.isascii() and key.isalnum():
         return f"Digit{key}" if key.isdigit() else f"Key{key.upper()}"
     if re.fullmatch(r"[A-Z][A-Za-z]+\d?|Digit\d|F\d+", key):
         return key
-    raise TerrellaError(f"'{key}' is no key; name it as a, 1, left, space, or as the browser does (KeyA, ShiftLeft).")
+    raise TerrellaError(
+        f"'{key}' is not a key; give a name such as a, 1, left or space, or a browser code such as KeyA or ShiftLeft."
+    )
 
 
 def keys_of(names: Sequence[str]) -> dict[str, int]:
-    """code -> which of the names: arrows, WASD and the space bar for what moves and acts, combinations ("ArrowUp+Space") for
-    what is several of them, and the letter that a name begins with, or another, for the rest. What rests needs no key."""
-    found: dict[str, int] = {}
+    """code -> index of the name that the key triggers.
+
+    Names of movements and actions ("left", "fire") get arrows, W A S D and the space bar; names of several at once get
+    combinations ("ArrowUp+Space"); other names get their first letter, or a free key. The idle action gets none.
+    """
+    taken: dict[str, int] = {}
     parts = {at: _parts(name) for at, name in enumerate(names)}
     single = {at: known[0] for at, (known, _) in parts.items() if len(known) == 1}
     turning = {way for at, way in single.items() if way != "Space" and not parts[at][1] & _STRAFES}
     for at, way in single.items():
         strafes = bool(parts[at][1] & _STRAFES) and way in turning
-        found.setdefault(way if way == "Space" else _SIDEWAYS[way] if strafes else f"Arrow{way}", at)
+        taken.setdefault(way if way == "Space" else _SIDEWAYS[way] if strafes else f"Arrow{way}", at)
     for arrow, other in (("Up", "Right"), ("Down", "Left"), ("Left", "Down"), ("Right", "Up")):
-        if f"Arrow{arrow}" not in found and f"Arrow{other}" in found and _one_axis(found):
-            found[f"Arrow{arrow}"] = found[f"Arrow{other}"]
+        if f"Arrow{arrow}" not in taken and f"Arrow{other}" in taken and _one_axis(taken):
+            taken[f"Arrow{arrow}"] = taken[f"Arrow{other}"]
     for way, letter in _SIDEWAYS.items():
-        if f"Arrow{way}" in found and letter not in found:
-            found[letter] = found[f"Arrow{way}"]
+        if f"Arrow{way}" in taken and letter not in taken:
+            taken[letter] = taken[f"Arrow{way}"]
     for at, (known, _) in parts.items():
         codes = [way if way == "Space" else f"Arrow{way}" for way in known]
-        if len(codes) > 1 and all(code in found for code in codes):
-            found.setdefault("+".join(codes), at)
+        if len(codes) > 1 and all(code in taken for code in codes):
+            taken.setdefault("+".join(codes), at)
     idle = idle_name(names)
     for at, name in enumerate(names):
-        if at not in found.values() and at != idle:
+        if at not in taken.values() and at != idle:
             letter = f"Key{name[:1].upper()}" if name[:1].isascii() and name[:1].isalpha() else ""
-            free = [code for code in (letter, *_SPARE) if code and code not in found]
+            free = [code for code in (letter, *_SPARE) if code and code not in taken]
             if free:
-                found[free[0]] = at
-    return found
+                taken[free[0]] = at
+    return taken
 
 
-def _one_axis(found: Mapping[str, int]) -> bool:
-    """Whether a game moves along one axis only, so that it may listen to both pairs of arrows."""
-    ways = {found[code] for code in found if code.startswith("Arrow")}
+def _one_axis(taken: Mapping[str, int]) -> bool:
+    """Whether a game moves along one axis only, so that both pairs of arrows can serve it."""
+    ways = {taken[code] for code in taken if code.startswith("Arrow")}
     return len(ways) <= 2
 
 
 def _parts(name: str) -> tuple[list[str], set[str]]:
-    """What of a name is known: ways to go and "Space", in that order; and all its words."""
+    """(directions and "Space" that a name means, in a fixed order; all its words)."""
     words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)}
     if not words & set(_WORDS):  # UPRIGHTFIRE
         words |= set(re.findall(r"up|down|left|right|fire|jump", name.lower())) if name.isupper() else set()
@@ -116,10 +121,13 @@ def _parts(name: str) -> tuple[list[str], set[str]]:
 
 
 def default_keys(space: spaces.Space, names: Sequence[str] = (), rest: Sequence[float] = ()) -> dict[str, list[float]]:
-    """code -> flat action, for whoever says nothing of keys. Of choices and buttons by their names; two or three nameless
-    choices are on the left and right arrows, more on the digits and letters. Of several choices each has a cluster of keys
-    (`_clusters`), and `rest` is the action that does nothing. Of axes: left and right are the ends of the first,
-    up and down those of the second, or, where that knows no backwards (a throttle), up is the second and down the third."""
+    """code -> flat action, the default keys of an action space.
+
+    Choices and buttons get keys by their names (`keys_of`). Two or three choices without names get the left and right
+    arrows, more get digits and letters. Each choice of a MultiDiscrete gets a cluster of keys (`_clusters`); `rest` is the
+    action that does nothing. Of a Box, left and right are the limits of the first axis, up and down those of the second;
+    where the second axis has no negative values (a throttle), down is the upper limit of the third.
+    """
     if isinstance(space, spaces.MultiDiscrete):
         return _clusters(space, names, rest)
     if isinstance(space, spaces.Discrete):
@@ -148,30 +156,33 @@ def default_keys(space: spaces.Space, names: Sequence[str] = (), rest: Sequence[
 
 
 def _clusters(space: spaces.MultiDiscrete, names: Sequence[str], rest: Sequence[float]) -> dict[str, list[float]]:
-    """Keys of several choices made at once; each is one value of one of them, while the others rest. A choice of two has a
-    key, of three a pair (left and right, up and down, then letters), of five the four arrows, others digits; of very many the
-    ends are a pair. Names such as "turn", "forward" or "fire" come first; W A S D double the arrows where they are free."""
+    """Keys of several simultaneous choices; each key sets one choice, while the others rest.
+
+    A choice of two values gets one key, of three a pair (left and right, up and down, then letters), of five the arrows,
+    other numbers get digits and letters; of more than _MANY values, the two ends get a pair. Choices with known names
+    ("turn", "forward", "fire") are served first. W A S D repeat the arrows where they are free.
+    """
     low, count = (np.asarray(value, np.float64).ravel() for value in (space.start, space.nvec))
     still = np.asarray(rest, np.float64) if len(rest) == len(low) else low
     names = names if len(names) == len(low) else [""] * len(low)
     hints = [_hint(name) for name in names]
-    found: dict[str, list[float]] = {}
+    taken: dict[str, list[float]] = {}
     for at in sorted(range(len(low)), key=lambda at: hints[at] is None):
         values = [value for value in low[at] + np.arange(count[at]) if value != still[at]]
         values = [values[0], values[-1]] if len(values) > _MANY else values
-        codes = _cluster(len(values), hints[at], names[at], found)
+        codes = _cluster(len(values), hints[at], names[at], taken)
         if len(values) == 2 and values[0] < still[at] < values[1] and _UPWARDS & set(codes):
             values.reverse()
-        found |= {
+        taken |= {
             code: np.where(np.arange(len(low)) == at, value, still).tolist() for code, value in zip(codes, values)
         }
-    if not found.keys() & set(_SIDEWAYS.values()):
-        found |= {letter: found[f"Arrow{way}"] for way, letter in _SIDEWAYS.items() if f"Arrow{way}" in found}
-    return found
+    if not taken.keys() & set(_SIDEWAYS.values()):
+        taken |= {letter: taken[f"Arrow{way}"] for way, letter in _SIDEWAYS.items() if f"Arrow{way}" in taken}
+    return taken
 
 
 def _hint(name: str) -> int | None:
-    """Which cluster of its size the name of a choice asks for: 0 across or to act, 1 along; None where it says nothing."""
+    """The cluster that the name of a choice suggests: 0 sideways or an action key, 1 forwards and back; None for neither."""
     known, words = _parts(name)
     if known:
         return 0 if {"Left", "Right", "Space"} & set(known) else 1
@@ -179,7 +190,7 @@ def _hint(name: str) -> int | None:
 
 
 def _cluster(size: int, hint: int | None, name: str, taken: Mapping[str, object]) -> list[str]:
-    """Keys that are free, as many as there are values."""
+    """`size` keys that are free."""
     known = list(_CLUSTERS.get(size, ()))
     if size == 1 and hint is None and name[:1].isascii() and name[:1].isalpha():
         known.insert(0, (f"Key{name[0].upper()}",))
@@ -189,9 +200,9 @@ def _cluster(size: int, hint: int | None, name: str, taken: Mapping[str, object]
     return free[0] if free else [code for code in _SPARE if code not in taken][:size]
 
 
-def told_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
-    """The keys of Gymnasium's `get_keys_to_action`: {"w": 1, ("w", "a"): 5, (ord("d"),): 3, None: 0}; those without a key rest."""
-    found = {}
+def parse_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
+    """code -> flat action, from a table of Gymnasium's `get_keys_to_action`: {"w": 1, ("w", "a"): 5, (ord("d"),): 3, None: 0}."""
+    parsed = {}
     for keys, action in table.items():
         keys = () if keys is None else (keys,) if isinstance(keys, int) else tuple(keys)
         try:
@@ -199,13 +210,13 @@ def told_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
         except TerrellaError:
             continue
         if code:
-            found[code] = np.asarray(action, np.float64).reshape(-1).tolist()
+            parsed[code] = np.asarray(action, np.float64).reshape(-1).tolist()
     width = int(np.prod(shape_of(space)))
-    return {code: action for code, action in found.items() if len(action) == width}
+    return {code: action for code, action in parsed.items() if len(action) == width}
 
 
 def unnamed(space: spaces.Space) -> list[str]:
-    """Names for actions that have none."""
+    """Generated names for the actions of a space: "action 0", "button 1", "axis 1"."""
     if isinstance(space, spaces.Discrete):
         return [f"action {at}" for at in range(int(space.n))]
     what = {"MultiBinary": "button", "MultiDiscrete": "choice"}.get(type(space).__name__, "axis")
@@ -213,13 +224,15 @@ def unnamed(space: spaces.Space) -> list[str]:
 
 
 def all_names(spec: Spec) -> list[str]:
-    """A name for every action, made up where it has none."""
+    """A name for every action, generated where the spec has none."""
     return [*spec.action_names, *unnamed(spec.action)[len(spec.action_names) :]]
 
 
 def renamed(spec: Spec, names: Mapping[int, str]) -> Spec:
-    """The spec with other names at these places; what rests goes on resting, whatever it is called. TerrellaError where two
-    would have one name."""
+    """The spec with new names for the actions at these indices; its idle action stays the same.
+
+    TerrellaError where two actions would have one name.
+    """
     if not names:
         return spec
     whole = [names.get(at, name) for at, name in enumerate(all_names(spec))]
@@ -232,7 +245,7 @@ def renamed(spec: Spec, names: Mapping[int, str]) -> Spec:
 
 
 def with_changes(own: Spec, before: Spec, after: Spec) -> Spec:
-    """`own` with the keys and names that differ between two other specs of its world, and nothing else of them."""
+    """`own` with those keys and names of `after` that differ from `before`; the three are specs of one world."""
     keys = {code: value for code, value in own.keys.items() if code in after.keys or code not in before.keys}
     keys |= {code: value for code, value in after.keys.items() if before.keys.get(code) != value}
     names = zip(all_names(before), all_names(after), strict=True)
@@ -242,39 +255,44 @@ def with_changes(own: Spec, before: Spec, after: Spec) -> Spec:
 def with_controls(
     spec: Spec, keys: Sequence[str] = (), action_names: Sequence[str] = (), idle: str | None = None
 ) -> Spec:
-    """The spec with what a person said on the command line: keys as "a=left" or "w=0,1,0" (by a name or the numbers of an
-    action, "up+space=5" for two at once, "w=move:2" for one of several choices),
-    names of all actions in order, and the action that rests. TerrellaError where
-    something does not fit."""
+    """The spec with a user's controls.
+
+    keys:         "KEY=ACTION", where the action is a name or numbers: "a=left", "w=0,1,0", "up+space=5" for two keys at
+                  once, "w=move:2" for one of several choices.
+    action_names: names of all actions, in order.
+    idle:         the action that does nothing.
+
+    TerrellaError where something does not fit the world.
+    """
     if action_names:
         count = int(spec.action.n) if isinstance(spec.action, spaces.Discrete) else int(np.prod(shape_of(spec.action)))
         if len(action_names) != count:
             raise TerrellaError(f"{spec.name} has {count} actions; {len(action_names)} names were given.")
         chosen = default_keys(spec.action, action_names, spec.idle)
         spec = replace(spec, action_names=tuple(action_names), keys=chosen or spec.keys)
-    told = {}
+    given = {}
     for pair in keys:
         key, equals, action = pair.partition("=")
         if not equals:
-            raise TerrellaError(f"a key is said as KEY=ACTION, as in --keys a=left d=right; got '{pair}'.")
-        told["+".join(code_of(part) for part in key.split("+"))] = _action(spec, action)
+            raise TerrellaError(f"a key is given as KEY=ACTION, as in --keys a=left d=right; got '{pair}'.")
+        given["+".join(code_of(part) for part in key.split("+"))] = _action(spec, action)
     rests = tuple(_action(spec, idle)) if idle is not None else spec.idle
     own = spec.keys
     if rests != spec.idle and own == default_keys(spec.action, spec.action_names, spec.idle):
         own = default_keys(spec.action, spec.action_names, rests)
     how = spec.card.get("how")
     card = (
-        {**spec.card, "how": {**how, **({"keys": "as told"} if told else {})}} if isinstance(how, dict) else spec.card
+        {**spec.card, "how": {**how, **({"keys": "as given"} if given else {})}} if isinstance(how, dict) else spec.card
     )
-    return replace(spec, keys=told or own, idle=rests, card=card)
+    return replace(spec, keys=given or own, idle=rests, card=card)
 
 
-def _action(spec: Spec, said: str) -> list[float]:
-    """The flat action of a name, or of numbers."""
+def _action(spec: Spec, text: str) -> list[float]:
+    """The flat action that a name or a list of numbers means."""
     low, high = (np.asarray(limit, np.float64).reshape(-1) for limit in spec.action_limits)
-    lower, (name, _, value) = [name.lower() for name in spec.action_names], said.lower().partition(":")
-    if said.lower() in lower:
-        at = lower.index(said.lower())
+    lower, (name, _, value) = [name.lower() for name in spec.action_names], text.lower().partition(":")
+    if text.lower() in lower:
+        at = lower.index(text.lower())
         rest = neutral_action(spec).ravel() if isinstance(spec.action, spaces.MultiDiscrete) else 0
         return (
             [low[0] + at]
@@ -282,15 +300,15 @@ def _action(spec: Spec, said: str) -> list[float]:
             else np.where(np.arange(len(low)) == at, high, rest).astype(np.float64).tolist()
         )
     if isinstance(spec.action, spaces.MultiDiscrete) and name in lower and value:
-        said = ",".join(
+        text = ",".join(
             value if at == lower.index(name) else str(n) for at, n in enumerate(neutral_action(spec).ravel())
         )
     try:
-        found = [float(number) for number in said.split(",")]
+        action = [float(number) for number in text.split(",")]
     except ValueError:
-        found = []
-    if len(found) != len(low) or not ((low <= found).all() and (found <= high).all()):
+        action = []
+    if len(action) != len(low) or not ((low <= action).all() and (action <= high).all()):
         known = f"its actions are {', '.join(spec.action_names)}" if spec.action_names else "give it as a number"
-        near = did_you_mean(said, spec.action_names)
-        raise TerrellaError(f"'{said}' is no action of {spec.name}, which takes {spec.action}; {known}{near or '.'}")
-    return found
+        near = did_you_mean(text, spec.action_names)
+        raise TerrellaError(f"'{text}' is no action of {spec.name}, which takes {spec.action}; {known}{near or '.'}")
+    return action

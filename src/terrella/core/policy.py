@@ -1,4 +1,4 @@
-"""The one Policy: whatever turns observations into actions, be it a person, a planner, a network or chance."""
+"""Policy: turns observations into actions. People, scripts, planners, networks and replays all have this interface."""
 
 from __future__ import annotations
 
@@ -15,26 +15,34 @@ from .world import Observation
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts in any World. What it remembers of a batch of episodes is handed back to it at each step, so that a policy itself
-    never changes and one policy can play many episodes at once. It may name the channels that it is to be shown, as `sees`;
-    one that does not is shown all that a recording would hold."""
+    """Acts in any World.
+
+        memory = policy.begin(batch, rng)
+        action, memory = policy.act(observation, memory, rng)
+
+    The memory of its episodes is passed in and returned, so a policy itself never changes, and one policy can act in many
+    episodes at once. A policy may have an attribute `sees`: the channels that it is shown. Without it, it is shown every
+    channel that a recording holds (`Spec.recorded`).
+    """
 
     def begin(self, batch: int, rng: torch.Generator) -> Any:
-        """The memory in which `batch` episodes begin: None, or a State, tensor or list that leads with the batch."""
+        """The memory at the start of `batch` episodes: None, or a State, tensor or list that leads with the batch axis."""
         ...
 
     def act(self, observation: Observation, memory: Any, rng: torch.Generator) -> tuple[torch.Tensor, Any]:
-        """The actions [B, *spec.action.shape] of this step, and the memory for the next."""
+        """The actions [B, *spec.action.shape] of this step, and the memory for the next step."""
         ...
 
 
 def act(
     policy: Policy, observation: Observation, memory: Any, batch: int, spec: Spec, rng: torch.Generator
 ) -> tuple[torch.Tensor, Any]:
-    """`policy.act`, held to its contract: ContractError for a memory or an action of another batch."""
+    """`policy.act` with its contract checked: ContractError for a memory or an action of another batch."""
     held = _batch_of(memory)
     if held is not None and held != batch:
-        raise ContractError(f"the policy's memory is of {held} episodes, and {batch} are played: begin it again.")
+        raise ContractError(
+            f"the policy's memory holds {held} episodes, not {batch}; call policy.begin({batch}, rng) first."
+        )
     action, memory = policy.act(observation, memory, rng)
     action = torch.as_tensor(action)
     if tuple(action.shape) != (batch, *shape_of(spec.action)):
@@ -74,7 +82,7 @@ class Reactive:
 
 
 class Replay:
-    """Plays given actions [T, B, *action.shape]; ContractError after the last. Its memory is the step."""
+    """Plays given actions [T, B, *action.shape]; ContractError after the last. Its memory is the step number."""
 
     sees = ()
 
@@ -89,12 +97,14 @@ class Replay:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         step = int(memory[0]) if len(memory) else 0
         if step >= len(self.actions):
-            raise ContractError(f"the {len(self.actions)} actions to replay are used up.")
+            raise ContractError(
+                f"the {len(self.actions)} actions to replay are used up; give more, or take fewer steps."
+            )
         return self.actions[step], memory + 1
 
 
 class Constant:
-    """Does one action always."""
+    """Always takes the same action."""
 
     sees = ()
 
@@ -111,21 +121,21 @@ class Constant:
 
 
 class Idle(Constant):
-    """Does as little as the world's actions allow: the baseline "do nothing"."""
+    """Takes the neutral action of the world: the baseline that does nothing."""
 
     def __init__(self, spec: Spec):
         super().__init__(torch.from_numpy(neutral_action(spec)))
 
 
 class Held(NamedTuple):
-    """A random action and the steps for which it is still held."""
+    """A random action, and the steps for which it will be repeated."""
 
     action: torch.Tensor
     steps: int
 
 
 class Random:
-    """Uniformly random actions, each held for `hold` steps, between the least and the most, both counted."""
+    """Uniformly random actions, each repeated for a random number of steps in `hold` = (least, most), both inclusive."""
 
     sees = ()
 

@@ -1,4 +1,4 @@
-"""Rolling a world forward under a policy or given actions, and what comes back."""
+"""rollout: steps a world under a policy or given actions, and collects its observations."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .state import State
 from .world import Leaping, World
 
 
-def advanced(world: World, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
-    """The state after actions [B, T, *action.shape], in leaps as far as the world has them: of it the channel `latent` counts."""
+def advance(world: World, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
+    """The state after actions [B, T, *action.shape], by leaps where the world has them; only its channel `latent` is defined."""
     at, steps = 0, actions.shape[1]
     while at < steps:
         if world.spec.leap and steps - at >= world.spec.leap and isinstance(world, Leaping):
@@ -29,11 +29,11 @@ def advanced(world: World, state: State, actions: torch.Tensor, rng: torch.Gener
 
 @dataclass(frozen=True)
 class Rollout:
-    """T steps of B episodes: `actions` [T, B, ...] led from observation t to t+1, so `observations` hold T+1 each."""
+    """T steps of B episodes; action t leads from observation t to observation t + 1."""
 
     observations: dict[str, torch.Tensor]  # name -> [T + 1, B, ...]
     actions: torch.Tensor  # [T, B, *action.shape]
-    final: State
+    final: State  # after the last action
 
 
 def rollout(
@@ -45,10 +45,11 @@ def rollout(
     steps: int | None = None,
     gradients: bool = False,
 ) -> Rollout:
-    """Moves `state` for `steps` steps under a policy that sees `channels`, or through actions [T, B, ...].
+    """Steps `state` under a policy for `steps` steps, or through given actions [T, B, *action.shape].
 
-    Nothing but `channels` is rendered: a world that draws on demand draws no picture that nobody asked for. Episodes do not
-    stop at `done`: mask by the `done` channel where it matters. With `gradients` they flow, as far as the world lets them.
+    Only `channels` are rendered, for the policy and for the result. Episodes go on after `done`: mask with the channel
+    `done` where that matters. `gradients=True` keeps the graph, as far as the world is differentiable.
+    ChannelError for unknown channels; ContractError where the policy gives an action of another shape.
     """
     world.spec.check_channels(channels)
     if isinstance(policy, Policy):

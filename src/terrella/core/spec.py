@@ -1,6 +1,6 @@
-"""What a world is, as data: its actions, its cameras, its channels, its clock and its units.
+"""Spec: the declaration of a world: its actions, cameras, channels, time step and units.
 
-Importing this needs no torch, so that people who only convert and mend recordings need none either.
+Importing this needs no torch, so tools that only convert and repair recordings run without it.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from .errors import ActionError, ChannelError
 if TYPE_CHECKING:
     import torch
 
-# The spaces of the channels `reward` and `done`, alike in all worlds.
+# The spaces of channels that are the same in all worlds.
 REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 DONE = spaces.Box(0, 1, (), np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
 POSE = spaces.Box(-np.inf, np.inf, (7,), np.float32)
 POSE_UNIT = "m, quaternion wxyz of T_world_cam"
 PLACES_UNIT = "x and y in m, heading in rad, kind"
-WALKABLE = 4  # the kind of place where one can stand (core/world.py)
+WALKABLE = 4  # kind in the channel `places`: somewhere to stand (core/world.py)
 NO_MOUNT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 BUTTONS, CHOICE = "buttons", "choice"
-AXES = ("axes", "position", "velocity", "torque", "pose_delta")  # what the numbers of a Box may mean
+AXES = ("axes", "position", "velocity", "torque", "pose_delta")  # meanings of the numbers of a Box
 MODES = (BUTTONS, CHOICE, *AXES)
 _IDLE = {"noop", "idle", "none", "stay", "nothing", "donothing", "noaction", "wait", "still", "pass", "noopaction"}
 
@@ -41,91 +41,87 @@ def shape_of(space: spaces.Space) -> tuple[int, ...]:
 
 
 def dtype_of(space: spaces.Space) -> np.dtype:
-    """The dtype of the values."""
+    """The numpy dtype of the values."""
     return np.dtype(space.dtype)
 
 
 def torch_dtype_of(space: spaces.Space) -> torch.dtype:
-    """The same as torch spells it."""
+    """The torch dtype of the values."""
     import torch
 
     return torch.from_numpy(np.zeros(0, space.dtype)).dtype
 
 
 def kind_of(channel: str) -> str:
-    """The kind of a channel, "rgb" of "rgb.wrist": what its values mean."""
+    """The kind of a channel, which says what its values mean: "rgb" of "rgb.wrist"."""
     return channel.partition(".")[0]
 
 
 def suffix_of(channel: str) -> str:
-    """Which one of its kind a channel is, "wrist" of "rgb.wrist"; "" for the main one."""
+    """The suffix of a channel, "wrist" of "rgb.wrist"; "" for the main channel of its kind."""
     return channel.partition(".")[2]
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
-
-    intrinsics: fx/W, fy/H, cx/W, cy/H.
-    size:       height and width of its pictures in pixels.
-    pose:       the pose channel that it is mounted on; None where nobody knows where it is.
-    mount:      T_pose_cam: x, y, z in metres and quaternion w, x, y, z; camera x forward, y left, z up.
-    """
+    """A pinhole camera."""
 
     intrinsics: tuple[float, float, float, float]
+    """fx/W, fy/H, cx/W, cy/H."""
     size: tuple[int, int]
+    """Height and width of its pictures, pixels."""
     pose: str | None = "pose"
+    """The pose channel of the body that it is mounted on; None where its pose is unknown."""
     mount: tuple[float, float, float, float, float, float, float] = NO_MOUNT
+    """T_pose_cam: x, y, z in metres and quaternion w, x, y, z; camera x forward, y left, z up."""
 
 
 @dataclass(frozen=True)
 class Spec:
-    """The declaration that every tool reads instead of asking `hasattr`.
-
-    action:       space of one action (no batch axis).
-    channels:     what `render` can show, name -> space of one observation (no batch axis). A name is a kind, or a kind and
-                  which one of it: "rgb" and "rgb.wrist", "depth.wrist", "pose.wrist".
-    observes:     the channels that `observe` needs as evidence.
-    may_observe:  the channels that it takes as well where they are at hand (what moves, how the player is).
-    dt_s:         seconds of world time that one `imagine` advances.
-    units:        channel -> unit, for the channels that have one ("m", "reward").
-    cameras:      picture channel -> the camera that takes it.
-    action_names: one name per button (MultiBinary), choice (Discrete, of which a MultiDiscrete has several) or axis (Box).
-    action_units: one unit per axis ("m", "rad/s", "N m"), or none.
-    action_mode:  what the numbers mean: "buttons", "choice", "axes", "position", "velocity", "torque" or "pose_delta"; read off
-                  the space where it is "".
-    action_frame: the frame in which axes are meant ("world", "body", "tool"), where they have one.
-    keys:         browser key (`KeyboardEvent.code`) -> the action that it stands for while held, as a
-                  flat list of floats; buttons held together are combined by element-wise maximum, of one choice the last counts.
-    forkable:     False where a state cannot be kept and returned to (an external game process).
-    max_batch:    the largest batch that `start` accepts; None for no limit.
-    max_episode_steps: steps after which whoever trains in the world cuts an episode off (truncates it); None for no limit.
-    differentiable: True where gradients flow from the channels through `imagine` to the action.
-    card:         free facts for people: training data, hardware, scores.
-    idle:         the flat action that does nothing, where there is one and neither its name nor its mode says which.
-    leap:         steps that the world's `leap` takes at once (core/world.py); 0 where it has none.
-    """
+    """The declaration of a world. Tools read it instead of asking `hasattr`."""
 
     name: str
+    """Name of the world."""
     action: spaces.Space
+    """Space of one action, without the batch axis."""
     channels: Mapping[str, spaces.Space]
+    """What `render` can show: channel -> space of one entry, without the batch axis. A channel is named by its kind, or by its
+    kind and a suffix: "rgb" and "rgb.wrist", "depth.wrist", "pose.wrist"."""
     observes: tuple[str, ...]
+    """Channels that `observe` requires."""
     dt_s: float
+    """Seconds of world time that one `imagine` advances."""
     units: Mapping[str, str] = field(default_factory=dict)
+    """Channel -> unit ("m", "reward"), for channels that have one."""
     action_names: tuple[str, ...] = ()
+    """One name for each button (MultiBinary), choice (Discrete, or one of a MultiDiscrete) or axis (Box); () for none."""
     action_units: tuple[str, ...] = ()
+    """One unit for each axis ("m", "rad/s", "N m"); () for none."""
     action_mode: str = ""
+    """Meaning of the numbers: one of MODES. "" takes it from the space."""
     action_frame: str = ""
+    """Coordinate frame of the axes ("world", "body", "tool"); "" for none."""
     keys: Mapping[str, list[float]] = field(default_factory=dict)
+    """Browser key (`KeyboardEvent.code`) -> flat action while it is held. Buttons held together combine by element-wise
+    maximum; of a choice, the key pressed last counts."""
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    """Picture channel -> its camera."""
     forkable: bool = True
+    """False where an earlier state cannot be used again (an external game process)."""
     max_batch: int | None = None
+    """Largest batch that `start` accepts; None for no limit."""
     max_episode_steps: int | None = None
+    """Steps after which training truncates an episode; None for no limit."""
     differentiable: bool = False
+    """Whether gradients flow from the channels through `imagine` to the action."""
     card: Mapping[str, object] = field(default_factory=dict)
+    """Facts for people: training data, hardware, scores."""
     may_observe: tuple[str, ...] = ()
+    """Channels that `observe` uses where the observation has them."""
     idle: tuple[float, ...] = ()
+    """The flat action that does nothing, where its name and mode do not say which one does."""
     leap: int = 0
+    """Steps that `leap` advances at once (core/world.py); 0 for worlds without it."""
 
     def __post_init__(self):
         if not self.action_mode:
@@ -138,24 +134,24 @@ class Spec:
         return main.intrinsics if main else None
 
     def kinds(self, kind: str) -> tuple[str, ...]:
-        """The channels of one kind, the main one first: kinds("rgb") -> ("rgb", "rgb.wrist")."""
+        """The channels of one kind, the main one first: kinds("rgb") gives ("rgb", "rgb.wrist")."""
         return tuple(sorted((name for name in self.channels if kind_of(name) == kind), key=suffix_of))
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The channels that a recording holds, and a policy sees: all but a mosaic, which is made of the pictures before."""
+        """The channels that a recording holds and a policy sees: all but a mosaic, which follows from earlier pictures."""
         return tuple(name for name in self.channels if kind_of(name) != "mosaic")
 
     def check_channels(self, channels) -> None:
-        """Raises ChannelError naming the channels that exist."""
+        """ChannelError, with the channels that exist, where the world lacks one."""
         for name in channels:
             if name not in self.channels:
                 raise ChannelError(f"{self.name} cannot render '{name}'; it has {', '.join(self.channels)}.")
 
     def check_action(self, action: torch.Tensor, batch: int) -> torch.Tensor:
-        """The action as a tensor [batch, *action.shape] of the space's dtype; ActionError where it does not fit.
+        """The action as a tensor [batch, *action.shape] of the dtype of the space, with its gradient.
 
-        A float action that needs a gradient keeps it.
+        ActionError where the shape, the type or a value does not fit the space.
         """
         import torch
 
@@ -180,7 +176,7 @@ class Spec:
         return tensor.to(torch_dtype_of(self.action), copy=True)
 
     def sample_action(self, batch: int, rng: torch.Generator) -> torch.Tensor:
-        """Uniform random actions [batch, *action.shape], from `rng` alone; axes without a limit stay within 1000."""
+        """Uniform random actions [batch, *action.shape], drawn from `rng`; unbounded axes are drawn from -1000 to 1000."""
         import torch
 
         low, high = self.action_limits
@@ -194,7 +190,7 @@ class Spec:
 
     @cached_property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """The smallest and the largest action, in the space's dtype."""
+        """(smallest, largest) action [*action.shape], in the dtype of the space."""
         space = self.action
         if isinstance(space, spaces.Box):
             return space.low, space.high
@@ -205,24 +201,27 @@ class Spec:
         if isinstance(space, spaces.MultiDiscrete):
             return space.start, space.start + space.nvec - 1
         raise ActionError(
-            f"{self.name} has the action space {space}; only Box, Discrete, MultiBinary and MultiDiscrete are known."
+            f"{self.name} has the action space {space}; it must be a Box, Discrete, MultiBinary or MultiDiscrete."
         )
 
 
 def idle_name(names: Sequence[str]) -> int | None:
-    """Which of the names is called doing nothing; None where none is."""
+    """The index of the name that means doing nothing ("noop", "idle", ...); None where none does."""
     plain = ["".join(filter(str.isalpha, name.lower())) for name in names]
     return next((at for at, name in enumerate(plain) if name in _IDLE), None)
 
 
 def can_idle(spec: Spec) -> bool:
-    """Whether there is an action that does nothing; a choice must be named so, or told."""
+    """Whether some action does nothing. Of a choice, its name or `spec.idle` must say so."""
     return spec.action_mode != CHOICE or bool(spec.idle) or idle_name(spec.action_names) is not None
 
 
 def neutral_action(spec: Spec) -> np.ndarray:
-    """The action [*action.shape] that does least: what the spec says, no button, the first choice that is called a no-op or
-    else the first, axes at 0 or at the limit nearest to it."""
+    """The action [*action.shape] that does least.
+
+    It is `spec.idle` where that is given; else no button; the choice whose name means doing nothing, or the first; axes at
+    0, or at the limit nearest to 0.
+    """
     low, high = spec.action_limits
     if spec.idle:
         return np.asarray(spec.idle, dtype_of(spec.action)).reshape(shape_of(spec.action))

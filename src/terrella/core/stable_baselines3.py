@@ -16,11 +16,11 @@ from .world import World
 
 
 class WorldVecEnv(VecEnv):
-    """`num_envs` episodes of `world` side by side; the arguments are those of WorldEnv, and the world is not closed with it.
+    """`num_envs` parallel episodes of `world`; arguments as in WorldEnv. Closing it leaves the world open.
 
-    Pictures lead with their channels, single numbers have one axis, choices count from 0. An episode that ends begins anew in
-    the same step: its last observation is infos[i]["terminal_observation"], and infos[i]["TimeLimit.truncated"] says whether it
-    was cut off.
+    Pictures are channels first, single numbers have one axis, choices count from 0. A new episode starts in the step in
+    which one ends: infos[i]["terminal_observation"] is the last observation of the old one, and
+    infos[i]["TimeLimit.truncated"] says whether it was truncated.
     """
 
     def __init__(
@@ -85,14 +85,14 @@ def _map(change, seen):
 
 
 def _arranged(array: np.ndarray) -> np.ndarray:
-    """[B, H, W, 3] -> [B, 3, H, W] where it is pictures, [B] -> [B, 1]."""
+    """Pictures [B, H, W, 3] -> [B, 3, H, W]; numbers [B] -> [B, 1]."""
     if array.dtype == np.uint8 and array.ndim == 4:
         return np.ascontiguousarray(array.transpose(0, 3, 1, 2))
     return array[:, None] if array.ndim == 1 else array
 
 
 def _space(space: spaces.Space) -> spaces.Space:
-    """The same of a space."""
+    """The space of arranged arrays."""
     if not isinstance(space, spaces.Box):
         return space
     low, high = (_arranged(limit[None])[0] for limit in (space.low, space.high))

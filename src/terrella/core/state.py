@@ -16,17 +16,20 @@ from .arena import Arena
 from .deferred import Deferred, Pick
 from .errors import CheckpointError, ContractError
 
-_ARENA = "arena:"  # how the names of an arena's parts begin in a file
+_ARENA = "arena:"  # prefix of the names of an arena's parts in a file
 
 
 class State(Mapping):
-    """Named tensors that all lead with the same batch axis; never changed in place.
+    """Named tensors that lead with one batch axis; a value that never changes.
 
-    `state["pose"]` reads one tensor, `state.at(i)` picks batch entries (int, slice or index tensor; the batch
-    axis stays), `state.replace(pose=...)` makes a new value, `state.fork(n)` repeats each entry n times.
+        state["pose"]                read a tensor
+        state.at(i)                  batch entries i (an int, a slice or an index tensor); the batch axis stays
+        state.replace(pose=...)      a new state with other tensors
+        state.fork(n)                each entry n times
+        State.stack([a, b])          states joined along the batch axis
 
-    arenas: by the name of a pointer tensor (int64 rows, 0 for none), the arena that it points into. deferred: further
-    tensors, that are computed when they are first read.
+    arenas:   pointer tensor (int64 row numbers, 0 for none) -> the Arena that holds the rows.
+    deferred: further tensors, computed when one of them is first read.
     """
 
     __slots__ = ("_tensors", "_arenas", "_deferred", "_names", "__weakref__")
@@ -73,7 +76,7 @@ class State(Mapping):
         return name in self._names
 
     def __eq__(self, other) -> bool:
-        """The same names with the same tensors, bit for bit; of an arena, the same rows."""
+        """Whether both have the same names and tensors, bit for bit; pointers are compared by the rows that they point at."""
         return (
             isinstance(other, State)
             and set(self) == set(other)
@@ -90,33 +93,37 @@ class State(Mapping):
 
     @property
     def batch(self) -> int:
+        """The number of batch entries."""
         return len(next(iter(self._tensors.values()))) if self._tensors else self._deferred.batch
 
     @property
     def device(self) -> torch.device:
+        """The device of the tensors, also of those that are deferred."""
         return next(iter(self._tensors.values())).device if self._tensors else self._deferred.device
 
     @property
     def arenas(self) -> Mapping[str, Arena]:
+        """Pointer tensor -> the arena that it points into."""
         return self._arenas
 
     @property
     def deferred(self) -> Deferred | None:
-        """What computes the tensors that nobody has read yet; None where none wait."""
+        """The plan of the tensors that have not been computed; None where all have."""
         return None if self._deferred is None or self._deferred.done else self._deferred
 
     @property
     def nbytes(self) -> int:
-        """Of the tensors that are there, what is repeated (by a fork) counted once; without the arenas."""
+        """Bytes of the computed tensors, without the arenas; an axis expanded by `fork` counts once."""
         ready = [self[name] for name in self._names if name in self._tensors or self.deferred is None]
         sizes = ([n for n, stride in zip(part.shape, part.stride()) if stride or not n] for part in ready)
         return sum(part.element_size() * int(np.prod(size, dtype=np.int64)) for part, size in zip(ready, sizes))
 
     def replace(self, **tensors: torch.Tensor) -> State:
+        """A state with these tensors in place of its own, or beside them."""
         return State({**self._tensors, **tensors}, self._arenas, self._deferred)
 
     def at(self, index) -> State:
-        """Batch entries `index` (int, slice, list or index tensor) as a State that still has a batch axis."""
+        """The batch entries `index` (int, slice, list, bool or int64 tensor), as a State with a batch axis."""
         if isinstance(index, (int, np.integer)):
             index = [int(index)]
         elif isinstance(index, torch.Tensor) and index.ndim == 0:
@@ -124,7 +131,7 @@ class State(Mapping):
         return self._combined([self], lambda tensor: tensor[index], lambda rows: rows[index])
 
     def fork(self, n: int) -> State:
-        """Each batch entry n times in a row: [a, b].fork(2) = [a, a, b, b]. The copies of a single entry take no room."""
+        """Each batch entry n times in a row: [a, b].fork(2) is [a, a, b, b]. Copies of a single entry take no memory."""
         if self.batch == 1:
             return self._combined(
                 [self], lambda tensor: tensor.expand(n, *tensor.shape[1:]), lambda rows: rows.expand(n)
@@ -132,7 +139,7 @@ class State(Mapping):
         return self._combined([self], *[lambda tensor: tensor.repeat_interleave(n, dim=0)] * 2)
 
     def where(self, which: torch.Tensor, other: State) -> State:
-        """This state's entries where `which` (bool [B]), the other's elsewhere."""
+        """Entries of this state where `which` (bool [B]) is True, entries of `other` elsewhere."""
         other = other.into(self._arenas)
 
         def choose(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
@@ -141,7 +148,7 @@ class State(Mapping):
         return self._combined([self, other], choose, choose)
 
     def put(self, index, fresh: State) -> State:
-        """This state with its entries `index` (int64 [n], or bool [B]) replaced by those of `fresh` (a batch of n)."""
+        """This state with its entries `index` (int64 [n], or bool [B]) replaced by the n entries of `fresh`."""
         where = torch.as_tensor(index, device=self.device)
         where = where.nonzero()[:, 0] if where.dtype == torch.bool else where.long()
         if fresh.batch != len(where) or set(fresh) != set(self):
@@ -162,8 +169,10 @@ class State(Mapping):
         return first._combined(adopted, *[lambda *tensors: torch.cat(tensors)] * 2)
 
     def into(self, arenas: Arena | Mapping[str, Arena]) -> State:
-        """The same state with what it points at in the given arenas (one for all, or by pointer): rows of others are copied.
-        ContractError where an arena has another layout."""
+        """The same state with its rows in the given arenas (one for all pointers, or by pointer); copies rows of other arenas.
+
+        ContractError where an arena has another layout.
+        """
         changed = {}
         for name, mine in self._arenas.items():
             arena = arenas if isinstance(arenas, Arena) else arenas.get(name, mine)
@@ -176,14 +185,15 @@ class State(Mapping):
         return State(tensors, held, self._deferred)
 
     def to(self, device) -> State:
-        there = torch.device(device)
+        """The state on another device, with its rows in arenas there."""
+        target = torch.device(device)
         state = self.into(
-            {name: Arena(arena.parts, there) for name, arena in self._arenas.items() if arena.device != there}
+            {name: Arena(arena.parts, target) for name, arena in self._arenas.items() if arena.device != target}
         )
-        return State({name: tensor.to(there) for name, tensor in state.items()}, state.arenas)
+        return State({name: tensor.to(target) for name, tensor in state.items()}, state.arenas)
 
     def narrowed(self, rows: torch.Tensor) -> State:
-        """`at(rows)`, where what waits is planned for those entries alone."""
+        """`at(rows)` that plans deferred tensors for these entries alone, without a reference to the whole state."""
         deferred = self.deferred
         if deferred is None:
             return self.at(rows)
@@ -194,7 +204,7 @@ class State(Mapping):
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes one safetensors file, with the rows that the state points at."""
+        """Writes one safetensors file that includes the rows pointed at."""
         tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.items()}
         for name, arena in self._arenas.items():
             rows, place = torch.unique(
@@ -208,7 +218,7 @@ class State(Mapping):
 
     @staticmethod
     def load(path: str | Path) -> State:
-        """Reads what `save` wrote, with arenas of its own; CheckpointError where the file is missing or foreign."""
+        """Reads a file of `save`, into new arenas; CheckpointError where it is missing or no saved state."""
         try:
             with safe_open(str(path), framework="pt") as file:
                 meta = json.loads((file.metadata() or {}).get("terrella", "{}"))
@@ -236,7 +246,7 @@ class State(Mapping):
         combine: Callable[..., torch.Tensor],
         pick: Callable[..., torch.Tensor],
     ) -> State:
-        """`combine` of the states' tensors that are there; of what waits in one of them, `pick` of the rows' numbers."""
+        """`combine` of the computed tensors; for tensors deferred in any state, a Pick of the entries that `pick` selects."""
         if any(set(state) != set(self) for state in states):
             raise ValueError("only states of the same world can be stacked, put or mixed")
         for name in self._tensors:
@@ -260,7 +270,7 @@ def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def _same_rows(one: State, other: State, name: str) -> bool:
-    """Whether two states' pointers of one name are nothing at the same places, and point at equal rows elsewhere."""
+    """Whether two pointer tensors are 0 at the same places and point at equal rows elsewhere."""
     if name not in other.arenas or not one.arenas[name].same_layout(other.arenas[name]):
         return False
     mine, theirs = one[name], other[name]

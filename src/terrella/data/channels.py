@@ -1,4 +1,4 @@
-"""How a world's channels are named in a recording, and back: `rgb.wrist` is observation.images.wrist; which Sensor each is."""
+"""The features of a recording for the channels of a world, and back: `rgb.wrist` is observation.images.wrist."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .source import Sensor
 RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
 ACTION, REWARD, DONE = "action", "next.reward", "next.done"
 POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-NAME = re.compile(r"\w[\w.-]{0,200}")  # of a feature, and so of a file and a folder
+NAME = re.compile(r"\w[\w.-]{0,200}")  # valid name of a feature, which also names files and folders
 MOST_AXES = 5
 ESTIMATES = (
     "uncertainty",
     "known",
     "places",
     "keyframes",
-)  # what a learned world says of itself, which nobody learns from
-RENAMED = {"cast": "objects"}  # channel of old recordings -> what it is called now
+)  # a learned world's own estimates, which are no training data
+RENAMED = {"cast": "objects"}  # channel of old recordings -> its name now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
 _IMAGES = "observation.images."
 
@@ -41,7 +41,7 @@ def feature_of(channel: str) -> str:
 
 
 def channel_of(feature: str, names: Iterable[str] = ()) -> str:
-    """The inverse of `feature_of`, for a stranger's features too; `names`: one per number of it, () where unknown."""
+    """The inverse of `feature_of`, for other writers' features too; `names` of its numbers, () where unknown."""
     if feature in (STATE, POSE):
         return "pose" if tuple(names) == POSE_NAMES else feature.removeprefix("observation.")
     for channel, known in _MAIN.items():
@@ -54,17 +54,17 @@ def channel_of(feature: str, names: Iterable[str] = ()) -> str:
 
 
 def renamed(feature: str) -> str:
-    """What a feature of an old recording is called now."""
+    """The name now of a feature of an old recording."""
     channel = feature.removeprefix("observation.")
     return f"observation.{RENAMED[channel]}" if channel in RENAMED and channel != feature else feature
 
 
 def features_of(channels: Iterable[str]) -> dict[str, str]:
-    """channel -> feature of all channels of one world; DatasetError where two would be one, or a name can be none.
+    """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose.
 
-    Where a world has a channel `state` besides its `pose`, the pose is observation.pose.
+    DatasetError where two channels would share a feature, or a name is not a valid feature name.
     """
-    found: dict[str, str] = {}
+    features: dict[str, str] = {}
     channels = list(channels)
     for channel in channels:
         feature = POSE if channel == "pose" and "state" in channels else feature_of(channel)
@@ -72,17 +72,17 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
             raise DatasetError(
                 f"the channel '{channel[:100]}' cannot name a file; use letters, digits, '.', '_' and '-'."
             )
-        for other, taken in found.items():
+        for other, taken in features.items():
             if taken.lower() == feature.lower():
                 raise DatasetError(
                     f"the channels '{other}' and '{channel}' would both be {feature}; rename one of them."
                 )
-        found[channel] = feature
-    return found
+        features[channel] = feature
+    return features
 
 
 def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
-    """channel -> Sensor of all that is recorded of a world; DatasetError names what no recording can hold."""
+    """channel -> Sensor, for all recorded channels of a world; DatasetError for a channel that cannot be recorded."""
     features = features_of(spec.recorded)
     return {name: _sensor(spec, name, spec.channels[name], features[name]) for name in spec.recorded}
 
@@ -93,8 +93,8 @@ def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sens
     if kind == "rgb":
         if len(shape) != 3 or shape[2] != 3 or dtype != np.uint8:
             raise DatasetError(
-                f"the channel '{channel}' of {spec.name} is {dtype} {shape}, and a picture is uint8 [height, width, 3]: "
-                "give it another name, or that form."
+                f"the channel '{channel}' of {spec.name} is {dtype} {shape}, but a picture is uint8 [height, width, 3]; "
+                "rename the channel, or give it that form."
             )
         return Sensor(feature, "image", shape, "uint8")
     if kind == "depth" and len(shape) == 2 and dtype.kind == "f":
@@ -127,7 +127,7 @@ def _form(world: str, channel: str, space: spaces.Space) -> tuple[tuple[int, ...
 
 
 def facts_of(spec: Spec) -> dict[str, object]:
-    """What meta/terrella.json keeps of a world, JSON values: its actions, cameras, units and clock."""
+    """The facts of a world in meta/terrella.json, JSON values: its actions, cameras, units and time step."""
     low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
     limits = {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
     return {
@@ -160,9 +160,9 @@ def _camera_json(camera: Camera) -> dict[str, object]:
 
 
 def cameras_of(world: Mapping, size: Sequence[int] = (1, 1)) -> dict[str, Camera]:
-    """channel -> Camera, from the facts of a recorded world; {} where they name none. DatasetError where they are damaged.
+    """channel -> Camera, from the facts of a recorded world; {} without cameras. DatasetError where they are damaged.
 
-    Of an old recording, which knew but one camera: the main one, on the channel `pose`; `size` is that of its pictures.
+    An old recording states one camera only: the main one, mounted on `pose`, whose pictures have `size`.
     """
     try:
         if "cameras" not in world:
@@ -178,11 +178,13 @@ def cameras_of(world: Mapping, size: Sequence[int] = (1, 1)) -> dict[str, Camera
             for channel, about in dict(world["cameras"]).items()
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"meta/terrella.json tells no cameras ({error}); restore it from a copy.") from error
+        raise DatasetError(
+            f"the cameras in meta/terrella.json cannot be read ({error}); restore it from a copy."
+        ) from error
 
 
 def _numbers(values: Any, count: int, kind: type = float) -> Any:
-    found = tuple(kind(value) for value in values)
-    if len(found) != count or not np.isfinite(found).all():
+    numbers = tuple(kind(value) for value in values)
+    if len(numbers) != count or not np.isfinite(numbers).all():
         raise ValueError(f"{count} finite numbers were expected, not {values!r}")
-    return found
+    return numbers

@@ -1,4 +1,4 @@
-"""Coverage: what a recording has to teach: how often the picture changes, which actions show, how many places it saw."""
+"""Coverage: how much can be learned from a recording: how often its pictures change, which actions have an effect."""
 
 from __future__ import annotations
 
@@ -12,32 +12,30 @@ from PIL import Image
 from .dataset import Dataset
 from .format import ACTION
 
-_SIDE = 16  # of the small pictures that are compared
-_SHIFTS = 200  # of the actions against the pictures: what chance would make of them
-_LEAST_ROWS = 20  # of an action, to be judged
+_SIDE = 16  # side of the small pictures that are compared, pixels
+_SHIFTS = 200  # random time shifts of the actions, which give the null distribution
+_LEAST_ROWS = 20  # least rows of an action that is tested
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Of the rows looked at, whole stretches from all over the recording.
-
-    frames:  how many were looked at.
-    changed, changed_much: the share of them that differ from the one before (by more than 8 grey levels anywhere), and of
-             those that do so in more than one pixel of a hundred.
-    places:  different small pictures (16 x 16, 8 levels of each colour) among them.
-    shown:   action -> whether what follows it differs from what follows others, more than chance would have it; actions that
-             were taken too seldom to tell are absent.
-    rare:    those actions.
-    """
+    """Figures over a sample of rows: whole stretches from all over the recording."""
 
     frames: int = 0
+    """Rows in the sample."""
     changed: float = 0.0
+    """Share of them that differ from the row before, by more than 8 grey levels in any pixel."""
     changed_much: float = 0.0
+    """Share of them that do so in more than one pixel of a hundred."""
     places: int = 0
+    """Number of different small pictures (16 x 16 pixels, 8 levels of each colour)."""
     shown: dict[str, bool] = field(default_factory=dict)
+    """Action -> whether the change of the picture after it differs from that after other actions, beyond chance."""
     rare: tuple[str, ...] = ()
+    """Actions that are too rare to be tested."""
 
     def facts(self) -> dict[str, object]:
+        """The figures as JSON values, for people."""
         shown = [name for name, does in self.shown.items() if does]
         return {
             "frames_that_change": round(self.changed, 3),
@@ -47,22 +45,22 @@ class Coverage:
         }
 
     def warnings(self) -> list[str]:
-        """A sentence for each reason why little can be learned of the recording."""
-        found = []
+        """[] or one sentence, with the reasons why little can be learned from the recording."""
+        reasons = []
         if self.frames < 2:
-            return ["the recording has no pictures to compare, and worlds are learned from pictures."]
+            return ["the recording has fewer than two pictures, and worlds are learned from pictures."]
         if self.changed < 0.1:
-            found.append(f"only {self.changed:.0%} of the frames differ from the one before")
+            reasons.append(f"only {self.changed:.0%} of the frames differ from the one before")
         if self.places < 10:
-            found.append(f"only {self.places} different places were seen")
+            reasons.append(f"only {self.places} different places were seen")
         if self.shown and not any(self.shown.values()):
-            found.append("no action is clearly seen to do anything: what follows looks alike whichever is taken")
+            reasons.append("no action has a clear effect: the pictures after all of them look alike")
         more = "play it yourself (--human), record more --frames, and `terrella data merge` both"
-        return [f"this recording teaches little: {'; '.join(found)}; {more}."] if found else []
+        return [f"this recording teaches little: {'; '.join(reasons)}; {more}."] if reasons else []
 
 
 def coverage(dataset: Dataset, most: int = 4000) -> Coverage:
-    """Looks at up to `most` rows of a recording, in stretches of up to 250."""
+    """The coverage of a recording, from up to `most` rows in stretches of up to 250."""
     small, actions, starts, changed, much = [], [], [], 0, 0
     if dataset.rgb_key is None or dataset.length < 2:
         return Coverage()
@@ -81,9 +79,9 @@ def coverage(dataset: Dataset, most: int = 4000) -> Coverage:
     pictures, follows = np.stack(small).astype(np.float32), ~np.array(starts)
     places = {zlib.crc32((one // 32).astype(np.uint8).tobytes()) for one in pictures}
     steps = max(1, int(follows.sum()))
-    moved = [part[follows[1:]] for part in _movements(pictures)]
+    movements = [part[follows[1:]] for part in _movements(pictures)]
     taken = np.concatenate(actions)[:-1][follows[1:]]
-    shown, rare = _shown(moved, _groups(dataset, taken)) if acts else ({}, ())
+    shown, rare = _shown(movements, _groups(dataset, taken)) if acts else ({}, ())
     return Coverage(len(small), changed / steps, much / steps, len(places), shown, rare)
 
 
@@ -106,20 +104,23 @@ def _groups(dataset: Dataset, taken: np.ndarray) -> dict[str, np.ndarray]:
         high = int((world.get("action_high") or [taken.max()])[0])
         named = len(names) == high - low + 1
         return {names[at - low] if named else str(at): taken[:, 0] == at for at in range(low, high + 1)}
-    found = {}
+    groups = {}
     for at, name in enumerate(list(dataset.action_names)[: taken.shape[1]]):
         column = taken[:, at]
         rest = np.median(column)
         if set(np.unique(column)) <= {0, 1}:
-            found[name] = column > 0.5
+            groups[name] = column > 0.5
         else:
-            found |= {f"{name} {sign}": part for sign, part in (("-", column < rest), ("+", column > rest))}
-    return found
+            groups |= {f"{name} {sign}": part for sign, part in (("-", column < rest), ("+", column > rest))}
+    return groups
 
 
 def _movements(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What happened between small pictures [T, n, n, 3]: what brightened where, and by how much; and, wherever it was, which way
-    all that moved went (the sums of Lucas and Kanade's method, and of first moments) and how much changed: [T - 1, features]."""
+    """Features [T - 1, F] of the change between small pictures [T, n, n, 3]: (local, global).
+
+    Local: the change of brightness of each block, and its size. Global: optical flow (sums of Lucas and Kanade's method),
+    first moments of the change, and its total size.
+    """
     apart, grey = pictures[1:] - pictures[:-1], pictures[:-1].mean(3)
     steps, side = len(apart), pictures.shape[1]
     coarse = apart.reshape(steps, side // 2, 2, side // 2, 2, 3).mean((2, 4)).reshape(steps, -1)
@@ -131,10 +132,13 @@ def _movements(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([coarse, np.abs(coarse)], 1), whole
 
 
-def _shown(moved: Sequence[np.ndarray], groups: dict[str, np.ndarray]) -> tuple[dict[str, bool], tuple[str, ...]]:
-    """Which actions have an effect: whether the mean of some kind of movement after one is further from that after all than when
-    the same actions are shifted in time, which keeps how long each is held."""
-    kinds = [part - part.mean(0) for part in moved]
+def _shown(movements: Sequence[np.ndarray], groups: dict[str, np.ndarray]) -> tuple[dict[str, bool], tuple[str, ...]]:
+    """(action -> whether it has an effect, actions that are too rare).
+
+    An action has an effect if the mean change after it is further from the overall mean than for any random time shift of
+    the same actions. A shift keeps the time for which actions are held.
+    """
+    kinds = [part - part.mean(0) for part in movements]
     kinds = [(part / (part.std(0) + 1e-2)).astype(np.float32) for part in kinds]
     shown, rare, count = {}, [], len(kinds[0])
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Dataset: reads LeRobotDataset v3.0 folders, Terrella's own and others', near or far, as plain arrays."""
+"""Dataset: reads any LeRobotDataset v3.0, local or remote, as plain arrays."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..core.spec import Camera, kind_of
 from .channels import ACTION, DONE, REWARD, RGB, cameras_of, channel_of
-from .features import checked_features, decoded, metres, sensors_of, shown, unit_of
+from .features import checked_features, decode_picture, sensors_of, to_metres, to_picture, unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, INFO, TIME, names_of, stream_path, to_numpy
 from .meta import Episode, EpisodeTable, read_about, read_episodes, read_info, read_sensors, read_tasks
-from .source import Lazy, Readings, Sensor, Source, Take, follows, is_action
+from .source import Lazy, Readings, Sensor, Source, Take, is_action, is_outcome
 from .storage import mp4
 from .storage.remote import Files, LocalFiles, open_files
 from .storage.tables import RowsOf, ValuesOf, read_rows, read_whole
@@ -33,22 +33,26 @@ _FIXED = {
 
 
 class Dataset:
-    """A recording. DatasetError where the folder is missing, foreign, of another version, or a file is broken.
+    """A recording, for reading.
 
-    `root` is a folder, or the address of one ("hf://…", "s3://…"): its files are then fetched as they are needed.
+        dataset = Dataset("recordings/arm")            # or "hf://datasets/USER/NAME", "s3://BUCKET/NAME"
+        rows = dataset.episode(0, ["rgb", "action"])   # rgb uint8 [T, H, W, 3], action float32 [T, A]
 
     info:         meta/info.json.
     features:     its features.
-    sensors:      the same as Sensors, without those that every LeRobot dataset has.
-    streams:      sensors with clocks of their own, kept next to the rows.
+    sensors:      its features as Sensors, without the automatic ones of every LeRobot dataset.
+    streams:      sensors with a clock of their own, stored beside the rows.
     cameras:      names of the features that are pictures.
     channels:     channel of a World ("rgb", "rgb.wrist", "depth", "pose", "health", …) -> feature that holds it.
     fps:          rows a second.
-    length:       rows in all.
+    length:       number of rows.
     episodes:     a sequence of Episode.
-    action_names: one per number of an action.
-    world:        what Terrella's recorder knew of the recorded world (name, camera, keys, ...); {} for others.
-    about:        meta/terrella.json; {} for others.
+    action_names: one name for each number of an action.
+    world:        facts of the recorded world (name, camera, keys, ...); {} where Terrella did not record it.
+    about:        meta/terrella.json; {} without one.
+
+    The files of a remote recording are fetched when they are read. DatasetError where the folder is missing, foreign or of
+    another version, or a file is damaged.
     """
 
     def __init__(self, root: str | Path | LocalFiles | Files):
@@ -78,39 +82,40 @@ class Dataset:
 
     @cached_property
     def tasks(self) -> tuple[str, ...]:
-        """The texts of the tasks by their number ("task_index")."""
+        """The texts of the tasks, by task_index."""
         return read_tasks(self.root, self.files)
 
     @cached_property
     def camera_models(self) -> dict[str, Camera]:
-        """channel -> Camera: intrinsics, size, and the pose channel that it is mounted on; {} where nobody said."""
+        """channel -> Camera (intrinsics, size, mount); {} where they are unknown."""
         size = self.sensors[self.rgb_key].shape[:2] if self.rgb_key else (1, 1)
         return cameras_of(self.world, size)
 
     @property
     def action_names(self) -> tuple[str, ...]:
+        """One name for each number of an action."""
         feature = self.features.get(ACTION, {"shape": [0], "names": None})
         return names_of(feature) or tuple(f"action_{i}" for i in range(feature["shape"][0]))
 
     def has(self, name: str) -> bool:
-        """Whether episodes have the array `name` (rgb, depth, pose, action, action_valid, reward, done), or a channel."""
+        """Whether episodes have an array (rgb, depth, pose, action, action_valid, reward, done) or a channel of this name."""
         if name == "action_valid":
             return any(map(is_action, self.features))
         return name in self.channels
 
     def feature(self, name: str) -> str | None:
-        """The feature that an array, a channel or a feature's own name means; None where the recording has none such."""
+        """The feature that `name` (an array, a channel or a feature) means; None for none."""
         if name in self.features:
             return name
         meant = (_FIXED.get(name), self.channels.get(name), self.channels.get(channel_of(name)))
         return next((feature for feature in meant if feature in self.features), None)
 
     def episode(self, number: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The arrays of one episode of T rows: `names` (arrays, channels or features), or all but the cameras other than "rgb".
+        """The arrays of one episode of T rows. None reads all but further cameras.
 
-        rgb uint8 [T, H, W, 3]; depth float32 [T, h, w] metres (65.535 = beyond range); pose float32 [T, 7];
-        action float32 [T, A]; action_valid bool [T]; reward float32 [T]; done bool [T]; other features by their key
-        (cameras as rgb, other depth as depth, texts as objects, the rest as stored).
+        names: arrays, channels or features. rgb is uint8 [T, H, W, 3]; depth float32 [T, h, w], metres (65.535 is beyond
+        range); pose float32 [T, 7]; action float32 [T, A]; action_valid bool [T]; reward float32 [T]; done bool [T].
+        Other cameras are as rgb, other depth as depth, texts are objects; other features are as stored.
         """
         episode = self._episode(number)
         known = [name for name in ("rgb", *self._array) if self.has(name)]
@@ -125,9 +130,9 @@ class Dataset:
     def frames(
         self, number: int, camera: str | None = None, first: int = 0, count: int | None = None
     ) -> Iterator[np.ndarray]:
-        """The pictures of one episode, one after another: uint8 [H, W, 3]; of the first camera, or of `camera`.
+        """The pictures of one episode, one by one, uint8 [H, W, 3]; `camera` None takes the main camera.
 
-        Those of `count` rows from row `first` of the episode on; of all that follow without `count`.
+        Gives `count` pictures from row `first` of the episode on; None gives all the rest.
         """
         episode, camera = self._episode(number), self._camera(camera)
         count = episode.length - first if count is None else count
@@ -139,10 +144,10 @@ class Dataset:
         return (pictures[i] for i in range(first, first + count))
 
     def rgb_at(self, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        """Full-resolution pictures uint8 [n, H, W, 3] of any rows of the dataset, in the order asked."""
+        """Full-resolution pictures, uint8 [n, H, W, 3], of any rows of the dataset, in the order of `indices`."""
         wanted, camera = np.asarray(indices, dtype=np.int64).reshape(-1), self._camera(camera)
         if wanted.size and not (0 <= wanted.min() and wanted.max() < self.length):
-            raise DatasetError(f"row {wanted.max()} was asked of {self.root}, which has rows 0 to {self.length - 1}.")
+            raise DatasetError(f"{self.root} has rows 0 to {self.length - 1}, no row {wanted.max()}.")
         result = np.empty((len(wanted), *self.sensors[camera].shape), np.uint8)
         numbers = self.episodes.of_rows(wanted)
         for number in np.unique(numbers):
@@ -153,25 +158,25 @@ class Dataset:
         return result
 
     def time_s(self, number: int) -> np.ndarray:
-        """float64 [T]: the true time of each row in seconds since the episode began; row / fps where none was kept."""
+        """float64 [T]: the time of each row in seconds since the episode began; row / fps where none was recorded."""
         episode = self._episode(number)
         if TIME in self.features:
             return self._columns(episode, [TIME])[TIME].reshape(-1).astype(np.float64)
         return np.arange(episode.length) / self.fps
 
     def readings(self, number: int, name: str) -> Readings:
-        """What a sensor or stream read in one episode, at its true times; [] where it read nothing."""
+        """The readings of a sensor or stream in one episode, at their own times; empty where it has none."""
         if name not in self.streams and name not in self.sensors:
-            there = ", ".join(dict.fromkeys([*self.streams, *self.sensors])) or "none"
-            raise DatasetError(f"{self.root} has no sensor '{name}'; it has {there}.")
+            sensors = ", ".join(dict.fromkeys([*self.streams, *self.sensors])) or "none"
+            raise DatasetError(f"{self.root} has no sensor '{name}'; it has {sensors}.")
         if name in self.streams:
             stream = self._stream(number, self.streams[name])
             if len(stream.time_s) or name not in self.sensors:
                 return stream
-        return self._of_rows(self._episode(number), name, self.time_s(number))  # it has the rows' times
+        return self._of_rows(self._episode(number), name, self.time_s(number))  # at the times of the rows
 
     def source(self) -> Source:
-        """This recording as every format is read: sensors at the rows' times, streams at their own."""
+        """The recording as a Source: sensors at the times of the rows, streams at their own."""
         sensors = {**self.sensors, **self.streams}
         rate = None if self.streams or TIME in self.features else self.fps
         ours = ("version", "sensors", "streams", "channels", "terminal", "pose", "depth_unit_m", "depth_beyond")
@@ -191,40 +196,40 @@ class Dataset:
         return Take(readings, episode.task, episode.start_ns, facts)
 
     def _of_rows(self, episode: Episode, name: str, at: np.ndarray) -> Readings:
-        """What a sensor read in the rows, whose times are `at`."""
-        sensor, there = self.sensors[name], self._there(episode, name)
-        if not there.any():
+        """The readings of a sensor in the rows, whose times are `at`."""
+        sensor, valid = self.sensors[name], self._valid_rows(episode, name)
+        if not valid.any():
             return Readings(np.zeros(0), [])
         if sensor.kind == "vector":
-            return Readings(at[there], self._stored(episode, [name])[name][there])
-        rows, stored = np.flatnonzero(there), self._pictures(episode, name)
+            return Readings(at[valid], self._stored(episode, [name])[name][valid])
+        rows, stored = np.flatnonzero(valid), self._pictures(episode, name)
 
         def look(i: int) -> np.ndarray:
             value = stored[int(rows[i])]
-            return metres(value.reshape(sensor.shape), sensor) if sensor.kind == "depth" else value
+            return to_metres(value.reshape(sensor.shape), sensor) if sensor.kind == "depth" else value
 
-        return Readings(at[there], Lazy(len(rows), look))
+        return Readings(at[valid], Lazy(len(rows), look))
 
-    def _there(self, episode: Episode, name: str) -> np.ndarray:
-        """bool [T]: the rows in which a sensor was read; the rest is padding."""
+    def _valid_rows(self, episode: Episode, name: str) -> np.ndarray:
+        """bool [T]: the rows in which a sensor has a reading; the others are padding."""
         row, length = np.arange(episode.length), episode.length
-        if not follows(name) or ACTION_VALID not in self.features:
+        if not is_outcome(name) or ACTION_VALID not in self.features:
             return row < (episode.counts or {}).get(name, length)
         acted = self._stored(episode, [ACTION_VALID])[ACTION_VALID].reshape(-1).astype(bool)
-        if episode.counts is None:  # recorded by version 1: a terminal observation, after which nothing followed
+        if episode.counts is None:  # recorded by version 1: the last row is a terminal observation
             return acted
         count = episode.counts.get(name, length)
         return (row < count) & (acted | (row == length - 1)) if is_action(name) else row < count
 
     def _language(self, episode: Episode, at: np.ndarray) -> list[list]:
-        """[[time_s, text], ...]: what is being done from each time on, in an episode whose rows have several tasks."""
+        """[[time_s, text], ...]: the instruction from each time on, of an episode with several tasks."""
         number = self._stored(episode, [TASK])[TASK].reshape(-1)
         changes = [0, *(np.flatnonzero(np.diff(number)) + 1)]
         texts = dict(enumerate(self.tasks))
         return [[float(at[row]), texts.get(int(number[row]), "")] for row in changes]
 
     def _pictures(self, episode: Episode, name: str) -> Sequence[np.ndarray]:
-        """An image or depth sensor's rows as they are stored, each decoded when it is looked at."""
+        """The rows of an image or depth sensor as stored, each decoded when it is read."""
         sensor = self.sensors[name]
         if name in episode.videos:
             film = episode.videos[name]
@@ -233,7 +238,7 @@ class Dataset:
         stored = RowsOf(self.files.local(episode.data), name, episode.start, episode.stop, self.features)
         if self.features[name]["dtype"] != "image":
             return stored
-        return Lazy(episode.length, lambda i: shown(stored[i], sensor))
+        return Lazy(episode.length, lambda i: to_picture(stored[i], sensor))
 
     def _stream(self, number: int, sensor: Sensor) -> Readings:
         name = stream_path(sensor.name, number, "parquet")
@@ -257,7 +262,7 @@ class Dataset:
                 numbers = stored[i].reshape(shape)
             except ValueError as error:
                 raise DatasetError(f"{self.root / name}: reading {i} is not of shape {shape}; restore it.") from error
-            return metres(numbers, sensor) if sensor.kind == "depth" else numbers
+            return to_metres(numbers, sensor) if sensor.kind == "depth" else numbers
 
         values = Lazy(len(time_s), value)
         if sensor.kind == "vector" and len(time_s):
@@ -270,34 +275,34 @@ class Dataset:
         return self.episodes[number]
 
     def _camera(self, name: str | None) -> str:
-        found = self.rgb_key if name is None else self.feature(name)
-        if found is None or found not in self.cameras:
+        camera = self.rgb_key if name is None else self.feature(name)
+        if camera is None or camera not in self.cameras:
             raise DatasetError(
                 f"{self.root} has no pictures{f' {name}' if name else ''}; it has {', '.join(self.features)}."
             )
-        return found
+        return camera
 
     def _channels(self) -> dict[str, str]:
-        stated, found = {feature: channel for channel, feature in self.about.get("channels", {}).items()}, {}
+        stated, channels = {feature: channel for channel, feature in self.about.get("channels", {}).items()}, {}
         main = {"rgb": self.rgb_key} if self.rgb_key else {}
         for name, sensor in self.sensors.items():
             channel = stated.get(name) or channel_of(name, sensor.names)
             kind = {"image": "rgb", "depth": "depth"}.get(sensor.kind)
-            if kind and kind_of(channel) != kind:  # a stranger's own way of naming it
+            if kind and kind_of(channel) != kind:  # another writer's name
                 channel = f"{kind}.{name.rsplit('.', 1)[-1]}"
                 main.setdefault(kind, name)
-            found.setdefault(channel, name)
-        return {**main, **found}
+            channels.setdefault(channel, name)
+        return {**main, **channels}
 
     def _look_for_depth(self) -> None:
-        """Makes depth of image features of one channel that prove to have 16 bits, though nothing says that they are depth."""
+        """Turns image features of one channel into depth where their pictures have 16 bits."""
         for name, sensor in self.sensors.items():
             feature = self.features[name]
             grey = feature["dtype"] == "image" and feature["shape"][2] == 1
             if sensor.kind == "image" and grey and len(self.episodes):
-                with suppress(DatasetError):  # whoever reads it gets an error
+                with suppress(DatasetError):  # reading it raises
                     first = self._table(self.episodes[0], [name])[name]
-                    if len(first) and decoded(first[0].as_py(), sensor.shape, name).ndim == 2:
+                    if len(first) and decode_picture(first[0].as_py(), sensor.shape, name).ndim == 2:
                         self.sensors[name] = replace(sensor, kind="depth", shape=sensor.shape[:2], dtype="float32")
 
     def _table(self, episode: Episode, columns: list[str]):
@@ -305,35 +310,35 @@ class Dataset:
 
     def _stored(self, episode: Episode, names: list[str]) -> dict[str, np.ndarray]:
         """Columns as they are stored, [T, *shape]."""
-        table, found = self._table(episode, names), {}
+        table, stored = self._table(episode, names), {}
         for name in names:
             try:
-                found[name] = to_numpy(table[name], tuple(self.features[name]["shape"]))
+                stored[name] = to_numpy(table[name], tuple(self.features[name]["shape"]))
             except (ValueError, TypeError, NotImplementedError) as error:
                 raise DatasetError(
                     f"{self.root / episode.data}: column '{name}' is not what info.json says ({error})."
                 ) from error
-        return found
+        return stored
 
     def _columns(self, episode: Episode, names: list[str]) -> dict[str, np.ndarray]:
         stored = {name: self.feature(name) for name in names}
         columns = dict.fromkeys(key for key in stored.values() if key is not None)
         pictured = [key for key in columns if self.features[key]["dtype"] in ("image", "video")]
-        there = self._stored(episode, [key for key in columns if key not in pictured])
-        there |= {key: np.stack(list(self._pictures(episode, key))) for key in pictured}
-        found = {}
+        arrays = self._stored(episode, [key for key in columns if key not in pictured])
+        arrays |= {key: np.stack(list(self._pictures(episode, key))) for key in pictured}
+        result = {}
         for name, key in stored.items():
-            if key is None:  # action_valid of a stranger's recording: what follows the last row is unknown
-                found[name] = np.arange(episode.length) < episode.length - 1
+            if key is None:  # other writers have no action_valid: the outcome of the last row is unknown
+                result[name] = np.arange(episode.length) < episode.length - 1
             else:
-                found[name] = _as_promised(name, there[key], self.sensors.get(key))
-        return found
+                result[name] = _as_promised(name, arrays[key], self.sensors.get(key))
+        return result
 
 
 def _as_promised(name: str, array: np.ndarray, sensor: Sensor | None) -> np.ndarray:
     if sensor is not None and sensor.kind == "depth":
         flat = array.reshape(len(array), *sensor.shape)
-        return metres(flat, sensor, beyond=DEPTH_BEYOND * unit_of(sensor))
+        return to_metres(flat, sensor, beyond=DEPTH_BEYOND * unit_of(sensor))
     if name in ("reward", "done", "action_valid"):
         return array.reshape(-1).astype(np.float32 if name == "reward" else bool)
     return array.astype(np.float32) if name in ("pose", "action") else array

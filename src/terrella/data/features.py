@@ -15,16 +15,16 @@ from .channels import MOST_AXES
 from .format import ACTION_VALID, AUTOMATIC, DEPTH_BEYOND, DEPTH_UNIT_M, TIME, names_of, schema
 from .source import Sensor
 
-_WIDEST = 1 << 27  # numbers in one row of one feature; more is damage
+_WIDEST = 1 << 27  # most numbers in a row of a feature; more is damage
 _PICTURES = ("PNG", "JPEG", "WEBP", "TIFF")
 _DEEP = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's modes of one channel of more than 8 bits
 _BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
-_UNIT_KEYS = ("unit_m", "depth_unit_m", "depth_scale", "depth_unit", "unit", "units")  # where writers say it
+_UNIT_KEYS = ("unit_m", "depth_unit_m", "depth_scale", "depth_unit", "unit", "units")  # keys that writers use
 
 
 def checked_features(features: object) -> dict[str, dict]:
-    """The features of an info.json; ValueError where they are none."""
+    """The features of an info.json, checked; ValueError where they are invalid."""
     if not isinstance(features, dict) or not 0 < len(features) <= 10_000:
         raise ValueError("features")
     for name, feature in features.items():
@@ -44,11 +44,11 @@ def checked_features(features: object) -> dict[str, dict]:
 
 
 def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dict[str, Sensor]:
-    """The sensors of a stranger's `features`; what `known` (meta/terrella.json) says of one is added.
+    """The Sensors of `features`, with the facts in `known` (the sensors of meta/terrella.json) added.
 
-    Depth is what the feature calls a depth map, or, by its name, uint16 numbers or pictures of one channel.
+    A feature is depth if it states so, or if its name does and it holds uint16 numbers or pictures of one channel.
     """
-    found = {}
+    sensors = {}
     for name, feature in features.items():
         if name in AUTOMATIC or name in (ACTION_VALID, TIME):
             continue
@@ -64,12 +64,12 @@ def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dic
         if more is not None:
             facts = {**sensor.facts, **more.facts}
             sensor = replace(sensor, units=more.units, frame=more.frame, rate_hz=more.rate_hz, facts=facts)
-        found[name] = sensor
-    return found
+        sensors[name] = sensor
+    return sensors
 
 
-def decoded(picture: Mapping | None, shape: tuple[int, ...], camera: str) -> np.ndarray:
-    """A picture kept as bytes: uint8 [H, W, 3], or [H, W] as it is stored where it has one channel of more than 8 bits."""
+def decode_picture(picture: Mapping | None, shape: tuple[int, ...], camera: str) -> np.ndarray:
+    """A picture stored as bytes: uint8 [H, W, 3], or [H, W] as stored where it has one channel of more than 8 bits."""
     try:
         with Image.open(io.BytesIO((picture or {})["bytes"]), formats=_PICTURES) as image:
             if image.size != (shape[1], shape[0]):
@@ -79,28 +79,26 @@ def decoded(picture: Mapping | None, shape: tuple[int, ...], camera: str) -> np.
         raise DatasetError(f"a picture of {camera} cannot be read ({error}); restore its file from a copy.") from error
 
 
-def shown(picture: Mapping | None, sensor: Sensor) -> np.ndarray:
+def to_picture(picture: Mapping | None, sensor: Sensor) -> np.ndarray:
     """A picture kept as bytes, as its sensor is: uint8 [H, W, 3], or depth [H, W] as it is stored (of 8 bits too)."""
-    found = decoded(picture, sensor.shape, sensor.name)
+    array = decode_picture(picture, sensor.shape, sensor.name)
     if sensor.kind == "depth":
-        return found if found.ndim == 2 else found[..., 0].astype(np.uint16)
-    if found.ndim == 2:
-        raise DatasetError(
-            f"a picture of {sensor.name} has one channel of {found.dtype}, as depth has: it is no picture."
-        )
-    return found
+        return array if array.ndim == 2 else array[..., 0].astype(np.uint16)
+    if array.ndim == 2:
+        raise DatasetError(f"a picture of {sensor.name} has one channel of {array.dtype}: it is depth, not a picture.")
+    return array
 
 
-def metres(stored: np.ndarray, sensor: Sensor, beyond: float = np.inf) -> np.ndarray:
-    """float32 metres of depth as it is stored; `beyond` where nothing lay within range. Floats are metres already."""
+def to_metres(stored: np.ndarray, sensor: Sensor, beyond: float = np.inf) -> np.ndarray:
+    """Stored depth as float32 metres; `beyond` where nothing was in range. Floats are metres already."""
     if stored.dtype.kind == "f":
         return stored.astype(np.float32, copy=False)
-    found = stored.astype(np.float32) * np.float32(unit_of(sensor))
-    return np.where(stored == DEPTH_BEYOND, np.float32(beyond), found)
+    depth_m = stored.astype(np.float32) * np.float32(unit_of(sensor))
+    return np.where(stored == DEPTH_BEYOND, np.float32(beyond), depth_m)
 
 
 def unit_of(sensor: Sensor) -> float:
-    """Metres that one step of stored depth is."""
+    """Metres of one step of stored depth."""
     unit = sensor.facts.get("unit_m", DEPTH_UNIT_M)
     return float(unit) if isinstance(unit, int | float) and 0 < unit < math.inf else DEPTH_UNIT_M
 
@@ -119,8 +117,8 @@ def _depth_size(name: str, feature: Mapping, known: Sensor | None) -> tuple[int,
 
 
 def _about(feature: Mapping) -> Mapping:
-    found = feature.get("info") or feature.get("video_info") or {}
-    return found if isinstance(found, Mapping) else {}
+    info = feature.get("info") or feature.get("video_info") or {}
+    return info if isinstance(info, Mapping) else {}
 
 
 def _is_depth_map(about: Mapping) -> bool:
@@ -128,7 +126,7 @@ def _is_depth_map(about: Mapping) -> bool:
 
 
 def _unit_m(feature: Mapping) -> float:
-    """Metres that one step of a depth feature is, as far as it says."""
+    """Metres of one step of a depth feature, by its facts; DEPTH_UNIT_M where it states none."""
     for stated in (feature, _about(feature)):
         for key in _UNIT_KEYS:
             unit = stated.get(key)

@@ -70,27 +70,27 @@ class Layout:
         follow = {"reward": Sensor(REWARD, "vector", (1,)), "done": Sensor(DONE, "vector", (1,), "bool")}
         seen = [sensor for name, sensor in channels.items() if name not in follow]
         made = [*seen, action, *(channels.get(name, sensor) for name, sensor in follow.items())]
-        rate = tidy(fps if fps is not None else 1 / spec.dt_s)
+        rate = whole_rate(fps if fps is not None else 1 / spec.dt_s)
         named = {name: sensor.name for name, sensor in channels.items()}
         return Layout(rate, {sensor.name: sensor for sensor in made}, world=facts_of(spec), channels=named)
 
     @property
     def rows(self) -> dict[str, Sensor]:
         """The sensors of a row, with those that the recorder adds: which actions count, and the true time."""
-        found = dict(self.sensors)
-        if any(map(is_action, found)):
-            found[ACTION_VALID] = Sensor(ACTION_VALID, "vector", (1,), "bool")
+        sensors = dict(self.sensors)
+        if any(map(is_action, sensors)):
+            sensors[ACTION_VALID] = Sensor(ACTION_VALID, "vector", (1,), "bool")
         if self.clock:
-            found[TIME] = Sensor(TIME, "vector", (1,), "float64", units={TIME: "s"})
-        return found
+            sensors[TIME] = Sensor(TIME, "vector", (1,), "float64", units={TIME: "s"})
+        return sensors
 
     def features(self) -> dict[str, dict]:
         """The `features` of meta/info.json."""
-        found = {name: self._feature(sensor) for name, sensor in self.rows.items()}
-        found["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        features = {name: self._feature(sensor) for name, sensor in self.rows.items()}
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         for name in AUTOMATIC[1:]:
-            found[name] = {"dtype": "int64", "shape": [1], "names": None}
-        return found
+            features[name] = {"dtype": "int64", "shape": [1], "names": None}
+        return features
 
     def _feature(self, sensor: Sensor) -> dict:
         shape, names = list(sensor.shape), list(sensor.names) or None
@@ -107,14 +107,14 @@ class Layout:
             return {"dtype": sensor.dtype, "shape": shape, "names": names}
         if self.pictures == "png":
             return {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
-        height, width = even(sensor)
+        height, width = even_size(sensor)
         info = {"height": height, "width": width, "codec": "h264", "pix_fmt": "yuv420p", "is_depth_map": False}
         info = {f"video.{key}": value for key, value in {**info, "fps": self.fps, "channels": 3}.items()}
         names = ["height", "width", "channels"]
         return {"dtype": "video", "shape": shape, "names": names, "info": {**info, "has_audio": False}}
 
 
-def even(sensor: Sensor) -> tuple[int, int]:
+def even_size(sensor: Sensor) -> tuple[int, int]:
     """(height, width) of an image sensor that H.264 can hold; DatasetError where it cannot."""
     height, width = sensor.shape[:2]
     if height % 2 or width % 2:
@@ -157,25 +157,25 @@ def sensor_from_json(name: str, stated: Mapping) -> Sensor:
     )
 
 
-def tidy(fps: float) -> float:
+def whole_rate(fps: float) -> float:
     """A rate that is whole but for rounding, as an int."""
     return int(round(fps)) if abs(fps - round(fps)) < 1e-6 else float(fps)
 
 
-def where(episode: int) -> dict[str, int]:
+def file_numbers(episode: int) -> dict[str, int]:
     """Chunk and file number of an episode's own files."""
     return {"chunk_index": episode // FILES_PER_CHUNK, "file_index": episode % FILES_PER_CHUNK}
 
 
 def stream_path(name: str, episode: int, suffix: str) -> str:
     """Where a stream's table ("parquet") or film ("mp4") of an episode lies."""
-    return "streams/{}/chunk-{chunk_index:03d}/file-{file_index:03d}.{}".format(name, suffix, **where(episode))
+    return "streams/{}/chunk-{chunk_index:03d}/file-{file_index:03d}.{}".format(name, suffix, **file_numbers(episode))
 
 
 _FIELD = re.compile(r"\{(\w+)(?::0?[0-9])?d?\}")
 
 
-def fill(template: str, **values: object) -> str:
+def fill_template(template: str, **values: object) -> str:
     """A path template of info.json, filled in; DatasetError where it has other fields, or leads out of the dataset."""
     bare = _FIELD.sub("", template)
     unknown = set(_FIELD.findall(template)) - set(values)
@@ -185,10 +185,10 @@ def fill(template: str, **values: object) -> str:
         path = template.format(**values)
     except (ValueError, TypeError) as error:
         raise DatasetError(f"the path template {template[:200]!r} of info.json is not one of LeRobot v3.") from error
-    return inside(path)
+    return checked_name(path)
 
 
-def inside(path: str) -> str:
+def checked_name(path: str) -> str:
     """A relative path that stays in its folder; else DatasetError."""
     parts = path.replace("\\", "/").split("/")
     if not path or path.startswith(("/", "~")) or ".." in parts or "\0" in path or ":" in parts[0] or len(path) > 1000:
@@ -198,12 +198,12 @@ def inside(path: str) -> str:
     return path
 
 
-def contained(root: Path, name: str) -> Path:
+def path_inside(root: Path, name: str) -> Path:
     """Where a file of a dataset lies, there or not; DatasetError where its name or a symbolic link leads out of `root`.
 
     Of a Hugging Face cache (snapshots/REVISION/… -> ../../blobs/…) a link may lead to that cache's own blobs.
     """
-    path, home = root / inside(name), os.path.realpath(root)
+    path, home = root / checked_name(name), os.path.realpath(root)
     real = os.path.realpath(path)
     parts = Path(home).parts
     blobs = [Path(*parts[:at], "blobs") for at, part in enumerate(parts) if part == "snapshots"]

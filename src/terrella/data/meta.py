@@ -1,4 +1,4 @@
-"""What a dataset says of itself in meta/, read with an error that says what to do: its facts, tasks and episodes."""
+"""Reads the folder meta/ of a dataset: its facts, tasks and episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from ..core.errors import DatasetError
-from .format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, fill, sensor_from_json
+from .format import DATA_PATH, INFO, TASKS, VIDEO_PATH, WORLD, fill_template, sensor_from_json
 from .source import Sensor
 from .storage.remote import Files, LocalFiles
 from .storage.tables import read_json, read_whole
@@ -48,7 +48,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def read_about(root: Path, files: LocalFiles | Files) -> dict:
-    """meta/terrella.json; {} where a stranger's recording has none."""
+    """meta/terrella.json; {} where there is none."""
     if not files.exists(WORLD):
         return {}
     path = files.local(WORLD)
@@ -59,39 +59,39 @@ def read_about(root: Path, files: LocalFiles | Files) -> dict:
 
 
 def read_sensors(root: Path, about: Mapping, kind: str) -> dict[str, Sensor]:
-    """What meta/terrella.json says of the sensors of a kind ("sensors", "streams")."""
+    """The Sensors under a key ("sensors", "streams") of meta/terrella.json."""
     with _readable(root / WORLD):
         return {name: sensor_from_json(name, stated) for name, stated in dict(about.get(kind, {})).items()}
 
 
 def read_tasks(root: Path, files: LocalFiles | Files) -> tuple[str, ...]:
-    """The texts of meta/tasks.parquet by their number, "" for a number that has none; () where there is no such table."""
+    """The texts of meta/tasks.parquet by task_index, "" for a missing number; () without that table."""
     if not files.exists(TASKS):
         return ()
     with _readable(root / TASKS):
-        found = sentences(files.local(TASKS))
-    return tuple(found.get(number, "") for number in range(max(found, default=-1) + 1))
+        texts = sentences(files.local(TASKS))
+    return tuple(texts.get(number, "") for number in range(max(texts, default=-1) + 1))
 
 
 def sentences(path: Path) -> dict[int, str]:
-    """task_index -> its text, of a table of tasks; DatasetError or ValueError where it is none."""
+    """task_index -> text, of a table of tasks; DatasetError or ValueError where it is not one."""
     table = read_whole(path)
     texts = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)
     if texts is None or "task_index" not in table.column_names:
-        raise ValueError("it is no table of tasks")
+        raise ValueError("it is not a table of tasks")
     numbers = table["task_index"].to_pylist()
     if not all(isinstance(number, int) and 0 <= number < len(numbers) + 1_000_000 for number in numbers):
-        raise ValueError("it numbers its tasks by what is no number")
+        raise ValueError("a task_index is not a valid number")
     return {number: str(text) for number, text in zip(numbers, table[texts].to_pylist())}
 
 
-MOST = 20_000_000  # episodes; more is damage
-OPTIONAL = ("tasks", "start_ns", "counts")  # columns of meta/episodes that a stranger's recording may lack
+MOST = 20_000_000  # most episodes; more is damage
+OPTIONAL = ("tasks", "start_ns", "counts")  # columns of meta/episodes that other writers may lack
 
 
 @dataclass(frozen=True)
 class Film:
-    """The pictures of one camera in one episode: frames from `first` on in `file` (relative to the dataset)."""
+    """The pictures of one camera in one episode: frames of `file` (relative to the dataset) from number `first` on."""
 
     file: str
     first: int
@@ -101,9 +101,9 @@ class Film:
 class Episode:
     """Rows [start, stop) of the dataset; `data` (relative to the dataset) holds them, `videos` show them.
 
-    task:     what it is about; `tasks` all of them, where its rows differ.
-    start_ns: wall-clock time of its time 0 in nanoseconds since 1970, None where it was not kept.
-    counts:   sensor -> rows up to the last that has it, where that is not the last of all; None where it was not kept.
+    tasks:    its instructions; more than one where its rows differ.
+    start_ns: wall-clock time of its time 0, nanoseconds since 1970; None where unknown.
+    counts:   sensor -> rows up to the last that has it, where that is not the last row; None where unknown.
     """
 
     number: int
@@ -117,20 +117,22 @@ class Episode:
 
     @property
     def task(self) -> str:
+        """The first instruction; "" for none."""
         return self.tasks[0] if self.tasks else ""
 
     @property
     def length(self) -> int:
+        """Number of rows."""
         return self.stop - self.start
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Every file that holds a part of it, relative to the dataset."""
+        """The files that hold its rows and videos, relative to the dataset."""
         return (self.data, *(film.file for film in self.videos.values()))
 
 
 class EpisodeTable(Sequence[Episode]):
-    """All episodes; an Episode is made when it is looked at."""
+    """All episodes; an Episode is made when it is read."""
 
     def __init__(self, table: pa.Table, data_path: str, video_path: str, cameras: Sequence[str], fps: float):
         self._table, self._cameras, self._fps = table, tuple(cameras), fps
@@ -142,7 +144,7 @@ class EpisodeTable(Sequence[Episode]):
         self._from = {name: table[f"videos/{name}/from_timestamp"].to_numpy() for name in cameras}
         for seconds in self._from.values():
             if not np.isfinite(seconds).all() or (seconds < 0).any():
-                raise ValueError("a video begins at no time")
+                raise ValueError("the start of a video is not a valid time")
         if (self.starts < 0).any() or (self.stops < self.starts).any():
             raise ValueError("an episode ends before it starts")
 
@@ -155,13 +157,13 @@ class EpisodeTable(Sequence[Episode]):
         index = int(index) % len(self)
         videos = {}
         for name in self._cameras:
-            file = fill(self._video_path, video_key=name, **self._place(f"videos/{name}", index))
+            file = fill_template(self._video_path, video_key=name, **self._place(f"videos/{name}", index))
             videos[name] = Film(file, round(float(self._from[name][index]) * self._fps))
         tasks, start_ns, counts = (
             self._table[name][index].as_py() if name in self._table.column_names else None for name in OPTIONAL
         )
         tasks = tuple(map(str, [tasks] if isinstance(tasks, str) else tasks or []))
-        data = fill(self._data_path, **self._place("data", index))
+        data = fill_template(self._data_path, **self._place("data", index))
         start, stop = int(self.starts[index]), int(self.stops[index])
         return Episode(index, start, stop, data, videos, tasks, start_ns or None, counts_of(counts))
 
@@ -181,9 +183,7 @@ def read_episodes(
     info: meta/info.json. cameras: the features that are stored as video.
     """
     if count > MOST:
-        raise DatasetError(
-            f"{root} claims {count:,} episodes, more than can be meant; restore meta/info.json from a copy."
-        )
+        raise DatasetError(f"{root} claims {count:,} episodes, more than possible; restore meta/info.json from a copy.")
     parts = _read_parts(files, cameras, count)
     try:
         table = pa.concat_tables(parts, promote_options="default") if parts else _nothing(columns_of(cameras))
@@ -200,13 +200,13 @@ def read_episodes(
 
 
 def columns_of(cameras: Sequence[str]) -> list[str]:
-    """The columns of meta/episodes that say where an episode lies."""
+    """The columns of meta/episodes that locate an episode."""
     films = [f"videos/{name}/{key}" for name in cameras for key in ("chunk_index", "file_index", "from_timestamp")]
     return ["episode_index", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index", *films]
 
 
 def read_part(path: Path, cameras: Sequence[str], most_rows: int, more: Sequence[str] = OPTIONAL) -> pa.Table:
-    """One table of meta/episodes, with the columns `more` as far as it has them; DatasetError where it is none."""
+    """One table of meta/episodes, with those of the columns `more` that it has; DatasetError where it is damaged."""
     columns = columns_of(cameras)
     table = read_whole(path, [*columns, *more], most_rows)
     for name in set(columns) - set(table.column_names):
@@ -215,7 +215,7 @@ def read_part(path: Path, cameras: Sequence[str], most_rows: int, more: Sequence
 
 
 def _read_parts(files: LocalFiles | Files, cameras: Sequence[str], count: int, attempts: int = 3) -> list[pa.Table]:
-    """The tables of meta/episodes; listed anew where a recorder has just made one of many."""
+    """The tables of meta/episodes; listed again where a recorder has just merged some."""
     parts = []
     for name in files.list("meta/episodes", ".parquet"):
         try:

@@ -1,4 +1,4 @@
-"""Workers on Ray: processes of this machine or of a whole cluster that play the episodes of one recording."""
+"""RayWorkers: the workers of `collect` as processes on a Ray cluster, or on this machine."""
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 # ray is an extra
@@ -17,12 +17,12 @@ from ..core.errors import TerrellaError
 from .collect import MOST_DEATHS, Job, Player
 from .staged import Parcel
 
-START_S, CLEAR_S = 180.0, 5.0  # that workers may take to start, and to remove what they keep
+START_S, CLEAR_S = 180.0, 5.0  # seconds that workers may take to start, and to remove their files
 
 
 @contextmanager
 def _finding_our_modules() -> Iterator[None]:
-    """Processes that begin here import from where this one does."""
+    """Processes started in here have the import path of this one."""
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(path or os.getcwd() for path in sys.path)
     try:
@@ -35,15 +35,17 @@ def _finding_our_modules() -> Iterator[None]:
 
 
 class RayWorkers:
-    """`size` actors of one processor each, on the cluster of RAY_ADDRESS, or else on a Ray of this machine alone that ends with us.
-    Episodes come back through Ray: the machines need no common disk, but the same packages. TerrellaError where Ray is not
-    installed, or where the cluster has fewer processors."""
+    """`size` actors of one processor each, on the cluster at RAY_ADDRESS, or on a local Ray that ends with this process.
+
+    Episodes come back through Ray: the machines need the same packages but no shared disk. TerrellaError where Ray is not
+    installed, or the cluster has too few processors.
+    """
 
     def __init__(self, size: int):
         if size < 1:
             raise TerrellaError(f"{size} workers play nothing; ask for one or more.")
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_worker_niceness", "0")  # else of 15: on a busy machine they would hardly run
+        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's default of 15 would starve them on a busy machine
         try:
             import ray
         except ImportError as error:
@@ -61,7 +63,7 @@ class RayWorkers:
                     ray.init(log_to_driver=False, logging_level="ERROR", **local)
             except Exception as error:
                 first = (str(error).strip() or type(error).__name__).splitlines()[0]
-                raise TerrellaError(f"Ray did not start ({first}); look at RAY_ADDRESS, or leave it unset.") from error
+                raise TerrellaError(f"Ray did not start ({first}); check RAY_ADDRESS, or unset it.") from error
         here = int(ray.cluster_resources().get("CPU", 0))
         if here < self.size:
             raise TerrellaError(f"this Ray has {here} processors; ask for as many --workers or fewer.")
@@ -71,7 +73,7 @@ class RayWorkers:
         self._started()
 
     def _started(self) -> None:
-        """Goes on with the workers that have started, which may be fewer than were asked for. TerrellaError where none has."""
+        """Continues with the workers that have started, which may be fewer than `size`; TerrellaError where none has."""
         ready = {actor.__ray_ready__.remote(): actor for actor in self._actors}
         _, late = self._ray.wait(list(ready), num_returns=self.size, timeout=START_S)
         if len(late) == self.size:

@@ -1,4 +1,4 @@
-"""Recorder: what happens, row by row, into a LeRobotDataset v3.0 folder, so that a crash costs next to nothing."""
+"""Recorder: writes rows to a LeRobotDataset v3.0 folder as they happen; a crash loses next to nothing."""
 
 from __future__ import annotations
 
@@ -19,40 +19,44 @@ from ..core.files import FULL
 from . import stats
 from .channels import ACTION, DONE, REWARD, feature_of
 from .features import unit_of
-from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even
-from .source import Sensor, follows, is_action
-from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Parcel, Staged, about, growing, pack_row
+from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even_size
+from .source import Sensor, is_action, is_outcome
+from .staged import LOG, ROW, SAMPLE_EVERY, WORDS, Parcel, Staged, growing_film, pack_row, staging_facts
 from .storage.journal import Journal
 from .storage.mp4 import Mp4Writer, Pressure
-from .writer import Draft, Writer, fresh
+from .writer import Draft, Writer, fresh_folder
 
 _BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
 
 
 class Watch(Protocol):
-    """Where what is recorded is shown to somebody at the same time. start_ns: wall-clock time of its time 0."""
+    """A live view of a recording."""
 
     start_ns: int
+    """Wall-clock time of its time 0, nanoseconds since 1970."""
 
     def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None: ...
 
 
 class Recorder:
-    """Appends to `root`, which is created or, where it was written by a Recorder of the same layout, gone on with.
+    """Appends episodes to the folder `root`, which is new or was written by a Recorder of the same layout.
 
-    Each row is an observation, the action taken there and the reward and done that followed; the last row of an
-    episode is its terminal observation and has action_valid = False. Rows are handed to the system one by one and frames
-    as soon as they are encoded, in a hidden folder; `end_episode` makes an episode of them and replaces meta/info.json
-    last. What a killed recorder, or one whose disk was full, left there is made an episode when the folder is opened
-    again, up to the last row whose frames are whole (interrupted="keep"), or thrown away where it is about the same task
-    ("discard": for recordings that will be made again). No frame is ever dropped: where an encoder is behind, `add`
-    waits (64 frames a camera may queue), and `pressure` tells.
-    DatasetError where root is foreign, locked by another recorder, or the disk is full; nothing that was recorded goes.
+        with Recorder("recordings/arm", layout, "lift the cup") as recorder:
+            recorder.add(observation, action, reward, done)    # one row
+            recorder.end_episode()                             # commits the episode
 
-    task:      what the episodes from now on are about.
-    live:      where each row and reading is logged too, for somebody to watch; it never holds the recording up.
-    recovered: rows of interrupted episodes that were kept.
-    pressure:  how far behind the encoders were, of all episodes so far.
+    A row is an observation, the action taken in it, and the reward and done that followed. The last row of an episode is
+    its terminal observation and has action_valid = False. Rows, and frames once they are encoded, are written at once to
+    a hidden folder; `end_episode` makes an episode of them and replaces meta/info.json last. After a kill or a full disk,
+    opening the folder again keeps the unfinished episode up to its last whole row (interrupted="keep"), or discards it if
+    its task is the same ("discard", for recordings that will be made again). No frame is dropped: `add` blocks while 64
+    frames of a camera wait for their encoder. DatasetError where `root` is foreign, locked by another recorder, or the
+    disk is full; recorded data is never lost.
+
+    task:      the instruction of the next episodes.
+    live:      a live view that is sent each row and reading.
+    recovered: rows kept of interrupted episodes.
+    pressure:  how far the encoders fell behind so far.
     """
 
     def __init__(
@@ -71,7 +75,7 @@ class Recorder:
         self._numbers = {name: 1 + i for i, name in enumerate(layout.streams)}
         self._videos: dict[str, Mp4Writer] = {}
         self._films: dict[str, Mp4Writer] = {}
-        self._running: list[Callable[[], object]] = []  # ends the files in flight
+        self._running: list[Callable[[], object]] = []  # functions that close the open files
         self._journal: Journal | None = None
         weakref.finalize(self, _abandon, self._running, self._writer.close).atexit = False
         self.pressure = Pressure()
@@ -85,12 +89,12 @@ class Recorder:
 
     @property
     def rows(self) -> int:
-        """Rows that are safe."""
+        """Number of committed rows."""
         return self._writer.rows
 
     @property
     def episodes(self) -> int:
-        """Episodes that are safe."""
+        """Number of committed episodes."""
         return self._writer.episodes
 
     def add(
@@ -101,7 +105,7 @@ class Recorder:
         done: bool | None = None,
         time_s: float | None = None,
     ) -> None:
-        """One row: observation without batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...).
+        """Adds one row; the observation has no batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...).
 
         `action` is None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`.
         """
@@ -119,12 +123,11 @@ class Recorder:
         self.add_row(row, time_s)
 
     def add_row(self, row: Mapping[str, np.ndarray | None], time_s: float | None = None) -> None:
-        """One row by the names of the layout's sensors.
+        """Adds one row, by the names of the layout's sensors.
 
-        Actions and what follows them ("action", "next.…") may be absent: nothing was done, nothing followed. Any other
-        that is not there is given as None; it is stored as zeros and counts as not seen where the whole episode lacks
-        it. `time_s` is the row's true time in seconds since the episode began, kept where the layout has a clock;
-        without it, now.
+        Actions and outcomes ("action", "next.…") may be absent. A missing reading of another sensor is given as None and
+        stored as zeros; a sensor that a whole episode lacks counts as absent. `time_s` is the time of the row, in seconds
+        since the episode began, stored if the layout has a clock; None takes the current time.
         """
         self._check_open()
         at = self._elapsed() if time_s is None else float(time_s)
@@ -132,19 +135,19 @@ class Recorder:
         given = [name in (ACTION_VALID, TIME) or row.get(name) is not None for name in self._names]
         with self._nothing_lost():
             journal = self._begin()
-            self._torn = True  # until row and frames are both under way
+            self._torn = True  # until row and frames are both written or queued
             journal.add(ROW, at, *pack_row(values, given, self._packed))
             for name, video in self._videos.items():
                 video.add(values[name])
             for name, seen in self._pictures.items():
                 if self.in_flight % SAMPLE_EVERY == 0:
                     seen.append(stats.summarise_pictures(values[name][None, ::4, ::4]))
-            self._before = {name: values[name] for name in values if follows(name) and values[name].dtype == bool}
+            self._before = {name: values[name] for name in values if is_outcome(name) and values[name].dtype == bool}
             self.in_flight, self._time_s, self._torn = self.in_flight + 1, at, False
         self._show({name: value for name in self.layout.sensors if (value := row.get(name)) is not None})
 
     def log(self, stream: str, value: np.ndarray, time_s: float | None = None) -> None:
-        """One reading of a stream of the layout, at `time_s` seconds since the episode began (without it, now)."""
+        """Adds one reading of a stream, at `time_s` seconds since the episode began; None takes the current time."""
         self._check_open()
         if stream not in self._numbers:
             raise DatasetError(f"this recording has no stream '{stream}'; it has {', '.join(self._numbers) or 'none'}.")
@@ -162,16 +165,16 @@ class Recorder:
         self._show({stream: value})
 
     def say(self, task: str) -> None:
-        """What the next rows of this episode are about, until it is said otherwise."""
+        """Sets the instruction of the next rows of this episode."""
         self._check_open()
         with self._nothing_lost():
             self._begin().add(WORDS, 0.0, task.encode())
 
     def end_episode(self, start_ns: int | None = None) -> int | None:
-        """Commits the episode in flight and returns its number; None (and nothing kept) for fewer than 2 rows.
+        """Commits the episode in flight and returns its number; an episode of fewer than 2 rows is dropped and gives None.
 
-        `start_ns` is the wall-clock time of its time 0 (nanoseconds since 1970); without it, where the layout has a
-        clock, when it began.
+        `start_ns` is the wall-clock time of its time 0 (nanoseconds since 1970); None takes the time at which it began, if
+        the layout has a clock.
         """
         if self._closed:
             return None
@@ -179,7 +182,7 @@ class Recorder:
             before = self.episodes
             self._recover("keep")
             return self.episodes - 1 if self.episodes > before else None
-        if self.in_flight < 2 or self._number != self.episodes:  # an interrupt may come just after it was committed
+        if self.in_flight < 2 or self._number != self.episodes:  # an interrupt may come just after the commit
             self._discard()
             return None
         with self._nothing_lost():
@@ -189,7 +192,7 @@ class Recorder:
         return number
 
     def take_episode(self) -> Parcel | None:
-        """The episode in flight, which is not committed here, for `put_episode` of another recorder; None for fewer than 2 rows."""
+        """Takes the episode in flight, for `put_episode` of another recorder; None for fewer than 2 rows."""
         if self.in_flight < 2:
             self._discard()
             return None
@@ -199,12 +202,12 @@ class Recorder:
         return parcel
 
     def put_episode(self, parcel: Parcel) -> int:
-        """Commits an episode that another recorder of this layout took; returns its number."""
+        """Commits an episode taken from another recorder of this layout; returns its number."""
         self._check_open()
         if self.in_flight or self._left:
             raise DatasetError(f"an episode of {self.root} is in flight; end it before another is put there.")
         with self._nothing_lost():
-            number = self._writer.put(parcel.unpacked(fresh(self._staging)))
+            number = self._writer.put(parcel.unpacked(fresh_folder(self._staging)))
         self._discard()
         self._writer.tidy()
         return number
@@ -216,12 +219,12 @@ class Recorder:
         return Staged(self._staging).draft(self.in_flight, began if start_ns is None else start_ns, pictures)
 
     def drop_episode(self) -> None:
-        """Throws the episode in flight away."""
+        """Drops the episode in flight."""
         if not self._closed:
             self._discard()
 
     def close(self) -> None:
-        """Commits the episode in flight and lets go of the folder."""
+        """Commits the episode in flight and unlocks the folder."""
         if self._closed:
             return
         try:
@@ -254,30 +257,30 @@ class Recorder:
             )
 
     def _checked(self, row: Mapping[str, np.ndarray | None], time_s: float) -> dict[str, np.ndarray]:
-        """The row's values as they are stored, each owned by us."""
-        found: dict[str, np.ndarray] = {}
+        """Copies of the values of a row, as they are stored."""
+        values: dict[str, np.ndarray] = {}
         for name, sensor in self.layout.sensors.items():
             value = row.get(name)
             if value is not None:
-                found[name] = _as_stored(sensor, value, f"row {self.in_flight} of the episode: {name}")
-            elif name in row or follows(name):
-                found[name] = self._before.get(name, _blank(sensor))
+                values[name] = _as_stored(sensor, value, f"row {self.in_flight} of the episode: {name}")
+            elif name in row or is_outcome(name):
+                values[name] = self._before.get(name, _blank(sensor))
             else:
                 short = name.removeprefix("observation.").removeprefix("images.")
                 raise DatasetError(f"this recording has a channel '{short}', which the observation lacks.")
         acted = [row.get(name) is not None for name in self.layout.sensors if is_action(name)]
         if acted:
-            found[ACTION_VALID] = np.array([any(acted)])
+            values[ACTION_VALID] = np.array([any(acted)])
         if self.layout.clock:
-            found[TIME] = np.array([time_s], np.float64)
+            values[TIME] = np.array([time_s], np.float64)
             if time_s < self._time_s:
                 raise DatasetError(
-                    f"row {self.in_flight} of the episode is at {time_s} s, the one before at {self._time_s} s."
+                    f"row {self.in_flight} of the episode is at {time_s} s, the row before at {self._time_s} s; times must ascend."
                 )
-        for name, value in found.items():
+        for name, value in values.items():
             if value.dtype.kind == "f" and not np.isfinite(value).all():
                 raise NotFinite(f"row {self.in_flight} of the episode has a {name} that is not a finite number.")
-        return found
+        return values
 
     def _show(self, values: Mapping[str, np.ndarray]) -> None:
         if self.live is not None:
@@ -292,43 +295,47 @@ class Recorder:
         if self._journal is None:
             if self._left:  # the disk was full; now it may not be
                 self._recover("keep")
-            fresh(self._staging)
+            fresh_folder(self._staging)
             self._number, self._start_ns, self._began_ns = self.episodes, time.time_ns(), time.monotonic_ns()
-            stated = about(self.layout, self._number, self.task, self._start_ns)
+            stated = staging_facts(self.layout, self._number, self.task, self._start_ns)
             self._journal = Journal(self._staging / LOG, stated)
             layout, folder = self.layout, self._staging
             for name, sensor in layout.sensors.items():
                 if sensor.kind == "image":
                     self._pictures[name] = []
                 if self._is_video(sensor):
-                    self._videos[name] = Mp4Writer(growing(folder, name), even(sensor), layout.fps, self.pressure)
+                    self._videos[name] = Mp4Writer(
+                        growing_film(folder, name), even_size(sensor), layout.fps, self.pressure
+                    )
             for name, sensor in layout.streams.items():
                 if sensor.kind == "image":
                     rate = sensor.rate_hz or layout.fps
-                    self._films[name] = Mp4Writer(growing(folder, f"stream-{name}"), even(sensor), rate, self.pressure)
+                    self._films[name] = Mp4Writer(
+                        growing_film(folder, f"stream-{name}"), even_size(sensor), rate, self.pressure
+                    )
             videos = [*self._videos.values(), *self._films.values()]
             self._running += [self._journal.close, *(video.abandon for video in videos)]
         return self._journal
 
-    # -- what is left over --------------------------------------------------------------------------------------
+    # -- interrupted episodes --------------------------------------------------------------------------------------
 
     def _recover(self, interrupted: Literal["keep", "discard"]) -> None:
-        """Makes an episode of what lies in the staging folder, up to the last row whose frames are whole."""
+        """Makes an episode of the staging folder, up to the last row whose frames are whole."""
         if not (self._staging / LOG).exists():
             return self._discard()
         try:
             with self._nothing_lost():
                 staged = Staged(self._staging)
-        except (ValueError, KeyError, TypeError):  # not even a beginning
+        except (ValueError, KeyError, TypeError):  # not even the first record is whole
             return self._discard()
-        if staged.number != self.episodes:  # it was killed after the episode was safe
+        if staged.number != self.episodes:  # the recorder was killed after the commit
             return self._discard()
         if interrupted == "discard" and staged.task == self.task:
             return self._discard()
         if not staged.fits(self.layout):
             raise DatasetError(
                 f"an interrupted episode of another layout lies in {self._staging}; "
-                f"`terrella data doctor {self.root} --repair` keeps it, deleting that folder does not."
+                f"`terrella data doctor {self.root} --repair` keeps it; deleting that folder drops it."
             )
         with self._nothing_lost():
             length = staged.whole()
@@ -340,7 +347,7 @@ class Recorder:
 
     @contextmanager
     def _nothing_lost(self) -> Iterator[None]:
-        """Turns a failure to write into a DatasetError that says what is safe; what is in flight stays where it is."""
+        """Turns a failed write into a DatasetError that says what is safe; the episode in flight stays in its folder."""
         try:
             yield
         except _BROKEN as error:
@@ -355,7 +362,7 @@ class Recorder:
             raise DatasetError(f"{why} at {self.root}; {safe}: free some space and record again to go on.") from error
 
     def _stop(self, quietly: bool = False) -> None:
-        """Ends the files in flight."""
+        """Closes the files of the episode in flight."""
         videos, self._videos, self._films = [*self._videos.values(), *self._films.values()], {}, {}
         self._running.clear()
         if self._journal:
@@ -372,17 +379,17 @@ class Recorder:
         self._before: dict[str, np.ndarray] = {}
 
     def _discard(self) -> None:
-        """Forgets the episode in flight."""
+        """Drops the episode in flight and its files."""
         self._stop(quietly=True)
         self._forget()
         shutil.rmtree(self._staging, ignore_errors=True)
 
 
-def _abandon(running: list[Callable[[], object]], let_go: Callable[[], None]) -> None:
-    """What is left to do for a recorder that nobody closed: the next one keeps the rows that it has staged."""
+def _abandon(running: list[Callable[[], object]], unlock: Callable[[], None]) -> None:
+    """Closes the files of a recorder that was not closed; the next recorder keeps its rows."""
     for end in running:
         end()
-    let_go()
+    unlock()
 
 
 class NotFinite(DatasetError):
@@ -397,7 +404,7 @@ def _blank(sensor: Sensor) -> np.ndarray:
 
 
 def _as_stored(sensor: Sensor, value, what: str) -> np.ndarray:
-    """A copy of the value as rows and streams hold it: depth in millimetres."""
+    """A copy of the value as it is stored; depth in steps of its unit."""
     array = np.asarray(value)
     if sensor.dtype == "string":
         return np.array([str(array.reshape(-1)[0])], object)

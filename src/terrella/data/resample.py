@@ -1,4 +1,4 @@
-"""resample: what a sensor with a clock of its own showed at other times, by a stated policy; row_times: those times."""
+"""resample: the readings of a sensor at other times, by a stated policy; row_times: the times of rows."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from .source import Lazy, Readings, Sensor, Take
 
 Policy = Literal["previous", "nearest", "linear"]
 
-SAME_TIME_S = 1e-4  # times this near are one time: many formats keep them in float32 (LeRobot allows as much)
+SAME_TIME_S = (
+    1e-4  # times closer than this are equal: many formats store them as float32 (LeRobot has the same tolerance)
+)
 _MOST_ROWS = 20_000_000
 _QUATERNION = re.compile(r"(|.*[^a-z])q(?:uat|uaternion)?[_.]?([wxyz])", re.IGNORECASE)
 
 
 def row_times(take: Take, sensors: Iterable[str], fps: float) -> np.ndarray:
-    """float64 [T]: the times of a take's rows, `fps` a second, from when every sensor has begun until the last has ended.
+    """float64 [T]: the times of the rows of a take, `fps` a second, from the time when every sensor has a reading.
 
-    Of the names in `sensors` those count that begin with "observation." and have a reading in this take; only where there
-    are none of these, the others (so actions neither start nor prolong a take that observes anything). Row i is at
-    first + i / fps, where `first` is the latest of their first readings; the last row is not later than the latest of
-    their last readings (+ SAME_TIME_S). Float64 [0] where nothing was read. DatasetError where fps is not positive, a
-    clock is broken, or there would be more than twenty million rows.
+    Only sensors named "observation.…" with a reading count; without any, all sensors do. So actions neither start nor
+    prolong a take. Row i is at first + i / fps, where `first` is the latest first reading; the last row is not later than
+    the latest last reading (+ SAME_TIME_S). Empty where nothing was read. DatasetError where fps is not positive, a clock
+    is invalid, or there would be more than twenty million rows.
     """
     if not (np.isfinite(fps) and fps > 0):
         raise DatasetError(f"rows need a positive number per second, not {fps}: give another fps.")
@@ -43,8 +44,8 @@ def row_times(take: Take, sensors: Iterable[str], fps: float) -> np.ndarray:
     return first + np.arange(int(count)) / fps
 
 
-def pick(time_s: np.ndarray, at_s: np.ndarray, policy: Policy, max_gap_s: float | None = None) -> np.ndarray:
-    """int64 [T]: which reading "previous" or "nearest" takes at each time, -1 for none; as `resample` says."""
+def picked_rows(time_s: np.ndarray, at_s: np.ndarray, policy: Policy, max_gap_s: float | None = None) -> np.ndarray:
+    """int64 [T]: the reading that the policy "previous" or "nearest" takes at each time, -1 for none; see `resample`."""
     at_s = np.asarray(at_s, np.float64)
     if not len(time_s):
         return np.full(len(at_s), -1)
@@ -66,26 +67,24 @@ def resample(
     policy: Policy = "previous",
     max_gap_s: float | None = None,
 ) -> tuple[np.ndarray | Lazy, np.ndarray]:
-    """What the sensor showed at the times `at_s` (float64 [T], any order): (values, valid).
+    """(values, valid): the readings of a sensor at the times `at_s` (float64 [T], any order).
 
-    values: a vector's [T, *shape] of the sensor's dtype; images, depth and points a Lazy of T, each fetched at its look (the
-            one looked at last is kept). Where not valid: zeros (False); depth inf; points none.
+    values: of a vector, [T, *shape] of the dtype of the sensor; of images, depth and points, a Lazy of T that decodes
+            each when it is read. Where not valid: zeros (False); depth inf; no points.
     valid:  bool [T].
 
-    "previous"  The newest reading not later than the row: causal. Not valid before the first reading, nor where the
-                reading is older than `max_gap_s`. A reading up to SAME_TIME_S later counts as not later.
-    "nearest"   The reading nearest in time, before or after; of two equally near the earlier, of several at one time the
-                newest. Not valid where it is further away than `max_gap_s`.
-    "linear"    Vectors of floats only. Between two readings the straight line; the shorter arc (slerp) for four
-                numbers named qw, qx, qy, qz, with any common prefix; the nearer of the two for a number in rad or deg
-                that differs by more than half a turn (it wrapped). Within SAME_TIME_S of a reading that reading itself,
-                unchanged. After the last reading that one, as "previous". Not valid before the first, between two
-                readings more than `max_gap_s` apart, nor more than `max_gap_s` after the last. What is not a number
-                stays so in what is made of it. Vectors of integers, bools or text: as "previous".
+    "previous"  The newest reading up to SAME_TIME_S after the row: causal. Not valid before the first reading, nor where
+                the reading is older than `max_gap_s`.
+    "nearest"   The reading nearest in time; of two equally near the earlier, of several at one time the newest. Not
+                valid where it is further away than `max_gap_s`.
+    "linear"    Linear interpolation of vectors of floats; others are as "previous". Four numbers named qw, qx, qy, qz
+                (with a common prefix) use slerp. A number in rad or deg that differs by more than half a turn has
+                wrapped: the nearer reading is taken. Within SAME_TIME_S of a reading it is taken unchanged; after the
+                last, the last is. Not valid before the first, between readings more than `max_gap_s` apart, nor more
+                than `max_gap_s` after the last. NaN stays NaN.
 
-    `max_gap_s` None is no limit; gaps are compared with SAME_TIME_S to spare. DatasetError where times are not finite
-    and ascending, readings and times differ in number, a vector has another shape than its sensor says, or the
-    policy does not suit the kind.
+    `max_gap_s` None sets no limit; gaps may exceed it by SAME_TIME_S. DatasetError where times are not finite and
+    ascending, readings and times differ in number, a vector has the wrong shape, or the policy does not suit the kind.
     """
     if policy not in get_args(Policy):
         raise DatasetError(f"there is no resampling policy '{policy}'; choose {', '.join(get_args(Policy))}.")
@@ -96,19 +95,19 @@ def resample(
     if sensor.kind != "vector":
         if policy == "linear":
             raise DatasetError(f"{sensor.name} is of kind {sensor.kind}: take 'previous' or 'nearest', not 'linear'.")
-        index = pick(time_s, at_s, policy, max_gap_s)
+        index = picked_rows(time_s, at_s, policy, max_gap_s)
         return _looked_up(readings, sensor, index), index >= 0
     values = stacked(readings, sensor)
     if policy == "linear" and values.dtype.kind == "f":
         return _interpolated(time_s, values, sensor, at_s, max_gap_s)
-    index = pick(time_s, at_s, "previous" if policy == "linear" else policy, max_gap_s)
-    found = np.full((len(at_s), *sensor.shape), blank(sensor))
-    found[index >= 0] = values[index[index >= 0]]
-    return found, index >= 0
+    index = picked_rows(time_s, at_s, "previous" if policy == "linear" else policy, max_gap_s)
+    result = np.full((len(at_s), *sensor.shape), blank_value(sensor))
+    result[index >= 0] = values[index[index >= 0]]
+    return result, index >= 0
 
 
 def quaternions(names: tuple[str, ...]) -> list[list[int]]:
-    """Where the names of a vector hold quaternions: the places of each one's w, x, y, z."""
+    """The quaternions among the names of a vector: the indices of w, x, y, z of each."""
     groups: dict[str, dict[str, int]] = {}
     for place, name in enumerate(names):
         match = _QUATERNION.fullmatch(name)
@@ -117,8 +116,8 @@ def quaternions(names: tuple[str, ...]) -> list[list[int]]:
     return [[group[axis] for axis in "wxyz"] for group in groups.values() if len(group) == 4]
 
 
-def blank(sensor: Sensor) -> np.ndarray:
-    """A reading that shows nothing: zeros ("" of text), depth inf everywhere, no points."""
+def blank_value(sensor: Sensor) -> np.ndarray:
+    """An empty reading: zeros ("" for text), depth inf, no points."""
     nothing = np.inf if sensor.kind == "depth" else "" if sensor.dtype == "string" else 0
     return np.full(sensor.shape, nothing, _dtype(sensor))
 
@@ -132,7 +131,7 @@ def _limit(max_gap_s: float | None) -> float:
 
 
 def clock_of(readings: Readings, name: str) -> np.ndarray:
-    """float64 [n]: the times of the readings; DatasetError where they are not finite, ascending and one for each."""
+    """float64 [n]: the times of the readings; DatasetError where they are not finite, ascending and n in number."""
     time_s = np.asarray(readings.time_s, np.float64)
     if time_s.ndim != 1 or not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
         raise DatasetError(f"the times of {name} are not all finite and ascending; mend or leave out that sensor.")
@@ -142,9 +141,7 @@ def clock_of(readings: Readings, name: str) -> np.ndarray:
 
 
 def stacked(readings: Readings, sensor: Sensor) -> np.ndarray:
-    """[n, *shape]: all readings of a vector, of its dtype (objects where that is "string"); DatasetError where one has
-    another shape than the sensor says.
-    """
+    """[n, *shape]: all readings of a vector, of its dtype (objects for "string"); DatasetError for a wrong shape."""
     try:
         values = np.asarray(readings.values if len(readings.values) else np.zeros((0, *sensor.shape)), _dtype(sensor))
         return values.reshape(len(readings.time_s), *sensor.shape)
@@ -153,12 +150,12 @@ def stacked(readings: Readings, sensor: Sensor) -> np.ndarray:
 
 
 def _looked_up(readings: Readings, sensor: Sensor, index: np.ndarray) -> Lazy:
-    kept: tuple[int, np.ndarray] = (-1, blank(sensor))  # rows often show one reading again and again
+    kept: tuple[int, np.ndarray] = (-1, blank_value(sensor))  # consecutive rows often take the same reading
 
     def look(row: int) -> np.ndarray:
         nonlocal kept
         if index[row] < 0:
-            return blank(sensor)
+            return blank_value(sensor)
         if index[row] != kept[0]:
             kept = int(index[row]), np.asarray(readings.values[int(index[row])])
         return kept[1]
@@ -167,25 +164,25 @@ def _looked_up(readings: Readings, sensor: Sensor, index: np.ndarray) -> Lazy:
 
 
 def _interpolated(time_s, values, sensor: Sensor, at_s, max_gap_s) -> tuple[np.ndarray, np.ndarray]:
-    found = np.zeros((len(at_s), *sensor.shape), values.dtype)
+    result = np.zeros((len(at_s), *sensor.shape), values.dtype)
     if not len(time_s):
-        return found, np.zeros(len(at_s), bool)
-    near = pick(time_s, at_s, "nearest")
+        return result, np.zeros(len(at_s), bool)
+    near = picked_rows(time_s, at_s, "nearest")
     same = np.abs(time_s[near] - at_s) <= SAME_TIME_S
     after = np.searchsorted(time_s, at_s, side="right")
     last = ~same & (after == len(time_s)) & (at_s - time_s[-1] <= _limit(max_gap_s))
     between = np.flatnonzero(~same & (after > 0) & (after < len(time_s)))
     between = between[time_s[after[between]] - time_s[after[between] - 1] <= _limit(max_gap_s)]
-    found[same], found[last] = values[near[same]], values[-1]
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # what is not a number stays so
-        found[between] = _mixed(time_s, values, sensor, at_s[between], after[between])
+    result[same], result[last] = values[near[same]], values[-1]
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # NaN stays NaN
+        result[between] = _mixed(time_s, values, sensor, at_s[between], after[between])
     valid = same | last
     valid[between] = True
-    return found, valid
+    return result, valid
 
 
 def _mixed(time_s, values, sensor: Sensor, at_s, b) -> np.ndarray:
-    """Between the readings b - 1 and b, at times that lie between theirs."""
+    """Interpolates between the readings b - 1 and b."""
     a = b - 1
     share = ((at_s - time_s[a]) / (time_s[b] - time_s[a]))[:, None]
     flat = values.reshape(len(values), int(np.prod(sensor.shape))).astype(np.float64)
@@ -203,7 +200,7 @@ def _mixed(time_s, values, sensor: Sensor, at_s, b) -> np.ndarray:
 def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Unit quaternions [n, 4] on the shorter arc from a (share 0) to b (share 1), in a's sign; share [n, 1].
 
-    What has no length is no rotation: where a or b is zero, the nearer of them is given unchanged. (Shoemake 1985)
+    Where a or b is zero, and so no rotation, the nearer of the two is returned unchanged. (Shoemake 1985)
     """
     long_a, long_b = np.linalg.norm(a, axis=1, keepdims=True), np.linalg.norm(b, axis=1, keepdims=True)
     whole = (long_a > 0) & (long_b > 0)

@@ -1,8 +1,8 @@
-"""What every format is read into and written from: takes of sensors, each reading with its own true time.
+"""Source: the common form of all recording formats: episodes of sensor readings, each reading with its own time.
 
-A `Source` is a recording in any format: which sensors it has, and its takes one after another. A `Take` is one episode:
-for each sensor its `Readings`, n values seen at n times. Importers make Sources, exporters write them; merging,
-resampling and conversion lie between. Values are decoded when they are looked at, so a Source may be larger than memory.
+A `Source` is a recording in any format: its sensors and its takes. A `Take` is one episode: for each sensor its
+`Readings`, n values at n times. Importers make Sources, exporters write them; merging, resampling and conversion lie in
+between. Values are decoded when they are read, so a Source may be larger than memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Kind = Literal["image", "depth", "points", "vector"]
 
 @dataclass(frozen=True)
 class Sensor:
-    """One stream of readings, named as LeRobot names features.
+    """One sensor, named like a LeRobot feature.
 
     name:  "action", "next.reward", "next.done", or "observation.…": "observation.images.front", "observation.depth",
            "observation.depth.front", "observation.points.lidar", "observation.state", "observation.imu", ….
@@ -32,7 +32,7 @@ class Sensor:
     units: name of a number -> its unit ("m", "rad", "m/s2"); what is not listed is unknown.
     frame: coordinate frame of the readings, "" where unknown.
     rate_hz: nominal rate of the sensor's clock; None where it has none or it is unknown.
-    facts: whatever else is worth keeping, JSON values (an image's camera calibration under "calibration", say).
+    facts: further JSON values (an image's camera calibration under "calibration", for example).
     """
 
     name: str
@@ -48,66 +48,63 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Readings:
-    """values[i] was seen at time_s[i] (float64 [n], ascending, seconds since the take began).
-
-    `values` is a numpy array [n, ...] or anything with len and [i]; images and depth may be decoded at each look.
-    """
+    """The readings of a sensor: values[i] at time_s[i]."""
 
     time_s: np.ndarray
+    """float64 [n], ascending, seconds since the take began."""
     values: Sequence[np.ndarray] | np.ndarray
+    """[n, ...], or a sequence of n arrays, which may be decoded each time they are read."""
 
 
 @dataclass(frozen=True)
 class Take:
-    """One episode. Every sensor of the source is in `readings` unless this take lacks it.
+    """One episode.
 
-    Action i is what was done at time_s[i], after what was observed there; reward and done i are what followed. So an
-    episode of T observations has T - 1 actions where its format keeps a terminal observation, else T.
-
-    task:     the instruction in plain language, "" where there is none; where it changes, facts["language"] has
-              [[time_s, text], ...], each said until the next.
-    start_ns: wall-clock time of time_s = 0 in nanoseconds since 1970 (UTC), None where unknown.
+    Action i was taken at time_s[i], after the observation at that time; reward and done i followed it. So an episode of T
+    observations has T - 1 actions where its format has a terminal observation, else T.
     """
 
     readings: Mapping[str, Readings]
+    """Sensor -> its readings; sensors without a reading may be absent."""
     task: str = ""
+    """The instruction, "" for none. Where it changes, facts["language"] is [[time_s, text], ...]."""
     start_ns: int | None = None
+    """Wall-clock time of time_s = 0, nanoseconds since 1970 (UTC); None where unknown."""
     facts: Mapping[str, object] = field(default_factory=dict)
+    """Further JSON values."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A recording in any format.
-
-    takes:    gives the takes from the first on, anew at each call; a sequence of them where any can be had at once.
-    sensors:  name -> Sensor.
-    fps:      rate of its rows, where the format has rows; None where every sensor has a clock of its own.
-    robot:    type of the body ("terrella", "aloha", …), "" where unknown.
-    notes:    sentences: what of the original could not be carried over.
-    facts:    JSON values kept with the recording.
-    """
+    """A recording in any format."""
 
     name: str
     sensors: Mapping[str, Sensor]
+    """Name -> Sensor."""
     takes: Callable[[], Iterable[Take]]
+    """Gives the takes from the first on, at each call; a sequence where the format allows random access."""
     fps: float | None = None
+    """Rows a second, for formats with rows; None where every sensor has a clock of its own."""
     robot: str = ""
+    """Type of the robot ("terrella", "aloha", …), "" where unknown."""
     notes: tuple[str, ...] = ()
+    """Sentences about parts of the original that could not be converted."""
     facts: Mapping[str, object] = field(default_factory=dict)
+    """JSON values stored with the recording."""
 
 
 def is_action(name: str) -> bool:
-    """Whether a sensor is what was done: "action", or a part of it ("action.gripper")."""
+    """Whether a sensor is the action, or a part of it ("action.gripper")."""
     return name == "action" or name.startswith("action.")
 
 
-def follows(name: str) -> bool:
-    """Whether a sensor tells what was done after an observation or came of it, so that the last row may lack it."""
+def is_outcome(name: str) -> bool:
+    """Whether a sensor is an action or its outcome ("next.…"), which the last row may lack."""
     return is_action(name) or name.startswith("next.")
 
 
 class Lazy(Sequence):
-    """`count` values (readings, takes) of which each is made by `make(i)` when it is looked at."""
+    """A sequence of `count` values, each made by `make(i)` when it is read."""
 
     def __init__(self, count: int, make: Callable[[int], Any]):
         self._count, self._make = count, make

@@ -1,4 +1,4 @@
-"""An episode in flight, as it lies in a recorder's staging folder: written row by row, read back whole or cut short."""
+"""An episode in the staging folder of a recorder: written row by row, and read back as far as it is whole."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .storage.films import whole_frames
 from .writer import Draft, group_columns
 
 LOG = "rows.log"
-SAMPLE_EVERY = 16  # rows; pictures looked at for the statistics
-ROW, WORDS = 0, 0xFFFF  # what a record of the journal is; in between are the streams, numbered from 1
+SAMPLE_EVERY = 16  # rows from one picture to the next that enters the statistics
+ROW, WORDS = 0, 0xFFFF  # kinds of journal records; streams are numbered from 1
 
 
-def about(layout: Layout, number: int, task: str, start_ns: int) -> dict:
-    """What the journal of episode `number` says of itself: all that is needed to read it."""
+def staging_facts(layout: Layout, number: int, task: str, start_ns: int) -> dict:
+    """The first record of the journal of episode `number`: all facts that are needed to read it."""
     return {
         "episode": number,
         "task": task,
@@ -38,24 +38,24 @@ def about(layout: Layout, number: int, task: str, start_ns: int) -> dict:
 
 
 def pack_row(values: Mapping[str, np.ndarray], given: Sequence[bool], sensors: Sequence[Sensor]) -> list:
-    """A row as raw bytes: which of the layout's rows were given, then the values of `sensors` (no videos) in order."""
+    """A row as raw bytes: a bit for each sensor that was given, then the values of `sensors` (no videos) in order."""
     return [np.packbits(given), *(_packed(values[sensor.name]) for sensor in sensors)]
 
 
-def growing(folder: Path, camera: str) -> Path:
-    """The film of a camera; of one with a clock of its own, "stream-" stands before its name."""
+def growing_film(folder: Path, camera: str) -> Path:
+    """The growing film of a camera; `camera` is "stream-NAME" for a stream."""
     return folder / f"{camera}.growing.mp4"
 
 
 class Staged:
-    """The episode in a staging folder. ValueError, KeyError, TypeError or OSError where not even its beginning is whole.
+    """The episode in a staging folder. ValueError, KeyError, TypeError or OSError where its first record is not whole.
 
-    number, task, start_ns: as when it began. rows, streams: its Sensors. length: rows in the journal.
+    number, task, start_ns: from its first record. rows, streams: its Sensors. length: rows in the journal.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
-        stated = journal.about(folder / LOG)
+        stated = journal.read_about(folder / LOG)
         self.number, self.task, self.start_ns = int(stated["episode"]), str(stated["task"]), int(stated["start_ns"])
         self.fps, self.pictures = float(stated["fps"]), str(stated["pictures"])
         self.rows = {name: sensor_from_json(name, sensor) for name, sensor in stated["rows"].items()}
@@ -66,28 +66,28 @@ class Staged:
         self.length = sum(1 for _ in self._journal(ROW))
 
     def fits(self, layout: Layout) -> bool:
-        """Whether its rows and streams are those of a layout, in whatever order."""
+        """Whether its rows and streams are those of a layout, in any order."""
         both = [(self.rows, layout.rows), (self.streams, layout.streams)]
         return all(a.keys() == b.keys() and all(map(_alike, a.values(), map(b.get, a))) for a, b in both)
 
     def whole(self) -> int:
-        """Rows that every camera shows: none of their frames is cut or damaged (each is decoded once)."""
+        """Rows up to the first whose frame is cut or damaged in any camera; decodes every frame."""
         length = self.length
         for name in self.cameras:
-            length = min(length, _good(growing(self.folder, name), self.folder / "tried.mp4", length, self.fps))
+            length = min(length, _good(growing_film(self.folder, name), self.folder / "tried.mp4", length, self.fps))
         return length
 
     def draft(self, length: int, start_ns: int | None, pictures: Mapping[str, stats.Summary] | None = None) -> Draft:
-        """The first `length` rows as an episode; `pictures`: statistics of its cameras, made anew without them."""
-        videos = {name: self._finished(growing(self.folder, name), name, length) for name in self.cameras}
+        """The first `length` rows as an episode. `pictures` are statistics of its cameras; None computes them."""
+        videos = {name: self._finished(growing_film(self.folder, name), name, length) for name in self.cameras}
         films, streams = {}, {}
         for name, sensor in self.streams.items():
             if sensor.kind == "image":
-                film, rate = growing(self.folder, f"stream-{name}"), sensor.rate_hz or self.fps
+                film, rate = growing_film(self.folder, f"stream-{name}"), sensor.rate_hz or self.fps
                 times = [time_s for time_s, _ in self._readings(name)]
                 count = _good(film, self.folder / "tried.mp4", len(times), rate) if pictures is None else len(times)
                 if not count:
-                    continue  # this camera has seen nothing
+                    continue  # this camera has no frame
                 films[name] = self._finished(film, f"stream-{name}", count)
                 streams[name] = [(time_s, None) for time_s in times[:count]]
             else:
@@ -98,10 +98,10 @@ class Staged:
         return Draft(length, rows, videos, seen, self.task, streams, films, start_ns, tasks, counts)
 
     def _counted(self, length: int) -> tuple[dict[str, int], list[str]]:
-        """Rows up to the last that has a sensor, where that is not the last of all; each row's task, [] where all have `task`."""
+        """(sensor -> rows up to the last that has it, if that is not the last row; task of each row, [] if all have `task`)."""
         newest = np.zeros(len(self.rows), int)
         tasks, task = [], self.task
-        for number, _, raw in journal.readings(self.folder / LOG):
+        for number, _, raw in journal.read_records(self.folder / LOG):
             if number == WORDS:
                 task = raw.decode()
             elif number == ROW and len(tasks) < length:
@@ -126,27 +126,27 @@ class Staged:
             yield time_s, None if sensor.kind == "image" else np.frombuffer(raw, dtype)
 
     def _journal(self, wanted: int) -> Iterator[tuple[float, bytes]]:
-        return ((time_s, raw) for number, time_s, raw in journal.readings(self.folder / LOG) if number == wanted)
+        return ((time_s, raw) for number, time_s, raw in journal.read_records(self.folder / LOG) if number == wanted)
 
     def _finished(self, film: Path, name: str, length: int) -> Path:
         target = self.folder / f"{name}.mp4"
-        mp4.trim(film)
-        kept = mp4.finish(film, target, length)
+        mp4.trim_fragments(film)
+        kept = mp4.finish_video(film, target, length)
         if kept != length:
-            raise DatasetError(f"the film {film} has {kept} of the {length} frames that are needed.")
+            raise DatasetError(f"the film {film} has only {kept} of {length} frames.")
         return target
 
     def _sampled(self, videos: Mapping[str, Path], length: int) -> dict[str, stats.Summary]:
         """Statistics of the cameras, from every SAMPLE_EVERY-th row."""
-        found = {name: sampled(mp4.Frames(video, 0, length, self.fps)) for name, video in videos.items()}
+        summaries = {name: sampled_statistics(mp4.Frames(video, 0, length, self.fps)) for name, video in videos.items()}
         images = [name for name, sensor in self.rows.items() if sensor.kind == "image" and name not in videos]
         rows = islice(self._rows(encode=False), 0, length, SAMPLE_EVERY) if images else ()
-        return found | stats.merge({name: look(row[name]) for name in images} for row in rows)
+        return summaries | stats.merge({name: picture_statistics(row[name]) for name in images} for row in rows)
 
 
 @dataclass(frozen=True)
 class Parcel:
-    """A whole episode in memory, on its way from one recorder to another. draft: its films are names alone; films: their bytes."""
+    """A whole episode in memory, sent from one recorder to another. Films in `draft` are file names; `films` has their bytes."""
 
     draft: Draft
     films: Mapping[str, bytes]
@@ -169,14 +169,14 @@ def _moved(draft: Draft, folder: Path) -> Draft:
     return replace(draft, videos=videos, films=films)
 
 
-def look(picture: np.ndarray) -> stats.Summary:
-    """Statistics of a picture [H, W, …], from a part of its pixels."""
+def picture_statistics(picture: np.ndarray) -> stats.Summary:
+    """Statistics of a picture [H, W, …], from every fourth row and column of pixels."""
     return stats.summarise_pictures(picture[None, ::4, ::4])
 
 
-def sampled(pictures: Sequence[np.ndarray]) -> stats.Summary:
+def sampled_statistics(pictures: Sequence[np.ndarray]) -> stats.Summary:
     """Statistics of an episode's pictures, from every SAMPLE_EVERY-th."""
-    parts = [{"": look(pictures[row])} for row in range(0, len(pictures), SAMPLE_EVERY)]
+    parts = [{"": picture_statistics(pictures[row])} for row in range(0, len(pictures), SAMPLE_EVERY)]
     return stats.merge(parts)[""]
 
 
@@ -186,12 +186,12 @@ def _alike(mine: Sensor, other: Sensor) -> bool:
 
 
 def _good(film: Path, target: Path, most: int, fps: float) -> int:
-    """How many of the first frames of a growing film are whole and can be decoded."""
+    """Number of frames of a growing film, at most `most`, before the first that cannot be decoded."""
     if not most:
         return 0
     try:
-        mp4.trim(film)
-        count = mp4.finish(film, target, most)
+        mp4.trim_fragments(film)
+        count = mp4.finish_video(film, target, most)
         good = whole_frames(target, 0, count, fps)
         return int(count if good.all() else good.argmin())
     except (DatasetError, FileNotFoundError):
@@ -201,7 +201,7 @@ def _good(film: Path, target: Path, most: int, fps: float) -> int:
 
 
 def _packed(value: np.ndarray) -> bytes | np.ndarray:
-    """Of fixed size as it is; text with its length in front."""
+    """The value as stored in the journal; a text has its length in front."""
     if value.dtype != object:
         return value
     text = str(value[0]).encode()
@@ -209,19 +209,19 @@ def _packed(value: np.ndarray) -> bytes | np.ndarray:
 
 
 def _unpacked(raw: bytes, sensors: Sequence[Sensor], encode: bool) -> dict:
-    """The inverse of `_packed` for the values of a row; pictures become PNG where `encode`."""
-    found, at = {}, 0
+    """The inverse of `_packed` for all values of a row; `encode` turns pictures into PNG."""
+    values, at = {}, 0
     for sensor in sensors:
         if sensor.dtype == "string":
             size = int.from_bytes(raw[at : at + 4], "little")
-            found[sensor.name] = raw[at + 4 : at + 4 + size].decode()
+            values[sensor.name] = raw[at + 4 : at + 4 + size].decode()
             at += 4 + size
             continue
         dtype = np.dtype(np.uint16 if sensor.kind == "depth" else sensor.dtype)
         array = np.frombuffer(raw, dtype, int(np.prod(sensor.shape)), at).reshape(sensor.shape)
         at += array.nbytes
-        found[sensor.name] = png(array) if sensor.kind == "image" and encode else array
-    return found
+        values[sensor.name] = png(array) if sensor.kind == "image" and encode else array
+    return values
 
 
 def png(picture: np.ndarray) -> bytes:

@@ -1,4 +1,4 @@
-"""Minimum, maximum, mean, deviation and count of each feature, per episode and merged (LeRobot's meta/stats.json)."""
+"""Minimum, maximum, mean, standard deviation and count of features, per episode and merged (meta/stats.json)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Summary = dict[str, np.ndarray]  # min, max, mean, std: float64 [n] (or [3, 1, 1
 
 
 def summarise(values: np.ndarray, sampled: bool = False) -> Summary:
-    """Of rows [T] or [T, ...], of each number; `sampled`: of maps [T, h, w], over a sample of everything, as shape [1, 1]."""
+    """The summary of each number of rows [T, ...]; `sampled`: one summary, shape [1, 1], of a sample of maps [T, h, w]."""
     if sampled:
         some = values[::4, ::4, ::4].astype(np.float64).reshape(-1, 1)
         return _summary(some, len(values), (1,) * (values.ndim - 1))
@@ -19,24 +19,24 @@ def summarise(values: np.ndarray, sampled: bool = False) -> Summary:
 
 
 def summarise_pictures(pictures: np.ndarray) -> Summary:
-    """Of uint8 [n, H, W, 3] pictures, per colour in 0..1 as shape [3, 1, 1]; of depth [n, H, W] as it is, shape [1, 1, 1]."""
+    """The summary of pictures uint8 [n, H, W, 3] by colour, in 0..1, shape [3, 1, 1]; of depth [n, H, W], shape [1, 1, 1]."""
     if pictures.ndim == 3:
         return _summary(pictures.reshape(-1, 1).astype(np.float64), len(pictures), (1, 1, 1))
     return _summary(pictures.reshape(-1, 3) / 255.0, len(pictures), (3, 1, 1))
 
 
 def _summary(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
-    with np.errstate(over="ignore", invalid="ignore"):  # of numbers near the largest the deviation is none
+    with np.errstate(over="ignore", invalid="ignore"):  # the deviation of numbers near the largest overflows
         return _of(rows, count, shape)
 
 
 def _of(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
-    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    return {**{name: value.reshape(shape) for name, value in found.items()}, "count": np.array([count])}
+    figures = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    return {**{name: value.reshape(shape) for name, value in figures.items()}, "count": np.array([count])}
 
 
 def merge(parts: Iterable[Mapping[str, Summary]]) -> dict[str, Summary]:
-    """One summary per feature of all the parts' rows together."""
+    """One summary for each feature, over the rows of all parts."""
     total: dict[str, Summary] = {}
     for part in parts:
         for name, new in part.items():
@@ -64,7 +64,7 @@ def to_json(stats: Mapping[str, Summary]) -> dict:
     }
 
 
-def from_json(found: Mapping) -> dict[str, Summary]:
+def from_json(stated: Mapping) -> dict[str, Summary]:
     """The inverse of `to_json`; KeyError, TypeError or ValueError where it is not one."""
     keys = ("min", "max", "mean", "std", "count")
-    return {name: {key: np.asarray(summary[key], float) for key in keys} for name, summary in found.items()}
+    return {name: {key: np.asarray(summary[key], float) for key in keys} for name, summary in stated.items()}

@@ -34,73 +34,74 @@ from .format import (
     VIDEO_PATH,
     WORLD,
     Layout,
-    even,
+    even_size,
+    file_numbers,
     schema,
     sensor_json,
     stream_path,
     to_arrow,
-    where,
 )
 from .source import Sensor
 
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
-_CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error, not another number
-EPISODES_PER_TABLE = 128  # so many one-row tables of meta/episodes are made one: a long dataset opens quickly
+_CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error
+EPISODES_PER_TABLE = (
+    128  # one-row tables of meta/episodes that are merged into one, so that a long dataset opens quickly
+)
 
 
 @dataclass(frozen=True)
 class Draft:
-    """One whole episode that waits to be put in place.
-
-    length:   its rows.
-    rows:     columns of at most ROWS_PER_GROUP rows each, all but LeRobot's automatic ones and the videos; last of all
-              the last row's action counts for nothing (no outcome was recorded).
-    videos:   camera -> finished mp4 of `length` frames, in the writer's staging folder.
-    pictures: camera -> its statistics.
-    streams:  stream -> its readings in order, (time_s, value); the value of a camera's is None.
-    films:    camera stream -> finished mp4 of as many frames.
-    start_ns: wall-clock time of its time 0, None where unknown.
-    tasks:    of each row, where they differ; () where all rows are about `task`.
-    counts:   sensor -> rows up to the last that has it, where that is not the episode's last.
-    """
+    """One whole episode, ready to be committed."""
 
     length: int
+    """Number of rows."""
     rows: Iterable[Mapping[str, np.ndarray]]
+    """Columns, at most ROWS_PER_GROUP rows at a time, without videos and LeRobot's automatic columns. The action of the
+    last row is stored as not valid, because its outcome was not recorded."""
     videos: Mapping[str, Path]
+    """Camera -> finished mp4 of `length` frames, in the staging folder of the writer."""
     pictures: Mapping[str, stats.Summary]
+    """Camera -> statistics of its pictures."""
     task: str
+    """The instruction."""
     streams: Mapping[str, Iterable[tuple[float, np.ndarray | None]]] = field(default_factory=dict)
+    """Stream -> its readings (time_s, value) in order; the value is None for cameras."""
     films: Mapping[str, Path] = field(default_factory=dict)
+    """Camera stream -> finished mp4, one frame a reading."""
     start_ns: int | None = None
+    """Wall-clock time of its time 0, nanoseconds since 1970; None where unknown."""
     tasks: Sequence[str] = ()
+    """The instruction of each row, where they differ; else ()."""
     counts: Mapping[str, int] = field(default_factory=dict)
+    """Sensor -> rows up to the last that has it, where that is not the last row."""
 
 
 class Writer:
-    """The folder `root`, created or, where it was written with the same layout, gone on with; locked until `close`.
+    """Writes episodes to the folder `root`, which is new or was written with the same layout; locked until `close`.
 
-    rows, episodes: what is safe there. DatasetError where root is foreign, damaged, or locked by another writer.
+    rows, episodes: committed so far. DatasetError where `root` is foreign, damaged, or locked by another writer.
     """
 
     def __init__(self, root: str | Path, layout: Layout):
         self.root, self.layout = Path(root), layout
         if not 0.001 <= layout.fps <= 100_000:
-            raise DatasetError(f"{layout.fps} rows a second are none that a video can have; give 0.001 to 100,000.")
+            raise DatasetError(f"{layout.fps} rows a second are no possible video rate; give 0.001 to 100,000.")
         self.features = layout.features()
         self.schema = schema(self.features)
         self.staging = self.root / ".staging"
         for sensor in [*layout.sensors.values(), *layout.streams.values()]:
             if not NAME.fullmatch(sensor.name):
                 raise DatasetError(
-                    f"'{sensor.name[:100]}' is no name of a feature; use letters, digits, '.', '_' and '-'."
+                    f"'{sensor.name[:100]}' is not a valid feature name; use letters, digits, '.', '_' and '-'."
                 )
         for sensor in layout.streams.values():
             if sensor.kind == "image":
-                even(sensor)
+                even_size(sensor)
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            self._lock = lock(self.root)
+            self._lock = lock_folder(self.root)
         except OSError as error:
             raise DatasetError(f"cannot record to {self.root}: {error.strerror}; choose another folder.") from error
         try:
@@ -110,23 +111,23 @@ class Writer:
             raise
 
     def close(self) -> None:
-        """Lets go of the folder."""
+        """Unlocks the folder."""
         self._lock.close()
 
     def put(self, draft: Draft) -> int:
-        """Commits an episode: its files move into place, meta/info.json is replaced last; returns its number."""
+        """Commits an episode and returns its number. Its files move into place; meta/info.json is replaced last."""
         number = self.episodes
         tasks = list(dict.fromkeys([*self._tasks, *(draft.tasks or [draft.task])]))
         rows, of_episode = self._stage_rows(draft, tasks)
-        staged = {DATA_PATH.format(**where(number)): rows}
+        staged = {DATA_PATH.format(**file_numbers(number)): rows}
         of_episode |= {name: {**seen, "count": np.array([draft.length])} for name, seen in draft.pictures.items()}
         for name, file in draft.videos.items():
-            staged[VIDEO_PATH.format(video_key=name, **where(number))] = file
+            staged[VIDEO_PATH.format(video_key=name, **file_numbers(number))] = file
         for name, readings in draft.streams.items():
             staged[stream_path(name, number, "parquet")] = self._stage_stream(self.layout.streams[name], readings)
             if name in draft.films:
                 staged[stream_path(name, number, "mp4")] = draft.films[name]
-        staged[EPISODES_PATH.format(**where(number))] = table = self.staging / "episode.parquet"
+        staged[EPISODES_PATH.format(**file_numbers(number))] = table = self.staging / "episode.parquet"
         pq.write_table(self._episode_table(number, draft, of_episode), table, **_CHECKED)
         files.sync_file(table)
         for path, file in staged.items():
@@ -140,27 +141,27 @@ class Writer:
         return number
 
     def tidy(self, first: int | None = None) -> None:
-        """Makes one table of the one-row tables of meta/episodes, where there are enough; what fails is left as it is.
+        """Merges one-row tables of meta/episodes, EPISODES_PER_TABLE at a time; a failure leaves them as they are.
 
         Looks at the newest episodes, or at all from number `first` on.
         """
         newest = max(0, self.episodes // EPISODES_PER_TABLE - 1) * EPISODES_PER_TABLE
         with suppress(
             OSError, pa.ArrowException, ValueError, KeyError
-        ):  # reading many small tables is slower, and as right
+        ):  # many small tables are slower to read, but valid
             for begin in range(
                 newest if first is None else first, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE
             ):
-                files = [self.root / EPISODES_PATH.format(**where(begin + i)) for i in range(EPISODES_PER_TABLE)]
-                if files[-1].exists():  # it is the last to be removed
-                    _merge_tables([file for file in files if file.exists()], where(begin))
+                files = [self.root / EPISODES_PATH.format(**file_numbers(begin + i)) for i in range(EPISODES_PER_TABLE)]
+                if files[-1].exists():  # the last one that a merge removes
+                    _merge_tables([file for file in files if file.exists()], file_numbers(begin))
 
     def remove_unfinished(self) -> None:
-        """Files of an episode that were moved into place but never committed."""
+        """Removes files of an episode that was moved into place but not committed."""
         number = self.episodes
         videos = [name for name, feature in self.features.items() if feature["dtype"] == "video"]
-        files = [path.format(**where(number)) for path in (DATA_PATH, EPISODES_PATH)]
-        files += [VIDEO_PATH.format(video_key=name, **where(number)) for name in videos]
+        files = [path.format(**file_numbers(number)) for path in (DATA_PATH, EPISODES_PATH)]
+        files += [VIDEO_PATH.format(video_key=name, **file_numbers(number)) for name in videos]
         files += [stream_path(name, number, suffix) for name in self.layout.streams for suffix in ("parquet", "mp4")]
         for file in files:
             (self.root / file).unlink(missing_ok=True)
@@ -205,7 +206,7 @@ class Writer:
         changed = sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
         for kind, sensors in (("streams", self.layout.streams), ("sensors", self.layout.sensors)):
             now = json.loads(json.dumps(_json(sensors)))
-            was = world.get(kind, {} if kind == "streams" else now)  # recordings of version 1 do not tell
+            was = world.get(kind, {} if kind == "streams" else now)  # recordings of version 1 do not state them
             stated = sorted(name for name in {*was, *now} if not _alike(was.get(name), now.get(name)))
             changed += [name for name in stated if name not in changed]
         if changed or info["fps"] != self.layout.fps:
@@ -214,10 +215,10 @@ class Writer:
         self.rows, self.episodes = info["total_frames"], info["total_episodes"]
         if self.episodes:
             self._tasks = pq.read_table(self.root / TASKS).column("__index_level_0__").to_pylist()
-            found = json.loads((self.root / STATS).read_text(encoding="utf-8"))
-            self._stats = stats.from_json(found)
+            stored = json.loads((self.root / STATS).read_text(encoding="utf-8"))
+            self._stats = stats.from_json(stored)
             if any(int(summary["count"][0]) != self.rows for summary in self._stats.values()):
-                self._stats = self._stats_of_episodes()  # it was killed before info.json was replaced
+                self._stats = self._stats_of_episodes()  # the recorder was killed before info.json was replaced
 
     def _stats_of_episodes(self) -> dict[str, stats.Summary]:
         parts: dict[int, dict[str, stats.Summary]] = {}
@@ -241,7 +242,7 @@ class Writer:
             for group in draft.rows:
                 columns = dict(group)
                 left = range(min(ROWS_PER_GROUP, draft.length - done))
-                count = len(next(iter(columns.values()), left))  # of videos alone there are no columns
+                count = len(next(iter(columns.values()), left))  # a recording of videos alone has no columns
                 frame = np.arange(done, done + count, dtype=np.int64)
                 done += count
                 if done == draft.length and ACTION_VALID in columns:
@@ -257,7 +258,7 @@ class Writer:
                 numbers = {name: value for name, value in columns.items() if value.dtype != object}
                 parts.append({name: stats.summarise(value, name in maps) for name, value in numbers.items()})
         if done != draft.length or done != len(task):
-            raise DatasetError(f"an episode of {draft.length} rows came with {done}.")
+            raise DatasetError(f"an episode of {draft.length} rows was given {done} rows.")
         files.sync_file(file)
         return file, stats.merge(parts)
 
@@ -277,7 +278,7 @@ class Writer:
         return file
 
     def _episode_table(self, number: int, draft: Draft, of_episode: dict[str, stats.Summary]) -> pa.Table:
-        at, length, tasks = where(number), draft.length, list(dict.fromkeys(draft.tasks or [draft.task]))
+        at, length, tasks = file_numbers(number), draft.length, list(dict.fromkeys(draft.tasks or [draft.task]))
         row: dict[str, object] = {"episode_index": number, "tasks": tasks, "length": length}
         row |= {f"data/{key}": value for key, value in at.items()}
         row |= {"dataset_from_index": self.rows, "dataset_to_index": self.rows + length}
@@ -310,7 +311,7 @@ class Writer:
 
 
 def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:
-    """Makes one table of several of episodes, which lies where the first did; of a killed merge it has some rows already."""
+    """Merges tables of episodes into the first; after a killed merge, the first has some of the rows already."""
     table = pa.concat_tables([pq.ParquetFile(file).read() for file in tables], promote_options="default")
     table = table.take(np.unique(table["episode_index"].to_numpy(), return_index=True)[1])
     for key, value in at.items():
@@ -323,9 +324,9 @@ def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:
 
 
 def stream_schema(sensor: Sensor) -> pa.Schema:
-    """Of a stream's table: its true times, and (but for cameras, whose mp4 lies next to it) its numbers, flattened.
+    """The schema of a stream's table: its times and, for all but cameras (which have an mp4), its flattened values.
 
-    The Sensor is kept in the table's metadata too, for the day on which meta/terrella.json is lost.
+    The metadata holds the Sensor as well, in case meta/terrella.json is lost.
     """
     fields = [pa.field("time_s", pa.float64())]
     if sensor.kind != "image":
@@ -334,7 +335,7 @@ def stream_schema(sensor: Sensor) -> pa.Schema:
     return pa.schema(fields, metadata={"sensor": json.dumps(sensor_json(sensor))})
 
 
-def lock(root: Path):
+def lock_folder(root: Path):
     """The folder's lock, held until it is closed; DatasetError where another writer holds it."""
     handle = open(root / ".lock", "a")
     try:
@@ -346,7 +347,7 @@ def lock(root: Path):
     return handle
 
 
-def fresh(folder: Path) -> Path:
+def fresh_folder(folder: Path) -> Path:
     """The folder, empty."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -372,20 +373,20 @@ def _some(items: Iterator) -> Iterator:
 
 
 def _columns(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    found = {}
+    columns = {}
     for name, value in rows[0].items():
         values = [row[name] for row in rows]
         if isinstance(value, np.ndarray) and value.dtype != object:
-            found[name] = np.stack(values)
+            columns[name] = np.stack(values)
         else:
             column = np.empty(len(values), object)
             column[:] = values
-            found[name] = column
-    return found
+            columns[name] = column
+    return columns
 
 
 def _alike(was: Mapping | None, now: Mapping | None) -> bool:
-    """Whether a sensor is what it was, units and frame that were not stated then apart."""
+    """Whether a sensor is the same as before; units and frame may have been unknown then."""
     if was is None or now is None:
         return was is now
     return all(was.get(key) == value or (key in ("units", "frame") and not was.get(key)) for key, value in now.items())

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from ..core.files import replacing
-from ..data.storage.mp4 import Mp4Writer, finish
+from ..data.storage.mp4 import Mp4Writer, finish_video
 from .page_parts import COLOURS, QUIET, figure_text, section, table_of
 from .plot import Line, line_chart
 from .statistics import Figure
@@ -49,7 +49,7 @@ def film(
         writer.add(np.asarray(canvas))
     writer.close()
     with replacing(path) as staged:
-        finish(growing, staged)
+        finish_video(growing, staged)
     growing.unlink()
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from ..core.keys import default_keys, told_keys
+from ..core.keys import default_keys, parse_keys
 
 _NAMERS = ("get_action_meanings", "action_meanings", "get_action_names", "action_names", "get_combos")
 DEFAULT_FPS = 10  # where an environment tells no frame rate
@@ -37,7 +37,7 @@ def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
     dt_s, clock = _step_seconds(env)
     how = {"action names": source or "none told", "frame rate": clock}
     table = _called(getattr(bare, "get_keys_to_action", None)) or getattr(bare, "keys_to_action", None)
-    keys = told_keys(table, space) if isinstance(table, Mapping) else {}
+    keys = parse_keys(table, space) if isinstance(table, Mapping) else {}
     how["keys"] = "get_keys_to_action" if keys else "by the actions' names" if found else "chosen"
     return EnvironmentFacts(found, keys or default_keys(space, found), dt_s, how)
 

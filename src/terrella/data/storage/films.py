@@ -1,4 +1,4 @@
-"""Videos as packets: which frames a file holds, where it may be cut, and cutting without encoding anew."""
+"""Videos as packets: which frames a file holds, and cutting it, where possible without encoding it again."""
 
 from __future__ import annotations
 
@@ -17,58 +17,54 @@ from . import mp4
 from .mp4 import Mp4Writer
 
 _MOST = 50_000_000  # frames of one file; more is damage
-_PACKED, _ZEROS = ("h264", "hevc", "av1", "libdav1d", "vp9"), bytes(24)  # entropy coding leaves no such run of zeros
+_PACKED, _ZEROS = (
+    ("h264", "hevc", "av1", "libdav1d", "vp9"),
+    bytes(24),
+)  # entropy-coded packets never contain this run of zeros
 
 
 @dataclass(frozen=True)
-class Reel:
-    """The packets of a video in the order of its file.
+class Packets:
+    """The n packets of a video, in the order of the file."""
 
-    frames:  int64 [n]: which frame (by its time and the rate) each packet is.
-    keys:    bool [n]: whether decoding may begin there.
-    digests: bytes of n: 8 of each packet, equal where packets are.
-    zeroed:  bool [n]: whether a part of it was overwritten with zeros, as no encoder writes them.
-    """
-
-    frames: np.ndarray
-    keys: np.ndarray
-    digests: np.ndarray
-    zeroed: np.ndarray
+    frames: np.ndarray  # int64 [n], frame number of each packet, by its time and the rate
+    keys: np.ndarray  # bool [n], whether it is a keyframe
+    digests: np.ndarray  # [n], 8 bytes of a hash of each packet
+    zeroed: np.ndarray  # bool [n], whether a part of it was overwritten with zeros
 
     @property
     def count(self) -> int:
-        """Frames from the first on without a gap."""
-        there = np.unique(self.frames[self.frames >= 0])
-        return int(np.searchsorted(there - np.arange(len(there)), 1))
+        """Number of frames from frame 0 up to the first gap."""
+        frames = np.unique(self.frames[self.frames >= 0])
+        return int(np.searchsorted(frames - np.arange(len(frames)), 1))
 
 
-def reel(path: Path, fps: float) -> Reel:
-    """Reads the packets, decodes nothing; DatasetError where the file is none."""
-    found, keys, digests, zeroed = [], [], [], []
+def read_packets(path: Path, fps: float) -> Packets:
+    """Reads the packets without decoding; DatasetError where the file is not a video."""
+    times, keys, digests, zeroed = [], [], [], []
     try:
-        with mp4.opened(path) as (container, stream):
-            a_tick = mp4.ticks(stream, fps)
+        with mp4.open_video(path) as (container, stream):
+            a_tick = mp4.frames_per_tick(stream, fps)
             codec = stream.codec_context.name if stream.codec_context else ""
             for packet in container.demux(stream):
-                if packet.size == 0 or packet.is_corrupt or packet.pts is None or len(found) == _MOST:
+                if packet.size == 0 or packet.is_corrupt or packet.pts is None or len(times) == _MOST:
                     break
-                found.append(round(packet.pts * a_tick))
+                times.append(round(packet.pts * a_tick))
                 keys.append(packet.is_keyframe)
                 raw = bytes(packet)
                 digests.append(hashlib.blake2b(raw, digest_size=8).digest())
                 zeroed.append(codec in _PACKED and _ZEROS in raw)
     except mp4.BROKEN as error:
-        if not found:
-            raise mp4.broken(path, str(error)) from error
-    frames = np.array(found, np.int64) if all(abs(at) < 2**62 for at in found) else np.full(len(found), -1)
-    return Reel(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
+        if not times:
+            raise mp4.broken_video(path, str(error)) from error
+    frames = np.array(times, np.int64) if all(abs(at) < 2**62 for at in times) else np.full(len(times), -1)
+    return Packets(frames, np.array(keys, bool), np.array(digests, "V8"), np.array(zeroed, bool))
 
 
-def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Reel) -> bool:
-    """Frames `first` .. `first + count - 1` of a video as one of its own.
+def cut_video(path: Path, first: int, count: int, fps: float, target: Path, packed: Packets) -> bool:
+    """Writes frames `first` to `first + count - 1` of a video to `target`.
 
-    True where its packets were copied; False where they had to be decoded and encoded again. DatasetError where a frame
-    cannot be had.
+    True where packets were copied, False where they were encoded again. DatasetError where a frame cannot be decoded.
     """
     begin = np.flatnonzero(packed.frames == first)
     if len(begin) == 1 and packed.keys[begin[0]]:
@@ -79,12 +75,12 @@ def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Re
                 shutil.copyfile(path, target)
             else:
                 try:
-                    mp4.finish(path, target, count, at)
-                except (DatasetError, *mp4.BROKEN) as error:  # what this mp4 writer cannot hold may still be decoded
+                    mp4.finish_video(path, target, count, at)
+                except (DatasetError, *mp4.BROKEN) as error:  # packets that cannot be copied may still be decoded
                     if getattr(error, "errno", None) in files.FULL:
                         raise
             with suppress(DatasetError):
-                if np.array_equal(np.sort(reel(target, fps).frames), np.arange(count)):
+                if np.array_equal(np.sort(read_packets(target, fps).frames), np.arange(count)):
                     files.sync_file(target)
                     return True
     _encode(path, first, count, fps, target)
@@ -94,7 +90,7 @@ def cut(path: Path, first: int, count: int, fps: float, target: Path, packed: Re
 def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> None:
     growing, writer = target.with_suffix(".again.mp4"), None
     try:
-        for frame in mp4.frames(path, first, count, fps):
+        for frame in mp4.decode_frames(path, first, count, fps):
             if writer is None:
                 height, width = frame.shape[:2]
                 if height % 2 or width % 2:
@@ -105,7 +101,7 @@ def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> Non
             writer.add(frame)
         if writer:
             writer.close()
-            mp4.finish(growing, target, count)
+            mp4.finish_video(growing, target, count)
     finally:
         if writer:
             writer.abandon()
@@ -113,12 +109,12 @@ def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> Non
 
 
 def whole_frames(path: Path, first: int, count: int, fps: float) -> np.ndarray:
-    """bool [count]: which of the frames can be decoded, all that they refer to included. Every one is tried."""
+    """bool [count]: the frames that can be decoded, with all frames that they refer to. Decodes every frame."""
     good = np.zeros(count, bool)
     try:
-        with mp4.opened(path) as (container, stream):
-            mp4.bound(stream)
-            a_tick = mp4.ticks(stream, fps)
+        with mp4.open_video(path) as (container, stream):
+            mp4.limit_pixels(stream)
+            a_tick = mp4.frames_per_tick(stream, fps)
             if first:
                 container.seek(round(first / a_tick), stream=stream)
             lost = False

@@ -1,7 +1,7 @@
-"""Journal: an append-only log of readings that a kill, a power cut or a full disk can only shorten, never corrupt.
+"""Journal: an append-only log of readings. A kill, a power cut or a full disk can shorten it but not corrupt it.
 
-Each record is its length, the CRC-32 of what follows, and the payload: the number of a sensor, its time, and its raw
-numbers. Reading stops at the first record that is cut or does not match, so a torn tail costs that record alone.
+A record is its length, the CRC-32 of its payload, and the payload: sensor number, time, raw values. Reading stops at the
+first record that is cut or does not match its checksum, so a torn tail loses that record alone.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Journal:
     """Appends readings to a new file; every append reaches the operating system before it returns."""
 
     def __init__(self, path: Path, about: Mapping[str, object]):
-        """`about` (JSON values) is kept as the first record."""
+        """`about` (JSON values) becomes the first record."""
         self._file = open(path, "wb", buffering=0)
         self._append(json.dumps(about).encode())
 
     def add(self, sensor: int, time_s: float, *values: bytes | np.ndarray) -> None:
-        """One reading of a sensor, as raw bytes one after another."""
+        """Appends one reading of a sensor, as the raw bytes of its values."""
         raw = [value if isinstance(value, bytes) else np.ascontiguousarray(value).tobytes() for value in values]
         self._append(_STAMP.pack(sensor, time_s) + b"".join(raw))
 
@@ -40,16 +40,16 @@ class Journal:
         self._file.close()
 
 
-def about(path: Path) -> dict:
-    """What the journal says of itself; ValueError where not even that is whole."""
+def read_about(path: Path) -> dict:
+    """The first record; ValueError where it is not whole."""
     for payload in _records(path):
-        found = json.loads(payload)
-        if isinstance(found, dict):
-            return found
+        about = json.loads(payload)
+        if isinstance(about, dict):
+            return about
     raise ValueError(f"{path} holds no whole record")
 
 
-def readings(path: Path) -> Iterator[tuple[int, float, bytes]]:
+def read_records(path: Path) -> Iterator[tuple[int, float, bytes]]:
     """(sensor, time_s, raw) of every whole record, in the order written."""
     records = _records(path)
     next(records, None)  # `about`

@@ -1,6 +1,6 @@
 """H.264 video files: an encoder that runs in parallel with the world, and exact frame reading (PyAV).
 
-The boxes of a file are walked before FFmpeg makes room for the frames that they claim, and up to the last whole one.
+The boxes of a file are checked before FFmpeg allocates memory for the frames that they claim.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ...core.errors import DatasetError
 from ..source import Lazy
 
 _RUN = struct.Struct(">II")  # flags and frames of a fragment's run
-_FIELDS = (0x100, 0x200, 0x400, 0x800)  # what a run may keep for each frame, four bytes each
+_FIELDS = (0x100, 0x200, 0x400, 0x800)  # optional fields of a run, four bytes a frame each
 _LARGEST = 1 << 24  # bytes of one fragment's table
 
 
@@ -51,7 +51,7 @@ def _checked(path: str, size: int, _changed_ns: int) -> None:
 
 
 def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
-    """(place, bytes, kind) of the boxes of a file; the last may be cut, or claim what no box can have."""
+    """(place, bytes, kind) of the boxes of a file; the last may be cut or have an invalid length."""
     at = 0
     while at + 8 <= size:
         file.seek(at)
@@ -84,9 +84,9 @@ def _fragment(file: BinaryIO, start: int, end: int, size: int) -> None:
 
 
 def whole_fragments(path: Path) -> tuple[int, int]:
-    """(bytes, fragments) of a growing file up to the end of its last fragment (moof and mdat) that is whole.
+    """(bytes, fragments) of a growing file up to the end of its last whole fragment (moof and mdat).
 
-    All bytes of a file that has no fragments, or is damaged: whoever reads it will tell.
+    All bytes, and 0, of a file without fragments or with other damage, which the reader reports.
     """
     with open(path, "rb") as file:
         end = file.seek(0, 2)
@@ -103,8 +103,8 @@ def whole_fragments(path: Path) -> tuple[int, int]:
     return kept, fragments
 
 
-def trim(path: Path) -> None:
-    """Cuts a growing file after its last whole fragment; a half-written one would spoil the rest."""
+def trim_fragments(path: Path) -> None:
+    """Cuts a growing file after its last whole fragment; FFmpeg cannot read on from half of one."""
     size = whole_fragments(path)[0]
     if size < os.stat(path).st_size:
         os.truncate(path, size)
@@ -121,25 +121,25 @@ _CODEC = {
     "bf": "0",
     "threads": "1",
 }
-# While it is recorded every frame is a fragment that stands alone, so that a cut file is whole up to its last frame.
+# While recording, every frame is a fragment of its own, so a cut file is readable up to its last frame.
 _GROWING = {"movflags": "frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
-FINISHED = {"movflags": "+faststart"}  # the index first: a cut file still plays up to the cut
-_WAITING = 64  # frames that may wait for the encoder; then `add` waits, no frame is ever dropped
+FINISHED = {"movflags": "+faststart"}  # the index in front: a cut file still plays up to the cut
+_WAITING = 64  # frames that may wait for the encoder; then `add` blocks, and no frame is dropped
 _LARGEST = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
 
 
 @dataclass
 class Pressure:
-    """How far behind encoders were. waited_s: time that `add` stood still; most_waiting: frames that queued at worst."""
+    """How far encoders fell behind."""
 
-    waited_s: float = 0.0
-    most_waiting: int = 0
+    waited_s: float = 0.0  # time for which `add` blocked
+    most_waiting: int = 0  # longest queue, frames
 
 
 class Mp4Writer:
     """Encodes uint8 [H, W, 3] frames in a thread of its own; errors of that thread surface in `add` or `close`.
 
-    The file at `path` grows frame by frame; `pressure` is told where the encoder is behind.
+    The file at `path` grows frame by frame. `pressure` counts how far the encoder falls behind.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float, pressure: Pressure | None = None):
@@ -151,7 +151,7 @@ class Mp4Writer:
         self._thread.start()
 
     def add(self, frame: np.ndarray) -> None:
-        """Queues a frame that nobody changes afterwards; waits where the encoder is behind."""
+        """Queues a frame, which must not change afterwards; blocks while the queue is full."""
         if self._error:
             raise self._error
         try:
@@ -163,14 +163,14 @@ class Mp4Writer:
         self._pressure.most_waiting = max(self._pressure.most_waiting, self._frames.qsize())
 
     def close(self) -> None:
-        """Ends the growing file; raises what went wrong in the encoder."""
+        """Finishes the growing file; raises an error of the encoder."""
         self._frames.put(None)
         self._thread.join()
         if self._error:
             raise self._error
 
     def abandon(self) -> None:
-        """Stops without caring for the file."""
+        """Stops, and ignores errors."""
         try:
             self.close()
         except (OSError, av.FFmpegError):
@@ -200,27 +200,26 @@ class Mp4Writer:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video's container and its first stream; one of BROKEN where it is none."""
+def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The container of a video and its first stream; raises one of BROKEN where it is not a video."""
     _check_boxes(path)
     with av.open(str(path), "r") as container:
         yield container, container.streams.video[0]
 
 
-def ticks(stream: VideoStream, fps: float) -> Fraction:
-    """Frames of a video of `fps` that one tick of its stream's clock is."""
+def frames_per_tick(stream: VideoStream, fps: float) -> Fraction:
+    """Frames, at `fps`, in one tick of the clock of a stream."""
     return (stream.time_base or Fraction(0)) * Fraction(fps).limit_denominator(10_000)
 
 
-def finish(path: Path, target: Path, frames: int | None = None, first: int = 0) -> int:
-    """Copies frames to a file of their own with its index in front; returns how many it holds.
+def finish_video(path: Path, target: Path, frames: int | None = None, first: int = 0) -> int:
+    """Copies at most `frames` packets, from packet `first` on, to a file with its index in front; returns their number.
 
-    At most `frames` are taken, from packet number `first` on, which begins at time 0. Nothing is encoded anew. DatasetError
-    where not one is whole.
+    Nothing is encoded again; the first packet gets time 0. DatasetError where no packet is whole.
     """
     count, begin, options = 0, 0, FINISHED
     try:
-        with opened(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
+        with open_video(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
             out = copy.add_stream_from_template(stream, opaque=True)
             for packet in islice(source.demux(stream), first, None):
                 if packet.size == 0 or packet.is_corrupt or packet.pts is None or count == frames:
@@ -235,26 +234,26 @@ def finish(path: Path, target: Path, frames: int | None = None, first: int = 0) 
         if isinstance(error, OSError) and error.errno and not isinstance(error, av.InvalidDataError):
             raise
         if not count:
-            raise broken(path, str(error)) from error
+            raise broken_video(path, str(error)) from error
     if not count:
-        raise broken(path, "it holds no frame")
+        raise broken_video(path, "it holds no frame")
     files.sync_file(target)
     return count
 
 
-def frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -> Iterator[np.ndarray]:
-    """Frames `first` .. `first + count - 1` of the file, uint8 [H, W, 3]; DatasetError where one is missing.
+def decode_frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -> Iterator[np.ndarray]:
+    """Frames `first` to `first + count - 1` of the file, uint8 [H, W, 3]; DatasetError where one is missing.
 
-    deep: of depth in a video of one channel of 16 bits, uint16 [H, W].
+    deep: the video is depth of one channel of 16 bits; frames are uint16 [H, W].
     """
     expected = first
     try:
-        with opened(path) as (container, stream):
-            bound(stream)
+        with open_video(path) as (container, stream):
+            limit_pixels(stream)
             if stream.width * stream.height > _LARGEST:
-                raise broken(path, f"it claims pictures of {stream.height}x{stream.width}")
-            frames_a_tick = ticks(stream, fps)
-            stream.thread_count = 1  # of several episodes at once, each has a thread
+                raise broken_video(path, f"it claims pictures of {stream.height}x{stream.width}")
+            frames_a_tick = frames_per_tick(stream, fps)
+            stream.thread_count = 1  # several episodes are decoded at once, each in a thread of its own
             reformatter = VideoReformatter()
             if first:
                 container.seek(round(first / frames_a_tick), stream=stream)
@@ -265,25 +264,25 @@ def frames(path: Path, first: int, count: int, fps: float, deep: bool = False) -
                 if at > expected:
                     break
                 if (frame.width, frame.height) != (stream.width, stream.height):
-                    raise broken(path, f"frame {expected} has another size than it claims")
+                    raise broken_video(path, f"frame {expected} has another size than it claims")
                 yield reformatter.reformat(frame, format="gray16le" if deep else "rgb24").to_ndarray()
                 expected += 1
                 if expected == first + count:
                     return
     except BROKEN as error:
-        raise broken(path, str(error)) from error
-    raise broken(path, f"frame {expected} is missing, {first + count} are needed")
+        raise broken_video(path, str(error)) from error
+    raise broken_video(path, f"frame {expected} is missing, {first + count} are needed")
 
 
-def bound(stream) -> None:
-    """Lets the stream's decoder refuse pictures of absurd size; ValueError where there is no decoder for it."""
+def limit_pixels(stream) -> None:
+    """Makes the decoder refuse pictures of absurd size; ValueError where there is no decoder."""
     if stream.codec_context is None:
         raise ValueError("it is of an unknown codec")
     stream.codec_context.options = {"max_pixels": str(_LARGEST)}
 
 
 class Frames(Lazy):
-    """Frames `first` .. `first + count - 1` of a file, decoded when looked at; seeks where that saves decoding."""
+    """Frames `first` to `first + count - 1` of a file, each decoded when it is read; seeks where that is faster."""
 
     def __init__(self, path: Path, first: int, count: int, fps: float, deep: bool = False):
         super().__init__(count, self._frame)
@@ -294,8 +293,8 @@ class Frames(Lazy):
         ahead = index - self._next
         if self._next < 0 or not 0 <= ahead <= KEYFRAME_EVERY:
             path, first, fps, deep = self._film
-            self._run, ahead = frames(path, first + index, len(self) - index, fps, deep), 0
-        self._next = -1  # until it is found
+            self._run, ahead = decode_frames(path, first + index, len(self) - index, fps, deep), 0
+        self._next = -1  # until the frame is decoded
         for _ in range(ahead):
             next(self._run)
         frame = next(self._run)
@@ -303,7 +302,7 @@ class Frames(Lazy):
         return frame
 
 
-def broken(path: Path, why: str) -> DatasetError:
+def broken_video(path: Path, why: str) -> DatasetError:
     return DatasetError(
         f"the video {path} is missing, truncated or not H.264 mp4 ({why}); restore it from a copy, or remove its episode."
     )

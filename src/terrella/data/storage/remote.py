@@ -1,4 +1,4 @@
-"""Files of a recording, near or far: a remote's are fetched whole when they are needed, into a bounded cache (fsspec)."""
+"""Files of a local or remote recording. Remote files are fetched whole, when needed, into a bounded cache (fsspec)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from ...core import files
 from ...core.errors import DatasetError
-from ..format import contained, inside
+from ..format import checked_name, path_inside
 
 BUDGET_BYTES = 8 << 30
 _LOCKS = 64
@@ -48,43 +48,43 @@ class LocalFiles:
     __str__ = __fspath__
 
     def local(self, name: str) -> Path:
-        """Where the file lies, whether it exists or not."""
-        return contained(self.root, name)
+        """The path of a file, whether it exists or not."""
+        return path_inside(self.root, name)
 
     def exists(self, name: str) -> bool:
         return self.local(name).is_file()
 
     def mark(self, name: str) -> str:
-        """What changes when the file does: its size; "" where it is not there."""
+        """A string that changes when the file does: its size; "" for no such file."""
         path = self.local(name)
         return str(path.stat().st_size) if path.is_file() else ""
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`.
+        """Sorted names, relative to the root, of the files anywhere under `folder` ("" for all) that end in `suffix`.
 
-        Hidden ones and linked folders are passed over.
+        Skips hidden files and linked folders.
         """
-        found = []
-        for place, folders, names in os.walk(self.root / inside(folder) if folder else self.root):
+        paths = []
+        for place, folders, names in os.walk(self.root / checked_name(folder) if folder else self.root):
             folders[:] = (name for name in folders if not name.startswith("."))
             names = (name for name in names if name.endswith(suffix) and not name.startswith("."))
-            found += [Path(place, name).relative_to(self.root).as_posix() for name in names]
-        return sorted(found)
+            paths += [Path(place, name).relative_to(self.root).as_posix() for name in names]
+        return sorted(paths)
 
     @contextmanager
     def holding(self, *names: str) -> Iterator[None]:
-        """Nothing is ever evicted here."""
+        """Does nothing: local files are never evicted."""
         yield
 
 
 class Files:
     """The files under a remote address, by their names relative to it.
 
-    `local` fetches a file whole: into a hidden neighbour, checked by its size, then renamed. Several processes may share
-    one cache; together they keep it within `budget_bytes`, removing what was used longest ago, but never a file that
-    somebody is `holding`. A file that the remote has changed (by its size, or its tag or date where it tells one) is
-    fetched anew. DatasetError where the remote cannot be reached, refuses, or is silent for `timeout_s` seconds, each
-    after `attempts` trials; where a package is missing; where the cache is too small.
+    `local` fetches a whole file, checks its size and renames it into the cache. Processes can share one cache: together
+    they keep it within `budget_bytes`, by removing the files used longest ago, except those that a process is `holding`.
+    A file is fetched again when its size, tag or date on the remote has changed. DatasetError where the remote cannot be
+    reached, refuses, or is silent for `timeout_s` seconds, after `attempts` attempts; where a package is missing; where
+    the cache is too small.
     """
 
     def __init__(
@@ -117,26 +117,29 @@ class Files:
         return self._facts(name) is not None
 
     def mark(self, name: str) -> str:
-        """What changes when the file does: its size, and its tag or date; "" where it is not there."""
+        """A string that changes when the file does: its size, and its tag or date; "" for no such file."""
         return ":".join(map(str, self._facts(name) or ("",)))
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
-        """Names, relative to the root and sorted, of the files anywhere under `folder` ("": all) that end in `suffix`."""
-        where, depth = f"{self._base}/{inside(folder)}" if folder else self._base, len(self._base.strip("/").split("/"))
+        """Sorted names, relative to the root, of the files anywhere under `folder` ("" for all) that end in `suffix`."""
+        where, depth = (
+            f"{self._base}/{checked_name(folder)}" if folder else self._base,
+            len(self._base.strip("/").split("/")),
+        )
         try:
-            found = self._ask(f"list {folder}", lambda alive: self._system.find(where, detail=True))
+            entries = self._ask(f"list {folder}", lambda alive: self._system.find(where, detail=True))
         except FileNotFoundError:
             return []
         names = []
-        for path, about in found.items():
+        for path, about in entries.items():
             parts = path.strip("/").split("/")[depth:]
             if about["type"] == "file" and parts and not any(part.startswith(".") for part in parts):
-                names.append(inside("/".join(parts)))
-                self._listed.setdefault("/".join(parts[:-1]), {})[parts[-1]] = _told(self.root, about)
+                names.append(checked_name("/".join(parts)))
+                self._listed.setdefault("/".join(parts[:-1]), {})[parts[-1]] = _size_and_mark(self.root, about)
         return sorted(name for name in names if name.endswith(suffix))
 
     def local(self, name: str) -> Path:
-        """A copy of the file on this machine, fetched where there is none. Whoever keeps using it is `holding` it."""
+        """The path of a local copy, fetched if there is none. Use it within `holding`, or it may be evicted."""
         facts = self._facts(name)
         if facts is None:
             raise DatasetError(
@@ -158,7 +161,7 @@ class Files:
 
     @contextmanager
     def holding(self, *names: str) -> Iterator[None]:
-        """While this is entered nobody removes these files from the cache, in whatever process."""
+        """Keeps these files in the cache, for all processes, until the context ends."""
         held: list[int] = []
         try:
             for name in names:
@@ -169,7 +172,7 @@ class Files:
                 os.close(file)
 
     def _held(self, name: str) -> int:
-        """An open file with a shared lock, which is what eviction respects."""
+        """An open file with a shared lock, which keeps it from eviction."""
         while True:
             path = self.local(name)
             try:
@@ -182,40 +185,42 @@ class Files:
             os.close(file)
 
     def _facts(self, name: str) -> tuple[int, str] | None:
-        """(bytes, what changes with the content) of a remote file, None where there is no such file."""
-        folder, _, last = inside(name).rpartition("/")
+        """(bytes, mark that changes with the content) of a remote file; None for no such file."""
+        folder, _, last = checked_name(name).rpartition("/")
         if folder not in self._listed:
             try:
-                found = self._ask(
+                entries = self._ask(
                     f"list {folder}", lambda alive: self._system.ls(f"{self._base}/{folder}", detail=True)
                 )
             except (FileNotFoundError, NotADirectoryError):
-                found = []
-            files = (about for about in found if about["type"] == "file")
-            self._listed[folder] = {about["name"].rsplit("/", 1)[-1]: _told(self.root, about) for about in files}
+                entries = []
+            files = (about for about in entries if about["type"] == "file")
+            self._listed[folder] = {
+                about["name"].rsplit("/", 1)[-1]: _size_and_mark(self.root, about) for about in files
+            }
         return self._listed[folder].get(last)
 
     def _fetch(self, name: str, size: int, path: Path) -> None:
         def get(alive: Callable[[], None]) -> Path:
             handle, made = tempfile.mkstemp(prefix="part-", dir=room)
             os.close(handle)
-            beat = self._callback(hooks={"alive": alive})  # is called as bytes come
+            beat = self._callback(hooks={"alive": alive})  # called as bytes arrive
             self._system.get_file(f"{self._base}/{name}", made, callback=beat)
             got = os.stat(made).st_size
             if got != size:
-                raise OSError(f"{got} of {size} bytes came")
+                raise OSError(f"{got} of {size} bytes arrived")
             return Path(made)
 
         with self._room(name, size) as room:
             try:
                 part = self._ask(f"fetch {name}", get)
             except FileNotFoundError as error:
-                raise DatasetError(f"{name} is gone from {self.root}; open the recording anew.") from error
+                raise DatasetError(f"{name} is gone from {self.root}; open the recording again.") from error
             files.sync_file(part)
             files.move_into_place(part, path)
 
     def _ask(self, what: str, action: Callable[[Callable[[], None]], _Result]) -> _Result:
-        """`action(alive)`, tried again where it fails; `alive()` says that it is getting on."""
+        """`action(alive)`, repeated where it fails; the action calls `alive()` when it makes progress."""
         last: Exception = TimeoutError()
         for attempt in range(self._attempts):
             if attempt:
@@ -238,7 +243,7 @@ class Files:
 
     @contextmanager
     def _room(self, name: str, size: int) -> Iterator[Path]:
-        """A folder for a file that comes, whose `size` bytes are set aside until it has come or failed."""
+        """A folder for a file to be fetched; its `size` bytes are reserved until the context ends."""
         if size > self.budget_bytes:
             raise DatasetError(
                 f"{name} of {self.root} has {size:,} bytes and {self.budget_bytes:,} may be kept here; allow more."
@@ -259,7 +264,7 @@ class Files:
             os.close(handle)
 
     def _claimed(self, size: int) -> tuple[int, Path] | None:
-        """A locked folder named after the bytes that are set aside; None where files in use leave too little room."""
+        """A locked folder named after the reserved bytes; None where files in use leave too little space."""
         with _locked(self._cache / ".lock"):
             if self._evicted(size) + size > self.budget_bytes:
                 return None
@@ -269,9 +274,9 @@ class Files:
             return handle, folder
 
     def _evicted(self, size: int) -> int:
-        """Bytes in use after what was used longest ago has made room for `size`."""
-        # What comes is counted first: if it arrives meanwhile it counts twice until the next look, never not at all.
-        # What nobody has locked is of a process that was killed.
+        """Bytes in use, after files used longest ago were removed to make room for `size`."""
+        # Reservations are counted before files: a file that arrives in between counts twice, never not at all.
+        # A reservation without a lock is of a process that was killed.
         coming = [
             entry for entry in os.scandir(self._cache / ".coming") if not _let_go(Path(entry.path), shutil.rmtree)
         ]
@@ -289,7 +294,7 @@ class Files:
 
 
 def _file_system(root: str) -> tuple[Any, str, Any]:
-    """fsspec's file system for an address, the path in it, and fsspec's class of callbacks."""
+    """(fsspec file system of an address, path in it, fsspec's Callback class)."""
     scheme = root.split("://", 1)[0]
     try:
         import fsspec
@@ -310,10 +315,12 @@ def _file_system(root: str) -> tuple[Any, str, Any]:
         raise DatasetError(f"{root} cannot be opened ({error}); check the address and your credentials.") from error
 
 
-def _told(root: str, about: dict) -> tuple[int, str]:
-    """What a listing says of a file: its bytes, and a mark that changes when its content does."""
+def _size_and_mark(root: str, about: dict) -> tuple[int, str]:
+    """The size in bytes of a listed file, and a mark that changes when its content does."""
     if not isinstance(about.get("size"), int):
-        raise DatasetError(f"{root} does not tell the size of {about.get('name')}; copy the recording to this machine.")
+        raise DatasetError(
+            f"{root} does not state the size of {about.get('name')}; copy the recording to this machine."
+        )
     for key in ("ETag", "etag", "blob_id", "md5Hash", "LastModified", "last_modified", "mtime", "created"):
         if about.get(key):
             return about["size"], str(about[key])
@@ -321,7 +328,7 @@ def _told(root: str, about: dict) -> tuple[int, str]:
 
 
 def _in_time(action: Callable[[Callable[[], None]], _Result], silence_s: float) -> _Result:
-    """`action(alive)` in a thread of its own; TimeoutError once it has not called `alive` for `silence_s`."""
+    """`action(alive)` in a thread of its own; TimeoutError once it has not called `alive` for `silence_s` seconds."""
     heard, answer = [time.monotonic()], Future[_Result]()
 
     def alive(*_, **__) -> None:
@@ -343,7 +350,7 @@ def _in_time(action: Callable[[Callable[[], None]], _Result], silence_s: float) 
 
 
 def _touched(path: Path, size: int) -> bool:
-    """Whether the file is there and whole; if so it now counts as used last."""
+    """Whether the file exists and is whole; if so, marks it as just used."""
     try:
         whole = path.stat().st_size == size
         if whole:
@@ -354,7 +361,7 @@ def _touched(path: Path, size: int) -> bool:
 
 
 def _let_go(path: Path, remove: Callable[[Path], object]) -> bool:
-    """Removes what nobody has locked; whether it is gone."""
+    """Removes a path that no process has locked; returns whether it is gone."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except FileNotFoundError:

@@ -1,8 +1,7 @@
-"""Reading tables and JSON with pyarrow; what is damaged, or would fill the memory, is a clear error.
+"""Reads tables and JSON with pyarrow; a damaged file, or one that would fill the memory, is a clear error.
 
-pyarrow reads a damaged file without harm as long as nobody asks for its view of a column's metadata
-(`metadata.row_group(i).column(j)` ends the process), so row groups are chosen by the numbers in their column "index".
-What a file unpacks to is bounded by reading it in batches.
+Reading the metadata of a column of a damaged file (`metadata.row_group(i).column(j)`) ends the process, so row groups are
+chosen by the values of their column "index". Reading in batches bounds what a file unpacks to.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from ..format import to_numpy
 from ..source import Lazy
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, RuntimeError)
-_BATCH = 64 << 20  # bytes that one batch of numbers may take
-_TEXTS = 16  # rows of texts and pictures that are read at once, for nothing says how long they are
-_TABLE = 64  # the same, of tables whose rows are short
-_SLACK = 64 << 20  # bytes that any reading may unpack to
-_LONG = 64 << 10  # bytes of each row beyond these: a few bytes of a file can repeat a text without end
+_BATCH = 64 << 20  # most bytes of one batch of numbers
+_TEXTS = 16  # rows of texts or pictures in a batch; their length is not known before
+_TABLE = 64  # the same for tables with short rows
+_SLACK = 64 << 20  # bytes that any read may unpack to
+_LONG = 64 << 10  # further bytes for each row with texts: compressed, a text can repeat without end
 _WIDEST = 64 << 20  # bytes of one reading of a stream
 _LARGEST_JSON = 256 << 20  # bytes; stats.json of many cameras is long, but not so long
-_ROWS_A_BYTE = 64  # more rows than these for each byte of a file are a bomb: at least their counters differ
+_ROWS_A_BYTE = 64  # more rows for each byte of a file are an attack: even their counters take space
 _FEW_ROWS = 1_000_000
 
 
@@ -44,7 +43,7 @@ def read_whole(path: Path, columns: list[str] | None = None, most_rows: int | No
                 raise ValueError(f"it claims {rows:,} rows where at most {most_rows:,} can be")
             return _bounded(file, range(file.num_row_groups), columns, _table_step(file, columns), _LONG)
     except BROKEN as error:
-        raise damaged(path, error) from error
+        raise damaged_table(path, error) from error
 
 
 def read_rows(
@@ -65,11 +64,11 @@ def read_rows(
                 )
         return {name: table[name] for name in columns}
     except BROKEN as error:
-        raise damaged(path, error) from error
+        raise damaged_table(path, error) from error
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """The file, its pages checked against their checksums where it has some; ValueError where it claims absurdly many rows."""
+    """Opens a file with page checksums verified; ValueError where it claims absurdly many rows."""
     file = pq.ParquetFile(path, page_checksum_verification=True)
     if not 0 <= file.metadata.num_rows <= max(_FEW_ROWS, _ROWS_A_BYTE * os.stat(path).st_size):
         raise ValueError(f"it claims {file.metadata.num_rows:,} rows in {os.stat(path).st_size:,} bytes")
@@ -79,24 +78,24 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 def _groups(path: Path) -> tuple[tuple[int, int, int], ...]:
     """(rows, least, greatest "index") of each row group."""
     about = os.stat(path)
-    return _found_groups(str(path), about.st_size, about.st_mtime_ns)
+    return _read_groups(str(path), about.st_size, about.st_mtime_ns)
 
 
 @lru_cache(1024)
-def _found_groups(path: str, _size: int, _changed_ns: int) -> tuple[tuple[int, int, int], ...]:
-    found = []
+def _read_groups(path: str, _size: int, _changed_ns: int) -> tuple[tuple[int, int, int], ...]:
+    groups = []
     with open_parquet(Path(path)) as file:
         for number in range(file.num_row_groups):
             try:
                 index = file.read_row_group(number, columns=["index"])["index"].to_numpy()
-                found.append((len(index), int(index.min()), int(index.max())))
-            except BROKEN:  # whoever needs it is told; the rest can be read
-                found.append((0, -1, 1 << 62))
-    return tuple(found)
+                groups.append((len(index), int(index.min()), int(index.max())))
+            except BROKEN:  # reading this group raises; the others can be read
+                groups.append((0, -1, 1 << 62))
+    return tuple(groups)
 
 
 def _features(file: pq.ParquetFile, groups: Sequence[int], columns: list[str], features: Mapping[str, dict]):
-    """Columns of a data file; ValueError where they unpack to more than the features promise."""
+    """Columns of a data file; ValueError where they unpack to more than their features allow."""
     wide, texts = 16, False
     for name in columns:
         dtype, shape = (features[name]["dtype"], features[name]["shape"]) if name in features else ("int64", [1])
@@ -106,7 +105,7 @@ def _features(file: pq.ParquetFile, groups: Sequence[int], columns: list[str], f
 
 
 def _table_step(file: pq.ParquetFile, columns: list[str] | None) -> int:
-    """Rows that are read at once of a table that no feature describes."""
+    """Rows in a batch of a table that no feature describes."""
     numbers = all(
         pa.types.is_primitive(field.type) for field in file.schema_arrow if columns is None or field.name in columns
     )
@@ -126,8 +125,8 @@ def _bounded(file: pq.ParquetFile, groups: Iterable[int], columns: list[str] | N
     return table if parts or columns is None else table.select([name for name in columns if name in form.names])
 
 
-def damaged(path: Path, error: BaseException) -> DatasetError:
-    """What is said of a table that cannot be read."""
+def damaged_table(path: Path, error: BaseException) -> DatasetError:
+    """The error for a table that cannot be read."""
     short = (str(error).splitlines() or [type(error).__name__])[0][:300]
     return DatasetError(
         f"the table {path} is missing, truncated or not parquet ({short}); restore it from a copy, or remove its episode."
@@ -135,7 +134,7 @@ def damaged(path: Path, error: BaseException) -> DatasetError:
 
 
 def read_json(path: Path) -> object:
-    """What a JSON file holds; OSError where it is missing, ValueError where it is damaged, huge or nested without end."""
+    """The value in a JSON file; OSError where it is missing, ValueError where it is damaged, huge or nested too deeply."""
     if path.stat().st_size > _LARGEST_JSON:
         raise ValueError(f"it has {path.stat().st_size:,} bytes")
     try:
@@ -145,7 +144,7 @@ def read_json(path: Path) -> object:
 
 
 class ValuesOf(Lazy):
-    """The lists of numbers of one column, each a numpy array, read row group by row group when they are looked at."""
+    """The lists of numbers of one column as numpy arrays; a row group is read when one of its rows is."""
 
     def __init__(self, path: Path, column: str, count: int):
         super().__init__(count, self._row)
@@ -154,7 +153,7 @@ class ValuesOf(Lazy):
             with open_parquet(path) as file:
                 rows = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
         except BROKEN as error:
-            raise damaged(path, error) from error
+            raise damaged_table(path, error) from error
         self._starts = np.cumsum([0, *rows])
         self._open, self._group = -1, None
 
@@ -167,7 +166,7 @@ class ValuesOf(Lazy):
                     self._group, self._open = self._read(file, group), group
             return self._value(row - int(self._starts[group]))
         except (AttributeError, IndexError, NotImplementedError, *BROKEN) as error:
-            raise damaged(self._path, error) from error
+            raise damaged_table(self._path, error) from error
 
     def _read(self, file: pq.ParquetFile, group: int) -> Any:
         return _bounded(file, [group], [self._column], _TEXTS, _WIDEST)[self._column]
@@ -178,16 +177,16 @@ class ValuesOf(Lazy):
 
 
 class RowsOf(ValuesOf):
-    """One feature of the rows `start` to `stop` (by the column "index"): arrays of its shape, pictures as they are kept."""
+    """One feature of the rows `start` to `stop` (by the column "index"): arrays of its shape, pictures as stored."""
 
     def __init__(self, path: Path, column: str, start: int, stop: int, features: Mapping[str, dict]):
         super().__init__(path, column, stop - start)
         self._features, self._shape = features, tuple(features[column]["shape"])
         index = read_whole(path, ["index"])["index"].to_numpy()
         self._first = int(np.argmax(index == start)) if len(index) else 0
-        there = index[self._first : self._first + stop - start]
-        if len(there) != stop - start or not np.array_equal(there, np.arange(start, stop)):
-            raise damaged(path, ValueError(f"it lacks rows of {start} to {stop - 1}, or they are moved"))
+        stored = index[self._first : self._first + stop - start]
+        if len(stored) != stop - start or not np.array_equal(stored, np.arange(start, stop)):
+            raise damaged_table(path, ValueError(f"it lacks rows of {start} to {stop - 1}, or they are moved"))
 
     def _read(self, file: pq.ParquetFile, group: int) -> Any:
         column = _features(file, [group], [self._column], self._features)[self._column]

@@ -1,4 +1,4 @@
-"""ClipCache: a recording as memory-mapped arrays of one size, built once, so that training never decodes video."""
+"""ClipCache: a recording as memory-mapped arrays with pictures of one size, so that training never decodes video."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..storage.remote import BUDGET_BYTES, LocalFiles
 Kinds = Mapping[str, tuple[np.dtype, tuple[int, ...]]]  # (dtype, shape of a row) by array
 INSTRUCTION = "instruction"
 _FORMAT = 3
-_FETCHING = 4  # episodes of a recording far away that are fetched at once
+_FETCHING = 4  # episodes of a remote recording that are fetched at once
 _TYPES = {
     "rgb": np.uint8,
     "depth": np.float16,
@@ -43,24 +43,21 @@ _NUMBERS = {"float64": "float32"} | {
 
 
 class ClipCache:
-    """Read-only arrays over all N rows of a dataset; what the recording lacks is None.
+    """Read-only, memory-mapped arrays over all N rows of a dataset. Opening reads none of them, however long they are.
 
-    rgb uint8 [N, H, W, 3]; depth float16 [N, h, w] metres (>= 65.5: beyond range); pose float32 [N, 7]; action float32
-    [N, A]; action_valid bool [N]; reward float32 [N]; done bool [N]; task int64 [N], the place in `tasks` of the text that
-    the row is about; episodes: (start, stop) row ranges, `ranges` the same as int64 [E, 2].
-    `arrays` has those that there are by name, and the recording's other vectors ("observation.state", …) by their key;
-    `keys` names the array of each channel. All are memory-mapped: opening reads nothing of them, and takes no longer for a
-    longer recording.
+    episodes: (start, stop) row ranges; `ranges` is the same as int64 [E, 2].
+    arrays:   name -> array: those below that the recording has, and its other vectors ("observation.state", …).
+    keys:     channel -> name of its array.
     """
 
-    rgb: np.ndarray | None
-    depth: np.ndarray | None
-    pose: np.ndarray | None
-    action: np.ndarray
-    action_valid: np.ndarray
-    reward: np.ndarray
-    done: np.ndarray
-    task: np.ndarray | None
+    rgb: np.ndarray | None  # uint8 [N, H, W, 3]; like the others, None where the recording has none
+    depth: np.ndarray | None  # float16 [N, h, w], metres; 65.5 or more is beyond range
+    pose: np.ndarray | None  # float32 [N, 7]
+    action: np.ndarray  # float32 [N, A]
+    action_valid: np.ndarray  # bool [N]
+    reward: np.ndarray  # float32 [N]
+    done: np.ndarray  # bool [N]
+    task: np.ndarray | None  # int64 [N], index into `tasks`
 
     def __init__(self, path: Path):
         self.path = path
@@ -78,15 +75,17 @@ class ClipCache:
                 raise ValueError(f"{short[0]} has {len(self.arrays[short[0]])} of {self.length} rows")
         except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
             raise DatasetError(
-                f"the cache {path} is damaged ({error}); delete that folder and it is built anew."
+                f"the cache {path} is damaged ({error}); delete that folder, and it is built again."
             ) from error
         for name in _TYPES:
             setattr(self, name, self.arrays.get(name))
 
     @property
     def further(self) -> dict[str, np.ndarray]:
-        """What else was recorded of the world's channels, such as "things" or "health", by name: no pictures, and nothing
-        of what a learned world says of itself, which is no evidence."""
+        """The recording's other channels ("things", "health", ...), by name.
+
+        Pictures are left out, and so are a learned world's estimates, which are no evidence.
+        """
         prefix = "observation."
         names = {key: key.removeprefix(prefix) for key in self.arrays if key.startswith(prefix)}
         hidden = {key for key, name in names.items() if name in ESTIMATES or name.startswith("images.")}
@@ -94,7 +93,7 @@ class ClipCache:
 
     @property
     def vitals(self) -> dict[str, np.ndarray]:
-        """Of these, what is one number a row."""
+        """Those of `further` that are one number a row."""
         return {name: array for name, array in self.further.items() if int(np.prod(array.shape[1:])) == 1}
 
     @staticmethod
@@ -105,13 +104,14 @@ class ClipCache:
         cameras: Sequence[str] = (),
         budget_bytes: int = BUDGET_BYTES,
     ) -> ClipCache:
-        """The cache of `dataset` with rgb at `size` (height, width), built first where it is missing or out of date.
+        """The cache of `dataset` with pictures of `size` (height, width), built if it is missing or out of date.
 
-        `cameras` are further ones by their keys, kept at the same size in `arrays`.
+        cameras:      features of further cameras to keep, at the same size, in `arrays`.
+        progress:     `progress(done, total)` counts episodes.
+        budget_bytes: most bytes of the cache of a remote recording.
 
-        It lies in ROOT/.cache/terrella, or under $XDG_CACHE_HOME where the dataset's folder cannot be written or lies far
-        away ("hf://…", "file://…"); then its files are fetched one by one, and the cache has at most `budget_bytes`.
-        `progress(done, total)` counts episodes. Killing the build leaves nothing that could be mistaken for a cache.
+        It lies in ROOT/.cache/terrella, or under $XDG_CACHE_HOME where that folder cannot be written or is remote. A build
+        that is killed leaves no cache.
         """
         dataset = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
         if not dataset.length:
@@ -137,13 +137,13 @@ class ClipCache:
 
 
 def split(n_episodes: int, held_out: float = 0.05, seed: int = 0) -> tuple[list[int], list[int]]:
-    """Episode numbers (train, held_out), ascending; at least one is held out where there are two or more."""
+    """(train, held_out) episode numbers, ascending; of two or more episodes at least one is held out."""
     count = min(max(1, round(n_episodes * held_out)), n_episodes - 1) if held_out > 0 and n_episodes > 1 else 0
     chosen = set(np.random.default_rng(seed).permutation(n_episodes)[:count].tolist())
     return [i for i in range(n_episodes) if i not in chosen], sorted(chosen)
 
 
-def shrink(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def shrink_pictures(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """uint8 [T, H, W, 3] -> uint8 [T, *size, 3]: each pixel the mean of the area that it covers, rounded half up."""
     count, height, width, _ = pictures.shape
     if (height, width) == tuple(size):
@@ -153,14 +153,14 @@ def shrink(pictures: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         tall = pictures[:, ::down].astype(np.uint16 if down * across <= 256 else np.uint32)
         for y in range(1, down):
             tall += pictures[:, y::down]
-        found = np.empty((count, *size, 3), np.uint8)
+        small = np.empty((count, *size, 3), np.uint8)
         for colour in range(3):  # one at a time: numpy is slow where the innermost axis has three elements
             total = tall[:, :, ::across, colour] + tall.dtype.type(down * across // 2)
             for x in range(1, across):
                 total += tall[:, :, x::across, colour]
             total //= tall.dtype.type(down * across)
-            found[..., colour] = total
-        return found
+            small[..., colour] = total
+        return small
     tall = _box(height, size[0]) @ pictures.reshape(count, height, width * 3).astype(np.float32)
     tall = tall.reshape(count, size[0], width, 3).transpose(2, 0, 1, 3).reshape(width, -1)
     mixed = (_box(width, size[1]) @ tall).reshape(size[1], count, size[0], 3).transpose(1, 2, 0, 3)
@@ -176,7 +176,7 @@ def _box(source: int, target: int) -> np.ndarray:
 
 
 def _key(dataset: Dataset, size: tuple[int, int]) -> str:
-    """Changes whenever the recording does: its info, its episodes' statistics and every file's size go in."""
+    """A hash that changes when the recording does: of its info, meta/episodes and the size of every file."""
     digest, files = hashlib.sha256(json.dumps([_FORMAT, list(size)]).encode()), dataset.files
     for name in (INFO, *files.list("meta/episodes", ".parquet")):
         with open(files.local(name), "rb") as file:
@@ -190,7 +190,7 @@ def _key(dataset: Dataset, size: tuple[int, int]) -> str:
 
 
 def _shelf(dataset: Dataset) -> Path:
-    """The folder of a dataset's caches: in its own, or in the user's where that cannot be written or is far away."""
+    """The folder of a dataset's caches: its own, or the user's where that cannot be written or is remote."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "terrella"
     if isinstance(dataset.files, LocalFiles):
         name, near = str(dataset.root.resolve()), [dataset.root / ".cache" / "terrella"]
@@ -246,13 +246,13 @@ def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path
 
 
 def further_cameras(dataset: Dataset, channels: Sequence[str]) -> list[str]:
-    """The features of the cameras among `channels`, but for the main one."""
+    """The features of the cameras among `channels`, without the main one."""
     features = [dataset.feature(name) for name in channels]
     return [name for name in features if name in dataset.cameras and name != dataset.rgb_key]
 
 
 def array_for(channel: str, arrays: Collection[str], keys: Mapping[str, str]) -> str | None:
-    """The array of a cache that a channel, a feature or an array's own name means; None where it has none such."""
+    """The array that `channel` (a channel, a feature or the name of an array) means; None for none."""
     task = "task" if channel == INSTRUCTION else None
     meant = (channel, keys.get(channel), keys.get(channel_of(channel)), feature_of(channel), task)
     return next((name for name in meant if name in arrays), None)
@@ -265,9 +265,9 @@ def keys_of(dataset: Dataset) -> dict[str, str]:
 
 
 def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:
-    """(dtype, shape of a row) of every array that the cache of a dataset has, with pictures at `size` (height, width)."""
+    """(dtype, shape of a row) of every array in the cache of a dataset, with pictures of `size` (height, width)."""
     if min(size) < 1:
-        raise DatasetError(f"pictures of {size[0]}x{size[1]} pixels cannot be; ask for a (height, width).")
+        raise DatasetError(f"pictures of {size[0]}x{size[1]} pixels are impossible; give a (height, width).")
     seen = dataset.feature("depth")
     shapes = {
         "rgb": (*size, 3),
@@ -275,20 +275,20 @@ def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = (
         "pose": (7,),
         "action": (len(dataset.action_names),),
     }
-    found = {name: (np.dtype(_TYPES[name]), shapes.get(name, ())) for name in _TYPES if _has(dataset, name)}
-    taken = {dataset.feature(name) for name in found}
+    kinds = {name: (np.dtype(_TYPES[name]), shapes.get(name, ())) for name in _TYPES if _has(dataset, name)}
+    taken = {dataset.feature(name) for name in kinds}
     for name, sensor in dataset.sensors.items():
         if Path(name).name != name:
             raise DatasetError(f"a feature is named '{name[:100]}', which no file can be; rename it in meta/info.json.")
         if sensor.kind == "depth" and name not in taken:
-            found[renamed(name)] = (np.dtype(np.float16), sensor.shape)
+            kinds[renamed(name)] = (np.dtype(np.float16), sensor.shape)
         elif sensor.kind == "vector" and sensor.dtype in _NUMBERS and name not in taken:
-            found[renamed(name)] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
+            kinds[renamed(name)] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
     for name in cameras:
         if name not in dataset.cameras:
             raise DatasetError(f"{dataset.root} has no camera '{name}'; it has {', '.join(dataset.cameras) or 'none'}.")
-        found[name] = (np.dtype(np.uint8), (*size, 3))
-    return {name: kind for name, kind in found.items() if np.prod(kind[1]) > 0}
+        kinds[name] = (np.dtype(np.uint8), (*size, 3))
+    return {name: kind for name, kind in kinds.items() if np.prod(kind[1]) > 0}
 
 
 def _has(dataset: Dataset, name: str) -> bool:
@@ -356,5 +356,5 @@ def fill_episode(
         pictures = dataset.frames(number, None if name == "rgb" else name, first, count)
         done = at
         while batch := list(islice(pictures, 4)):  # few, so that they stay in the processor's cache
-            arrays[name][done : done + len(batch)] = shrink(np.stack(batch), size)
+            arrays[name][done : done + len(batch)] = shrink_pictures(np.stack(batch), size)
             done += len(batch)

@@ -1,4 +1,4 @@
-"""Clips: seeded, exactly resumable batches of clips for training, from the clip cache or, window by window, from afar."""
+"""Clips: seeded, exactly resumable batches of clips for training, from the clip cache or from a remote recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 from .windows import Windows
 
 Fill = Callable[[int, int, Mapping[str, np.ndarray]], None]
-_PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64), ())}  # any recording has these
+_PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64), ())}  # every recording has these
 
 
 @dataclass(frozen=True)
@@ -119,47 +119,47 @@ class Clips:
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The texts that "task" numbers."""
+        """The texts that the channel "task" numbers."""
         return self._shelf.tasks
 
     def _chosen(self, channels: Sequence[str]) -> tuple[dict[str, str], Kinds]:
-        """(channel -> array that holds it, the arrays that are filled)."""
+        """(channel -> its array, kinds of the arrays to read)."""
         kinds, keys = {**_PLACES, **self._shelf.kinds}, {}
         for name in channels:
             key = array_for(name, kinds, self._shelf.keys)
             if key is None:
-                there = {*kinds, *self._shelf.keys, *([INSTRUCTION] if "task" in kinds else [])}
-                raise DatasetError(f"the recording has no '{name}'; it has {', '.join(sorted(there))}.")
+                names = {*kinds, *self._shelf.keys, *([INSTRUCTION] if "task" in kinds else [])}
+                raise DatasetError(f"the recording has no '{name}'; it has {', '.join(sorted(names))}.")
             keys[name] = key
         return keys, {key: kinds[key] for key in keys.values()}
 
     def __len__(self) -> int:
-        """Batches of the whole of this epoch."""
+        """Batches in this epoch."""
         return self._batches(self._epoch)
 
     @property
     def epoch(self) -> int:
-        """The epoch of the batch that comes next, from 0."""
+        """The epoch of the next batch, from 0."""
         return self._epoch
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The batches that are left of this epoch."""
+        """The remaining batches of this epoch."""
         return self._run(range(self._epoch, self._epoch + 1))
 
     def forever(self) -> Iterator[dict[str, Any]]:
-        """The batches of this and all epochs to come, without a pause between epochs."""
+        """The remaining batches of this epoch and those of all later epochs, without a pause in between."""
         return self._run(range(self._epoch, 1 << 62))
 
     def state(self) -> dict:
-        """Where reading stands, as JSON values: after the batch that was given last."""
+        """The position after the last batch, as JSON values."""
         return {"epoch": self._epoch, "batch": self._next, "of": self._shelf.facts()}
 
     def resume(self, state: Mapping) -> Clips:
-        """Goes on after `state`, whatever the number of workers; DatasetError where it belongs to other clips."""
+        """Continues at `state`, with any number of workers; DatasetError where it belongs to other clips."""
         try:
             epoch, batch, stated = int(state["epoch"]), int(state["batch"]), dict(state["of"])
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(f"this is no state of Clips ({error!r}); pass what `state()` gave.") from error
+            raise DatasetError(f"this is not a state of Clips ({error!r}); pass the result of `state()`.") from error
         for name, mine in self._shelf.facts().items():
             if stated.get(name) != mine:
                 raise DatasetError(
@@ -172,14 +172,14 @@ class Clips:
         return self
 
     def _batches(self, epoch: int) -> int:
-        found = self._shelf.batches(epoch)
-        if not found:
+        count = self._shelf.batches(epoch)
+        if not count:
             raise DatasetError(
                 f"{self._shelf.facts()['clips']} clips of {self._order.length} rows make no batch of {self._order.batch} "
                 f"for each of {self._order.world_size} ranks; ask for fewer or shorter clips, or for drop_last=False (and where "
                 "it is read in windows, which are dealt to the ranks, for a smaller budget_bytes)."
             )
-        return found
+        return count
 
     def _run(self, epochs: range) -> Iterator[dict[str, Any]]:
         first = self._next
@@ -195,7 +195,7 @@ class Clips:
                 yield _as_torch(arrays) if self._torch else arrays
 
     def _made(self, fill: Fill, places: Iterator[tuple[int, int]]) -> Iterator[tuple[tuple[int, int], dict]]:
-        """Each place with its batch, in order; workers are at most two batches each ahead."""
+        """Each place with its batch, in order; each worker is at most two batches ahead."""
         if not self._workers:
             yield from ((place, self._make(fill, *place)) for place in places)
             return
@@ -218,11 +218,11 @@ class Clips:
         return {name: self._meant(name, arrays[key]) for name, key in self._keys.items()}
 
     def _meant(self, channel: str, array: np.ndarray) -> np.ndarray:
-        """What was asked for: the array that holds it, or the embeddings of its tasks."""
+        """The array of a channel: as read, or, for instructions, the embeddings of its tasks."""
         if channel != INSTRUCTION or array.dtype.kind == "f":
             return array
-        found = self._memory.empty((*array.shape, self._meanings.shape[1]), self._meanings.dtype)
-        return np.take(self._meanings, array, axis=0, out=found, mode="clip")
+        out = self._memory.empty((*array.shape, self._meanings.shape[1]), self._meanings.dtype)
+        return np.take(self._meanings, array, axis=0, out=out, mode="clip")
 
 
 def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) -> Any:
@@ -230,10 +230,10 @@ def _files(source: str | Path, cache_dir: str | Path | None, budget_bytes: int) 
 
 
 class _Whole:
-    """All clips of one clip cache, which any number of processes map at once.
+    """All clips of one clip cache, which many processes can map at once. `Windows` has the same interface.
 
-    `facts` are the JSON values that, with the epoch, decide the order; `clips` and `batches` tell how many of an epoch are
-    this rank's; while `reading` is entered, `fill(epoch, batch, arrays)` works from batch `first` of the first epoch on.
+    `facts` are the JSON values that, with the epoch, decide the order. `clips` and `batches` count those of this rank in
+    an epoch. `reading` gives a function `fill(epoch, batch, arrays)`, for batches from `first` of the first epoch on.
     """
 
     def __init__(self, cache: ClipCache, order: ClipOrder, episodes: Sequence[int] | None):
@@ -266,7 +266,7 @@ class _Whole:
 
 
 class _Memory:
-    """Gives arrays whose memory comes back by itself when nobody refers to them or their views any more."""
+    """Gives arrays whose memory is reused once neither they nor their views are referenced."""
 
     def __init__(self):
         self._spare: dict[int, deque[bytearray]] = {}
@@ -278,7 +278,7 @@ class _Memory:
             memory = spare.pop()
         except IndexError:
             memory = bytearray(size)
-        array = np.ndarray(shape, dtype, memory)  # every view holds on to it, for it owns no memory that numpy knows
+        array = np.ndarray(shape, dtype, memory)  # views refer to it, because it does not own its memory
         weakref.finalize(array, spare.append, memory).atexit = False
         return array
 

@@ -1,4 +1,4 @@
-"""Windows: a recording far away, read a few episodes at a time, the next while this one is used; both bounded in bytes."""
+"""Windows: reads a remote recording a few episodes at a time, and fetches the next window while one is used."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from ..dataset import Dataset
 from .cache import Kinds, array_for, bytes_a_row, fill_episode, further_cameras, keys_of, kinds_of
 from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 
-_FILES, _CLIPS = 1, 2  # which of an epoch's shuffles
+_FILES, _CLIPS = 1, 2  # the two shuffles of an epoch
 
 
 class Windows:
-    """Clips of a recording in windows of as many rows of `channels` as `window_bytes` hold, two of which exist at a time.
+    """Clips of a recording in windows of at most `window_bytes`, two of which exist at a time.
 
-    `kinds` lacks the channels that the recording does.
-    An epoch takes the recording's files in shuffled order, cuts what they hold into windows, deals these to the ranks in
-    turn, and shuffles the clips of each. A file is fetched once an epoch (twice where a window ends inside it). An
-    episode that is longer than a window is cut into several; which clips there are does not change.
+    An epoch takes the files in shuffled order, cuts their rows into windows, deals these to the ranks in turn, and
+    shuffles the clips of each window. A file is fetched once an epoch (twice where a window ends inside it). An episode
+    longer than a window is spread over several; its clips stay the same. `kinds` has the channels that the recording has.
     """
 
     def __init__(
@@ -38,9 +37,9 @@ class Windows:
         episodes: Sequence[int] | None,
         window_bytes: int,
     ):
-        there, self.keys = kinds_of(dataset, size, further_cameras(dataset, channels)), keys_of(dataset)
-        wanted = [array_for(name, there, self.keys) for name in channels]
-        self.kinds: Kinds = {key: there[key] for key in wanted if key is not None} or there
+        kinds, self.keys = kinds_of(dataset, size, further_cameras(dataset, channels)), keys_of(dataset)
+        wanted = [array_for(name, kinds, self.keys) for name in channels]
+        self.kinds: Kinds = {key: kinds[key] for key in wanted if key is not None} or kinds
         self.window_rows = window_bytes // bytes_a_row(self.kinds)
         if self.window_rows < order.span:
             raise DatasetError(
@@ -89,7 +88,7 @@ class Windows:
             left, at = int(self._counts[i]), 0
             while left:
                 rows = left + self.order.span - 1
-                if room < min(rows, self.window_rows):  # what fits into a window is not cut
+                if room < min(rows, self.window_rows):  # rows that fit into a window stay together
                     windows.append([])
                     room = self.window_rows
                 clips = min(left, room - self.order.span + 1)
@@ -104,26 +103,26 @@ class Windows:
 
 @dataclass(frozen=True)
 class ClipRun:
-    """`clips` clips of an episode, of which the first begins at its row `first`."""
+    """Consecutive clips of an episode."""
 
     episode: int
-    first: int
-    clips: int
+    first: int  # row of the episode at which the first clip starts
+    clips: int  # number of clips
 
 
 @dataclass(frozen=True)
 class _Epoch:
-    """This rank's windows: their pieces, their numbers among all ranks', and clips before each; clips of every rank."""
+    """The windows of this rank in one epoch."""
 
     windows: list[list[ClipRun]]
-    numbers: list[int]
-    before: np.ndarray
-    of_ranks: np.ndarray
+    numbers: list[int]  # of the windows, among those of all ranks
+    before: np.ndarray  # clips before each window
+    of_ranks: np.ndarray  # clips of each rank
 
 
 @dataclass(frozen=True)
 class _Window:
-    """Rows of several pieces one after another; row r of piece i is row r + shift[i] of the dataset."""
+    """The rows of several clip runs in one array; row r of run i is row r + shift[i] of the dataset."""
 
     arrays: dict[str, np.ndarray]
     starts: ClipStarts
@@ -132,13 +131,13 @@ class _Window:
 
 
 class _Belt:
-    """Windows in the order of their use: a thread makes the next one while batches are filled from this one."""
+    """The queue of windows: a thread loads the next one while batches are filled from the current one."""
 
     def __init__(self, windows: Windows, epochs: range, first: int):
-        self._windows, self._plan = windows, windows.plan
+        self._windows, self._plan = windows, windows.order
         self._changed = threading.Condition()
         self._ready: dict[tuple[int, int], _Window] = {}
-        self._left: dict[tuple[int, int], int] = {}  # clips that nobody has copied yet
+        self._left: dict[tuple[int, int], int] = {}  # clips that have not been copied
         self._error: BaseException | None = None
         self._closed = False
         self._pool = ThreadPoolExecutor(os.cpu_count() or 1, "window")
@@ -152,7 +151,7 @@ class _Belt:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def fill(self, epoch: int, number: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Copies the clips of a batch, from as many windows as they lie in."""
+        """Copies the clips of a batch, which may lie in several windows."""
         before, clips = self._windows.epoch(epoch).before, len(next(iter(arrays.values())))
         done, place = 0, number * self._plan.batch
         while done < clips:
@@ -174,7 +173,7 @@ class _Belt:
             self._changed.wait_for(lambda: (epoch, w) in self._ready or self._error or self._closed)
             if (epoch, w) in self._ready:
                 return self._ready[epoch, w]
-            raise self._error or DatasetError("reading was stopped; begin a new loop.")
+            raise self._error or DatasetError("reading was stopped; start a new loop.")
 
     def _copy(self, window: _Window, epoch: int, w: int, first: int, arrays: Mapping[str, np.ndarray]) -> None:
         places = first + np.arange(len(next(iter(arrays.values()))))
@@ -201,7 +200,7 @@ class _Belt:
                         self._ready[epoch, w], self._left[epoch, w] = window, left
                         self._changed.notify_all()
                     del window
-        except BaseException as error:  # handed to whoever waits
+        except BaseException as error:  # raised in the waiting thread
             with self._changed:
                 self._error = error
                 self._changed.notify_all()

@@ -14,10 +14,10 @@ from ...core.errors import DatasetError
 from ...core.files import creating, not_written
 from ...data.dataset import Dataset
 from ...data.features import unit_of
-from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, tidy
+from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, whole_rate
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
-from ...data.source import Readings, Sensor, Source, Take, follows
+from ...data.source import Readings, Sensor, Source, Take, is_outcome
 from . import rows
 
 
@@ -99,7 +99,7 @@ def _lead(source: Source, first: Take) -> str:
     there = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
     if not there:
         raise DatasetError(f"the first take of {source.name} has no readings at all.")
-    seen = [sensor for sensor in there if not follows(sensor.name) and sensor.kind != "points"] or there
+    seen = [sensor for sensor in there if not is_outcome(sensor.name) and sensor.kind != "points"] or there
     cameras = [sensor for sensor in seen if sensor.kind == "image"]
     return max(cameras or seen, key=lambda sensor: len(first.readings[sensor.name].time_s)).name
 
@@ -119,7 +119,9 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
     for name, sensor in source.sensors.items():
         if name in (*AUTOMATIC, ACTION_VALID, TIME):
             continue
-        reserved = sensor.kind == "points" or (sensor.rate_hz is not None and tidy(sensor.rate_hz) != tidy(rate))
+        reserved = sensor.kind == "points" or (
+            sensor.rate_hz is not None and whole_rate(sensor.rate_hz) != whole_rate(rate)
+        )
         if sensor.kind == "image" and (sensor.shape[0] % 2 or sensor.shape[1] % 2) and pictures == "video":
             pictures = "png"
             notes.append(
@@ -136,7 +138,7 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
     facts = dict(source.facts)
     world = facts.pop("world", {})
     layout = Layout(
-        tidy(float(rate)),
+        whole_rate(float(rate)),
         sensors,
         streams,
         clock=source.fps is None,
@@ -166,11 +168,11 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
         readings = take.readings.get(name, _NONE)
         place = _places(readings.time_s, at)
         apart = len(readings.time_s) < len(at) - 1  # fewer than rows: only where the source has rows are they gaps
-        if len(readings.time_s) and place is not None and (not apart or (follows(name) and has_rows)):
+        if len(readings.time_s) and place is not None and (not apart or (is_outcome(name) and has_rows)):
             columns[name], _ = (readings.values, place), exact.add(name)
             continue
         columns[name] = _resampled(readings, sensor, at, how.policy)
-        if len(readings.time_s) and not follows(name) and columns[name][1][0] < 0:
+        if len(readings.time_s) and not is_outcome(name) and columns[name][1][0] < 0:
             notes.append(f"rows before the first reading of {name} hold that first reading")
     said = [(float(when), str(words)) for when, words in take.facts.get("language", ())]  # type: ignore[misc]
     for i, time_s in enumerate(at):
@@ -180,7 +182,7 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
         for name, (values, place) in columns.items():
             if place[i] >= 0:
                 row[name] = values[int(place[i])]
-            elif not follows(name):
+            elif not is_outcome(name):
                 first = int((place >= 0).argmax())
                 row[name] = values[int(place[first])] if place[first] >= 0 else None
         for name in deep:
@@ -210,10 +212,10 @@ def _resampled(
     readings: Readings, sensor: Sensor, at: np.ndarray, policy: Policy
 ) -> tuple[Sequence | np.ndarray, np.ndarray]:
     """(values of T rows, int64 [T]: the row itself, or -1 where there is no value)."""
-    mixes = sensor.kind == "vector" and not follows(sensor.name)
+    mixes = sensor.kind == "vector" and not is_outcome(sensor.name)
     held: Policy = "nearest" if policy == "linear" and not mixes else policy
     values, valid = resample(readings, sensor, at, held)
-    if follows(sensor.name) and len(readings.time_s):  # an action lasts until the next; after the last there is none
+    if is_outcome(sensor.name) and len(readings.time_s):  # an action lasts until the next; after the last there is none
         period = np.median(np.diff(readings.time_s)) if len(readings.time_s) > 1 else 0.0
         valid = valid & (at < readings.time_s[-1] + max(period, SAME_TIME_S))
     return values, np.where(valid, np.arange(len(at)), -1)

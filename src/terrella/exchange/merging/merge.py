@@ -31,7 +31,7 @@ import numpy as np
 from PIL import Image
 
 from ...core.errors import DatasetError
-from ...data.resample import SAME_TIME_S, blank, clock_of, pick, resample, row_times, stacked
+from ...data.resample import SAME_TIME_S, blank_value, clock_of, picked_rows, resample, row_times, stacked
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from .mapping import (
     ACTION,
@@ -285,7 +285,7 @@ def _pictures(take, at_s, source, origin, mapping, sensors, count) -> dict[str, 
 def _fitted(seen, valid: np.ndarray, sensor: Sensor, name: str) -> Lazy:
     def look(row: int) -> np.ndarray:
         if not valid[row]:
-            return blank(sensor)
+            return blank_value(sensor)
         picture, shape = np.asarray(seen[row]), sensor.shape
         good = picture.ndim == len(shape) and picture.shape[2:] == shape[2:] and picture.size
         if not good or picture.dtype != sensor.dtype:
@@ -323,7 +323,7 @@ def _kept(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.n
         elif to.startswith(FOLLOWS):
             values, valid = _followed(take.readings[name], origin.sensors[name], sensor, at_s, source, mapping)
         elif sensor.kind == "points":
-            index = pick(clock_of(take.readings[name], name), at_s, mapping.rows.images, mapping.rows.max_gap_s)
+            index = picked_rows(clock_of(take.readings[name], name), at_s, mapping.rows.images, mapping.rows.max_gap_s)
             values, valid = np.zeros(0), index >= 0
         else:
             policy, gap = mapping.rows.continuous, mapping.rows.max_gap_s
