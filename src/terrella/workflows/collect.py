@@ -16,8 +16,8 @@ from ..core.errors import DatasetError, TerrellaError
 from ..core.policy import Policy
 from ..core.spec import Spec
 from ..core.world import World, make_rng
-from ..data import Dataset, Layout, Recorder, record
-from ..data.collect import LocalWorkers
+from ..data import Dataset, Layout, Recorder, RecordOptions, record
+from ..data.collect import Job, LocalWorkers
 from ..data.collect import collect as collect_episodes
 from ..data.ray import RayWorkers
 from .opening import ControlsConfig, EnvironmentConfig
@@ -157,16 +157,19 @@ def explore(
     report: Report,
     pictures: Stored,
     policy: Policy | None = None,
-    **limits: Any,
+    live: Any = None,
+    enough: Callable[[], bool] = lambda: False,
 ) -> Recorder:
-    """Adds episodes of a script, or of `policy`, to the dataset `out`. `limits`: as `data.record` takes them."""
+    """Adds episodes of a script, or of `policy`, to the dataset `out`; `live` and `enough` as in `data.record`."""
     has_rows = (out / "meta" / "info.json").exists()
     if policy is None:
         policy = explorer = Explorer(world.spec, out / ".explorer")
         kept = Dataset(out) if has_rows else None
         explorer.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
     try:
-        return record(world, policy, out, frames, make_rng(seed), report, pictures=pictures, **limits)
+        return record(
+            world, policy, out, frames, make_rng(seed), report, enough, RecordOptions(pictures=pictures, live=live)
+        )
     except DatasetError:
         raise
     except TerrellaError as error:  # the world's
@@ -183,7 +186,8 @@ def _collect_by_workers(
     upto = None if config.episodes is not None else FRAMES if config.frames is None else config.frames
     try:
         with stage("recording", progress) as report:
-            collect_episodes(make, world, out, make_rng(config.seed), workers, config.episodes, upto, report, layout)
+            job = Job.of(make, world.spec, make_rng(config.seed), layout)
+            collect_episodes(job, out, workers, config.episodes, upto, report)
     except KeyboardInterrupt:
         safe = len(Dataset(out).episodes) if (out / "meta" / "info.json").exists() else 0
         raise KeyboardInterrupt(f"stopped: {safe:,} episodes are safe in {out}; the same command goes on.") from None

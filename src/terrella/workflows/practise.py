@@ -26,7 +26,7 @@ from ..core.files import write_json
 from ..core.policy import Policy
 from ..core.spec import AXES, shape_of
 from ..core.world import World, make_rng
-from ..data import Dataset, record
+from ..data import Dataset, RecordOptions, record
 from ..learn.recipes.latent import LatentTraining, train_latent
 from ..learn.recipes.policy import Practice, seen_unless_said, train_policy
 from ..measure.statistics import mean_interval
@@ -233,7 +233,8 @@ def _collect(rounds: _Rounds, number: int, real: World, config: PractiseConfig, 
         return
     policy = load_learned_policy(rounds.policy(number - 1), real.spec, library.load(rounds.world(number - 1)))
     mixed = NoisyPolicy(sampling(policy), RANDOM_SHARE, real.spec)
-    record(real, mixed, rounds.recording, upto, make_rng(seed), counted, pictures=stored, enough=enough)
+    options = RecordOptions(pictures=stored)
+    record(real, mixed, rounds.recording, upto, make_rng(seed), counted, enough, options)
 
 
 def sampling(policy: Policy) -> Policy:

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from ...core.errors import PlanningError
-from ...core.rollouts import advanced
+from ...core.rollouts import advance
 from ...core.world import World, make_rng
 from ..goal_network import GOAL, LATENT, GoalActor
 from .costs import distance
@@ -42,7 +42,7 @@ class CostModel(nn.Module):
         rng = make_rng(0)
         begun, goal = (self.world.observe({"rgb": info[name][:, 0, -1]}, None, rng) for name in ("pixels", "goal"))
         codes = candidates.reshape(batch * samples, -1, self.moves.size).float().clamp(-1, 1)
-        ended = advanced(self.world, begun.fork(samples), self.moves.actions(codes), rng)
+        ended = advance(self.world, begun.fork(samples), self.moves.actions(codes), rng)
         seen = {LATENT: self.world.render(ended, (LATENT,))[LATENT].unflatten(0, (batch, samples))}
         return distance(self.world.spec, self.world.render(goal, (LATENT,)), seen)
 

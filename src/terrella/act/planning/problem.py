@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 
 from ...core.errors import PlanningError
-from ...core.rollouts import advanced
+from ...core.rollouts import advance
 from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import LATENT, Cost
@@ -125,7 +125,7 @@ class PlanningProblem:
                 self.block // self.world.spec.leap,
             )
             self._count, self.imagined_steps = self._count + 1, self.imagined_steps + candidates * leaps
-            state = advanced(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
+            state = advance(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
             return state, self.cost.step_cost(self._render(state, candidates), self.goal).cpu(), alive, None
         for _ in range(self.block):
             state = self._imagine(state, actions, candidates)
