@@ -155,21 +155,18 @@ def explore(
     frames: int,
     seed: int,
     report: Report,
-    pictures: Stored,
+    options: RecordOptions,
     policy: Policy | None = None,
-    live: Any = None,
     enough: Callable[[], bool] = lambda: False,
 ) -> Recorder:
-    """Adds episodes of a script, or of `policy`, to the dataset `out`; `live` and `enough` as in `data.record`."""
+    """Adds episodes of a script, or of `policy`, to the dataset `out`; `options` and `enough` as in `data.record`."""
     has_rows = (out / "meta" / "info.json").exists()
     if policy is None:
         policy = explorer = Explorer(world.spec, out / ".explorer")
         kept = Dataset(out) if has_rows else None
         explorer.recall(kept.length - len(kept.episodes) if kept else 0)  # each episode ends with a row without action
     try:
-        return record(
-            world, policy, out, frames, make_rng(seed), report, enough, RecordOptions(pictures=pictures, live=live)
-        )
+        return record(world, policy, out, frames, make_rng(seed), report, enough, options)
     except DatasetError:
         raise
     except TerrellaError as error:  # the world's
@@ -205,7 +202,8 @@ def _record(
             _serve_recorder(world, config, layout, live, progress)
         else:
             with stage("recording", progress) as report:
-                done = explore(world, out, frames, config.seed, report, pictures, policy, live=live)
+                options = RecordOptions(pictures=pictures, live=live)
+                done = explore(world, out, frames, config.seed, report, options, policy)
             facts |= {"waited_for_encoder_s": round(done.pressure.waited_s, 3)}
     dataset = Dataset(out) if out.exists() else None
     if dataset is None or not dataset.length:

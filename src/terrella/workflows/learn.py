@@ -11,7 +11,7 @@ from typing import Any
 
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
-from ..data import Dataset
+from ..data import Dataset, RecordOptions
 from ..data.recording import LONGEST
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
@@ -188,8 +188,8 @@ class _Learning:
         def enough() -> bool:
             return schedule.left_s(RECORDING) <= 0 and overtime_s() <= 0
 
-        limits: dict[str, Any] = {"max_episode_steps": schedule.facts["longest"], "enough": enough}
-        explore(world, out, frames, self.config.seed, counted, storage_of(world.spec), **limits)
+        options = RecordOptions(max_episode_steps=schedule.facts["longest"], pictures=storage_of(world.spec))
+        explore(world, out, frames, self.config.seed, counted, options, enough=enough)
         dataset = Dataset(out)
         if dataset.length < min(FEWEST_FRAMES, frames):
             raise DatasetError(

@@ -227,13 +227,12 @@ def _collect(rounds: _Rounds, number: int, real: World, config: PractiseConfig, 
     def enough() -> bool:
         return rows >= least and time.monotonic() - began > seconds
 
-    stored = storage_of(real.spec)
+    options = RecordOptions(pictures=storage_of(real.spec))
     if number == 0:
-        explore(real, rounds.recording, upto, seed, counted, stored, enough=enough)
+        explore(real, rounds.recording, upto, seed, counted, options, enough=enough)
         return
     policy = load_learned_policy(rounds.policy(number - 1), real.spec, library.load(rounds.world(number - 1)))
     mixed = NoisyPolicy(sampling(policy), RANDOM_SHARE, real.spec)
-    options = RecordOptions(pictures=stored)
     record(real, mixed, rounds.recording, upto, make_rng(seed), counted, enough, options)
 
 
