@@ -19,6 +19,7 @@ LINKING = [*PATHS, ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*/*.md"))]
 SNIPPETS = [
     pytest.param(name, snippet, id=f"{name}-{number}")
     for name, page in GUIDES.items()
+    if name != "from-python.md"  # tests/test_from_python.py runs it
     for number, snippet in enumerate(re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL))
 ]
 COMMANDS = [

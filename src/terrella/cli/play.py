@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from .named import Controls, Device, Fast, Keeper, load_named
+from ..workflows.key_keeper import KeyKeeper
+from ..workflows.opening import ControlsConfig, Device, Fast, load_named
 from .say import Host, Json, Port, Seed, Token, result, say
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 def play(
     name: Positional[str],
-    controls: Controls,
+    controls: ControlsConfig,
     image: Path | None = None,
     compare: bool = False,
     truth: str | None = None,
@@ -76,7 +77,7 @@ def play(
         worlds = [_game_like(learned, truth), learned]
     worlds = [controls.of(world) for world in worlds]
     own = library.folder_for_keys(name) if is_loopback(host) and not compare else None
-    keeper, sink = Keeper(worlds[0].spec, own, learned.spec), None
+    keeper, sink = KeyKeeper(worlds[0].spec, own, learned.spec), None
     if record is not None:
         from ..data import Layout, Recorder
 
