@@ -31,7 +31,7 @@ def test_a_goal_is_reached_beside_a_floor_and_the_same_seed_does_the_same(capsys
     assert one["curve"][0]["imagined"] < one["curve"][1]["imagined"]
     whole = json.loads((tmp_path / "a" / "plan.json").read_text())
     assert len(whole["played"]) == 4 and max(whole["divergence"]["observation"]) < 1e-5 and not whole["film"]
-    assert "Does thinking longer help?" in (tmp_path / "a" / "plan.html").read_text()
+    assert "Does more search help?" in (tmp_path / "a" / "plan.html").read_text()
 
 
 def test_reality_and_dream_are_filmed(capsys, tmp_path):

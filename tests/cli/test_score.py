@@ -235,7 +235,7 @@ def test_a_simulator_that_takes_no_evidence_gets_a_card(tmp_path, capsys):
     assert main([*given, "--quick", "--horizons", "1", "8", "--json"]) == 0
     card = json.loads(capsys.readouterr().out)
     assert {row["probe"] for row in card["rows"]} >= {"speed"}
-    assert "needs a world that takes evidence" in card["verdict"][0]
+    assert "needs a world that observes something" in card["verdict"][0]
 
 
 def test_a_recording_without_pictures_is_refused_by_a_world_of_pictures(tmp_path, monkeypatch, capsys):

@@ -105,13 +105,13 @@ def scores_of(dream, real, control=None, measure="return"):
     "make, said",
     [
         (lambda: drawn(True), "ranks these 10 policies as reality does: Spearman"),
-        (lambda: drawn(False), "cannot be seen to tell these 10 policies apart"),
+        (lambda: drawn(False), "does not reliably rank these 10 policies"),
         (lambda: (-drawn(True)[1], drawn(True)[1]), "the wrong way round"),
-        (lambda: (torch.ones(5, 8), drawn(True, 5, 8)[1]), "cannot tell these 5 policies apart: it gives all the same"),
+        (lambda: (torch.ones(5, 8), drawn(True, 5, 8)[1]), "cannot rank these 5 policies: all have the same"),
         (lambda: (drawn(True, 5, 8)[1], torch.ones(5, 8)), "nothing to rank"),
         (lambda: drawn(True, 3), "too few"),
         (lambda: drawn(True, 2), "2 policies are too few"),
-        (lambda: drawn(True, 1), "One policy has no rank"),
+        (lambda: drawn(True, 1), "One policy has no ranking"),
     ],
 )
 def test_the_verdict_comes_first(make, said):

@@ -38,11 +38,11 @@ def test_the_report_stands_alone(card, tmp_path):
     assert html.index("better than copying the last frame") < html.index("<h2>Likeness")
     for heading in (
         "Likeness over time",
-        "Does it obey?",
+        "Does it follow actions?",
         "Position",
         "Does it remember?",
         "A long rollout",
-        "Does it fade while nobody plays?",
+        "Does it fade without actions?",
         "Speed",
     ):
         assert f"<h2>{heading}</h2>" in html

@@ -24,16 +24,16 @@ def test_an_oracle_and_chance_are_told_apart():
     wrong = errors()
     sure, curves = figures(wrong, wrong)
     assert sure["AURC"].figure.value == pytest.approx(sure["AURC"].baselines["by an oracle"].value)
-    assert sure["order worth"].figure.value == pytest.approx(100)
+    assert sure["order quality"].figure.value == pytest.approx(100)
     assert sure["calibration error"].figure.value == pytest.approx(0, abs=1e-6)
     assert curves[0].band.value == curves[1].band.value
     blind, _ = figures(wrong, torch.rand(wrong.shape, generator=make_rng(2)))
     assert blind["AURC"].figure.value == pytest.approx(blind["AURC"].baselines["by chance"].value, rel=0.12)
-    assert abs(blind["order worth"].figure.value) < 20
+    assert abs(blind["order quality"].figure.value) < 20
     assert blind["AURC"].baselines["by chance"].value == pytest.approx(100 * float(wrong.mean()), rel=1e-5)
     contrary, _ = figures(wrong, -wrong)
     assert contrary["AURC"].figure.value > contrary["AURC"].baselines["by chance"].value
-    assert contrary["order worth"].figure.value < 0
+    assert contrary["order quality"].figure.value < 0
 
 
 def test_the_area_is_that_of_the_curve():
@@ -75,5 +75,5 @@ def test_places_together_are_asked_as_well():
             return {**seen, "uncertainty": state["age"] / 1000}
 
     card = card_of({"a": Doubting("fading")}, {"recorded": some_clips(4), "new": some_clips(4, seed=9)})
-    rows = {row.place: row.figure for row in card.rows if row.what == "order worth" and row.motion == "predicted"}
+    rows = {row.place: row.figure for row in card.rows if row.what == "order quality" and row.motion == "predicted"}
     assert set(rows) == {"recorded", "new", "all"} and rows["all"].value > 50, "older is worse"

@@ -142,11 +142,11 @@ class CountBased:
         for entry, play in enumerate(memory):
             first = play.cells is None
             self._look(play, np.zeros((1, 1, 1)) if seen is None else seen[entry].cpu().numpy())
-            if play.left <= 0 or (play.still > 1 and play.kind != "rest" and _unit(rng) < 0.7):
+            if play.left <= 0 or (play.still > 1 and play.kind != "rest" and random_unit(rng) < 0.7):
                 self._move(play, rng)
             elif play.kind == "mash" and play.mash <= 0:
                 self._take(play, self._any(rng), rng)
-                play.mash = _whole(rng, 1, 3)
+                play.mash = random_int(rng, 1, 3)
             play.left, play.mash = play.left - 1, play.mash - 1
             chosen.append(play.action)
             if self.log is not None:
@@ -170,15 +170,15 @@ class CountBased:
         play.kind, play.still = kinds[int(torch.multinomial(odds, 1, generator=rng))], 0
         likely = self.novelty.holds.clip(0.05) ** 4 / np.sqrt([sum(ends) for ends in _HOLDS])
         play.hold = int(torch.multinomial(torch.from_numpy(likely / likely.sum() + 0.05), 1, generator=rng))
-        play.left = _whole(rng, *_HOLDS[play.hold])
+        play.left = random_int(rng, *_HOLDS[play.hold])
         if play.kind == "seek":
             score = self.novelty.score(play.cells)
             likely = np.exp((score - score.max()) / (0.05 * max(self.novelty.mean_novelty, 1e-9)))
             arm = int(torch.multinomial(torch.from_numpy(likely), 1, generator=rng))
         else:
             arm = 0 if play.kind == "rest" else self._any(rng)
-            play.left = min(play.left, 12) if play.kind == "rest" else round(40 ** _unit(rng))
-            play.left, play.mash = (_whole(rng, 5, 20), 1) if play.kind == "mash" else (play.left, 0)
+            play.left = min(play.left, 12) if play.kind == "rest" else round(40 ** random_unit(rng))
+            play.left, play.mash = (random_int(rng, 5, 20), 1) if play.kind == "mash" else (play.left, 0)
         self._take(play, arm, rng)
 
     def _any(self, rng: torch.Generator) -> int:
@@ -188,7 +188,7 @@ class CountBased:
     def _take(self, play: _Play, arm: int, rng: torch.Generator) -> None:
         play.arm, play.action = arm, self.arms[arm]
         if isinstance(self.spec.action, spaces.Box) and arm and self.spec.action.dtype.kind == "f":
-            rest, part = self.arms[0], _unit(rng)
+            rest, part = self.arms[0], random_unit(rng)
             if part < 0.5:  # continuous actions between their limits too
                 play.action = rest + (play.action - rest) * (2 * part)
 
@@ -237,16 +237,16 @@ def _arms(spec: Spec) -> torch.Tensor:
     singles, rng = list(arms.values()), torch.Generator().manual_seed(0)
     for _ in range(max(12, min(len(singles), 32))):
         if spec.action_mode == BUTTONS:
-            both = np.maximum(*(singles[_whole(rng, 0, len(singles) - 1)] for _ in range(2)))
+            both = np.maximum(*(singles[random_int(rng, 0, len(singles) - 1)] for _ in range(2)))
         else:
             both = spec.sample_action(1, rng)[0].numpy()
         arms[both.tobytes()] = both
     return torch.from_numpy(np.stack(list(arms.values())))
 
 
-def _unit(rng: torch.Generator) -> float:
+def random_unit(rng: torch.Generator) -> float:
     return float(torch.rand(1, generator=rng))
 
 
-def _whole(rng: torch.Generator, least: int, most: int) -> int:
+def random_int(rng: torch.Generator, least: int, most: int) -> int:
     return int(torch.randint(least, most + 1, (1,), generator=rng))

@@ -12,7 +12,7 @@ import torch
 from ..core.spec import Spec
 from ..core.world import Observation
 from ..space.camera import yaw
-from .count_based import CountBased
+from .count_based import CountBased, random_int, random_unit
 
 LEGS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
 _BODY_M = 0.55  # half the width that must be free to walk through
@@ -133,7 +133,7 @@ class _Walk:
         """Turns to the most promising open direction in sight and runs there, steering clear of walls."""
         score = self.promise(view)
         side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
-        along = [(), (), ("MOVE_BACKWARD",), ("MOVE_LEFT",), ("MOVE_RIGHT",)][_whole(self.rng, 0, 4)]
+        along = [(), (), ("MOVE_BACKWARD",), ("MOVE_LEFT",), ("MOVE_RIGHT",)][random_int(self.rng, 0, 4)]
         for _ in range(100):  # while only walls and known places are in sight, look elsewhere
             if float(score.max()) > 0.3 - self.boredom:
                 break
@@ -142,7 +142,7 @@ class _Walk:
             score = self.promise(view)
         self.boredom *= 0.5
         goal, stuck = self.choose(view, score), 0
-        for step in range(1, _whole(self.rng, 12, 40)):
+        for step in range(1, random_int(self.rng, 12, 40)):
             if step % 8 == 0:  # look again; keep the heading unless another is clearly better
                 apart = _wrapped(view.yaw + view.bearing - goal)
                 goal = self.choose(view, self.promise(view) + 0.3 * torch.exp(-((apart / 0.3) ** 2)))
@@ -169,15 +169,15 @@ class _Walk:
         times. One fight of five only aims, and one of three aims beside the object, sometimes barely: so recordings separate the
         effect of a hit from that of a shot, and of a shot from that of aiming."""
         along = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][
-            _whole(self.rng, 0, 6)
+            random_int(self.rng, 0, 6)
         ]
-        often = (0.0, 0.3, 0.8, 1.0, 1.0)[_whole(self.rng, 0, 4)]
+        often = (0.0, 0.3, 0.8, 1.0, 1.0)[random_int(self.rng, 0, 4)]
         beside = 0.0  # radians
         if _chance(self.rng, 1 / 3):
             side = -1 if _chance(self.rng, 0.5) else 1
-            beside = side * _whole(self.rng, 8, 45) / 100
+            beside = side * random_int(self.rng, 8, 45) / 100
         target, turned = view.thing(target=True), 0.0
-        for _ in range(_whole(self.rng, 20, 70)):
+        for _ in range(random_int(self.rng, 20, 70)):
             if target is None:
                 break
             off = target[0] - beside - turned  # a turn continues for one more step
@@ -206,7 +206,7 @@ class _Walk:
     def use(self, view: _View) -> _Moves:
         """Presses USE at an obstacle, waits for it to open, and walks on if it does."""
         view = yield from self.hold(("USE",), 1, 3)
-        for _ in range(_whole(self.rng, 10, 40)):
+        for _ in range(random_int(self.rng, 10, 40)):
             view = yield from self.step(*(("MOVE_FORWARD",) if view.ahead_m() > 1.0 else ()))
         return view
 
@@ -220,10 +220,10 @@ class _Walk:
         if _chance(self.rng, 0.15):
             left = not left
         if _chance(self.rng, 0.25):
-            for _ in range(_whole(self.rng, 3, 10)):
+            for _ in range(random_int(self.rng, 3, 10)):
                 view = yield from self.step("MOVE_BACKWARD")
         side = ("MOVE_" if _chance(self.rng, 0.2) else "TURN_") + ("LEFT" if left else "RIGHT")
-        for _ in range(_whole(self.rng, 8, 30)):
+        for _ in range(random_int(self.rng, 8, 30)):
             view = yield from self.step(side)
             if side.startswith("TURN") and view.ahead_m() > 2.0:
                 break
@@ -231,9 +231,11 @@ class _Walk:
 
     def run(self, view: _View) -> _Moves:
         """Straight ahead, sometimes diagonally or while turning, until a wall is near."""
-        extra = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)][_whole(self.rng, 0, 6)]
+        extra = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)][
+            random_int(self.rng, 0, 6)
+        ]
         bump = _chance(self.rng, 0.15)  # recordings should have collisions too
-        for _ in range(_whole(self.rng, 8, 40)):
+        for _ in range(random_int(self.rng, 8, 40)):
             view = yield from self.step("MOVE_FORWARD", *extra)
             if not bump and view.ahead_m() < 0.9:
                 return (yield from self.dodge(view))
@@ -261,7 +263,7 @@ class _Walk:
         """A quarter to a full turn, sometimes and back again (for loop closure)."""
         side = "TURN_LEFT" if _chance(self.rng, 0.5) else "TURN_RIGHT"
         sides = [side, "TURN_RIGHT" if side == "TURN_LEFT" else "TURN_LEFT"] if _chance(self.rng, 0.4) else [side]
-        angle = math.pi * (0.5 + 1.5 * _unit(self.rng))
+        angle = math.pi * (0.5 + 1.5 * random_unit(self.rng))
         for side in sides:
             turned = 0.0
             for _ in range(140):
@@ -274,14 +276,14 @@ class _Walk:
 
     def mash(self, view: _View) -> _Moves:
         """Random key combinations, as a person tries a keyboard."""
-        for _ in range(_whole(self.rng, 2, 6)):
+        for _ in range(random_int(self.rng, 2, 6)):
             pressed = torch.rand(len(LEGS), generator=self.rng) < 0.3
             buttons = tuple(name for name, down in zip(LEGS, pressed.tolist()) if down)
             view = yield from self.hold(buttons, 3, 12)
         return view
 
     def hold(self, buttons: tuple[str, ...], least: int, most: int) -> _Moves:
-        for _ in range(_whole(self.rng, least, most)):
+        for _ in range(random_int(self.rng, least, most)):
             view = yield from self.step(*buttons)
         return view
 
@@ -326,13 +328,5 @@ def _wrapped(angle):
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def _unit(rng: torch.Generator) -> float:
-    return float(torch.rand(1, generator=rng))
-
-
 def _chance(rng: torch.Generator, likelihood: float) -> bool:
-    return _unit(rng) < likelihood
-
-
-def _whole(rng: torch.Generator, least: int, most: int) -> int:
-    return int(torch.randint(least, most + 1, (1,), generator=rng))
+    return random_unit(rng) < likelihood

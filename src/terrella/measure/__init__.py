@@ -1,4 +1,4 @@
-"""The scorecard: asks any World what its predictions are worth, and writes the answer as JSON and as a page."""
+"""The scorecard: measures the predictions of any World, and writes the result as JSON and as a page."""
 
 from .album import Album
 from .clips import Clip, check_recording, clips_from_cache, in_box, out_of_sight

@@ -1,4 +1,4 @@
-"""How much faster than time a world imagines, with fresh actions at each control step: per stream, in all, and in joules."""
+"""Throughput of a world with fresh actions at each control step: imagined seconds per wall second, and energy."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ..core.world import World, make_rng
 from .statistics import Figure, last_step_above
 
 POWERCAP = Path("/sys/class/powercap")
-WATTS_OF_A_CORE = 10.0  # assumed where no counter of energy is at hand
-LEARNERS = ("observation", "reward", "done")  # what a learner is shown at each step
+WATTS_OF_A_CORE = 10.0  # assumed without an energy counter
+LEARNERS = ("observation", "reward", "done")  # channels rendered for a learner at each step
 
 
 @dataclass(frozen=True)
 class Throughput:
-    """Of one batch size: imagined seconds a wall second, of all streams together, and joules an imagined second."""
+    """The throughput at one batch size."""
 
     batch: int
-    aggregate: float
-    joules: float
+    aggregate: float  # imagined seconds per wall second, all streams together
+    joules: float  # per imagined second
 
     @property
     def stream(self) -> float:
@@ -32,47 +32,49 @@ class Throughput:
 
 
 class EnergyMeter:
-    """Joules since it was made: of RAPL where the machine tells, else processor seconds at an assumed power."""
+    """Joules since its construction: from RAPL if the machine has it, else processor seconds times an assumed power."""
 
     def __init__(self) -> None:
         self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _of_a_processor(file))
-        self._first, self._busy = self._counted(), time.process_time()
+        self._first, self._busy = self._readings(), time.process_time()
 
     @property
     def how(self) -> str:
-        return "RAPL, of the whole processor" if self.files else f"estimated: {WATTS_OF_A_CORE:g} W a busy core"
+        return "RAPL, the whole processor" if self.files else f"estimated: {WATTS_OF_A_CORE:g} W per busy core"
 
     def joules(self) -> float:
         if self.files:
-            return sum((now - then) % most for now, then, most in zip(self._counted(), self._first, self._ends())) / 1e6
+            return (
+                sum((now - then) % most for now, then, most in zip(self._readings(), self._first, self._ranges())) / 1e6
+            )
         return WATTS_OF_A_CORE * (time.process_time() - self._busy)
 
-    def _counted(self) -> list[int]:
+    def _readings(self) -> list[int]:
         return [int(file.read_text()) for file in self.files]
 
-    def _ends(self) -> list[int]:
-        """Where each counter begins again."""
+    def _ranges(self) -> list[int]:
+        """The value at which each counter wraps around."""
         return [int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files]
 
 
 @torch.inference_mode()
 def measure_throughput(world: World, batch: int, seconds: float, seed: int = 0) -> Throughput:
-    """Steps `batch` streams for about `seconds` of wall time, each step with fresh uniform actions, showing what a learner sees."""
+    """Steps `batch` streams for about `seconds` of wall time with fresh uniform actions, rendering the channels of a learner."""
     rng, spec = make_rng(seed), world.spec
     shown = [name for name in LEARNERS if name in spec.channels]
     low, high = (torch.as_tensor(limit).float() for limit in spec.action_limits)
-    state = _stepped(world, world.start(batch, rng), low, high, shown, rng)  # the first may compile
+    state = _step(world, world.start(batch, rng), low, high, shown, rng)  # the first step may compile
     fresh, steps, meter, began = state, 0, EnergyMeter(), time.perf_counter()
     while (took := time.perf_counter() - began) < seconds or steps < 3:
-        state = _stepped(world, state, low, high, shown, rng)
+        state = _step(world, state, low, high, shown, rng)
         steps += 1
         if steps % 50 == 0:
-            state = fresh  # so that none stands still after its end
+            state = fresh  # so that no episode is stepped after its end
     imagined = batch * steps * spec.dt_s
     return Throughput(batch, imagined / took, meter.joules() / imagined)
 
 
-def _stepped(
+def _step(
     world: World, state: State, low: torch.Tensor, high: torch.Tensor, shown: Sequence[str], rng: torch.Generator
 ) -> State:
     action = low + (high - low) * torch.rand(state.batch, *low.shape, generator=rng)
@@ -83,8 +85,8 @@ def _stepped(
 
 @torch.inference_mode()
 def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int = 0) -> Figure:
-    """The steps for which the world, begun where episodes of the real one do and given the same random actions, foretells its
-    numbers better than standing still does; in the channels that it observes."""
+    """The steps up to which the world predicts the real one better than holding the first observation does, from the same starts
+    under the same random actions, in the channels that it observes."""
     rng, names = make_rng(seed), list(world.spec.observes)
     truth = real.start(episodes, rng)
     first = real.render(truth, names)
@@ -104,9 +106,9 @@ def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, se
 
 
 def _of_a_processor(file: Path) -> bool:
-    """Whether a counter can be read and is of one whole processor: that of a machine (psys) counts the same joules again."""
+    """Whether a counter is readable and of one whole processor; that of the machine (psys) would count the same joules twice."""
     try:
-        told = {name: (file.parent / name).read_text() for name in (file.name, "max_energy_range_uj", "name")}
-        return all(told.values()) and told["name"].startswith("package")
+        files = {name: (file.parent / name).read_text() for name in (file.name, "max_energy_range_uj", "name")}
+        return all(files.values()) and files["name"].startswith("package")
     except OSError:
         return False

@@ -1,4 +1,4 @@
-"""Whether two judges rank policies alike: Pearson, Spearman and SIMPLER's mean maximum rank violation, with intervals."""
+"""Agreement of two scorings of policies: Pearson, Spearman and the mean maximum rank violation of SIMPLER, with intervals."""
 
 from __future__ import annotations
 
@@ -9,30 +9,29 @@ import torch
 
 from .statistics import RESAMPLES, Figure, figure_of
 
-LEAST = 3  # policies, below which no ranking is spoken of
+LEAST = 3  # policies for a ranking
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How two judges agree on P policies. mmrv: in shares of what the policies differ by in the second (`scale`). chance: how often
-    policies ranked by chance agree as well, by Spearman."""
+    """The agreement of two scorings of P policies."""
 
     pearson: Figure
     spearman: Figure
-    mmrv: Figure
-    scale: float
-    chance: float = math.nan
+    mmrv: Figure  # in shares of `scale`
+    scale: float  # the range of the second scores
+    chance: float = math.nan  # p-value: share of random rankings with as high a Spearman correlation
 
 
 def pearson(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """The linear correlation of scores [..., P]; NaN where either are all the same."""
+    """The linear correlation of scores [..., P]; NaN if either are all equal."""
     one, other = (scores.double() - scores.double().mean(-1, keepdim=True) for scores in (one, other))
     spread = one.square().sum(-1).sqrt() * other.square().sum(-1).sqrt()
     return torch.where(spread > 1e-12, (one * other).sum(-1) / spread.clamp_min(1e-300), torch.nan).clamp(-1, 1)
 
 
 def ranks(scores: torch.Tensor) -> torch.Tensor:
-    """The rank of each of the scores [..., P], from 0 up; equal ones share the mean of theirs."""
+    """The ranks of scores [..., P], from 0 up; equal scores share their mean rank."""
     below = scores[..., None, :] < scores[..., :, None]
     same = scores[..., None, :] == scores[..., :, None]
     return below.sum(-1).double() + (same.sum(-1).double() - 1) / 2
@@ -44,19 +43,18 @@ def spearman(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def mean_maximum_rank_violation(dream: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
-    """MMRV (Li et al. 2024, SIMPLER): of each policy, the most by which it differs in reality from one that the dream ranks on the
-    other side of it; the mean over the policies [..., P], in the unit of the real scores."""
+    """MMRV (Li et al. 2024, SIMPLER): for each policy, the largest real difference to a policy that the dream ranks on the wrong
+    side of it; the mean over policies [..., P], in the unit of the real scores."""
     wrong = (dream[..., :, None] > dream[..., None, :]) != (real[..., :, None] > real[..., None, :])
-    apart = (real[..., :, None] - real[..., None, :]).abs().double()
-    return (apart * wrong).amax(-1).mean(-1)
+    gap = (real[..., :, None] - real[..., None, :]).abs().double()
+    return (gap * wrong).amax(-1).mean(-1)
 
 
 def agreement(dream: torch.Tensor, real: torch.Tensor, rng: torch.Generator, scale: float | None = None) -> Agreement:
-    """How the scores [P, N] of P policies in N episodes agree, episode n of all of them having begun alike.
+    """The agreement of scores [P, N] of P policies in N episodes; episode n starts alike for all.
 
-    The 95% intervals are percentiles of a bootstrap over policies and episodes: both are drawn anew, the same episodes for all.
-    Draws in which nothing differs have no correlation and are left out. scale: by which MMRV is divided; by default the range
-    of the real means.
+    The 95% intervals are percentiles of a bootstrap over policies and episodes, the same episodes for all policies. Resamples
+    without any difference have no correlation and are left out. scale: divisor of MMRV, by default the range of the real means.
     """
     count, episodes = real.shape
     dream, real = dream.double(), real.double()
@@ -66,16 +64,16 @@ def agreement(dream: torch.Tensor, real: torch.Tensor, rng: torch.Generator, sca
     drawn = torch.randint(episodes, (RESAMPLES, episodes), generator=rng)
     weights = torch.zeros(RESAMPLES, episodes, dtype=torch.float64)
     weights.scatter_add_(1, drawn, torch.ones(RESAMPLES, episodes, dtype=torch.float64))
-    again = [(weights @ scores.T / episodes).gather(1, policies) for scores in (dream, real)]
-    figures = [_figure(measure(*means), measure(*again), count) for measure in (pearson, spearman)]
-    violated = [mean_maximum_rank_violation(*each) / (scale or math.nan) for each in (means, again)]
+    resampled = [(weights @ scores.T / episodes).gather(1, policies) for scores in (dream, real)]
+    figures = [_figure(measure(*means), measure(*resampled), count) for measure in (pearson, spearman)]
+    violated = [mean_maximum_rank_violation(*each) / (scale or math.nan) for each in (means, resampled)]
     shuffled = means[0][torch.rand(RESAMPLES, count, generator=rng).argsort(-1)]
-    luck = (spearman(shuffled, means[1].expand_as(shuffled)) >= figures[1].value - 1e-9).double().mean()
-    return Agreement(figures[0], figures[1], _figure(violated[0], violated[1], count), scale, float(luck))
+    p_value = (spearman(shuffled, means[1].expand_as(shuffled)) >= figures[1].value - 1e-9).double().mean()
+    return Agreement(figures[0], figures[1], _figure(violated[0], violated[1], count), scale, float(p_value))
 
 
 def halves(scores: torch.Tensor, rng: torch.Generator) -> Agreement | None:
-    """How a judge agrees with itself: every other episode of [P, N] against the others; None for too few."""
+    """The agreement of every other episode of [P, N] with the others; None for too few."""
     count = scores.shape[1] // 2
     return agreement(scores[:, 0 : 2 * count : 2], scores[:, 1 : 2 * count : 2], rng) if count > 1 else None
 

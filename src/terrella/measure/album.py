@@ -1,4 +1,4 @@
-"""An album of real frames by place: what does the game really look like from here?"""
+"""Real frames of recordings, looked up by pose."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ..space.camera import yaw
 from .clips import Clip
 from .fidelity import colour_statistics, gradient_energy
 
-NEAR_M, NEAR_DEG = 0.5, 10.0  # a real frame from within these counts as the same view
+NEAR_M, NEAR_DEG = 0.5, 10.0  # within which a real frame counts as the same view
 
 
 class Album:
-    """Posed frames of recordings, looked up by pose. rgb arrays are read only where they are looked at."""
+    """Posed frames of recordings, looked up by pose. rgb arrays are read only for the frames that are used."""
 
     def __init__(self, pieces: Sequence[tuple[np.ndarray, np.ndarray, int]]):
         """pieces: (rgb uint8 [n, H, W, 3], pose [n, 7], episode number) each."""
@@ -37,11 +37,11 @@ class Album:
         return Album([(cache.rgb[first:stop], cache.pose[first:stop], number) for number, (first, stop) in ranges])
 
     def nearest(self, pose: torch.Tensor, not_episode: torch.Tensor | None = None) -> torch.Tensor:
-        """Rows of the nearest views to poses [M, 7], long [M]; -1 where none is near enough.
+        """Rows of the nearest views to poses [M, 7], long [M]; -1 if none is near enough.
 
-        `not_episode` [M]: an episode that does not count for each pose.
+        not_episode [M]: an episode to leave out for each pose.
         """
-        found = []
+        rows = []
         for start in range(0, len(pose), 64):
             part = pose[start : start + 64].float()
             away = torch.cdist(part[:, :3], self.place) / NEAR_M
@@ -51,11 +51,11 @@ class Album:
             if not_episode is not None:
                 cost = cost.masked_fill(self.episode == not_episode[start : start + 64, None], torch.inf)
             least, row = cost.min(1)
-            found.append(torch.where(least.isfinite(), row, -1))
-        return torch.cat(found)
+            rows.append(torch.where(least.isfinite(), row, -1))
+        return torch.cat(rows)
 
     def appearances(self, rows: torch.Tensor) -> torch.Tensor:
-        """Looks of the frames of rows [M]: float64 [M, 7]; zeros for -1."""
+        """The appearance of the frames of rows [M]: float64 [M, 7]; zeros for -1."""
         out = torch.zeros(len(rows), 7, dtype=torch.float64)
         for number, row in enumerate(rows.tolist()):
             if row >= 0:

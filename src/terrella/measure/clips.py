@@ -1,4 +1,4 @@
-"""Clips: windows of held-out recordings that every arm of a scorecard is asked to dream again."""
+"""Clips: windows of held-out recordings that every arm of a scorecard predicts."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from ..space.floorplan import horizon, sees_into
 
 Where = Callable[
     [Any, int, int], np.ndarray
-]  # clip cache, first, stop -> bool [stop - first]: rows that may be in a clip
+]  # (clip cache, first, stop) -> bool [stop - first]: rows allowed in a clip
 
 
 @dataclass(frozen=True)
 class Clip:
-    """T = context + horizon rows of one episode; row t's action led from observation t to t + 1.
+    """T = context + horizon rows of one episode; the action of row t leads from observation t to t + 1.
 
-    channels: what was recorded, by the world's names, [T, ...] each: rgb and rgb.wrist uint8 [T, H, W, 3], depth metres,
-    pose float32 [T, 7], reward [T] and done [T] (what followed each action), vectors. action [T, A]. The first `context`
-    rows are shown to a world, the rest are the truth. Arrays may be views of a memory-mapped file.
+    The first `context` rows are observed by a world, the rest are the truth. Arrays may be views of a memory-mapped file.
     """
 
+    # Recorded channels by the world's names, [T, ...]: rgb uint8 [T, H, W, 3], depth in metres, pose float32 [T, 7], reward [T]
+    # and done [T] (after each action), vectors.
     channels: Mapping[str, np.ndarray]
-    action: np.ndarray
-    context: int
+    action: np.ndarray  # [T, A]
+    context: int  # rows
     episode: int
-    start: int
+    start: int  # row of the cache
 
     @property
     def horizon(self) -> int:
@@ -43,13 +43,13 @@ class Clip:
         return self.channels.get("pose")
 
     def walked_m(self, channel: str = "pose") -> np.ndarray:
-        """Length of the true path from the last context row to each later one: metres, float64 [horizon]."""
+        """The length of the true path from the last context row to each later one: metres, float64 [horizon]."""
         places = np.asarray(self.channels[channel], np.float64)[self.context - 1 :, :3]
         return np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()
 
     def moves(self) -> bool:
-        """True where the camera goes more than half a metre or turns more than 20 degrees after the context, or, without
-        poses, where anything changes."""
+        """Whether the camera moves more than half a metre or turns more than 20 degrees after the context; without poses, whether
+        anything changes."""
         if self.pose is None:
             main = next(iter(self.channels.values()))
             return bool((main[self.context :] != main[self.context - 1]).any())
@@ -58,31 +58,29 @@ class Clip:
 
 
 def recorded_channels(cache) -> dict[str, np.ndarray]:
-    """A clip cache's arrays by the names of the world's channels."""
+    """The arrays of a clip cache, by channel."""
     named = {name: getattr(cache, name, None) for name in ("rgb", "depth", "pose", "reward", "done")}
     keyed = {channel: cache.arrays.get(key) for channel, key in cache.keys.items()}
     return {name: array for name, array in {**named, **cache.further, **keyed}.items() if array is not None}
 
 
 def check_recording(cache, spec: Spec) -> None:
-    """DatasetError in one sentence where the recording holds other actions, or lacks what the world observes."""
+    """DatasetError if the recording has other actions, or lacks channels that the world observes."""
     low, high = spec.action_limits
     held = np.asarray(cache.action[:: max(1, len(cache.action) // 10000)]).reshape(-1, *(spec.action.shape or ()))
     if (held < low - 1e-3).any() or (held > high + 1e-3).any():
+        raise DatasetError(f"the recording has actions outside of {spec.name}'s {spec.action}: it is of another game.")
+    recorded = recorded_channels(cache)
+    missing = [name for name in spec.observes if name not in recorded]
+    if missing:
         raise DatasetError(
-            f"the recording holds actions outside of {spec.name}'s {spec.action}: it is of another game."
-        )
-    there = recorded_channels(cache)
-    lacking = [name for name in spec.observes if name not in there]
-    if lacking:
-        raise DatasetError(
-            f"{spec.name} observes {' and '.join(lacking)}, and the recording holds only {', '.join(there)}: "
+            f"{spec.name} observes {' and '.join(missing)}, and the recording has only {', '.join(recorded)}: "
             "score it on a recording of its own game."
         )
 
 
 def in_box(*box: float) -> Where:
-    """Rows whose place lies inside the box x0, y0, x1, y1 on the map, metres."""
+    """Rows with a position inside the box x0, y0, x1, y1 on the map, metres."""
     x0, y0, x1, y1 = box
 
     def inside(cache, first: int, stop: int) -> np.ndarray:
@@ -93,7 +91,7 @@ def in_box(*box: float) -> Where:
 
 
 def out_of_sight(*box: float) -> Where:
-    """Rows whose place lies outside the box and, where depth and camera are recorded, from which it is not seen into."""
+    """Rows with a position outside the box that, if depth and camera are recorded, do not see into it."""
 
     def outside(cache, first: int, stop: int) -> np.ndarray:
         away = ~in_box(*box)(cache, first, stop)
@@ -116,13 +114,13 @@ def clips_from_cache(
     rng: torch.Generator,
     where: Where | None = None,
 ) -> list[Clip]:
-    """Up to `count` windows that do not overlap, drawn at random from `episodes` of a clip cache.
+    """Up to `count` windows without overlap, drawn at random from `episodes` of a clip cache.
 
-    No window holds a row without a valid action or an end (`done`), nor a row that `where` refuses. Still windows are
-    kept: Clip.moves tells them apart. Fewer come back where the recording has no more; DatasetError where it has none.
+    Windows have valid actions, no end (`done`), and only rows that `where` allows. Windows without motion are kept (see
+    Clip.moves). Fewer are returned if the recording has no more; DatasetError if it has none.
     """
     if where is not None and cache.pose is None:
-        raise DatasetError("clips can be chosen by place only where the recording has poses; leave `where` out.")
+        raise DatasetError("choosing clips by place needs recorded poses; leave `where` out.")
     length = context + horizon
     starts: list[tuple[int, int]] = []
     for episode in episodes:
@@ -143,21 +141,21 @@ def clips_from_cache(
 
 
 def check_clips(place: str, clips: Sequence[Clip], steps: int) -> None:
-    """DatasetError unless there are clips of `place`, all of one shape, with `steps` steps or more to dream."""
+    """DatasetError unless there are clips of `place`, all of one length, with `steps` steps or more to predict."""
     if not clips:
         raise DatasetError(f"there are no clips of {place} places; draw some, or leave the place out.")
     if len({(clip.context, clip.horizon) for clip in clips}) != 1:
         raise DatasetError(f"the clips of {place} places differ in length; draw them with one context and one horizon.")
     if clips[0].horizon < steps:
         raise DatasetError(
-            f"the clips of {place} places have {clips[0].horizon} steps to dream, the largest horizon is {steps}; "
+            f"the clips of {place} places have {clips[0].horizon} steps to predict, the largest horizon is {steps}; "
             "draw longer ones."
         )
 
 
 def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Tensor]:
-    """What `spec` observes, and may_observe where it was recorded, of row `row` of each clip: name -> tensor [B, ...];
-    ObservationError where it cannot."""
+    """The channels of row `row` of each clip that `spec` observes, and those of may_observe that were recorded: name -> tensor
+    [B, ...]. ObservationError if one is missing or of another shape."""
     seen = {}
     for name in (*spec.observes, *spec.may_observe):
         arrays = [clip.channels[name] for clip in clips if name in clip.channels]
@@ -167,10 +165,10 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
             raise ObservationError(f"{spec.name} observes '{name}', which the recording lacks; record it as well.")
         stacked = torch.from_numpy(np.stack([np.asarray(array[row]) for array in arrays]))
         wanted = tuple(spec.channels[name].shape or ()) if name in spec.channels else tuple(stacked.shape[1:])
-        if kind_of(name) == "depth" and len(wanted) == 2:  # depth is recorded at a size of its own
+        if kind_of(name) == "depth" and len(wanted) == 2:  # depth may be recorded at another size
             stacked = F.interpolate(stacked.float()[:, None], wanted, mode="nearest-exact")[:, 0]
-        marks = stacked.ndim == 3 and stacked.dtype in (torch.bool, torch.uint8)
-        if name in spec.may_observe and marks and len(wanted) == 2:  # and so are marks: one pixel of many counts
+        is_mask = stacked.ndim == 3 and stacked.dtype in (torch.bool, torch.uint8)
+        if name in spec.may_observe and is_mask and len(wanted) == 2:  # masks too; a set pixel stays set
             stacked = F.adaptive_max_pool2d(stacked.float()[:, None], wanted)[:, 0].to(stacked.dtype)
         if wanted == () and stacked[0].numel() == 1:
             stacked = stacked.reshape(-1)
@@ -187,8 +185,8 @@ def evidence(clips: Sequence[Clip], spec: Spec, row: int) -> dict[str, torch.Ten
 
 
 def runs(cache, first: int, stop: int, where: Where | None, unbroken: bool = True) -> list[tuple[int, int]]:
-    """Stretches [first, stop) of the rows of an episode that `where` allows; where `unbroken`, each row is reached from the one
-    before by a valid action."""
+    """Runs [first, stop) of the rows of an episode that `where` allows. unbroken: each row follows from the one before by a valid
+    action."""
     allowed = np.ones(stop - first, bool) if where is None else np.asarray(where(cache, first, stop), bool)
     linked = allowed[1:] & allowed[:-1]
     if unbroken:

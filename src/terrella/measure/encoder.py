@@ -1,8 +1,8 @@
-"""The fixed encoder of the scorecard: a small convnet, shipped and never trained again, that turns frames into features.
+"""The fixed encoder of the scorecard: a small pretrained convnet from frames to features.
 
-It was trained by self-supervision to tell how a picture has been spoilt and which picture it is
-(recipes/frame_encoder.py). Its features are what `frechet` compares. It is not trained together with any world, and a
-world must not be trained against it: a figure that is optimised measures nothing any more.
+It was trained by self-supervision to recognise the distortion of a picture and the picture itself (recipes/frame_encoder.py).
+Its features are compared by `frechet`. It is not trained together with any world, and a world must not be trained against
+it: a measure that is optimised no longer measures.
 """
 
 from __future__ import annotations
@@ -30,10 +30,9 @@ _TAPS = (1, 3, 5)  # stages whose means and deviations are read: texture, parts,
 class FrameEncoder(nn.Module):
     """Frames uint8 [N, H, W, 3], both sides at least MIN_SIDE, to features float32 [N, FEATURES].
 
-    Six convolutions; the mean and the standard deviation over the picture of three of them; a linear map to directions
-    that change much when a picture is spoilt and little from one sound picture to the next, the telling ones drawn out
-    by `gain`. Large values are bent down (asinh), so that no single odd frame rules a set. There is no normalisation by
-    batch: a frame's features do not depend on its neighbours.
+    Six convolutions; mean and standard deviation over the picture of three of them; a linear map to directions that vary
+    with distortions and little between intact pictures, scaled by `gain`. asinh limits large values, so that no single frame
+    dominates a set. Without batch normalisation: the features of a frame do not depend on its batch.
     """
 
     def __init__(self):
@@ -48,18 +47,18 @@ class FrameEncoder(nn.Module):
 
     def pooled(self, pictures: torch.Tensor) -> torch.Tensor:
         """Means and deviations over the picture: float [N, 3, H, W] in 0..255 -> [N, 512]."""
-        x, found = pictures / 127.5 - 1, []
+        x, statistics = pictures / 127.5 - 1, []
         for number, conv in enumerate(self.convs):
             x = F.leaky_relu(conv(x), 0.1)
             if number in _TAPS:
                 spread = (x.var((2, 3), correction=0) + 1e-4).sqrt()
-                found += [x.mean((2, 3)), spread]
-        return torch.cat(found, 1)
+                statistics += [x.mean((2, 3)), spread]
+        return torch.cat(statistics, 1)
 
 
 @lru_cache(maxsize=1)
 def shipped_encoder() -> FrameEncoder:
-    """The encoder with its shipped weights, on the CPU; TerrellaError unless the file is exactly the published one."""
+    """The encoder with the shipped weights, on the CPU; TerrellaError if the file is not the published one."""
     try:
         data = WEIGHTS.read_bytes()
     except OSError as error:
@@ -68,11 +67,11 @@ def shipped_encoder() -> FrameEncoder:
 
 
 def encoder_of(data: bytes, sha256: str) -> FrameEncoder:
-    """An encoder of safetensors bytes whose SHA-256 must be as given; TerrellaError otherwise."""
-    found = hashlib.sha256(data).hexdigest()
-    if found != sha256:
+    """An encoder from safetensors bytes with this SHA-256; TerrellaError otherwise."""
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != sha256:
         raise TerrellaError(
-            f"the frame encoder's weights are not the published ones (SHA-256 {found[:12]}..., not {sha256[:12]}...), "
+            f"the frame encoder's weights are not the published ones (SHA-256 {digest[:12]}..., not {sha256[:12]}...), "
             "so its distances would compare with nobody else's; install terrella again."
         )
     encoder = FrameEncoder()
@@ -87,8 +86,8 @@ def frame_features(frames: torch.Tensor, encoder: nn.Module | None = None, batch
     """Features of uint8 [..., H, W, 3], both sides MIN_SIDE or more, -> float64 [..., FEATURES]."""
     encoder = encoder or shipped_encoder()
     flat = frames.cpu().reshape(-1, *frames.shape[-3:])
-    found = torch.zeros(len(flat), FEATURES, dtype=torch.float64)
+    features = torch.zeros(len(flat), FEATURES, dtype=torch.float64)
     with torch.no_grad():
         for first in range(0, len(flat), batch):
-            found[first : first + batch] = encoder(flat[first : first + batch])
-    return found.reshape(*frames.shape[:-3], FEATURES)
+            features[first : first + batch] = encoder(flat[first : first + batch])
+    return features.reshape(*frames.shape[:-3], FEATURES)

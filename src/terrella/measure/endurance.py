@@ -1,4 +1,4 @@
-"""Endurance: a thousand dreamt steps, played or standing still; do sharpness and colours stay those of the real game?"""
+"""Endurance: rollouts of a thousand steps, played or idle; do sharpness and colours stay as in the real game?"""
 
 from __future__ import annotations
 
@@ -22,30 +22,29 @@ from .scorecard import COPY_LAST, IDLE, PREDICTED, Curve, Picture, ProbeReport, 
 from .statistics import Band, Figure, ratio_band, ratio_interval
 from .work_units import UNSEEN, Unit
 
-STRIDE = 5  # every fifth frame is looked at
+STRIDE = 5  # every fifth frame is measured
 NAMES = ("sharpness", *(f"{what} of {colour}" for what in ("mean", "spread") for colour in ("red", "green", "blue")))
 _DRAWN = ("sharpness", "mean of green", "spread of green")
 LEAD = (
-    "Rollouts on end, by stretches, under the actions of recorded players. Each frame is held against the recorded one from "
-    "nearest to where the world says that it is, for a dull corner is dull in the game too; without poses against the mean of "
-    "the recordings. The table gives the stretch that strays most from 1, and how far real stretches stray by themselves."
+    "Long rollouts under recorded actions, in tenths. Each frame is compared with the recorded frame nearest to the world's own "
+    "pose, since a dull corner is dull in the game too; without poses, with the mean of the recordings. The table gives the tenth "
+    "that deviates most from 1, and the deviations of real stretches."
 )
 
 
 STILL_LEAD = (
-    "Nobody touches a key for as long: how far are sharpness and the mean of each colour from those of the last true frame, all "
-    "rollouts together, in the tenth that strays most? With poses, from those of the frame in which the camera came to rest. "
-    "Copying the last frame stays at 1. Only what moves by itself, in the game too, may change them: within 10% for sharpness "
-    "and 3% for colours nothing fades."
+    "Rollouts without actions: sharpness and mean of each colour relative to the last true frame, all rollouts together, in the "
+    "tenth that deviates most; with poses, relative to the frame in which the camera came to rest. Copying the last frame gives 1. "
+    "Only what moves by itself may change them: within 10% for sharpness and 3% for colours the picture holds."
 )
-GLIDES = 0.005  # metres, or of a quaternion, from where it comes to rest
+GLIDES = 0.005  # deviation from the last pose, metres or quaternion, above which the camera still moves
 SHARP_WITHIN, COLOUR_WITHIN = 0.1, 0.03
-LEAST = 0.5  # of 255: what is blacker, or flatter, is black
+FLOOR = 0.5  # of 255; lower values count as this
 
 
 @dataclass(frozen=True)
 class _Looks:
-    """Looks [n, lanes, 7] of frames and of their real counterparts; known [n, lanes] where there is one."""
+    """Appearance [n, lanes, 7] of frames and of their real counterparts; known [n, lanes]: whether there is one."""
 
     mine: torch.Tensor
     real: torch.Tensor
@@ -66,10 +65,10 @@ def long_rollout(
     tick: Tick = lambda done: None,
     idle: bool = False,
 ) -> Results:
-    """Goes on for `steps` steps from the contexts of `rollouts` clips, with the actions of recorded players on end, or `idle`.
+    """Rolls out `steps` steps from the contexts of `rollouts` clips, under concatenated recorded actions, or `idle`.
 
-    looks [n, lanes, 7] of every fifth frame, first [lanes, 7] of the last true one; poses [n, lanes, 7] where the world shows
-    them; frames uint8 [K, H, W, 3] of the first rollout: the last true one, at step 1 and at the ends of tenths.
+    looks [n, lanes, 7]: appearance of every fifth frame; first [lanes, 7]: of the last true one; poses [n, lanes, 7] if the
+    world has them; frames uint8 [K, H, W, 3] of the first rollout: the last true one, at step 1 and at the ends of tenths.
     """
     size = min(rollouts, len(clips), world.spec.max_batch or rollouts)
     order = _stillest(clips) if idle else [clips[pick] for pick in torch.randperm(len(clips), generator=rng).tolist()]
@@ -91,22 +90,22 @@ def long_rollout(
             if step == 1 or step % max(STRIDE, steps // 10 // STRIDE * STRIDE) == 0:
                 frames.append(seen["rgb"][0])
         tick(size)
-    found = {"looks": torch.stack(looks), "first": appearance(last), "frames": torch.stack(frames)}
-    return found | ({"poses": torch.stack(poses)} if posed else {})
+    results = {"looks": torch.stack(looks), "first": appearance(last), "frames": torch.stack(frames)}
+    return results | ({"poses": torch.stack(poses)} if posed else {})
 
 
 def _stillest(clips: Sequence[Clip]) -> list[Clip]:
-    """Those first whose last shown frames differ least: who runs when nobody acts any more comes to rest elsewhere."""
+    """The clips in order of motion at the end of their context: a running player comes to rest elsewhere."""
 
-    def moved(clip: Clip) -> float:
+    def motion(clip: Clip) -> float:
         last, before = (np.asarray(clip.channels["rgb"][max(0, clip.context - back)], np.float32) for back in (1, 2))
         return float(np.abs(last - before).mean())
 
-    return sorted(clips, key=moved)
+    return sorted(clips, key=motion)
 
 
 def recorded_actions(world: World, clips: Sequence[Clip], batch: int, steps: int, rng: torch.Generator) -> torch.Tensor:
-    """Actions [steps, batch, ...] made of the action runs of clips picked at random, one after the other."""
+    """Actions [steps, batch, ...]: the concatenated actions of randomly picked clips."""
     lanes = []
     for _ in range(batch):
         parts, length = [], 0
@@ -121,8 +120,7 @@ def recorded_actions(world: World, clips: Sequence[Clip], batch: int, steps: int
 def rows_of(
     gone: Results, clips: Sequence[Clip], album: Album | None, arm: str, place: str, rng: torch.Generator
 ) -> ProbeReport:
-    """By stretches of a tenth: ratios of sharpness, and of the mean and the spread of each colour; the worst of each as a
-    row, all as curves."""
+    """By tenths: ratios of sharpness, and of mean and spread of each colour; the worst of each as a row, all as curves."""
     mine, steps = gone["looks"], len(gone["looks"]) * STRIDE
     span = max(1, len(mine) // 10)
     if "poses" in gone:
@@ -136,7 +134,7 @@ def rows_of(
     starts = range(0, len(mine), span)
     buckets = [_bucket(dreamt, first, span, rng) for first in starts]
     low, high = _spread(real, mine.shape[1], rng)
-    found, matched = ProbeReport(), float(dreamt.known.double().mean())
+    report, matched = ProbeReport(), float(dreamt.known.double().mean())
     x = [min(first + span, len(mine)) * STRIDE for first in starts]
     for k, name in enumerate(NAMES):
         figures = [bucket[k] for bucket in buckets]
@@ -145,21 +143,21 @@ def rows_of(
         note = f"against {against} ({matched:.0%} of the frames have one)"
         natural = {"real stretches": Figure(1.0, low[k], high[k], len(clips))}
         where = "endurance", "rgb", name, "\u00d7", place, arm, PREDICTED
-        found.rows.append(Row(*where, steps, worst, 0, natural, note=note))
+        report.rows.append(Row(*where, steps, worst, 0, natural, note=note))
         if name in _DRAWN:
             value, low_, high_ = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
             band = Band(value, low_, high_, len(clips))
-            found.curves.append(Curve(*where, x, band, guides=(0.7, 1.0, 1.3)))
-    found.pictures.append(_picture("endurance", arm, gone, x))
-    return found
+            report.curves.append(Curve(*where, x, band, guides=(0.7, 1.0, 1.3)))
+    report.pictures.append(_picture("endurance", arm, gone, x))
+    return report
 
 
 def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> ProbeReport:
-    """By tenths of a rollout in which nobody acted: sharpness and the mean of each colour, against the last true frame."""
-    found, span, lanes = ProbeReport(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
+    """By tenths of an idle rollout: sharpness and the mean of each colour, relative to the last true frame."""
+    report, span, lanes = ProbeReport(), max(1, len(gone["looks"]) // 10), gone["looks"].shape[1]
     looks, first = _at_rest(gone)
-    parts = torch.stack([part.mean(0) for part in looks.split(span)], -1).clamp_min(LEAST)  # [lanes, 7, tenths]
-    first = first.clamp_min(LEAST)[..., None].expand_as(parts)
+    parts = torch.stack([part.mean(0) for part in looks.split(span)], -1).clamp_min(FLOOR)  # [lanes, 7, tenths]
+    first = first.clamp_min(FLOOR)[..., None].expand_as(parts)
     x = [min(stop, len(gone["looks"])) * STRIDE for stop in range(span, len(gone["looks"]) + span, span)]
     for k, name in enumerate(NAMES[:4]):
         band = ratio_band(parts[:, k], first[:, k], rng)
@@ -167,16 +165,15 @@ def still_rows(gone: Results, arm: str, place: str, rng: torch.Generator) -> Pro
         where = "stillness", "rgb", name, "\u00d7", place, arm, IDLE
         within = SHARP_WITHIN if name == "sharpness" else COLOUR_WITHIN
         note, copied = f"after {x[worst]:,} steps", {COPY_LAST: Figure(1.0, 1.0, 1.0, lanes)}
-        found.rows.append(Row(*where, x[-1], band.at(worst), 0, copied, note=note))
-        found.curves += [Curve(*where, x, band, guides=(1 - within, 1.0, 1 + within))] if name in _DRAWN else []
-    found.pictures.append(_picture("stillness", arm, gone, x))
-    return found
+        report.rows.append(Row(*where, x[-1], band.at(worst), 0, copied, note=note))
+        report.curves += [Curve(*where, x, band, guides=(1 - within, 1.0, 1 + within))] if name in _DRAWN else []
+    report.pictures.append(_picture("stillness", arm, gone, x))
+    return report
 
 
 def _at_rest(gone: Results) -> tuple[torch.Tensor, torch.Tensor]:
-    """The looks [n, lanes, 7] of rollouts in which nobody acted, and those [lanes, 7] that they are held against: of the last
-    true frame. Where the world says where it stands, of the frame in which it came to rest, which stands for those before it:
-    who still glides sees something else."""
+    """Appearance [n, lanes, 7] of idle rollouts, and the reference [lanes, 7]: the last true frame or, if the world has poses, the
+    frame in which the camera came to rest, which also replaces those before it."""
     looks, first = gone["looks"], gone["first"]
     if "poses" not in gone:
         return looks, first
@@ -199,17 +196,17 @@ def _units(kind: str, exam: Exam) -> list[Unit]:
         if not (_still_missing if idle else _missing)(exam, world):
             lanes = min(config.long_rollouts, len(clips), world.spec.max_batch or config.long_rollouts)
             calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * steps}
-            words = f"{arm}: {steps:,} steps {'standing still' if idle else 'on end'}"
+            words = f"{arm}: {steps:,} steps {'idle' if idle else 'played'}"
             run = partial(long_rollout, world, clips, exam.rng(4), steps, config.long_rollouts, idle=idle)
             units.append(Unit(f"{kind}|{arm}|0", words, calls, run))
     return units
 
 
-def _report(kind: str, exam: Exam, found: ExamResults) -> ProbeReport:
+def _report(kind: str, exam: Exam, results: ExamResults) -> ProbeReport:
     whole = ProbeReport()
     place, clips = next(iter(exam.places.items()))
     for arm in exam.arms:
-        if gone := found.of(kind, arm):
+        if gone := results.of(kind, arm):
             still = still_rows(gone, arm, place, exam.rng()) if kind == "stillness" else None
             one = still or rows_of(gone, clips, exam.album, arm, place, exam.rng())
             whole.rows += one.rows
@@ -220,13 +217,13 @@ def _report(kind: str, exam: Exam, found: ExamResults) -> ProbeReport:
 
 def _missing(exam: Exam, world: World) -> str:
     if not exam.config.long_steps:
-        return "needs long rollouts, which were not asked for"
+        return "needs long rollouts, which are switched off"
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
 def _still_missing(exam: Exam, world: World) -> str:
     if not exam.config.still_steps:
-        return "needs long rollouts, which were not asked for"
+        return "needs long rollouts, which are switched off"
     if not can_idle(world.spec):
         return "needs an action that does nothing"
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
@@ -237,7 +234,7 @@ def _probe(name: str, question: str, lead: str, missing) -> Probe:
 
 
 ENDURANCE = _probe("endurance", "A long rollout", LEAD, _missing)
-STILLNESS = _probe("stillness", "Does it fade while nobody plays?", STILL_LEAD, _still_missing)
+STILLNESS = _probe("stillness", "Does it fade without actions?", STILL_LEAD, _still_missing)
 
 
 def _matched(mine: torch.Tensor, poses: torch.Tensor, album: Album, not_episode: torch.Tensor | None = None) -> _Looks:
@@ -246,7 +243,7 @@ def _matched(mine: torch.Tensor, poses: torch.Tensor, album: Album, not_episode:
 
 
 def _real_stretches(clips: Sequence[Clip], album: Album | None, span: int) -> _Looks:
-    """Up to 64 clips' own frames, as many of each as a bucket has, against what dreamt frames would be held against."""
+    """The frames of up to 64 clips, as many of each as a tenth has, against the reference of imagined frames."""
     clips = clips[:64]
     rows = range(0, min(len(clips[0].action), span * STRIDE), STRIDE)
     mine = torch.stack(
@@ -261,13 +258,13 @@ def _real_stretches(clips: Sequence[Clip], album: Album | None, span: int) -> _L
 
 def _bucket(looks: _Looks, first: int, span: int, rng: torch.Generator) -> list[Figure]:
     stop = min(first + span, len(looks.mine))
-    known = looks.known[first:stop].any(0)  # a rollout without any counterpart says nothing
+    known = looks.known[first:stop].any(0)  # lanes without any counterpart are left out
     mine, real = (sums[known] for sums in looks.sums(first, stop))
     return [ratio_interval(mine[:, k], real[:, k], rng) for k in range(len(NAMES))]
 
 
 def _spread(real: _Looks, rollouts: int, rng: torch.Generator) -> tuple[list[float], list[float]]:
-    """2.5% and 97.5% of the ratios of `rollouts` stretches drawn at random, for each of the seven looks."""
+    """2.5% and 97.5% quantiles of the ratios of `rollouts` random stretches, for each of the seven numbers."""
     known = real.known.any(0)
     mine, reference = (sums[known] for sums in real.sums(0, len(real.mine)))
     if not len(mine):

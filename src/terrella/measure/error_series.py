@@ -1,4 +1,4 @@
-"""What any measure of likeness is reported as: figures and curves compared with copy-last, other actions, no action; drift."""
+"""Figures and curves of any error measure, compared with copy-last, other actions and no action; and drift."""
 
 from __future__ import annotations
 
@@ -20,30 +20,31 @@ FALL_DB = 10 * math.log10(2)  # twice the squared error
 
 @dataclass(frozen=True)
 class Series:
-    """A measure of every step. values [n, T] of what was dreamt; copied [n, T]: the same of the last row shown. counts [n, T]:
-    where given, both are squared errors summed over so many pixels, told as the PSNR of all clips' errors together."""
+    """A measure at every step of n clips."""
 
     channel: str
     what: str
     unit: str
-    better: int
-    values: torch.Tensor
-    copied: torch.Tensor
-    counts: torch.Tensor | None = None
+    better: int  # +1 or -1, as in Row
+    values: torch.Tensor  # [n, T], of the predictions
+    copied: torch.Tensor  # [n, T], of the last context row, repeated
+    counts: torch.Tensor | None = (
+        None  # [n, T] pixels: if given, the others are summed squared errors, reported as pooled PSNR
+    )
 
     @property
     def gain(self) -> torch.Tensor:
-        """[n, T]: by how much it is better than copying."""
+        """[n, T]: the gain over copying."""
         return self.better * (self.values - self.copied)
 
     def band(self, exam: Exam, values: torch.Tensor) -> Band:
-        """What `values`, like its own, are told as at each step."""
+        """The reported figure of `values` at each step."""
         if self.counts is None:
             return mean_band(values, exam.rng())
         return ratio_band(255.0**2 * self.counts[:, : values.shape[1]], values, exam.rng()).in_db()
 
     def gains(self, exam: Exam) -> Band:
-        """By how much it is better than copying, clip by clip, at each step."""
+        """The gain over copying, clip by clip, at each step."""
         if self.counts is None:
             return mean_band(self.gain, exam.rng())
         return ratio_band(self.copied, self.values, exam.rng()).in_db()
@@ -52,25 +53,25 @@ class Series:
 Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
 SeriesOf = Callable[
     [Exam, ExamResults, str, str, Sequence[Clip], Results], list[Series]
-]  # exam, found, set, place, clips, dreamt
+]  # exam, results, set, place, clips, dreamt
 
 
-def report(exam: Exam, found: ExamResults, probe: str, series_of: SeriesOf) -> ProbeReport:
-    """Rows at the horizons, curves at every step, of all arms and places; then those of the long clips."""
+def report(exam: Exam, results: ExamResults, probe: str, series_of: SeriesOf) -> ProbeReport:
+    """Rows at the horizons and curves at every step, of all arms and places."""
     whole = ProbeReport()
     for place, clips in exam.places.items():
         copied: set[str] = set()
         for arm in exam.arms:
             made = {
-                motion: _asked(motion, series_of(exam, found, CLIPS, place, clips, dreamt))
+                motion: _predicted(motion, series_of(exam, results, CLIPS, place, clips, dreamt))
                 for motion in (PREDICTED, TRUE, OTHERS, IDLE)
-                if (dreamt := found.dreamt(CLIPS, arm, place, motion))
+                if (dreamt := results.dreamt(CLIPS, arm, place, motion))
             }
             for motion in (PREDICTED, TRUE):
                 for number, series in enumerate(made.get(motion, ())):
-                    strangers = {name: made[name][number] for name in (OTHERS, IDLE) if name in made}
+                    controls = {name: made[name][number] for name in (OTHERS, IDLE) if name in made}
                     where = probe, series.channel, series.what, series.unit, place
-                    whole.rows += _rows(exam, where, arm, motion, series, strangers)
+                    whole.rows += _rows(exam, where, arm, motion, series, controls)
                     if series.counts is not None:
                         continue
                     whole.curves.append(_curve(exam, where, arm, motion, series.values))
@@ -82,15 +83,15 @@ def report(exam: Exam, found: ExamResults, probe: str, series_of: SeriesOf) -> P
     return whole
 
 
-def drift(exam: Exam, found: ExamResults, series_of: SeriesOf) -> ProbeReport:
-    """The long clips' curves, and how far each can be used.
+def drift(exam: Exam, results: ExamResults, series_of: SeriesOf) -> ProbeReport:
+    """The curves of the long clips, and the usable horizon of each.
 
-    A dream's PSNR can be used up to the last step before it has fallen by 3.01 dB (twice the squared error) from its own
-    first, and from copy-last's first, one yardstick for all; whatever else, as long as it is better than copy-last.
+    PSNR is usable up to the last step before it has fallen by 3.01 dB (twice the squared error) from its own first step, and
+    from that of copy-last, one threshold for all; other measures as long as they are better than copy-last.
     """
     whole, still = ProbeReport(), dict[Where, Series]()
-    for place, clips, arm, motion, dreamt in found.dreams(exam, LONG):
-        for series in _asked(motion, series_of(exam, found, LONG, place, clips, dreamt)):
+    for place, clips, arm, motion, dreamt in results.dreams(exam, LONG):
+        for series in _predicted(motion, series_of(exam, results, LONG, place, clips, dreamt)):
             where = "drift", series.channel, series.what, series.unit, place
             _add_usable(exam, whole, where, arm, motion, series.values, series)
             still.setdefault(where, series)
@@ -99,18 +100,18 @@ def drift(exam: Exam, found: ExamResults, series_of: SeriesOf) -> ProbeReport:
     return whole
 
 
-def _asked(motion: str, made: list[Series]) -> list[Series]:
-    """Poses that were given are not predicted."""
+def _predicted(motion: str, made: list[Series]) -> list[Series]:
+    """Without the poses if those were given."""
     return [series for series in made if motion != TRUE or kind_of(series.channel) != "pose"]
 
 
 def _rows(
-    exam: Exam, where: Where, arm: str, motion: str, series: Series, strangers: dict[str, Series]
+    exam: Exam, where: Where, arm: str, motion: str, series: Series, controls: dict[str, Series]
 ) -> Iterator[Row]:
-    """At each horizon; nothing where nothing was to be measured."""
+    """The rows at each horizon with a finite value."""
     mine, gains, others = series.band(exam, series.values), series.gains(exam), {COPY_LAST: series.copied}
     if motion == PREDICTED:
-        others |= {name: other.values for name, other in strangers.items()}
+        others |= {name: other.values for name, other in controls.items()}
     bands = {name: series.band(exam, values) for name, values in others.items()}
     for step in exam.config.horizons:
         if math.isfinite(mine.value[step - 1]):
@@ -119,7 +120,7 @@ def _rows(
 
 
 def _gain(exam: Exam, probe: str, place: str, arm: str, made: list[Series]) -> Curve:
-    """Of the measure that says most: of pictures their pooled errors."""
+    """The gain of the main measure: of pictures, pooled PSNR."""
     lead = next((series for series in made if series.counts is not None), made[0])
     where = probe, lead.channel, f"{lead.what}{GAIN}", lead.unit, place, arm, PREDICTED
     return Curve(*where, range(1, lead.values.shape[1] + 1), lead.gains(exam), guides=(0.0,))
@@ -130,8 +131,7 @@ def _curve(exam: Exam, where: Where, arm: str, motion: str, values: torch.Tensor
 
 
 def _control(exam: Exam, place: str, arm: str, made: dict[str, list[Series]]) -> list[Row]:
-    """By how much the true actions are better than another player's, and than none, clip by clip; and of pooled errors, those
-    that say most."""
+    """The gain of true actions over those of another clip and over none, clip by clip; of pooled errors, the main one."""
     rows, lead = [], next((series.what for series in made.get(PREDICTED, ()) if series.counts is not None), None)
     for name in (OTHERS, IDLE):
         for mine, theirs in zip(made.get(PREDICTED, ()), made.get(name, ())):
@@ -153,11 +153,11 @@ def _add_usable(
 ) -> None:
     steps, mark = values.shape[1], None
     if series.unit == "dB":
-        yardsticks = {
+        thresholds = {
             "steps within twice its first error": values[:, 0] - FALL_DB,
             "steps within twice copy-last's first error": series.copied[:, 0] - FALL_DB,
         }
-        usable = {what: last_step_above(values, floor, exam.rng()) for what, floor in yardsticks.items()}
+        usable = {what: last_step_above(values, floor, exam.rng()) for what, floor in thresholds.items()}
         mark = next(iter(usable.values())).value
     elif arm == COPY_LAST:
         usable = {}
@@ -175,17 +175,16 @@ def _long_missing(exam: Exam, world) -> str:
 
 
 def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
-    """Of every series that the other probes have."""
+    """The drift probe, of all series of the other probes."""
 
-    def found(exam: Exam, results: ExamResults) -> ProbeReport:
+    def drift_report(exam: Exam, results: ExamResults) -> ProbeReport:
         parts = [drift(exam, results, some) for some in series_of]
         return ProbeReport(
             [row for part in parts for row in part.rows], [curve for part in parts for curve in part.curves]
         )
 
     lead = (
-        "The same at every step of longer clips. A dot marks the last step up to which the squared error stays within twice "
-        "that of its own first step, which is where the curve has fallen by 3 dB; the table adds the same from "
-        "copy-last's first step, one yardstick for all."
+        "The same at every step of longer clips. A dot marks the last step at which the squared error is within twice that of the "
+        "first step (the curve has fallen by 3 dB); the table adds the same threshold from the first step of copy-last."
     )
-    return Probe("drift", "How far can it be used?", lead, _long_missing, found)
+    return Probe("drift", "How far can it be used?", lead, _long_missing, drift_report)

@@ -1,4 +1,4 @@
-"""The whole examination in one call: every probe asks every arm, and what was done is kept as it is done."""
+"""The whole examination in one call: every probe on every arm, with results stored as they come."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def examine(
     clock: Clock = time.monotonic,
     probes: Sequence[Probe] = PROBES,
 ) -> Scorecard:
-    """Everything that can be measured of the arms. The same seed gives the same card, speeds excepted.
+    """The scorecard of all arms. The same seed gives the same card, except for speeds.
 
-    folder: results are kept there as they come, and those of an exam that was stopped are not measured again; `identity`
-    says what else must be the same for that (the files of world and recording). What an arm lacks for a probe is listed.
+    folder: results are stored there, so that an interrupted examination resumes. identity: what else must be the same for that
+    (the files of world and recording). Probes that do not apply to an arm are listed with what it lacks.
     """
     config, first = exam.config, next(iter(exam.arms.values()))
     for place, clips in exam.places.items():
@@ -51,17 +51,17 @@ def examine(
     for place, clips in exam.sets.get(LONG, {}).items():
         check_clips(place, clips, 1)
     store = Store(folder, exam.fingerprint(identity))
-    progress(0.0, "measuring how fast the worlds are", 0.0)
+    progress(0.0, "timing the worlds", 0.0)
     prices = _prices(exam, clock)
     units = dreams(exam, probes) + [unit for probe in probes for unit in probe.units(exam)]
-    found = ExamResults(run_all(units, store, prices, clock, progress))
+    results = ExamResults(run_all(units, store, prices, clock, progress))
     card = Scorecard({arm: world.spec.name for arm, world in exam.arms.items()}, first.spec.dt_s, _places(exam))
     for probe in probes:
         for arm, world in exam.arms.items():
-            asked = probe.any_world or world.spec.observes
-            if why := probe.missing(exam, world) if asked else "needs a world that takes evidence":
+            applies = probe.any_world or world.spec.observes
+            if why := probe.missing(exam, world) if applies else "needs a world that observes something":
                 card.missing.append(Missing(probe.name, arm, why))
-        report = probe.report(exam, found)
+        report = probe.report(exam, results)
         card.rows.extend(report.rows)
         card.curves.extend(report.curves)
         card.pictures.extend(report.pictures)
@@ -72,8 +72,8 @@ def examine(
 def most_clips_within(
     exam: Exam, seconds: float, sizes: Sequence[int], clock: Clock = time.monotonic, probes: Sequence[Probe] = PROBES
 ) -> int:
-    """The most clips, of `sizes`, on which the exam takes no more than so many seconds, as far as a trial of the worlds tells;
-    the fewest where all take longer."""
+    """The largest number of clips, of `sizes`, with which the examination is forecast to take at most `seconds`; the smallest if
+    all take longer."""
     forecast = Forecast(_prices(exam, clock))
     for size in sorted(sizes, reverse=True):
         some = exam.of(size)
@@ -84,7 +84,7 @@ def most_clips_within(
 
 
 def _prices(exam: Exam, clock: Clock) -> Calls:
-    """Seconds of a call, by arm and verb."""
+    """Seconds per call, by arm and verb."""
     config, some = exam.config, next(iter(exam.places.values()))
     prices: dict[tuple[str, str], float] = {("recording", "compare"): 3e-3}
     for arm, world in {**exam.arms, **exam.closing}.items():
@@ -103,8 +103,8 @@ def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path,
 
 
 def _places(exam: Exam) -> list[PlaceSummary]:
-    def described(name: str, clips: Sequence[Clip]) -> PlaceSummary:
+    def summary(name: str, clips: Sequence[Clip]) -> PlaceSummary:
         moving = sum(clip.moves() for clip in clips) / len(clips)
         return PlaceSummary(name, len(clips), moving, clips[0].context, clips[0].horizon)
 
-    return [described(name, clips) for name, clips in exam.sets[CLIPS].items()]
+    return [summary(name, clips) for name, clips in exam.sets[CLIPS].items()]

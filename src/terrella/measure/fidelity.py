@@ -1,4 +1,4 @@
-"""How alike two pictures are and how a picture looks: PSNR, SSIM, gradient energy (sharpness), colour statistics."""
+"""Similarity of pictures (PSNR, SSIM) and their appearance (gradient energy, colour statistics)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import torch
 import torch.nn.functional as F
 
-PSNR_CAP_DB = 60.0  # identical 8-bit frames would be infinite and spoil every mean
+PSNR_CAP_DB = 60.0  # of identical frames, in place of infinity
 _FLOOR = 255.0**2 / 10 ** (PSNR_CAP_DB / 10)
-CHANGED = 8  # of 255: a pixel has changed where a channel differs by more; less is the noise of a video
+CHANGED = 8  # of 255; a pixel has changed if a channel differs by more (less is video noise)
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -27,15 +27,14 @@ def squared_error(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
 
 def pooled(error: torch.Tensor, changed: torch.Tensor) -> torch.Tensor:
-    """Sums of squared error [..., H, W] over all pixels, and over those that changed: [..., 2], no smaller than the cap of
-    `psnr` has it, so that nothing is infinitely better than anything."""
+    """Sums of squared error [..., H, W] over all pixels, and over those that changed: [..., 2], floored at the cap of `psnr`."""
     sums = torch.stack([error.sum((-2, -1)), (error * changed).sum((-2, -1))], -1)
     counts = torch.stack([torch.ones_like(changed).sum((-2, -1)), changed.sum((-2, -1))], -1)
     return torch.maximum(sums, _FLOOR * counts)
 
 
 def changes(last: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
-    """Which pixels of uint8 frames [..., H, W, 3] are no longer those of `last`: bool [..., H, W]."""
+    """The pixels of uint8 frames [..., H, W, 3] that differ from `last`: bool [..., H, W]."""
     return ((frames.short() - last.short()).abs() > CHANGED).any(-1)
 
 
@@ -60,7 +59,7 @@ def luma(frames: torch.Tensor) -> torch.Tensor:
 
 
 def gradient_energy(frames: torch.Tensor) -> torch.Tensor:
-    """Sharpness: mean squared step of luma across plus that down: uint8 [..., H, W, 3] -> float64 [...]."""
+    """Sharpness: mean squared difference of neighbouring luma, horizontal plus vertical: uint8 [..., H, W, 3] -> float64 [...]."""
     brightness = luma(frames)
     return brightness.diff(dim=-1).square().mean((-2, -1)) + brightness.diff(dim=-2).square().mean((-2, -1))
 
@@ -72,7 +71,7 @@ def colour_statistics(frames: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def blurred(frames: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
-    """uint8 [N, H, W, 3] behind a Gaussian blur of `sigma` pixels, edges mirrored; uint8 of the same shape."""
+    """uint8 [N, H, W, 3] under a Gaussian blur of `sigma` pixels, edges mirrored; uint8 of the same shape."""
     reach = math.ceil(3 * sigma)
     image = F.pad(frames.permute(0, 3, 1, 2).float(), (reach,) * 4, mode="reflect").flatten(0, 1)[:, None]
     image = _smoothed(image, sigma, reach)

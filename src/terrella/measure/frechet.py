@@ -1,16 +1,15 @@
-"""The Frechet distance between two sets of frames, in the features of the fixed encoder: blur cannot win here.
+"""The Frechet distance between two sets of frames, in the features of the fixed encoder.
 
 Two Gaussians are fitted to the features of real and of dreamt frames, and their 2-Wasserstein distance, squared, is
     |m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2))          (Dowson and Landau 1982; "FID" where the features are Inception's).
 
-What it means: 0 where the dreams look like the game as a set; it rises with blur, noise, wrong colours, blocks, ghosts,
-missing and made-up things, and does not care which dream belongs to which frame. What it does not: it is not the FID of
-papers (another encoder), figures at other frame sizes do not compare, it sees only means and covariances, it cannot tell a
-right frame from a wrong one that looks as real (PSNR does), and a set that lacks variety shows only through its spread.
+It is 0 if both sets look the same, and rises with blur, noise, wrong colours, blocks, ghosts, missing and invented things. It
+ignores which prediction belongs to which frame. Limits: it is not the FID of papers (another encoder), values at different
+frame sizes do not compare, it uses only means and covariances, and a wrong frame that looks real costs nothing (see PSNR).
 
-Finite samples: the plain figure is too large by about C / n. Both sets here have equally many frames, in groups (clips)
-that are left out one at a time, from both sets at once: the jackknife (Quenouille 1956, Tukey 1958) takes the 1/n term
-away and gives the interval. A corrected figure may fall a little below 0 where the sets are alike.
+Finite samples: the plain value is biased upwards by about C / n. Both sets have equally many frames, which are left out in
+groups (clips), from both sets at once: the jackknife (Quenouille 1956, Tukey 1958) removes the 1/n term and gives the
+interval. A corrected value may be slightly below 0 if the sets are alike.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ import torch
 
 from .statistics import Figure
 
-_LEAST_GROUPS, _MOST_GROUPS = 8, 50  # with fewer the jackknife's interval means little; more take long
+_MIN_GROUPS, _MAX_GROUPS = 8, 50  # of the jackknife: fewer give no reliable interval, more take long
 
 
 def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
-    """Squared Frechet distance of features [..., n, D] and [..., m, D]: float64 [...], as it stands, never below 0.
+    """Squared Frechet distance of features [..., n, D] and [..., m, D]: float64 [...], uncorrected, never below 0.
 
     Unbiased covariances; no matrix is inverted, so sets smaller than D are allowed (but see the bias above).
     """
@@ -38,8 +37,8 @@ def frechet_of_moments(
 ) -> torch.Tensor:
     """The same of means [..., D] and covariances [..., D, D].
 
-    tr (S1 S2)^(1/2) is the sum of the singular values of S1^(1/2) S2^(1/2): symmetric roots by eigenvalues, those that
-    rounding made negative set to 0. Squaring first and rooting after, as is usual, would lose half of the digits.
+    tr (S1 S2)^(1/2) is the sum of the singular values of S1^(1/2) S2^(1/2), with symmetric roots by eigenvalues; those made
+    negative by rounding are set to 0. The usual root of the product would lose half of the digits.
     """
     cross = torch.linalg.svdvals(_root(cov_a) @ _root(cov_b)).sum(-1)
     traces = torch.diagonal(cov_a + cov_b, dim1=-2, dim2=-1).sum(-1)
@@ -47,12 +46,12 @@ def frechet_of_moments(
 
 
 def frechet_interval(real: torch.Tensor, dreamt: torch.Tensor) -> Figure:
-    """The distance with its 1/n bias taken off, and a 95% interval, of features [n, D] of as many real as dreamt frames.
+    """The bias-corrected distance with a 95% interval, of features [n, D] of equally many real and predicted frames.
 
-    Each row is left out by itself; of more than 50, as many groups, joined at random, are. Figure.count is the number of
-    frames. NaN of fewer than three rows; without an interval below eight.
+    Rows are left out one by one, or in 50 random groups if there are more. Figure.count is the number of frames. NaN for fewer
+    than three rows; no interval for fewer than eight.
     """
-    mine, count = torch.arange(len(real)), min(len(real), _MOST_GROUPS)
+    mine, count = torch.arange(len(real)), min(len(real), _MAX_GROUPS)
     if len(real) > count:
         mine = torch.randperm(len(real), generator=torch.Generator().manual_seed(0)) % count
     if count < 3:
@@ -60,7 +59,7 @@ def frechet_interval(real: torch.Tensor, dreamt: torch.Tensor) -> Figure:
     whole = frechet(real, dreamt)
     left = torch.stack([frechet(real[mine != group], dreamt[mine != group]) for group in range(count)])
     value = float(count * whole - (count - 1) * left.mean())
-    if count < _LEAST_GROUPS:
+    if count < _MIN_GROUPS:
         return Figure(value, math.nan, math.nan, len(real))
     deviation = float(((count - 1) / count * (left - left.mean()).square().sum()).sqrt())
     return Figure(value, value - 1.96 * deviation, value + 1.96 * deviation, len(real))

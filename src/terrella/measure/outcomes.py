@@ -1,4 +1,4 @@
-"""Outcomes: does a dream tell rightly what a game pays, how its player fares, and when the episode ends?"""
+"""Outcomes: predictions of reward, of single numbers such as health, and of the end of the episode."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from .scorecard import COPY_LAST, PREDICTED, ProbeReport, Row
 from .statistics import Figure, mean_interval
 
 LEAD = (
-    "What is predicted of rewards, of numbers such as health, and of the end: the mean absolute error of the reward summed over "
-    "the steps, and its correlation with the recorded sum; how well the predicted sum tells stretches that paid more than usual, "
-    "and the predicted end tells stretches that ended (area under the ROC curve: 1 always, 0.5 by chance). Half of the stretches "
-    "are taken from shortly before an end, where there are ends."
+    "Predictions of reward, of numbers such as health, and of the end: the mean absolute error of the return over the steps, and "
+    "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
+    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance). Half of the stretches are from "
+    "shortly before an end, if there are ends."
 )
 USUAL = "the usual reward"
 
@@ -36,10 +36,10 @@ def clips_with_endings(
     rng: torch.Generator,
     where: Where | None = None,
 ) -> tuple[list[Clip], list[np.ndarray]]:
-    """`count` clips that may run into the end of their episode, and of each which rows' actions were played, bool [T].
+    """`count` clips that may include the end of their episode, and for each the rows before the end, bool [T].
 
-    After the end they stand still under neutral actions of the world's `spec`. They are of rows that `where` allows, half of
-    them shortly before an end where there are ends; DatasetError without any."""
+    After the end, the last row is repeated with the neutral action of `spec`. Rows are restricted by `where`; half of the clips
+    are from shortly before an end, if there are ends. DatasetError if no episode is long enough."""
     spans = [cache.episodes[number] for number in episodes]
     whole = [part for first, stop in spans for part in runs(cache, first, stop, where, False)]
     long = [(first, stop) for first, stop in whole if stop - first > context + 1]
@@ -47,21 +47,21 @@ def clips_with_endings(
     ending = [(first, stop) for first, stop in long if ends and bool(np.asarray(cache.done[first:stop]).any())]
     if not long:
         raise DatasetError(f"no episode is longer than the {context} rows of context; record longer ones.")
-    found, neutral = [], neutral_action(spec)
+    passages, neutral = [], neutral_action(spec)
     for number in range(count):
         pool = ending if ending and number % 2 == 0 else long
         first, stop = pool[_whole(rng, len(pool))]
         last = stop - context - 2  # a window has a step after its context
         least = max(first, last - horizon + 2) if pool is ending else first
-        found.append(_passage(cache, neutral, least + _whole(rng, last - least + 1), stop, context, horizon))
-    return [clip for clip, _ in found], [real for _, real in found]
+        passages.append(_passage(cache, neutral, least + _whole(rng, last - least + 1), stop, context, horizon))
+    return [clip for clip, _ in passages], [real for _, real in passages]
 
 
 def outcome_rows(
     exam: Exam, place: str, arm: str, shown: Sequence[Clip], going: torch.Tensor, dreamt: Results
 ) -> list[Row]:
-    """Figures of reward, of single numbers, and of the end, of clips that a world dreamt on from their context; going: bool
-    [n, T], rows whose action was played; what was dreamt after those is not judged, but for `done`."""
+    """Rows of reward, of single numbers, and of the end. going: bool [n, T], rows before the end; predictions after those do not
+    count, except for `done`."""
     context, rng = shown[0].context, exam.rng
     channels = {name: np.stack([clip.channels[name] for clip in shown]) for name in dreamt}
     truth = {name: torch.from_numpy(array.reshape(*array.shape[:2])).double() for name, array in channels.items()}
@@ -73,7 +73,7 @@ def outcome_rows(
         if "reward" in dreamt:
             usual = float((truth["reward"][going]).median())
             true, mine = (
-                (paid * live).sum(1) for paid in (truth["reward"][:, part], dreamt["reward"][:, :step].double())
+                (reward * live).sum(1) for reward in (truth["reward"][:, part], dreamt["reward"][:, :step].double())
             )
             plain = usual * live.double().sum(1)
             baselines = {USUAL: mean_interval((plain - true).abs(), rng())}
@@ -81,24 +81,24 @@ def outcome_rows(
             rows.append(Row(*where, "return error", "", *tail, mean_interval(error, rng()), -1, baselines, gain))
             rows.append(Row(*where, "return correlation", "", *tail, correlation(mine, true), 1))
             more = true > plain + 1e-6
-            note = f"{int(more.sum())} of {len(shown)} stretches paid more"
+            note = f"{int(more.sum())} of {len(shown)} stretches have more reward"
             rows.append(Row(*where, "pays: AUC", "", *tail, _plain(auc(mine, more), len(shown)), 1, note=note))
         if "done" in dreamt:
             ended = (truth["done"][:, part].bool() & live).any(1)
             note = f"{int(ended.sum())} of {len(shown)} stretches ended"
             figure = _plain(auc(dreamt["done"][:, :step].double().sum(1), ended), len(shown))
             rows.append(Row("outcomes", "done", "ends: AUC", "", *tail, figure, 1, note=note))
-        there = live[:, -1]  # the episode got as far as this step
-        for name in (name for name in dreamt if name not in ("reward", "done") and there.any()):
-            now, then = truth[name][there, context - 1], truth[name][there, context - 1 + step]
-            error, copied = (dreamt[name][there, step - 1].double() - then).abs(), (now - then).abs()
+        reached = live[:, -1]  # episodes that last until this step
+        for name in (name for name in dreamt if name not in ("reward", "done") and reached.any()):
+            now, then = truth[name][reached, context - 1], truth[name][reached, context - 1 + step]
+            error, copied = (dreamt[name][reached, step - 1].double() - then).abs(), (now - then).abs()
             figures = mean_interval(error, rng()), -1, {COPY_LAST: mean_interval(copied, rng())}
             rows.append(Row("outcomes", name, "error", "", *tail, *figures, mean_interval(copied - error, rng())))
     return rows
 
 
 def correlation(first: torch.Tensor, second: torch.Tensor) -> Figure:
-    """Pearson's, of [n] each, with the interval of Fisher's z (1921); NaN where one of them never changes."""
+    """Pearson correlation of [n] each, with the interval of Fisher's z (1921); NaN if one of them is constant."""
     a, b = first - first.mean(), second - second.mean()
     size = float(a.norm() * b.norm())
     if size < 1e-9 or len(a) < 4:
@@ -113,7 +113,7 @@ def _plain(value: float, count: int) -> Figure:
 
 
 def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
-    """Area under the ROC curve of scores [n]: how often a positive outranks a negative, ties counting half."""
+    """Area under the ROC curve of scores [n]: the probability that a positive outranks a negative, ties counting half."""
     high, low = score[positive], score[~positive]
     if not len(high) or not len(low):
         return float("nan")
@@ -122,7 +122,7 @@ def auc(score: torch.Tensor, positive: torch.Tensor) -> float:
 
 
 def _compared(exam: Exam, world: World) -> list[str]:
-    """reward, done, and the single numbers that both the world and the passages say."""
+    """reward, done, and single numbers that both the world and the clips have."""
     shown = next(iter(exam.sets.get(ENDINGS, {}).values()), None)
     if not shown:
         return []
@@ -136,9 +136,9 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     return [StepMetric(tuple(names), flat)] if names else []
 
 
-def _report(exam: Exam, found: ExamResults) -> ProbeReport:
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
     whole = ProbeReport()
-    for place, clips, arm, _, dreamt in found.dreams(exam, ENDINGS, (PREDICTED,)):
+    for place, clips, arm, _, dreamt in results.dreams(exam, ENDINGS, (PREDICTED,)):
         going = torch.from_numpy(np.stack(exam.going[place]))
         whole.rows += outcome_rows(exam, place, arm, clips, going, dreamt)
     return whole

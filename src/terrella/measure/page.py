@@ -7,39 +7,26 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .page_parts import charts_of, figure_table, number, picture_of, section, steps_words, table_of
+from .page_parts import charts_of, document, figure_table, number, picture_of, section, steps_words, table_of
 from .scorecard import COPY_LAST, Row, Scorecard, place_label
 from .verdict import BETTER, WORSE, compared, gain_verdict, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
 
-_HERE = Path(__file__).parent
-
 
 def page(card: Scorecard, title: str, probes: Sequence[Probe]) -> str:
-    """HTML that needs nothing from outside: styles, SVG and JPEGs are inside it. A section a probe that found something."""
-    style = (_HERE / "page.css").read_text(encoding="utf-8")
-    sections = [
-        _verdict(card),
-        *(_section(card, probe) for probe in probes),
-        _missing(card),
-        _method(card),
-    ]
+    """Self-contained HTML with styles, SVG and JPEGs, and a section for each probe with results."""
     places = " &middot; ".join(
         f"{place.clips} {escape(place_label(place.name))} ({place.moving_share:.0%} moving)" for place in card.places
     )
     worlds = " &middot; ".join(f"{escape(arm)}: {escape(name)}" for arm, name in card.worlds.items())
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1>"
-        f"<p>{places}</p><p>{worlds}</p></header><main>{''.join(sections)}</main></body></html>\n"
-    )
+    sections = [_verdict(card), *(_section(card, probe) for probe in probes), _missing(card), _method(card)]
+    return document(title, sections, f"<p>{places}</p><p>{worlds}</p>")
 
 
 def _verdict(card: Scorecard) -> str:
-    """The answer, and a table of gains over copying the last frame: filled where the whole interval says so."""
+    """The verdict, and a table of gains over copying the last frame, filled if the whole interval has one sign."""
     rows, lines = compared(card), []
     steps = sorted({row.horizon for row in rows})
     for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
@@ -54,12 +41,12 @@ def _verdict(card: Scorecard) -> str:
 
 
 def _gain(row: Row) -> str:
-    said = gain_verdict(row.gain)
-    kind = {BETTER: "met", WORSE: "missed"}.get(said, "void")
-    words = number(abs(row.gain.value)) if row.gain else ""
+    judgement = gain_verdict(row.gain)
+    kind = {BETTER: "met", WORSE: "missed"}.get(judgement, "void")
+    text = number(abs(row.gain.value)) if row.gain else ""
     sign = "" if row.gain is None else "\u2212" if row.gain.value < 0 else "+"
     beside = f"<small>{number(row.figure.value)}; copied {number(row.baselines[COPY_LAST].value)}</small>"
-    return f"<span class='status {kind}' title='{said}'>{sign}{words}</span>{beside}"
+    return f"<span class='status {kind}' title='{judgement}'>{sign}{text}</span>{beside}"
 
 
 def _section(card: Scorecard, probe: Probe) -> str:
@@ -71,27 +58,25 @@ def _section(card: Scorecard, probe: Probe) -> str:
     whole = section(probe.question, escape(probe.lead), inside)
     if not control:
         return whole
-    lead = (
-        "By how much a dream under the true actions is nearer to the truth than one under other actions, clip by clip."
-    )
-    return section("Does it obey?", lead, figure_table(control, card.dt_s)) + whole
+    lead = "The gain in accuracy of rollouts under the true actions over rollouts under other actions, clip by clip."
+    return section("Does it follow actions?", lead, figure_table(control, card.dt_s)) + whole
 
 
 def _missing(card: Scorecard) -> str:
     if not card.missing:
         return ""
     lines = "".join(f"<li>{escape(gone.probe)}, {escape(gone.arm)}: {escape(gone.why)}</li>" for gone in card.missing)
-    return section("Not applicable", "What could not be asked, and what it would need.", f"<ul>{lines}</ul>")
+    return section("Not applicable", "Probes that were skipped, and what they need.", f"<ul>{lines}</ul>")
 
 
 def _method(card: Scorecard) -> str:
-    asked = {f"<li class={row.probe}>" for row in card.rows} | {
+    shown = {f"<li class={row.probe}>" for row in card.rows} | {
         "<ul>",
         "</ul>",
         "<li>",
-    }  # what was not measured is not explained
-    lines = (_HERE / "method.html").read_text(encoding="utf-8").splitlines()
-    text = "".join(line for line in lines if line[: line.index(">") + 1] in asked)
+    }  # only probes that were measured
+    lines = (Path(__file__).parent / "method.html").read_text(encoding="utf-8").splitlines()
+    text = "".join(line for line in lines if line[: line.index(">") + 1] in shown)
     context = card.places[0].context if card.places else 0
     filled = text.format(context=context, dt_ms=card.dt_s * 1e3, rate=1 / card.dt_s)
     return f"<section><h2>How this was measured</h2>{filled}</section>"

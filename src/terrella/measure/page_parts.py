@@ -1,4 +1,4 @@
-"""What the page of a scorecard is put together from: sections, charts, tables of figures, pictures."""
+"""Parts of the page of a scorecard: sections, charts, tables of figures, pictures."""
 
 from __future__ import annotations
 
@@ -23,25 +23,31 @@ def section(heading: str, lead: str, inside: str) -> str:
     return f"<section><h2>{escape(heading)}</h2><p>{lead}</p>{inside}</section>" if inside else ""
 
 
-def document(title: str, sections: Sequence[str]) -> str:
-    """A page that needs nothing from outside."""
+def document(title: str, sections: Sequence[str], below_title: str = "") -> str:
+    """A self-contained HTML page; `below_title` is HTML."""
     style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1></header>"
-        f"<main>{''.join(sections)}</main></body></html>\n"
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1>"
+        f"{below_title}</header><main>{''.join(sections)}</main></body></html>\n"
     )
+
+
+def legend(lines: Sequence[Line]) -> str:
+    """The legend of a chart."""
+    keys = "".join(
+        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{line.colour}" stroke-width="2.5"'
+        + (f' stroke-dasharray="{line.dash}"' if line.dash else "")
+        + f"/></svg>{escape(line.label)}</span>"
+        for line in lines
+    )
+    return f"<figcaption>{keys}</figcaption>"
 
 
 def keys_of(colours: Mapping[str, str]) -> str:
     """The legend of a chart: label -> colour."""
-    keys = "".join(
-        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{colour}" stroke-width="2.5"/></svg>'
-        f"{escape(label)}</span>"
-        for label, colour in colours.items()
-    )
-    return f"<figcaption>{keys}</figcaption>"
+    return legend([Line(label, (), (), (), (), colour) for label, colour in colours.items()])
 
 
 def words_and_interval(words: str) -> str:
@@ -52,7 +58,7 @@ def words_and_interval(words: str) -> str:
 
 
 def number(value: float) -> str:
-    """Three figures, as people write them."""
+    """A number to three digits."""
     if not math.isfinite(value):
         return "&ndash;"
     if value == 0 or abs(value) >= 100:
@@ -76,7 +82,7 @@ def named(arm: str, motion: str) -> str:
 
 
 def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of ready-made cells; the first column is words, the others numbers set to the right."""
+    """A table of HTML cells; the first column is text, the others numbers aligned right."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
         return "".join(f"<{tag}{' class=n' if place else ''}>{cell}</{tag}>" for place, cell in enumerate(row))
@@ -86,18 +92,20 @@ def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def figure_table(rows: Sequence[Row], dt_s: float, open_: bool = True) -> str:
-    """A table a place: a line for each figure and arm, a column for each horizon, baselines below each figure."""
+    """A table for each place: a row for each figure and arm, a column for each horizon, baselines below each figure."""
     tables = ""
     for place in dict.fromkeys(row.place for row in rows):
         mine = [row for row in rows if row.place == place]
         steps = sorted({row.horizon for row in mine})
         lines = []
         for kind in dict.fromkeys((row.channel, row.what, row.unit, row.arm, row.motion) for row in mine):
-            found = {row.horizon: row for row in mine if kind == (row.channel, row.what, row.unit, row.arm, row.motion)}
+            by_step = {
+                row.horizon: row for row in mine if kind == (row.channel, row.what, row.unit, row.arm, row.motion)
+            }
             channel, what, unit, arm, motion = kind
             about = [named(arm, motion), *([channel] if channel else [])]
             words = f"{escape(f'{what}, {unit}' if unit else what)}<small>{escape(', '.join(about))}</small>"
-            lines.append([words, *(_cell(found[step]) if step in found else "" for step in steps)])
+            lines.append([words, *(_cell(by_step[step]) if step in by_step else "" for step in steps)])
         heads = [
             escape(place_label(place)),
             *(f"{steps_words(step)}<small>{step * dt_s:.2f} s</small>" for step in steps),
@@ -115,7 +123,7 @@ def _cell(row: Row) -> str:
 
 
 def charts_of(card: Scorecard, probe: str) -> str:
-    """One chart of all arms for each place and figure, those of one figure on one scale."""
+    """One chart of all arms for each place and figure; charts of one figure share a scale."""
     curves = [curve for curve in card.curves if curve.probe == probe]
     groups: dict[tuple, list[Curve]] = {}
     for curve in curves:
@@ -127,12 +135,12 @@ def charts_of(card: Scorecard, probe: str) -> str:
         for place in dict.fromkeys(curve.place for curve in some):
             mine = [curve for curve in some if curve.place == place]
             lines = [_line(card, curve) for curve in sorted(mine, key=lambda curve: curve.arm == COPY_LAST)]
-            x_label, log = ("% kept, the surest first", False) if probe == "calibration" else ("steps", True)
+            x_label, log = ("coverage in %, most certain first", False) if probe == "calibration" else ("steps", True)
             svg = line_chart(lines, _ticks(mine, log), x_label, f"{what}, {unit}" if unit else what, log, span, guides)
             title = f"{place_label(place)}, {what}" + (f" of {channel}" if channel not in ("", "rgb", "pose") else "")
-            boxes += _box(title, svg, lines)
+            boxes += f"<figure><h3>{escape(title)}</h3>{svg}{legend(lines)}</figure>"
         charts.append(boxes)
-    alone = len({curve.place for curve in curves}) == 1  # then all share one grid
+    alone = len({curve.place for curve in curves}) == 1  # then all charts share one grid
     return "".join(f"<div class=charts>{boxes}</div>" for boxes in (["".join(charts)] if alone else charts))
 
 
@@ -148,26 +156,11 @@ def _line(card: Scorecard, curve: Curve) -> Line:
     copied = curve.arm == COPY_LAST
     arm = curve.arm.partition(",")[0]
     colour = QUIET if copied else COLOURS[list(card.worlds).index(arm) % len(COLOURS)]
-    dash = (
-        "2 3"
-        if copied or curve.arm.endswith("oracle")
-        else "5 4"
-        if curve.motion == TRUE or "chance" in curve.arm
-        else ""
-    )
+    dotted, dashed = copied or curve.arm.endswith("oracle"), curve.motion == TRUE or "chance" in curve.arm
+    dash = "2 3" if dotted else "5 4" if dashed else ""
     band = curve.band
     label = named(curve.arm, curve.motion)
     return Line(label, list(curve.x), band.value, band.low, band.high, colour, dash, curve.mark)
-
-
-def _box(title: str, svg: str, lines: Sequence[Line]) -> str:
-    keys = "".join(
-        f'<span><svg viewBox="0 0 22 6" class=key><path d="M0 3H22" stroke="{line.colour}" stroke-width="2.5"'
-        + (f' stroke-dasharray="{line.dash}"' if line.dash else "")
-        + f"/></svg>{escape(line.label)}</span>"
-        for line in lines
-    )
-    return f"<figure><h3>{escape(title)}</h3>{svg}<figcaption>{keys}</figcaption></figure>"
 
 
 def picture_of(picture: Picture) -> str:

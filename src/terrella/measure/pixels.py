@@ -1,14 +1,15 @@
-"""Pixels, of every camera: PSNR, SSIM, sharpness, change per step, and the Frechet distance of looks."""
+"""Pixels, of every camera: PSNR, SSIM, sharpness, change per step, and Frechet distance."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
 
-from ..core.world import World
+from ..core.world import Observation, World
 from .clips import Clip
 from .encoder import MIN_SIDE, frame_features
 from .error_series import Series, report
@@ -21,21 +22,22 @@ from .statistics import Figure, mean_interval, ratio_band, ratio_interval
 from .work_units import Unit
 
 LEAD = (
-    "How close each predicted frame is to the recorded one. The grey line only repeats the last frame that was shown; shades "
-    "are 95% intervals. A mean of PSNR flatters copying where many frames do not change at all, for an identical frame counts "
-    "as 60 dB: pooled PSNR is that of all clips' errors together, of all frames, of those that changed, and of the pixels that "
-    "changed. Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. Change per step is "
-    "how many pixels change from step to step, in the eight steps before, predicted over recorded: below 1 things stop or are "
-    "gone, which PSNR forgives. The Frechet distance asks only whether the pictures could be the game's; 0 is alike, and blur "
-    "does not help."
+    "The distance of each predicted frame to the recorded one. The grey line repeats the last context frame; shades are 95% "
+    "intervals. Mean PSNR favours copying where many frames do not change, since an identical frame counts as 60 dB: pooled PSNR "
+    "is that of the errors of all clips together, over all frames, over frames that change, and over pixels that change. "
+    "Sharpness is gradient energy, predicted over recorded: below 1 is blurred, above 1 too rough. Change per step is the number "
+    "of pixels that change from step to step over the last eight steps, predicted over recorded: below 1 things stop or vanish, "
+    "which PSNR hardly penalises. The Frechet distance compares the sets of pictures; 0 is equal, and blur does not help."
 )
-_LEAST_SSIM = 11  # pixels: the size of its window
-_RECENT = 8  # steps over which what changes is counted
+_MIN_SSIM = 11  # pixels, the window of SSIM
+_CHANGE_STEPS = 8  # over which changes are counted
 
 
-def series(exam: Exam, found: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
-    """PSNR of every camera that was dreamt: the mean of the frames', and that of the pooled errors."""
-    truth = found.of("truth", of, place)
+def series(
+    exam: Exam, results: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results
+) -> list[Series]:
+    """PSNR of every camera: the mean over frames, and that of the pooled errors."""
+    truth = results.of("truth", of, place)
     made = []
     for name in [key.removesuffix("/psnr") for key in dreamt if key.endswith("/psnr")]:
         values = dreamt[f"{name}/psnr"]
@@ -59,30 +61,34 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     if of == ENDINGS:
         return []
     horizons = exam.config.horizons if of == CLIPS else ()
-    before: dict[str, torch.Tensor] = {}
-    return [
-        StepMetric((name,), partial(_see, exam, name, horizons, first, before)) for name in exam.shared(world, "rgb")
-    ]
+    strips = max(0, exam.config.strips - first)
+    return [StepMetric((name,), _FrameMetrics(name, horizons, strips)) for name in exam.shared(world, "rgb")]
 
 
-def _see(
-    exam: Exam, name: str, horizons, first: int, before: dict, seen, clips: Sequence[Clip], row: int, step: int
-) -> Results:
-    """`before`: the frame that was seen at the step before, by its name."""
-    mine, truth = seen[name], rows_at(clips, name, row)
-    kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
-    if horizons:
-        last = rows_at(clips, name, clips[0].context - 1)
-        kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
-        kept[f"{name}/change"] = _count(changes(last if step == 1 else before[name], mine))
-        before[name] = mine
-    if step in horizons:
-        if min(mine.shape[1:3]) >= _LEAST_SSIM:
-            kept[f"{name}/ssim"] = ssim(mine, truth)
-        if min(mine.shape[1:3]) >= MIN_SIDE:
-            kept[f"{name}/features"] = frame_features(mine)
-        kept[f"{name}/frames"] = mine[: max(0, exam.config.strips - first)]
-    return kept
+@dataclass
+class _FrameMetrics:
+    """Metrics of the frames of one camera in a rollout."""
+
+    name: str
+    horizons: tuple[int, ...]
+    strips: int  # frames to keep at each horizon
+    before: torch.Tensor | None = None  # the frames of the step before
+
+    def __call__(self, seen: Observation, clips: Sequence[Clip], row: int, step: int) -> Results:
+        name, mine, truth = self.name, seen[self.name], rows_at(clips, self.name, row)
+        kept = {f"{name}/psnr": psnr(mine, truth), f"{name}/energy": gradient_energy(mine)}
+        if self.horizons:
+            last = rows_at(clips, name, clips[0].context - 1)
+            kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
+            kept[f"{name}/change"] = _count(changes(last if step == 1 or self.before is None else self.before, mine))
+            self.before = mine
+        if step in self.horizons:
+            if min(mine.shape[1:3]) >= _MIN_SSIM:
+                kept[f"{name}/ssim"] = ssim(mine, truth)
+            if min(mine.shape[1:3]) >= MIN_SIDE:
+                kept[f"{name}/features"] = frame_features(mine)
+            kept[f"{name}/frames"] = mine[: self.strips]
+        return kept
 
 
 def _count(changed: torch.Tensor) -> torch.Tensor:
@@ -90,7 +96,7 @@ def _count(changed: torch.Tensor) -> torch.Tensor:
 
 
 def _units(exam: Exam) -> list[Unit]:
-    """What the recording says by itself, of each place: how alike the last frame shown is to those that follow."""
+    """Metrics of the recording alone, by place: the error of the last context frame against those that follow."""
     world, units = next(iter(exam.arms.values())), []
     names = exam.shared(world, "rgb")
     for of in (CLIPS, LONG) if names else ():
@@ -119,7 +125,7 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
                 before = frames
                 here[f"{name}/copied_pooled"] = pooled(squared_error(last, frames), changed)
             if step in horizons:
-                if min(last.shape[1:3]) >= _LEAST_SSIM:
+                if min(last.shape[1:3]) >= _MIN_SSIM:
                     here[f"{name}/copied_ssim"] = ssim(last, frames)
                 if looks:
                     here |= {
@@ -133,17 +139,17 @@ def _truth(exam: Exam, names: Sequence[str], clips: Sequence[Clip], steps: int, 
     return {key: torch.stack(values, 1) for key, values in kept.items()}
 
 
-def _report(exam: Exam, found: ExamResults) -> ProbeReport:
-    whole = report(exam, found, "pixels", series)
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
+    whole = report(exam, results, "pixels", series)
     for place, clips in exam.places.items():
-        truth, strips = found.of("truth", CLIPS, place), [{} for _ in clips[: exam.config.strips]]
+        truth, strips = results.of("truth", CLIPS, place), [{} for _ in clips[: exam.config.strips]]
         for name in [key.removesuffix("/copied") for key in truth if key.endswith("/copied")]:
             shown = [clip.context - 1 + step for clip in clips[:1] for step in (0, *exam.config.horizons)]
             for strip, clip in zip(strips, clips):
                 strip[f"truth, {name}"] = np.stack([np.asarray(clip.channels[name][row]) for row in shown])
             for arm in exam.arms:
                 for motion in (PREDICTED, TRUE):
-                    dreamt = found.dreamt(CLIPS, arm, place, motion)
+                    dreamt = results.dreamt(CLIPS, arm, place, motion)
                     if f"{name}/psnr" in dreamt:
                         where = "pixels", name, place, arm, motion
                         whole.rows += _rows(exam, where, dreamt, truth)
@@ -173,7 +179,7 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
         rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
         mine_change, change = (
-            some[f"{name}/change"][:, max(0, step - _RECENT) : step].sum(1) for some in (dreamt, truth)
+            some[f"{name}/change"][:, max(0, step - _CHANGE_STEPS) : step].sum(1) for some in (dreamt, truth)
         )
         if change.any():
             figure = ratio_interval(mine_change, change, exam.rng())

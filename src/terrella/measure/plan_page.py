@@ -1,4 +1,4 @@
-"""What a planner did, to look at: a film of reality beside the dream with their divergence below, and a page of its figures."""
+"""The results of `terrella plan` to look at: a film of reality beside the dream with their divergence, and a page of figures."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from PIL import Image, ImageDraw
 
 from ..core.files import replacing
 from ..data.storage.mp4 import Mp4Writer, finish_video
-from .page_parts import COLOURS, QUIET, figure_text, section, table_of
+from .page_parts import COLOURS, QUIET, document, figure_text, section, table_of
 from .plot import Line, line_chart
 from .statistics import Figure
 from .strip import jpeg, strip
 
-_HERE = Path(__file__).parent
-_HIGH, _CHART, _LINE = 224, 84, 18  # pixels: of a panel at least, of the divergence, of the words
-_LEAST = 0.01  # of the scale of a divergence: below it a curve lies on the floor
+_HIGH, _CHART, _LINE = 224, 84, 18  # heights in pixels: of a panel at least, of the divergence, of a line of text
+_MIN_SCALE = 0.01  # of the axis of a divergence
 _DARK, _WORDS, _CURVE = (14, 16, 20), (168, 176, 190), (111, 211, 193)
 
 
 def film(
     path: Path, rows: Mapping[str, np.ndarray], divergence: Sequence[float], what: str, fps: float, hold: int = 8
 ) -> None:
-    """Writes an MP4: pictures uint8 [T, H, W, 3] side by side under their labels, and below them the divergence [T] so far, on a
-    scale for all of it. The last picture stands for `hold` more frames."""
+    """Writes an MP4: pictures uint8 [T, H, W, 3] side by side under their labels, and below them the divergence [T] so far. The
+    last picture is held for `hold` more frames."""
     panels = [np.asarray(frames, np.uint8) for frames in rows.values()]
     height, width = panels[0].shape[1:3]
     times = max(1, -(-_HIGH // height))
@@ -58,7 +57,7 @@ def _draw_divergence(
 ) -> None:
     left, top, right, bottom = box
     draw.text((left + 2, top + 3), f"step {at}: {what} {values[at]:.3g}", fill=_WORDS)
-    most, top = max(max(values), _LEAST), top + _LINE
+    most, top = max(max(values), _MIN_SCALE), top + _LINE
     step = (right - left) / max(1, len(values) - 1)
     points = [(left + step * k, bottom - (bottom - top) * value / most) for k, value in enumerate(values[: at + 1])]
     draw.line([(left, bottom), (right, bottom)], fill=(60, 66, 78))
@@ -67,21 +66,21 @@ def _draw_divergence(
 
 
 def film_strip(rows: Mapping[str, np.ndarray], columns: int = 8) -> Image.Image:
-    """Some pictures of the film, evenly spread, one row for each label."""
+    """Some pictures of the film, evenly spaced, one row for each label."""
     count = len(next(iter(rows.values())))
     picks = sorted(set(np.linspace(0, count - 1, min(columns, count)).round().astype(int).tolist()))
     return strip({label: np.asarray(frames)[picks] for label, frames in rows.items()}, [f"step {at}" for at in picks])
 
 
 def compute_chart(points: Sequence[tuple[float, Figure]], floor: Figure, what: str) -> str:
-    """An <svg>: a figure with its interval against the steps imagined for a decision (log scale); dashed: acting at random."""
+    """An <svg>: a figure with its interval against the steps imagined per decision (log scale); dashed: random actions."""
     x = [steps for steps, _ in points]
     figures = [figure for _, figure in points]
     lines = [
         Line("planner", x, *_curve(figures), COLOURS[0]),
         Line("random", x, *_curve([floor] * len(x)), QUIET, "5 4"),
     ]
-    return line_chart(lines, [(step, f"{step:,.0f}") for step in x], "steps imagined for a decision", what, log_x=True)
+    return line_chart(lines, [(step, f"{step:,.0f}") for step in x], "imagined steps per decision", what, log_x=True)
 
 
 def _curve(figures: Sequence[Figure]) -> tuple[list[float], list[float], list[float]]:
@@ -97,12 +96,11 @@ def plan_page(
     film_name: str = "",
     facts: Mapping[str, object] | None = None,
 ) -> str:
-    """HTML: what came of it, a table with a line for each arm, success against compute, dream beside reality, and the settings."""
+    """HTML: the verdict, a table with a row for each arm, success against compute, dream beside reality, and the settings."""
     heads = list(dict.fromkeys(name for row in arms.values() for name in row))
     rows = [
         [escape(arm), *(figure_text(row[name]) if name in row else "" for name in heads)] for arm, row in arms.items()
     ]
-    style = (_HERE / "page.css").read_text(encoding="utf-8")
     words = "".join(f"<p>{escape(line)}</p>" for line in lead[1:])
     shown = (
         f'<video controls loop muted playsinline width="100%" src="{escape(film_name)}"></video>' if film_name else ""
@@ -113,15 +111,8 @@ def plan_page(
     settings = table_of(["setting", ""], [[escape(str(k)), escape(str(v))] for k, v in (facts or {}).items()])
     parts = [
         f"<section><h2>{escape(lead[0])}</h2>{words}{table_of(['', *map(escape, heads)], rows)}</section>",
-        section("Does thinking longer help?", "The same starts, ever more plans a decision.", chart),
-        section(
-            "Dream beside reality", "The dream begins where the episode did and is given its actions alone.", shown
-        ),
+        section("Does more search help?", "The same starts with more and more plans per decision.", chart),
+        section("Dream beside reality", "The dream starts from the first observation and is given the actions.", shown),
         section("Settings", "", settings if facts else ""),
     ]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1"><meta name="color-scheme" content="dark">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body><header><h1>{escape(title)}</h1></header>"
-        f"<main>{''.join(parts)}</main></body></html>\n"
-    )
+    return document(title, parts)

@@ -1,4 +1,4 @@
-"""Small plain SVG plots: lines with interval bands, on a dark page, legible on a phone."""
+"""Small SVG line charts with interval bands, for a dark page, legible on a phone."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ _LEFT, _TOP, _BOTTOM = 40, 14, 40
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: y at each x, with low and high of its band (equal to y for none); dash as in SVG, "" for solid;
-    mark: an x at which a dot stands on it."""
+    """One curve with its band."""
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
-    low: Sequence[float]
-    high: Sequence[float]
+    low: Sequence[float]  # equal to y without a band
+    high: Sequence[float]  # equal to y without a band
     colour: str
-    dash: str = ""
-    mark: float | None = None
+    dash: str = ""  # as in SVG; "" for solid
+    mark: float | None = None  # an x to mark with a dot
 
 
 def line_chart(
@@ -35,7 +34,7 @@ def line_chart(
     y_range: tuple[float, float] | None = None,
     guides: Sequence[float] = (),
 ) -> str:
-    """An <svg> of the lines; `guides` are dotted horizontals (targets). Title and legend are the page's affair."""
+    """An <svg> of the lines, without title and legend; `guides`: y of dotted lines (targets)."""
     width, height, margin = _WIDTH, _HEIGHT, _RIGHT
     warp = math.log2 if log_x else float
     xs = [warp(x) for line in lines for x in line.x]
@@ -89,11 +88,11 @@ def _path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def y_span(values: Sequence[float]) -> tuple[float, float]:
-    """A range that holds all finite values with a little air."""
+    """A range of all finite values, with a margin."""
     known = [value for value in values if math.isfinite(value)] or [0.0]
     low, high = min(known), max(known)
-    air = 0.06 * (high - low) or 0.5
-    return low - air, high + air
+    margin = 0.06 * (high - low) or 0.5
+    return low - margin, high + margin
 
 
 def round_ticks(low: float, high: float, about: int = 5) -> list[float]:

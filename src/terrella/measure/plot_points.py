@@ -1,4 +1,4 @@
-"""Small plain SVG plots of points with intervals: two judges against each other, and many things in a list."""
+"""Small SVG plots of points with intervals: scatter plots and dot plots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROW, _WORDS, _WIDE = 26, 190, 860
 
 @dataclass(frozen=True)
 class ScatterPoint:
-    """A point with intervals both ways."""
+    """A point with an interval in x and in y."""
 
     label: str
     x: Figure
@@ -25,7 +25,7 @@ class ScatterPoint:
 
 
 def scatter(points: Sequence[ScatterPoint], x_label: str, y_label: str) -> str:
-    """An <svg> with one scale both ways, and the diagonal on which both agree."""
+    """An <svg> with one scale for both axes, and the diagonal."""
     low, high = y_span([end for point in points for each in (point.x, point.y) for end in _ends(each)])
     across, up = _SIDE - _LEFT - _RIGHT, _SIDE - _TOP - _BOTTOM
 
@@ -61,8 +61,7 @@ def scatter(points: Sequence[ScatterPoint], x_label: str, y_label: str) -> str:
 def dot_plot(
     rows: Sequence[tuple[str, Sequence[tuple[Figure, str]]]], x_label: str, guides: Sequence[tuple[float, str]] = ()
 ) -> str:
-    """An <svg>: a line for each name with its figures, (figure, colour) from above to below, on one scale; guides: (value, colour),
-    dotted from top to bottom."""
+    """An <svg>: a row for each name with its figures (figure, colour), on one scale; guides: (value, colour) of dotted lines."""
     values = [end for _, figures in rows for figure, _ in figures for end in _ends(figure)] + [at for at, _ in guides]
     low, high = y_span(values)
     height = _TOP + _ROW * len(rows) + _BOTTOM

@@ -1,4 +1,4 @@
-"""Pose: how far the world's belief of where its cameras are drifts from the truth, in metres, radians, and of the way gone."""
+"""Pose: the drift of the world's camera poses from the truth, in metres, radians, and relative to the path length."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from .scorecard import COPY_LAST, PREDICTED, ProbeReport, Row
 from .statistics import mean_interval, median_interval
 
 LEAD = (
-    "Where the world believes the camera to be under the true actions, against where it was; copy-last stays where it is. "
-    "The table adds the distance as a share of the length of the true path."
+    "The camera pose predicted under the true actions against the true pose; copy-last keeps the last one. The table adds the "
+    "distance as a share of the length of the true path."
 )
 
-WALKED_M = 0.5  # clips that went less far have no share of it
+WALKED_M = 0.5  # least path length for the relative distance
 
 
-def series(exam: Exam, found: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results) -> list[Series]:
-    """Distance and turn between the predicted and the true pose."""
+def series(
+    exam: Exam, results: ExamResults, of: str, place: str, clips: Sequence[Clip], dreamt: Results
+) -> list[Series]:
+    """Distance and angle between the predicted and the true pose."""
     made, context = [], clips[0].context
     for name in [key.removesuffix("/where") for key in dreamt if key.endswith("/where")]:
         given = dreamt[f"{name}/where"].double()
@@ -45,10 +47,10 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     return [StepMetric(tuple(names), lambda seen, *_: {f"{name}/where": seen[name] for name in names})]
 
 
-def _report(exam: Exam, found: ExamResults) -> ProbeReport:
-    whole = report(exam, found, "pose", series)
-    for place, clips, arm, motion, dreamt in found.dreams(exam, CLIPS, (PREDICTED,)):
-        for made in series(exam, found, CLIPS, place, clips, dreamt):
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
+    whole = report(exam, results, "pose", series)
+    for place, clips, arm, motion, dreamt in results.dreams(exam, CLIPS, (PREDICTED,)):
+        for made in series(exam, results, CLIPS, place, clips, dreamt):
             walked = torch.from_numpy(np.stack([clip.walked_m(made.channel) for clip in clips]))
             for step in exam.config.horizons if made.unit == "m" else ():
                 went = walked[:, step - 1] > WALKED_M

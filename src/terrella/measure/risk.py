@@ -1,8 +1,8 @@
-"""Risk against coverage: does a world know which of its frames are wrong, and by how much?
+"""Risk-coverage: does the uncertainty of a world predict the errors of its frames?
 
-Frames are ordered by the world's own `uncertainty`; the risk at a coverage c is the mean error of the c that it is surest of
-(El-Yaniv and Wiener 2010), and the area under that curve (AURC, Geifman et al. 2019) is its mean over all coverages. Ordered
-by chance it is the mean error; by the error itself, as an oracle would, it is the least that any order has.
+Frames are ordered by the world's `uncertainty`; the risk at coverage c is the mean error of the share c of most certain frames
+(El-Yaniv and Wiener 2010), and the area under that curve (AURC, Geifman et al. 2019) is its mean over all coverages. A random
+order gives the mean error; the order by the error itself (oracle) the least area.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from .statistics import Band, figure_of
 RESAMPLES = 400
 POINTS, BINS = 50, 8
 LEAD = (
-    "Each frame comes with the error that the world expects of it. If the least certain frames are set aside, how large is "
-    "the mean absolute error of the rest (in % of full brightness)? AURC is the area under that curve; by chance it would be "
-    "the mean error, an oracle knows the errors. The calibration error is the mean distance between the errors expected and "
-    "found in eight equal bins."
+    "The world predicts the error of each of its frames. If the least certain frames are left out, how large is the mean absolute "
+    "error of the rest (in % of full brightness)? AURC is the area under that curve; a random order gives the mean error, an "
+    "oracle orders by the errors. The calibration error is the mean difference of expected and measured errors in eight bins."
 )
 _ORDERS = ("by its own order", "by an oracle", "by chance")
 
@@ -32,8 +31,8 @@ _ORDERS = ("by its own order", "by an oracle", "by chance")
 def risk_coverage_report(
     place: str, arm: str, motion: str, error: torch.Tensor, uncertainty: torch.Tensor, rng: torch.Generator
 ) -> ProbeReport:
-    """Of errors (mean absolute, intensities 0 to 1) and uncertainties [n, T] of the frames of n clips; in %, intervals over
-    clips. `order worth`: how much of the way from chance to the oracle its order goes."""
+    """From errors (mean absolute, intensities 0 to 1) and uncertainties [n, T] of the frames of n clips; in %, with intervals over
+    clips. `order quality`: the share of the gap between random order and oracle that the order closes."""
     clips, steps = error.shape
     wrong, expected = 100 * error.flatten().double(), 100 * uncertainty.flatten().double()
     clip = torch.arange(clips).repeat_interleave(steps)
@@ -48,7 +47,7 @@ def risk_coverage_report(
     off = torch.zeros(len(weights), dtype=torch.float64)
     for part in orders[0].tensor_split(BINS):
         off += (shares[:, clip[part]] @ (wrong[part] - expected[part])).abs()
-    where, found = ("calibration", "rgb"), ProbeReport()
+    where, report = ("calibration", "rgb"), ProbeReport()
     reference = {
         "by chance": figure_of(chance[0], chance[1:], clips),
         "by an oracle": figure_of(least[0], least[1:], clips),
@@ -56,37 +55,37 @@ def risk_coverage_report(
     closed = 100 * (chance - areas) / (chance - least).clamp_min(1e-12)
     for what, values, better, baselines in (
         ("AURC", areas, -1, reference),
-        ("order worth", closed, 1, {}),
+        ("order quality", closed, 1, {}),
         ("error expected", mean_expected, 0, {"error found": figure_of(chance[0], chance[1:], clips)}),
         ("calibration error", off, -1, {}),
     ):
         figure = figure_of(values[0], values[1:], clips)
-        found.rows.append(Row(*where, what, "%", place, arm, motion, steps, figure, better, baselines))
+        report.rows.append(Row(*where, what, "%", place, arm, motion, steps, figure, better, baselines))
     at = [max(1, round(len(wrong) * (k + 1) / POINTS)) - 1 for k in range(POINTS)]
     x = [100 * (k + 1) / len(wrong) for k in at]
     running = [_running(wrong[order])[at].tolist() for order in orders] + [[float(chance[0])] * POINTS]
     for name, y in zip(_ORDERS, running):
         band = Band(y, y, y, clips)
-        found.curves.append(Curve(*where, "mean error of the surest", "%", place, f"{arm}, {name}", motion, x, band))
-    return found
+        report.curves.append(Curve(*where, "mean error of the surest", "%", place, f"{arm}, {name}", motion, x, band))
+    return report
 
 
-def _see(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
-    away = (seen["rgb"].float() - rows_at(clips, "rgb", row).float()).abs().mean((1, 2, 3)) / 255
-    return {"error": away, "uncertainty": seen["uncertainty"]}
+def _frame_errors(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
+    error = (seen["rgb"].float() - rows_at(clips, "rgb", row).float()).abs().mean((1, 2, 3)) / 255
+    return {"error": error, "uncertainty": seen["uncertainty"]}
 
 
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
-    asked = of == CLIPS and not _missing(exam, world)
-    return [StepMetric(("rgb", "uncertainty"), _see)] if asked else []
+    applies = of == CLIPS and not _missing(exam, world)
+    return [StepMetric(("rgb", "uncertainty"), _frame_errors)] if applies else []
 
 
-def _report(exam: Exam, found: ExamResults) -> ProbeReport:
-    """Each place by itself, and all together: can it tell the known from the invented?"""
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
+    """Each place by itself, and all together."""
     whole = ProbeReport()
     for arm in exam.arms:
         for motion in (PREDICTED, TRUE):
-            parts = {place: found.dreamt(CLIPS, arm, place, motion) for place in exam.places}
+            parts = {place: results.dreamt(CLIPS, arm, place, motion) for place in exam.places}
             known = {place: (part["error"], part["uncertainty"]) for place, part in parts.items() if "error" in part}
             if len(known) > 1:
                 error, uncertainty = zip(*known.values())
@@ -106,11 +105,11 @@ def _missing(exam: Exam, world: World) -> str:
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
-CALIBRATION = Probe("calibration", "Does it know when it invents?", LEAD, _missing, _report, _watch)
+CALIBRATION = Probe("calibration", "Is its uncertainty calibrated?", LEAD, _missing, _report, _watch)
 
 
 def _area(weights: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-    """Of frames in order: error [N], weights [R, N] -> the mean over coverages of the mean error covered [R]."""
+    """The area under the risk-coverage curve [R] of errors [N] in order, with weights [R, N]."""
     covered = weights.cumsum(1)
     running = (weights * error).cumsum(1) / covered.clamp_min(1e-12)
     return (weights * running).sum(1) / covered[:, -1]

@@ -1,4 +1,4 @@
-"""Shows clips to a world and lets it go on, under a policy (actions alone) or along true poses, while others watch."""
+"""Rollouts of a world from clips, under recorded actions or along true poses, with metrics of each step."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ..core.world import Observation, World
 from .clips import Clip, evidence
 from .scorecard import IDLE, OTHERS, TRUE
 
-Tick = Callable[[float], None]  # steps x clips that were done since the last call
+Tick = Callable[[float], None]  # steps x clips done since the last call
 Results = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class StepMetric:
-    """What is kept of a rollout. channels: what must be rendered; see(observation, clips, row, step) -> name -> [B, ...]."""
+    """Values that are kept of each step of a rollout."""
 
-    channels: tuple[str, ...]
-    see: Callable[[Observation, Sequence[Clip], int, int], Mapping[str, torch.Tensor]]
+    channels: tuple[str, ...]  # to render
+    # (observation, clips, row of the clips, step from 1) -> name -> [B, ...]
+    measure: Callable[[Observation, Sequence[Clip], int, int], Mapping[str, torch.Tensor]]
 
 
 def fold_context(world: World, clips: Sequence[Clip], rng: torch.Generator) -> State:
-    """The state after the context frames: each is evidence upon what the world imagined from the one before. A world that
-    takes no evidence just starts."""
+    """The state after the context frames, imagined and observed in turn. A world that observes nothing just starts."""
     if not world.spec.observes:
         return world.start(len(clips), rng)
     state = world.observe(evidence(clips, world.spec, 0), None, rng)
@@ -45,14 +45,14 @@ def actions_at(world: World, clips: Sequence[Clip], row: int) -> torch.Tensor:
     return actions.reshape(len(clips), *(world.spec.action.shape or ()))
 
 
-def policy_of(
+def recorded_policy(
     world: World, clips: Sequence[Clip], motion: str, steps: int, others: Sequence[Clip] | None = None
 ) -> Policy:
-    """Who acts from the context on: the recorded player, that of `others`, or nobody."""
+    """The policy after the context: the recorded actions, those of `others`, or none."""
     if motion == IDLE:
         return Idle(world.spec)
-    hands, first = (others or clips) if motion == OTHERS else clips, clips[0].context - 1
-    return Replay(torch.stack([actions_at(world, hands, first + step) for step in range(steps)]))
+    source, first = (others or clips) if motion == OTHERS else clips, clips[0].context - 1
+    return Replay(torch.stack([actions_at(world, source, first + step) for step in range(steps)]))
 
 
 def dream(
@@ -61,18 +61,18 @@ def dream(
     motion: str,
     steps: int,
     rng: torch.Generator,
-    watches: Sequence[StepMetric],
+    metrics: Sequence[StepMetric],
     others: Sequence[Clip] | None = None,
     tick: Tick = lambda done: None,
 ) -> Results:
-    """Rolls clips (one batch) `steps` steps from their context; what each watch names, [B, T, ...], T the steps at which it
-    was named."""
+    """Rolls a batch of clips out for `steps` steps after their context; the values of the metrics, [B, T, ...], T the steps that
+    have a value."""
     state = fold_context(world, clips, rng)
     context = clips[0].context
     tick(len(clips) * context)
-    policy = None if motion == TRUE else policy_of(world, clips, motion, steps, others)
+    policy = None if motion == TRUE else recorded_policy(world, clips, motion, steps, others)
     memory = policy.begin(len(clips), rng) if policy else None
-    channels = tuple(dict.fromkeys(name for watch in watches for name in watch.channels))
+    channels = tuple(dict.fromkeys(name for metric in metrics for name in metric.channels))
     kept: dict[str, list[torch.Tensor]] = {}
     seen: Observation = {}
     for step in range(1, steps + 1):
@@ -83,20 +83,20 @@ def dream(
             action, memory = act(policy, seen, memory, len(clips), world.spec, rng)
             state = world.imagine(state, action, rng)
         seen = {name: tensor.cpu() for name, tensor in world.render(state, channels).items()}
-        for watch in watches:
-            for name, value in watch.see(seen, clips, row, step).items():
+        for metric in metrics:
+            for name, value in metric.measure(seen, clips, row, step).items():
                 kept.setdefault(name, []).append(value)
         tick(len(clips))
     return {name: torch.stack(values, 1) for name, values in kept.items()}
 
 
 def rows_at(clips: Sequence[Clip], channel: str, row: int) -> torch.Tensor:
-    """What was recorded of a channel in row `row` of each clip: [B, ...]."""
+    """The recorded channel in row `row` of each clip: [B, ...]."""
     return torch.from_numpy(np.stack([np.asarray(clip.channels[channel][row]) for clip in clips]))
 
 
 def poses_at(clips: Sequence[Clip], row: int) -> torch.Tensor:
     """The recorded pose of row `row` of each clip: float32 [B, 7]; DatasetError where a clip has none."""
     if any(clip.pose is None for clip in clips):
-        raise DatasetError("these clips hold no poses; record them, or leave true motion out.")
+        raise DatasetError("these clips have no poses; record them, or leave true motion out.")
     return rows_at(clips, "pose", row).float()

@@ -1,4 +1,4 @@
-"""The scorecard as data: figures with 95% intervals and baselines, curves, pictures, and what was not asked."""
+"""The scorecard as data: figures with 95% intervals and baselines, curves, pictures, and probes that do not apply."""
 
 from __future__ import annotations
 
@@ -9,43 +9,37 @@ import numpy as np
 
 from .statistics import Band, Figure
 
-PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alone; or at each step the true pose
-OTHERS, IDLE = "other actions", "no action"  # actions of another clip; the action at rest, held
+PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alone, or the true pose at each step
+OTHERS, IDLE = "other actions", "no action"  # those of another clip; the neutral action, held
 COPY_LAST = "copy last"
-POOLED = "pooled PSNR"  # that of all errors of all clips together
+POOLED = "pooled PSNR"  # of the errors of all clips together
 CHANGE = "change per step"  # how many pixels change from step to step, predicted over recorded
-GAIN = ": gain over copy-last"  # of a measure: the curve by which it is compared at every step
+GAIN = ": gain over copy-last"  # suffix of a measure: the curve of the comparison at every step
 
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of one probe.
-
-    channel: of which channel ("rgb.wrist"), "" for none; what: its name, unit: that of the figure; better: +1 where more
-    is better, -1 where less is, 0 where 1 or nothing in particular is best; horizon: after how many steps, 0 for none;
-    baselines: the same figure of those who know nothing; gain: over copying the last frame, clip by clip, positive is
-    better; void: it was measured and proves nothing, `note` says why.
-    """
+    """One figure of one probe."""
 
     probe: str
-    channel: str
-    what: str
+    channel: str  # "rgb.wrist"; "" for none
+    what: str  # the measure
     unit: str
-    place: str
-    arm: str
-    motion: str
-    horizon: int
+    place: str  # the set of clips
+    arm: str  # the world
+    motion: str  # PREDICTED or TRUE
+    horizon: int  # steps; 0 for none
     figure: Figure
-    better: int = 0
-    baselines: Mapping[str, Figure] = field(default_factory=dict)
-    gain: Figure | None = None
-    void: bool = False
+    better: int = 0  # +1: higher is better, -1: lower is better, 0: neither (1 is best, if anything)
+    baselines: Mapping[str, Figure] = field(default_factory=dict)  # the same figure of baselines
+    gain: Figure | None = None  # over copying the last frame, clip by clip; positive is better
+    void: bool = False  # measured, but proves nothing; `note` says why
     note: str = ""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A figure along x (steps from 1, or shares); arm COPY_LAST for the last frame copied. mark: an x worth a dot."""
+    """A figure along x."""
 
     probe: str
     channel: str
@@ -54,15 +48,15 @@ class Curve:
     place: str
     arm: str
     motion: str
-    x: Sequence[float]
+    x: Sequence[float]  # steps from 1, or shares
     band: Band
-    mark: float | None = None
-    guides: tuple[float, ...] = ()
+    mark: float | None = None  # an x to mark with a dot
+    guides: tuple[float, ...] = ()  # y of dotted lines
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Rows of frames uint8 [K, H, W, 3] to look at: label -> frames, one column label for each frame."""
+    """Rows of frames to look at: label -> uint8 [K, H, W, 3], with a column label for each frame."""
 
     probe: str
     title: str
@@ -72,7 +66,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Missing:
-    """A probe that was not applicable to an arm, and what it needs: "needs pose"."""
+    """A probe that does not apply to an arm, and what it needs: "needs pose"."""
 
     probe: str
     arm: str
@@ -81,18 +75,18 @@ class Missing:
 
 @dataclass(frozen=True)
 class PlaceSummary:
-    """What was shown: how many clips, the share of them in which anything moves, their lengths in steps."""
+    """A set of clips."""
 
     name: str
     clips: int
-    moving_share: float
-    context: int
-    horizon: int
+    moving_share: float  # of the clips
+    context: int  # steps
+    horizon: int  # steps
 
 
 @dataclass
 class ProbeReport:
-    """What one probe found."""
+    """The results of one probe."""
 
     rows: list[Row] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
@@ -101,9 +95,9 @@ class ProbeReport:
 
 @dataclass(frozen=True)
 class Scorecard:
-    """Everything measured, as data; `pictures` are for the page and stay out of the JSON. worlds: arm -> its world."""
+    """All results, as data; `pictures` are for the page and not in the JSON."""
 
-    worlds: dict[str, str]
+    worlds: dict[str, str]  # arm -> name of its world
     dt_s: float
     places: list[PlaceSummary]
     rows: list[Row] = field(default_factory=list)
@@ -112,7 +106,7 @@ class Scorecard:
     pictures: list[Picture] = field(default_factory=list)
 
     def find(self, probe: str, what: str, **wanted) -> list[Row]:
-        """The rows of a probe by name, and by whichever other fields are given."""
+        """The rows of a probe by measure, and by any other fields."""
         return [
             row
             for row in self.rows
@@ -121,5 +115,5 @@ class Scorecard:
 
 
 def place_label(place: str) -> str:
-    """As people are told of it: "recorded clips", "new places"."""
+    """The label of a set of clips: "recorded clips", "new places"."""
     return f"{place} {'places' if place == 'new' else 'clips'}"

@@ -1,4 +1,4 @@
-"""Speed: milliseconds for one imagined and rendered step of one rollout, and whether the cost grows with time."""
+"""Speed: milliseconds of one imagined and rendered step of a single rollout, and their growth over time."""
 
 from __future__ import annotations
 
@@ -20,16 +20,14 @@ from .scorecard import PREDICTED, ProbeReport, Row
 from .statistics import Figure
 from .work_units import Unit
 
-LEAD = (
-    "One imagined and drawn step of one rollout, in milliseconds. It depends on the machine and on what else it does."
-)
+LEAD = "One imagined and rendered step of a single rollout, in milliseconds. It depends on the machine and its load."
 _WARM = 10
 
 
 def speed(
     world: World, clips: Sequence[Clip], rng: torch.Generator, steps: int = 400, tick: Tick = lambda done: None
 ) -> Results:
-    """ms [steps] from the first clip's context under recorded actions, after ten untimed ones; `threads` of torch."""
+    """ms [steps] after the context of the first clip, under recorded actions, after ten untimed steps; `threads` of torch."""
     state = fold_context(world, clips[:1], rng)
     shown = tuple(name for name in world.spec.channels if kind_of(name) == "rgb") or tuple(world.spec.channels)
     policy = Replay(recorded_actions(world, clips, 1, steps + _WARM, rng))
@@ -56,7 +54,7 @@ def _units(exam: Exam) -> list[Unit]:
 
 
 def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
-    """The median and the 95th percentile, and how much dearer the last tenth is than the first."""
+    """The median, the 95th percentile, and the growth from the first to the last tenth."""
     took = timed["ms"]
     steps, tenth = len(took), max(1, len(took) // 10)
     first, last = float(took[:tenth].median()), float(took[-tenth:].median())
@@ -69,9 +67,9 @@ def rows_of(timed: Results, arm: str, place: str) -> list[Row]:
     ]
 
 
-def _report(exam: Exam, found: ExamResults) -> ProbeReport:
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
     place = next(iter(exam.places))
-    timed = {arm: found.of("speed", arm) for arm in exam.arms}
+    timed = {arm: results.of("speed", arm) for arm in exam.arms}
     return ProbeReport([row for arm, one in timed.items() if one for row in rows_of(one, arm, place)])
 
 

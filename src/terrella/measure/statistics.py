@@ -1,4 +1,4 @@
-"""Figures with 95% intervals, by a seeded bootstrap over clips."""
+"""Figures with 95% confidence intervals: seeded bootstrap over clips, Wilson, Clopper-Pearson."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured number: its value, the 95% interval (NaN where fewer than two clips) and the count of clips."""
+    """A measured value, its 95% interval (NaN for fewer than two clips) and the number of clips."""
 
     value: float
     low: float
@@ -40,10 +40,10 @@ class Band:
     def in_db(self) -> Band:
         """Ratios of powers as decibels."""
 
-        def told(ratios: list[float]) -> list[float]:
+        def decibels(ratios: list[float]) -> list[float]:
             return [10 * math.log10(ratio) if ratio > 0 else math.nan for ratio in ratios]
 
-        return Band(told(self.value), told(self.low), told(self.high), self.count)
+        return Band(decibels(self.value), decibels(self.low), decibels(self.high), self.count)
 
 
 def mean_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
@@ -58,7 +58,7 @@ def mean_band(values: torch.Tensor, rng: torch.Generator) -> Band:
 
 
 def wilson(successes: int, count: int) -> Figure:
-    """The share of successes with Wilson's 95% interval (1927), which holds for few trials and for none or all of them too."""
+    """The success rate with the 95% interval of Wilson (1927), valid also for few trials, and for none or all successful."""
     if not count:
         return Figure(math.nan, math.nan, math.nan, 0)
     share, z2 = successes / count, 1.959964**2
@@ -68,31 +68,30 @@ def wilson(successes: int, count: int) -> Figure:
 
 
 def clopper_pearson(successes: int, count: int) -> Figure:
-    """The share of successes with the exact 95% interval of Clopper and Pearson (1934): what it leaves out is less likely than
-    2.5% either way."""
+    """The success rate with the exact 95% interval of Clopper and Pearson (1934)."""
     if not count:
         return Figure(math.nan, math.nan, math.nan, 0)
-    log_ways = [math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(count + 1)]
+    log_binomials = [math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(count + 1)]
 
     def at_least(least: int, share: float) -> float:
-        """How likely `least` successes or more are."""
-        one, none = math.log(share), math.log1p(-share)
-        return sum(math.exp(log_ways[k] + k * one + (count - k) * none) for k in range(least, count + 1))
+        """The probability of `least` successes or more."""
+        log_p, log_q = math.log(share), math.log1p(-share)
+        return sum(math.exp(log_binomials[k] + k * log_p + (count - k) * log_q) for k in range(least, count + 1))
 
-    def where(least: int, level: float) -> float:
+    def solve(least: int, level: float) -> float:
         low, high = 0.0, 1.0
         for _ in range(50):
             middle = (low + high) / 2
             low, high = (middle, high) if at_least(least, middle) < level else (low, middle)
         return (low + high) / 2
 
-    low = where(successes, 0.025) if successes else 0.0
-    high = where(successes + 1, 0.975) if successes < count else 1.0
+    low = solve(successes, 0.025) if successes else 0.0
+    high = solve(successes + 1, 0.975) if successes < count else 1.0
     return Figure(successes / count, low, high, count)
 
 
 def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
-    """sum(top) / sum(bottom) over clips [n], both resampled together: no clip with a tiny denominator rules it."""
+    """sum(top) / sum(bottom) over clips [n], both resampled together; robust to clips with a tiny denominator."""
     return ratio_band(top[:, None], bottom[:, None], rng).at(0)
 
 
@@ -112,9 +111,9 @@ def median_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
 
 
 def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Generator) -> Figure:
-    """The step up to which the mean of values [n, T] has stayed at or above the mean of floor [n].
+    """The last step up to which the mean of values [n, T] has stayed at or above the mean of floor [n].
 
-    Steps count from 1; 0 where already the first is below, T where none is. Clips of both are resampled together.
+    Steps count from 1; 0 if the first is already below, T if none is. Clips of both are resampled together.
     """
     over = values.double() - floor.double()[:, None]
 
@@ -135,14 +134,14 @@ def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Gener
 
 
 def _weights(count: int, rng: torch.Generator) -> torch.Tensor:
-    """How often each of `count` clips was drawn in each resample: float64 [RESAMPLES, count]."""
+    """Bootstrap weights, the draws of each clip in each resample: float64 [RESAMPLES, count]."""
     picks = torch.randint(count, (RESAMPLES, count), generator=rng)
     ones = torch.ones(RESAMPLES, count, dtype=torch.float64)
     return torch.zeros_like(ones).scatter_add_(1, picks, ones)
 
 
 def figure_of(centre: torch.Tensor, resampled: torch.Tensor, count: int) -> Figure:
-    """The value, with the 2.5% and 97.5% quantiles of its resamples [R] where there are two clips or more."""
+    """The value, with the 2.5% and 97.5% quantiles of its resamples [R] if there are two clips or more."""
     if count < 2:
         return Figure(float(centre), math.nan, math.nan, count)
     low, high = resampled.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()

@@ -1,4 +1,4 @@
-"""Strips of pictures: truth against dream at a glance."""
+"""Strips of pictures: rows of frames with labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What came of carrying policies over to a real robot: successes of each arm, how much of the gap it recovers, and a verdict."""
+"""Sim-to-real transfer of policies: success rates of each arm, the share of the gap that it recovers, and a verdict."""
 
 from __future__ import annotations
 
@@ -15,24 +15,22 @@ from .statistics import Figure, clopper_pearson
 
 NOMINAL, ORACLE, RANDOM, IDLE = "nominal", "oracle", "random", "idle"
 FLOORS = (RANDOM, IDLE)
-FAILS, SUCCEEDS, RECOVERS = 0.2, 0.8, 0.6  # shares that the experiment asks for
+FAILS, SUCCEEDS, RECOVERS = 0.2, 0.8, 0.6  # success rates of nominal and of the best; share of the gap recovered
 
 Successes = Mapping[str, Mapping[int, torch.Tensor]]  # arm -> seed -> successes [episodes]
 
 
 @dataclass(frozen=True)
 class TransferScores:
-    """arms: of each its successes in the real one, over all seeds and episodes; least, most: over seeds; recovered: of the gap
-    between nominal and oracle; dial: arm -> gap -> successes; agreed: by simulator or model, how it and the real one agree on
-    all policies."""
+    """Success rates in the real environment, over all seeds and episodes."""
 
     arms: dict[str, Figure]
-    spread: dict[str, tuple[float, float]]
-    recovered: dict[str, float]
-    dial: dict[str, dict[float, Figure]]
-    agreed: dict[str, Agreement]
-    camera: dict[str, Figure]
-    errors: dict[str, tuple[float, float]]
+    spread: dict[str, tuple[float, float]]  # arm -> least and greatest over seeds
+    recovered: dict[str, float]  # arm -> share of the gap between nominal and oracle
+    dial: dict[str, dict[float, Figure]]  # arm -> share of the whole gap -> success rate
+    agreed: dict[str, Agreement]  # simulator or model -> agreement with the real environment on all policies
+    camera: dict[str, Figure]  # arms whose goal is read from a picture by an encoder
+    errors: dict[str, tuple[float, float]]  # the same arms -> least and greatest error of the goal over seeds
 
 
 def compare_transfer_arms(
@@ -42,9 +40,8 @@ def compare_transfer_arms(
     camera: Successes,
     errors: Mapping[str, Sequence[float]],
 ) -> TransferScores:
-    """Figures of all arms. inside: by simulator or model, the same policies' successes there, from starts of its own; camera: those
-    of arms that are told their goal by an encoder of pictures; errors: arm -> seeds, how far off the goal is that its encoder
-    reads."""
+    """Figures of all arms. inside: simulator or model -> successes of the same policies there, from other starts. camera: successes
+    of arms whose goal is read from a picture by an encoder; errors: their errors of the goal, by seed."""
     arms = {arm: _share(torch.cat(list(seeds.values()))) for arm, seeds in real.items()}
     spread = {arm: _ends([float(one.float().mean()) for one in seeds.values()]) for arm, seeds in real.items()}
     recovered = {}
@@ -66,61 +63,63 @@ def compare_transfer_arms(
     return TransferScores(arms, spread, recovered, curves, agreed, by_camera, off)
 
 
-def best_arm(found: TransferScores) -> str:
-    """The arm that succeeds most often of those that saw few real episodes or none."""
-    own = [arm for arm in found.arms if arm not in (*FLOORS, NOMINAL, ORACLE)]
-    return max(own, key=lambda arm: found.arms[arm].value, default=NOMINAL)
+def best_arm(scores: TransferScores) -> str:
+    """The arm with the highest success rate of those that saw few real episodes or none."""
+    own = [arm for arm in scores.arms if arm not in (*FLOORS, NOMINAL, ORACLE)]
+    return max(own, key=lambda arm: scores.arms[arm].value, default=NOMINAL)
 
 
-def verdict(found: TransferScores) -> list[str]:
-    """Sentences, the answer first."""
-    arms, winner = found.arms, best_arm(found)
-    lines = [f"Trained in the simulator alone a policy succeeds in {percent(arms[NOMINAL])} of real episodes"]
+def verdict(scores: TransferScores) -> list[str]:
+    """Sentences, the verdict first."""
+    arms, winner = scores.arms, best_arm(scores)
+    lines = [f"Trained in the simulator alone, a policy succeeds in {percent(arms[NOMINAL])} of real episodes"]
     if winner != NOMINAL:
         lines[0] += f"; the best of the others, {winner}, in {percent(arms[winner])}"
     lines[0] += "."
     if ORACLE in arms:
-        lines.append(f"trained in the real one itself: {percent(arms[ORACLE])}")
+        lines.append(f"trained in the real environment (oracle): {percent(arms[ORACLE])}")
     lines += [f"{arm}: {percent(arms[arm])}" for arm in FLOORS if arm in arms]
     if arms[NOMINAL].value >= FAILS:
-        lines.append(f"nominal succeeds in {FAILS:.0%} or more: an easier pair than where it mostly fails")
-    for arm, part in found.recovered.items():
+        lines.append(f"nominal succeeds in {FAILS:.0%} or more: this pair is easier than the experiment asks for")
+    for arm, part in scores.recovered.items():
         if arm not in (NOMINAL, ORACLE):
             lines.append(f"{arm} recovers {part:.0%} of the gap between nominal and oracle")
-    for name, agreed in found.agreed.items():
+    for name, agreed in scores.agreed.items():
         pearson, mmrv = with_interval(agreed.pearson), with_interval(agreed.mmrv)
-        lines.append(f"{name} and the real one on {agreed.pearson.count} policies: Pearson {pearson}, MMRV {mmrv}")
-    if found.camera:
-        winner = max((arm for arm in found.camera if ORACLE not in arm), key=lambda arm: found.camera[arm].value)
-        told_so = f"told the goal by a camera, nominal succeeds in {percent(found.camera[NOMINAL])}"
-        lines.append(f"{told_so}; the best that saw no real goal, {winner}, in {percent(found.camera[winner])}")
+        lines.append(
+            f"{name} and the real environment on {agreed.pearson.count} policies: Pearson {pearson}, MMRV {mmrv}"
+        )
+    if scores.camera:
+        winner = max((arm for arm in scores.camera if ORACLE not in arm), key=lambda arm: scores.camera[arm].value)
+        nominal = f"with the goal read from a camera, nominal succeeds in {percent(scores.camera[NOMINAL])}"
+        lines.append(f"{nominal}; the best without real goals, {winner}, in {percent(scores.camera[winner])}")
     return lines
 
 
-def camera_table(found: TransferScores) -> tuple[list[str], list[list[str]]]:
-    """The same of the arms with a camera, and how far off their encoder's goals are."""
+def camera_table(scores: TransferScores) -> tuple[list[str], list[list[str]]]:
+    """The table of the arms with a camera, and the errors of their goals."""
     lines = []
-    for arm, figure in found.camera.items():
-        off = found.errors.get(arm)
+    for arm, figure in scores.camera.items():
+        off = scores.errors.get(arm)
         lines.append([arm, percent(figure), f"{off[0]:.3f} to {off[1]:.3f}" if off else ""])
     return ["with a camera", "real successes", "goal's error, seeds"], lines
 
 
-def table(found: TransferScores) -> tuple[list[str], list[list[str]]]:
-    """Heads and lines of the arms in their order."""
+def table(scores: TransferScores) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of the arms in their order."""
     lines = []
-    for arm, figure in found.arms.items():
-        low, high = found.spread[arm]
-        part = f"{found.recovered[arm]:.0%}" if arm in found.recovered else ""
+    for arm, figure in scores.arms.items():
+        low, high = scores.spread[arm]
+        part = f"{scores.recovered[arm]:.0%}" if arm in scores.recovered else ""
         lines.append([arm, percent(figure), f"{low:.0%} to {high:.0%}", part])
     return ["arm", "real successes", "seeds", "gap recovered"], lines
 
 
-def as_dict(found: TransferScores) -> dict[str, Any]:
+def as_dict(scores: TransferScores) -> dict[str, Any]:
     """Plain data for JSON, the verdict first."""
-    plain = dataclasses.asdict(found)
+    plain = dataclasses.asdict(scores)
     plain["dial"] = {arm: {f"{gap:g}": one for gap, one in gaps.items()} for arm, gaps in plain["dial"].items()}
-    return {"verdict": verdict(found), **plain}
+    return {"verdict": verdict(scores), **plain}
 
 
 def _share(successes: torch.Tensor) -> Figure:

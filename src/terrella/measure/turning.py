@@ -1,4 +1,4 @@
-"""Which actions turn the camera, or scroll the picture: found by trying them, or in what was recorded, never by their names."""
+"""The actions that turn the camera or scroll the picture, from trials or recordings, not from their names."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from ..space.matching import scrolled
 from .clips import Clip
 from .rollouts import fold_context
 
-TRIED, TURNS_RAD = 4, math.radians(0.2)  # steps that an action is tried for; what turns less in a step does not turn
-REACH, SCROLLS = 8, 0.5  # pixels that a picture may go in a step, either way; what goes less does not scroll
+TRIAL_STEPS, MIN_TURN_RAD = 4, math.radians(0.2)  # steps of a trial; least turn per step
+REACH, MIN_SCROLL = 8, 0.5  # largest and least scroll per step, in pixels
 
 
 def turning_actions(
     world: World, clips: Sequence[Clip], rng: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor, str, float] | None:
-    """Two actions that turn the camera one way and the other, their name, and radians a step; None where nothing does.
+    """Two actions that turn the camera left and right, their names, and radians per step; None if none do.
 
-    Each button, choice or end of an axis is tried by itself in the world where it shows its pose; else their part in the
-    recorded turning is read off by least squares. Nobody needs to name a key TURN_LEFT.
+    Each button, choice or limit of an axis is tried by itself if the world has a pose; else their shares of the recorded turning
+    are fitted by least squares.
     """
     candidates = _candidates(world.spec)
     if not candidates:
         return None
     if "pose" in world.spec.channels and world.spec.forkable:
-        rates = _tried(world, clips[:1], [action for _, action in candidates], rng)
+        rates = _turn_rates_by_trial(world, clips[:1], [action for _, action in candidates], rng)
     elif clips[0].pose is not None:
-        rates = _read_off(world.spec, clips, [action for _, action in candidates])
+        rates = _turn_rates_by_regression(world.spec, clips, [action for _, action in candidates])
     else:
         return None
     left, right = int(rates.argmax()), int(rates.argmin())
     speed = min(float(rates[left]), -float(rates[right]))
-    if speed < TURNS_RAD:
+    if speed < MIN_TURN_RAD:
         return None
     return candidates[left][1], candidates[right][1], f"{candidates[left][0]} and {candidates[right][0]}", speed
 
@@ -48,36 +48,39 @@ def turning_actions(
 def scrolling_actions(
     world: World, clips: Sequence[Clip], rng: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor, str, float] | None:
-    """Two actions that scroll the picture one way and back, their name, and pixels a step; None where no two do. Each is tried in
-    this world, which shows `rgb`, from each of the clips; the steps that scroll furthest count, for some are blocked."""
+    """Two actions that scroll the picture one way and back, their names, and pixels per step; None if no two do. Each is tried
+    from each of the clips; the largest scroll counts, since some are blocked."""
     candidates = _candidates(world.spec)
     span = range(-REACH, REACH + 1)
     moves = torch.tensor(sorted(((x, y) for x in span for y in span), key=lambda move: abs(move[0]) + abs(move[1])))
     first, went = fold_context(world, clips, rng), []
     for _, action in candidates:
         state, frames = first, []
-        for step in range(TRIED + 1):
+        for step in range(TRIAL_STEPS + 1):
             state = state if step == 0 else world.imagine(state, action.expand(len(clips), *action.shape), rng)
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
-        steps = torch.stack([moves[scrolled(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0) / TRIED
+        steps = (
+            torch.stack([moves[scrolled(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0)
+            / TRIAL_STEPS
+        )
         went.append(steps[steps.abs().sum(1).argmax()])
     best = None
     for a, b in combinations(range(len(went)), 2):
         speed = min(float(went[a].norm()), float(went[b].norm()))
-        if speed >= SCROLLS and (went[a] + went[b]).norm() <= 0.5 * speed and (best is None or speed > best[3]):
+        if speed >= MIN_SCROLL and (went[a] + went[b]).norm() <= 0.5 * speed and (best is None or speed > best[3]):
             best = candidates[a][1], candidates[b][1], f"{candidates[a][0]} and {candidates[b][0]}", speed
     return best
 
 
 def _candidates(spec: Spec) -> list[tuple[str, torch.Tensor]]:
-    """Every button, choice, or end of an axis by itself, the others at rest."""
+    """Every button, choice, or limit of an axis by itself, the others neutral."""
     low, high = (np.asarray(limit) for limit in spec.action_limits)
     if isinstance(spec.action, spaces.Discrete):
         first = int(spec.action.start)
         names = spec.action_names or tuple(map(str, range(int(spec.action.n))))
         return [(name, torch.tensor(first + number)) for number, name in enumerate(names)]
     rest = np.clip(np.zeros_like(low), low, high)
-    found, names = [], spec.action_names
+    candidates, names = [], spec.action_names
     for place in range(low.size):
         name = names[place] if place < len(names) else f"action {place}"
         ends = (low.flat[place], high.flat[place]) if low.dtype.kind == "f" else (high.flat[place],)
@@ -86,25 +89,27 @@ def _candidates(spec: Spec) -> list[tuple[str, torch.Tensor]]:
                 action = rest.copy()
                 action.flat[place] = end
                 signed = f"{'-' if end < 0 else '+'}{name}" if len(ends) > 1 else name
-                found.append((signed, torch.from_numpy(action)))
-    return found
+                candidates.append((signed, torch.from_numpy(action)))
+    return candidates
 
 
-def _tried(world: World, clips: Sequence[Clip], actions: Sequence[torch.Tensor], rng: torch.Generator) -> torch.Tensor:
-    """Radians a step that each action turns the camera to the left, in this world."""
+def _turn_rates_by_trial(
+    world: World, clips: Sequence[Clip], actions: Sequence[torch.Tensor], rng: torch.Generator
+) -> torch.Tensor:
+    """Radians per step by which each action turns the camera to the left, by trials in the world."""
     first = fold_context(world, clips, rng)
     turned = []
     for action in actions:
         state = first
-        for _ in range(TRIED):
+        for _ in range(TRIAL_STEPS):
             state = world.imagine(state, action.expand(1, *action.shape), rng)
         seen = [world.render(each, ("pose",))["pose"].float().cpu() for each in (first, state)]
-        turned.append(_angle(yaw(seen[1]) - yaw(seen[0]))[0] / TRIED)
+        turned.append(_angle(yaw(seen[1]) - yaw(seen[0]))[0] / TRIAL_STEPS)
     return torch.stack(turned)
 
 
-def _read_off(spec: Spec, clips: Sequence[Clip], actions: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The same, of the recordings: the yaw of each step as a sum of what each button, choice or axis adds."""
+def _turn_rates_by_regression(spec: Spec, clips: Sequence[Clip], actions: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The same from recordings: the yaw of each step regressed on the buttons, choices or axes."""
 
     def features(rows: np.ndarray) -> torch.Tensor:
         flat = torch.from_numpy(np.array(rows, np.float64)).reshape(len(rows), -1)
@@ -115,7 +120,7 @@ def _read_off(spec: Spec, clips: Sequence[Clip], actions: Sequence[torch.Tensor]
     posed = [(clip, yaw(torch.from_numpy(np.array(clip.pose)))) for clip in clips if clip.pose is not None]
     change = torch.cat([_angle(heading.diff()) for _, heading in posed]).double()
     played = features(np.concatenate([np.asarray(clip.action[:-1]) for clip, _ in posed]))
-    still = torch.eye(played.shape[1], dtype=torch.float64) * 1e-3  # what was never played adds nothing
+    still = torch.eye(played.shape[1], dtype=torch.float64) * 1e-3  # actions never played get 0
     parts = torch.linalg.lstsq(
         torch.cat([played, still]), torch.cat([change, torch.zeros(len(still)).double()])
     ).solution

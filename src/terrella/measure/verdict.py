@@ -1,4 +1,4 @@
-"""What a scorecard says: one sentence first, computed from figures and their intervals; then lines; and all of it as JSON."""
+"""The verdict of a scorecard, computed from figures and their intervals: one sentence, then lines; and the card as JSON."""
 
 from __future__ import annotations
 
@@ -14,82 +14,82 @@ from .scorecard import CHANGE, COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve
 from .statistics import Figure
 
 BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
-REMEMBERED_DB = 25.0  # back where it was, the picture is the first one to this or better
-ALIKE = 0.7, 1.3  # sharpness, and the change per step, over the recorded one
+REMEMBERED_DB = 25.0  # PSNR of the first picture on return, from which a world remembers
+RATIO_RANGE = 0.7, 1.3  # of sharpness and change per step, predicted over recorded
 BLUR_STEPS = 32
 
 
 def to_json(card: Scorecard) -> str:
-    """The scorecard as one strict JSON document: no pictures, NaN as null, six digits."""
+    """The scorecard as a strict JSON document: no pictures, NaN as null, six digits."""
     return json.dumps(as_dict(card), indent=1, allow_nan=False)
 
 
 def as_dict(card: Scorecard) -> dict:
-    """What `to_json` writes, as plain data; the verdict comes first."""
+    """The content of `to_json` as plain data, the verdict first."""
     names = [part.name for part in dataclasses.fields(card) if part.name != "pictures"]
     return {"verdict": verdict(card), **{name: _plain(getattr(card, name)) for name in names}}
 
 
 def verdict(card: Scorecard) -> list[str]:
-    """Sentences, the answer first: that of the first arm; then one for each figure and place that was compared."""
+    """Sentences: the verdict on the first arm, then one for each measure and set of clips that was compared."""
     arm = next(iter(card.worlds))
     rows, name = compared(card), card.worlds[arm]
     curves = [curve for curve in card.curves if curve.arm == arm and curve.what.endswith(GAIN)]
     if not curves:
         needs = "; ".join(f"{gone.probe} {gone.why}" for gone in card.missing if gone.arm == arm)
-        return [f"{name} was not held against copying the last frame ({needs or 'no probe could be asked'})."]
-    told = ", ".join(_traits(card, arm))
-    traits = f"; it {told}" if told else ""
+        return [f"{name} was not compared with copying the last frame ({needs or 'no probe applies'})."]
+    traits = ", ".join(_traits(card, arm))
+    traits = f"; it {traits}" if traits else ""
     kinds = dict.fromkeys((row.channel, row.what, row.place) for row in rows)
     lines = (_line([row for row in rows if (row.channel, row.what, row.place) == kind]) for kind in kinds)
     return [f"{name} is {_copying(curves, rows)}{traits}.", *lines]
 
 
 def compared(card: Scorecard) -> list[Row]:
-    """The rows of the first arm, under actions alone, that are compared with copying the last frame."""
+    """The rows of the first arm, under actions alone, that have copying the last frame as a baseline."""
     arm = next(iter(card.worlds))
     mine = [row for row in card.rows if row.gain is not None and (row.arm, row.motion) == (arm, PREDICTED)]
     return [row for row in mine if COPY_LAST in row.baselines]
 
 
 def gain_verdict(gain: Figure | None) -> str:
-    """Better or worse where the whole interval of a gain says so; one clip alone cannot say."""
+    """Better or worse if the whole interval of a gain is; unclear for a single clip."""
     if gain is None or not math.isfinite(gain.low):
         return UNCLEAR
     return BETTER if gain.low > 0 else WORSE if gain.high < 0 else UNCLEAR
 
 
 def _copying(curves: Sequence[Curve], rows: Sequence[Row]) -> str:
-    """At which steps the world is worse, and better, than copying: of its main measure, by place; of pictures also where the
-    mean of the frames' PSNR says worse and their pooled errors do not."""
+    """The steps at which the world is worse, and better, than copying, in its main measure and by set of clips; of pictures also
+    where mean PSNR is worse but pooled PSNR is not."""
     lead, last = curves[0], "frame" if curves[0].unit == "dB" else "observation"
     than = {
         curve.place: _spans(curve.x, [gain_verdict(curve.band.at(at)) for at in range(len(curve.x))])
         for curve in curves
         if (curve.channel, curve.what) == (lead.channel, lead.what)
     }
-    (first, told), *others = than.items()
+    (first, text), *others = than.items()
     means = [row for row in rows if (row.channel, row.what, row.place) == (lead.channel, "PSNR", first)]
-    worse = [row.horizon for row in means if gain_verdict(row.gain) == WORSE and "worse" not in told]
-    told += f", though by mean PSNR worse after {_steps(worse)}" if worse else ""
-    told = told.replace("THAN", f"than copying the last {last}", 1)
-    parts = [told, *(f"in {place_label(place)} {words}" for place, words in others if words != than[first])]
+    worse = [row.horizon for row in means if gain_verdict(row.gain) == WORSE and "worse" not in text]
+    text += f", though by mean PSNR worse after {_steps(worse)}" if worse else ""
+    text = text.replace("THAN", f"than copying the last {last}", 1)
+    parts = [text, *(f"in {place_label(place)} {words}" for place, words in others if words != than[first])]
     return "; ".join(parts).replace(" THAN", "")
 
 
-def _spans(steps: Sequence[float], said: Sequence[str]) -> str:
-    """ "worse THAN beyond 4 steps, better THAN up to 2 steps": runs of steps that are judged alike; the unclear divide
-    none, but then nothing is better, or worse at every step, that is not surely so."""
-    known, told = [(kind, at) for at, kind in enumerate(said) if kind != UNCLEAR], []
+def _spans(steps: Sequence[float], verdicts: Sequence[str]) -> str:
+    """ "worse THAN beyond 4 steps, better THAN up to 2 steps": runs of steps with one verdict. Unclear steps do not divide a run,
+    but a run with unclear steps is not called better, nor worse at every step."""
+    known, texts = [(kind, at) for at, kind in enumerate(verdicts) if kind != UNCLEAR], []
     runs = [(kind, [at for _, at in some]) for kind, some in groupby(known, lambda one: one[0])]
     for kind in (WORSE, BETTER):
-        spans = [(places[0], places[-1]) for found, places in runs if found == kind]
-        gaps = said.count(kind) < sum(last + 1 - first for first, last in spans)
-        if len(spans) > 2 or gaps and (kind == BETTER or spans == [(0, len(said) - 1)]):
-            told.append(f"{kind} THAN at {said.count(kind)} of {_steps(steps[-1:])}")
+        spans = [(places[0], places[-1]) for run, places in runs if run == kind]
+        gaps = verdicts.count(kind) < sum(last + 1 - first for first, last in spans)
+        if len(spans) > 2 or gaps and (kind == BETTER or spans == [(0, len(verdicts) - 1)]):
+            texts.append(f"{kind} THAN at {verdicts.count(kind)} of {_steps(steps[-1:])}")
         elif spans:
-            told.append(f"{kind} THAN {' and '.join(_span(steps, *span) for span in spans)}")
-    return ", ".join(told) or f"not clearly better THAN at any step up to {steps[-1]}"
+            texts.append(f"{kind} THAN {' and '.join(_span(steps, *span) for span in spans)}")
+    return ", ".join(texts) or f"not clearly better THAN at any step up to {steps[-1]}"
 
 
 def _span(steps: Sequence[float], first: int, last: int) -> str:
@@ -107,7 +107,7 @@ def _steps(numbers: Sequence[float]) -> str:
 
 
 def _traits(card: Scorecard, arm: str) -> Iterable[str]:
-    """Does it obey, remember, stay sharp, keep moving, stand still? What was not asked is not said."""
+    """Whether it obeys, remembers, stays sharp, keeps moving, holds still; nothing for what was not measured."""
     mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
     sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
     main = {row.channel for row in sharp[:1]}
@@ -120,7 +120,7 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
     stillness = [row for row in mine if row.probe == "stillness"]
-    asked = (
+    questions = (
         (
             _first([row for row in control if row.what.startswith(POOLED)] or control),
             lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys"),
@@ -130,21 +130,21 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
         (_first([row for row in change if row.horizon == reach]), _moves),
         (stillness, _stands),
     )
-    for rows, say in asked:
+    for rows, say in questions:
         if rows:
             places = dict.fromkeys(row.place for row in rows)
             yield _by_place((place, max(say(row) for row in rows if row.place == place)[1]) for place in places)
 
 
 def _first(rows: Sequence[Row]) -> list[Row]:
-    """Those of the main channel at the first horizon."""
+    """The rows of the main channel at the first horizon."""
     return [
         row for row in rows if (row.channel, row.what, row.horizon) == (rows[0].channel, rows[0].what, rows[0].horizon)
     ]
 
 
 def _sure(row: Row, low: float, high: float, *words: str) -> tuple[int, str]:
-    """Whether the whole interval lies between low and high (0), outside (2), or neither is sure (1), and which word says so."""
+    """Whether the whole interval lies between low and high (0), outside (2), or neither (1), and the word for it."""
     inside, outside = low < row.figure.low <= row.figure.high < high, row.figure.high < low or row.figure.low > high
     rank = 0 if inside else 2 if outside else 1
     return rank, words[rank]
@@ -152,25 +152,28 @@ def _sure(row: Row, low: float, high: float, *words: str) -> tuple[int, str]:
 
 def _sharpness(row: Row) -> tuple[int, str]:
     return _sure(
-        row, *ALIKE, "stays sharp", *(("may blur", "blurs") if row.figure.value < 1 else ("may roughen", "roughens"))
+        row,
+        *RATIO_RANGE,
+        "stays sharp",
+        *(("may blur", "blurs") if row.figure.value < 1 else ("may roughen", "roughens")),
     )
 
 
 def _moves(row: Row) -> tuple[int, str]:
     much = "little" if row.figure.value < 1 else "much"
-    return _sure(row, *ALIKE, "moves as much as the recording", f"may move too {much}", f"moves too {much}")
+    return _sure(row, *RATIO_RANGE, "moves as much as the recording", f"may move too {much}", f"moves too {much}")
 
 
 def _stands(row: Row) -> tuple[int, str]:
     within = SHARP_WITHIN if row.what == "sharpness" else COLOUR_WITHIN
-    fading = row.what == "sharpness" and row.figure.value < 1  # else something moves, or takes another colour
+    fading = row.what == "sharpness" and row.figure.value < 1  # else something moves, or changes colour
     words = ("may fade", "fades") if fading else ("may change", "changes")
     return _sure(row, 1 - within, 1 + within, "holds still", *(f"{word} while nobody plays" for word in words))
 
 
-def _by_place(told: Iterable[tuple[str, str]]) -> str:
-    """What is said of the first place, then of each of which something else is."""
-    (_, first), *others = told
+def _by_place(texts: Iterable[tuple[str, str]]) -> str:
+    """The text of the first set of clips, then of each set with another text."""
+    (_, first), *others = texts
     return ", ".join([first, *(f"{words} in {place_label(place)}" for place, words in others if words != first)])
 
 
@@ -179,9 +182,9 @@ def _line(rows: Sequence[Row]) -> str:
         " / ".join(f"{figure.value:.3g}" for figure in figures)
         for figures in ([row.figure for row in rows], [row.baselines[COPY_LAST] for row in rows])
     )
-    said = [gain_verdict(row.gain) for row in rows]
+    verdicts = [gain_verdict(row.gain) for row in rows]
     about = f"{rows[0].channel} {rows[0].what}, {place_label(rows[0].place)}: {mine} {rows[0].unit}".rstrip()
-    unanimous = said[0] if len(set(said)) == 1 else ", ".join(said)
+    unanimous = verdicts[0] if len(set(verdicts)) == 1 else ", ".join(verdicts)
     return f"{about} after {_steps([row.horizon for row in rows])}; copy-last {copied} ({unanimous})"
 
 

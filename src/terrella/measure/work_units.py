@@ -1,4 +1,4 @@
-"""Work in units that are kept as they are done: go on where it was stopped, and say honestly how long it will take."""
+"""Work in units whose results are stored as they are done, so that it can resume, with a forecast of the time left."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ from .clips import Clip, evidence
 from .rollouts import Results, Tick, actions_at, fold_context, poses_at
 
 Clock = Callable[[], float]
-Progress = Callable[[float, str, float], None]  # share done in 0..1, what is being done, seconds left
-Calls = Mapping[tuple[str, str], float]  # (arm, verb) -> how many, each counted once for every clip
+Progress = Callable[[float, str, float], None]  # share done in 0..1, current work, seconds left
+Calls = Mapping[tuple[str, str], float]  # (arm, verb) -> calls, counted per clip
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A piece of work. key: names its result, "kind|number": units of a kind cost alike; calls: what it costs, by verb;
-    run(tick): does it, from its own seed alone, so that nothing depends on what was done before."""
+    """A piece of work, independent of the work before it."""
 
-    key: str
-    words: str
-    calls: Calls
+    key: str  # "kind|number", names its result; units of one kind cost alike
+    words: str  # for progress lines
+    calls: Calls  # its cost
     run: Callable[[Tick], Results]
 
     @property
@@ -45,11 +44,11 @@ class Unit:
 
 
 class Forecast:
-    """Seconds that units will take: their calls at measured prices, put right by how long units of their kind took."""
+    """Forecast seconds of units: their calls at measured prices, corrected by the time that units of their kind took."""
 
     def __init__(self, prices: Calls):
         self.prices = prices
-        self.took: dict[str, tuple[float, float]] = {}  # kind or arm -> seconds, priced seconds; the past fades
+        self.took: dict[str, tuple[float, float]] = {}  # kind or arm -> seconds, priced seconds; decayed
 
     def priced(self, unit: Unit) -> float:
         return sum(count * self.prices.get(call, 1e-3) for call, count in unit.calls.items()) + 1e-3
@@ -65,7 +64,7 @@ class Forecast:
 
 
 class Store:
-    """Results of units in a folder, or nowhere. What was begun as something else (another `fingerprint`) is thrown away."""
+    """Results of units in a folder, or nowhere. Results of another `fingerprint` are deleted."""
 
     def __init__(self, folder: Path | None, fingerprint: str):
         self.folder = folder and folder / _digest(fingerprint)
@@ -78,7 +77,7 @@ class Store:
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def get(self, key: str) -> Results | None:
-        """A result that was kept; None where there is none, or a damaged one."""
+        """A stored result; None if it is missing or damaged."""
         try:
             return load_file(self.folder / f"{_digest(key)}.safetensors") if self.folder else None
         except (OSError, SafetensorError):
@@ -98,7 +97,7 @@ def _digest(text: str) -> str:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Turns what a full or foreign disk says into one sentence."""
+    """TerrellaError for errors of writing."""
     try:
         yield
     except (OSError, SafetensorError) as error:
@@ -106,50 +105,52 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 def run_all(units: Sequence[Unit], store: Store, prices: Calls, clock: Clock, progress: Progress) -> dict[str, Results]:
-    """The results of all units by kind, batches as one; those that are in `store` as they were kept."""
+    """The results of all units by kind, with batches joined; stored results are reused."""
     forecast = Forecast(prices)
-    found = {unit.key: kept for unit in units if (kept := store.get(unit.key)) is not None}
+    results = {unit.key: kept for unit in units if (kept := store.get(unit.key)) is not None}
     whole = sum(map(forecast.priced, units)) or 1.0
-    behind = sum(forecast.priced(unit) for unit in units if unit.key in found)
-    todo = [unit for unit in units if unit.key not in found]
+    behind = sum(forecast.priced(unit) for unit in units if unit.key in results)
+    todo = [unit for unit in units if unit.key not in results]
     for number, unit in enumerate(todo):
         began, later = clock(), sum(map(forecast.seconds, todo[number + 1 :]))
 
-        def tell(share: float, unit=unit, began=began, later=later, behind=behind) -> None:
-            pace = (1 - share) * forecast.seconds(unit) + clock() - began  # believes its own pace more and more
+        def report(share: float, unit=unit, began=began, later=later, behind=behind) -> None:
+            pace = (
+                (1 - share) * forecast.seconds(unit) + clock() - began
+            )  # trusts the forecast less and its own pace more
             progress((behind + share * forecast.priced(unit)) / whole, unit.words, (1 - share) * pace + later)
 
-        result = unit.run(_ticks(sum(unit.calls.values()), tell))
-        found[unit.key] = {name: tensor.cpu() for name, tensor in result.items()}
-        store.put(unit.key, found[unit.key])
+        result = unit.run(_ticks(sum(unit.calls.values()), report))
+        results[unit.key] = {name: tensor.cpu() for name, tensor in result.items()}
+        store.put(unit.key, results[unit.key])
         forecast.done(unit, clock() - began)
         behind += forecast.priced(unit)
     progress(1.0, "measured", 0.0)
     parts: dict[str, list[Results]] = {}
     for unit in units:
-        parts.setdefault(unit.kind, []).append(found[unit.key])
+        parts.setdefault(unit.kind, []).append(results[unit.key])
     return {kind: {name: torch.cat([one[name] for one in some]) for name in some[0]} for kind, some in parts.items()}
 
 
-def _ticks(whole: float, tell: Callable[[float], None]) -> Tick:
-    """Counts what was done of a unit and tells the share."""
+def _ticks(whole: float, report: Callable[[float], None]) -> Tick:
+    """Counts the work done of a unit and reports the share."""
     done = 0.0
 
     def tick(count: float) -> None:
         nonlocal done
         done += count
-        tell(min(done / (whole or 1.0), 1.0))
+        report(min(done / (whole or 1.0), 1.0))
 
     tick(0.0)
     return tick
 
 
-UNSEEN = ", unseen"  # of steps of which few are looked at
+UNSEEN = ", unseen"  # steps of which few are rendered
 
 
 def prices_of(arm: str, world: World, clips: Sequence[Clip], clock: Clock) -> dict[tuple[str, str], float]:
-    """Seconds a clip of each verb, by a few steps of each: "observe" evidence after imagining, "imagine" and look, follow a
-    "pose" and look, either UNSEEN but for the last, and imagine "alone", one clip."""
+    """Seconds per clip of each verb, from a few steps of each: "observe" after imagining, "imagine" and render, follow a "pose" and
+    render, either UNSEEN (only the last is rendered), and imagine a single clip "alone"."""
     rng, state = make_rng(0), fold_context(world, clips, make_rng(0))
     shown = tuple(name for name in ("rgb", "pose") if name in world.spec.channels) or tuple(world.spec.channels)[:1]
 
@@ -166,22 +167,22 @@ def prices_of(arm: str, world: World, clips: Sequence[Clip], clock: Clock) -> di
         began = clock()
         for row in range(count + 1):
             if row == 1:
-                began = clock()  # the first may compile
+                began = clock()  # the first step may compile
             state = step(state, row)
             if look or row in (0, count):
                 world.render(state, shown)
         return state, (clock() - began) / (count * state.batch)
 
-    found: dict[tuple[str, str], float] = {}
+    prices: dict[tuple[str, str], float] = {}
     if world.spec.observes:
-        state, found[arm, "observe"] = seconds(state, observe, False)
+        state, prices[arm, "observe"] = seconds(state, observe, False)
     if "pose" in world.spec.observes:
         try:
-            state, found[arm, "pose"] = seconds(state, follow, True)
-            state, found[arm, "pose" + UNSEEN] = seconds(state, follow, False)
+            state, prices[arm, "pose"] = seconds(state, follow, True)
+            state, prices[arm, "pose" + UNSEEN] = seconds(state, follow, False)
         except TerrellaError:
-            pass  # it takes no pose alone
-    state, found[arm, "imagine"] = seconds(state, imagine, True)
-    state, found[arm, "imagine" + UNSEEN] = seconds(state, imagine, False)
-    state, found[arm, "alone"] = seconds(state.at(0) if state.batch > 1 else state, imagine, True)
-    return found
+            pass  # it does not take poses alone
+    state, prices[arm, "imagine"] = seconds(state, imagine, True)
+    state, prices[arm, "imagine" + UNSEEN] = seconds(state, imagine, False)
+    state, prices[arm, "alone"] = seconds(state.at(0) if state.batch > 1 else state, imagine, True)
+    return prices
