@@ -28,6 +28,7 @@ def test_plans_and_milliseconds_are_halved_and_two_plans_are_the_fewest():
         ((0, 5, 20, 20), "more than 8 plans a round is not seen to help"),
         ((0, 1, 5, 20), "no plateau is seen yet"),
         ((10, 11, 12, 10), "Thinking longer is not seen to help"),
+        ((10, 10, 10, 11), "Thinking longer is not seen to help"),
         ((20, 10, 5, 0), "Thinking longer is not seen to help"),
     ],
 )

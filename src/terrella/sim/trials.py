@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from ..core.errors import TerrellaError
-from ..core.policy import Policy
+from ..core.policy import Policy, observed_channels
 from ..core.rollouts import rollout
 from ..core.spec import Spec, neutral_action
 from ..core.state import State
@@ -48,10 +48,10 @@ class Trials:
 
     def drives(self) -> torch.Tensor:
         """The drives of each step and the PAST before it [N, T, PAST + 1, 1 + PLAYS, nu], the newest last."""
-        found = [self.idle[:, None].repeat(1, 1 + len(PLAYS), 1)] * PAST
+        drives = [self.idle[:, None].repeat(1, 1 + len(PLAYS), 1)] * PAST
         for step in range(self.actions.shape[1]):
-            found.append(driven(self.actions[:, step], found[-1]))
-        return torch.stack(found, 1).unfold(1, PAST + 1, 1).movedim(-1, 2)
+            drives.append(driven(self.actions[:, step], drives[-1]))
+        return torch.stack(drives, 1).unfold(1, PAST + 1, 1).movedim(-1, 2)
 
 
 def driven(actions: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
@@ -63,12 +63,12 @@ def driven(actions: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
 
 def collect(world: World, policy: Policy, episodes: int, seed: int) -> Trials:
     """What the policy does in `episodes` episodes of a world that shows qpos and qvel."""
-    rng, shown = make_rng(seed), [*getattr(policy, "sees", ()), "qpos", "qvel", "done"]
+    rng, shown = make_rng(seed), [*observed_channels(policy, world.spec), "qpos", "qvel", "done"]
     channels = tuple(dict.fromkeys(shown))
     steps = world.spec.max_episode_steps or 200
-    found = rollout(world, world.start(episodes, rng), policy, rng, channels, steps)
-    qpos, qvel, done = (found.observations[name].transpose(0, 1) for name in ("qpos", "qvel", "done"))
-    return Trials(qpos, qvel, found.actions.transpose(0, 1).float(), ~done[:, :-1], idle(world.spec, episodes))
+    rolled = rollout(world, world.start(episodes, rng), policy, rng, channels, steps)
+    qpos, qvel, done = (rolled.observations[name].transpose(0, 1) for name in ("qpos", "qvel", "done"))
+    return Trials(qpos, qvel, rolled.actions.transpose(0, 1).float(), ~done[:, :-1], idle(world.spec, episodes))
 
 
 def idle(spec: Spec, count: int) -> torch.Tensor:

@@ -23,11 +23,11 @@ def plan(world: str, config: PlanConfig | None = None, *, progress: Progress = s
         refuse(config, f"{config.agent} acts in place of the search", "cost", "proposal", *vars(config.search))
     study = open_study(world, config, progress)
     folder = config.out or Path("plans") / (re.sub(r"[^\w.-]+", "-", world.strip("/:")) or "world")
-    played, floor, points, stopped = study.run()
+    played = study.run()
     about = {"world": world, "real": config.real or world, "goal": config.goal, "within": study.within}
     about |= {"apart": config.apart, "success": config.success}
     search = {name: value for name, value in asdict(study.search).items() if value is not None}
     acting = {name: getattr(config, name) for name in ("cost", "proposal", "agent") if getattr(config, name)}
     counts = {"steps": study.steps, "episodes": config.episodes, "seed": config.seed}
-    settings = {**about, **search, **acting, **counts, "solved_starts_left_out": played.skipped}
-    return save_result(study, played, floor, points, settings, folder, stopped)
+    settings = {**about, **search, **acting, **counts, "solved_starts_left_out": played.planner.skipped}
+    return save_result(study, played, settings, folder)

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ..act.planning import PlayedEpisode, PlayResult, distance
+from ..act.planning import PlayedEpisode, distance
 from ..core.files import write_json
 from ..core.world import make_rng
 from ..measure.plan_page import compute_chart, film, film_strip, plan_page
 from ..measure.statistics import Figure
 from .compute_curve import CurvePoint, conclusion, figures_of, gain
-from .plan_study import PlanStudy
+from .plan_study import PlannedEpisodes, PlanStudy
 from .real_environment import comparable_channels
 from .results import jsonable
 
@@ -73,78 +73,68 @@ class PlanResult:
         return "\n".join([*self.lines, f"the page: {self.page}"])
 
 
-def save_result(
-    study: PlanStudy,
-    played: PlayResult,
-    floor: PlayResult | None,
-    points: Sequence[CurvePoint],
-    settings: Mapping[str, Any],
-    folder: Path,
-    stopped: bool,
-) -> PlanResult:
+def save_result(study: PlanStudy, played: PlannedEpisodes, settings: Mapping[str, Any], folder: Path) -> PlanResult:
     """Writes the page, the film and plan.json."""
-    seed = study.config.seed
-    planner, random = figures_of(played, seed), {} if floor is None else figures_of(floor, seed)
+    seed, episodes = study.config.seed, played.planner.episodes
+    planner, random = figures_of(played.planner, seed), {} if played.random is None else figures_of(played.random, seed)
     measure = "success" if "success" in planner else "return"
-    lines = _lines(study, played, planner, random, points)
-    if stopped:
-        lines.append(f"stopped: {len(played.episodes)} of {study.config.episodes} episodes are done")
+    lines = _lines(study, played, planner, random)
     folder.mkdir(parents=True, exist_ok=True)
-    seen = None if stopped else next((one for one in played.episodes if one.seen), None)
+    seen = None if played.stopped else next((one for one in episodes if one.seen), None)
     divergence, strip, name = ({}, None, "") if seen is None else _film(study, seen, folder)
-    curve = [(point.imagined, point.score) for point in points]
+    curve = [(point.imagined, point.score) for point in played.curve]
     chart = compute_chart(curve, random[measure], measure) if curve else ""
     arms = {"planner": planner, **({"random": random} if random else {})}
     page = plan_page(f"{settings['world']}: {settings['goal']}", lines, arms, chart, strip, name, settings)
     (folder / "plan.html").write_text(page, encoding="utf-8")
     result = PlanResult(
-        tuple(lines),
-        settings,
-        planner,
-        random,
-        {} if floor is None else {measure: gain(played, floor, measure, seed)},
-        tuple(points),
-        tuple(played.episodes),
-        divergence,
-        folder / "plan.html",
-        folder / name if name else None,
-        stopped,
+        lines=tuple(lines),
+        settings=settings,
+        planner=planner,
+        random=random,
+        difference={} if played.random is None else {measure: gain(played.planner, played.random, measure, seed)},
+        curve=played.curve,
+        episodes=tuple(episodes),
+        divergence=divergence,
+        page=folder / "plan.html",
+        film=folder / name if name else None,
+        stopped=played.stopped,
     )
-    episodes = [_episode(episode) for episode in played.episodes]
-    write_json(folder / "plan.json", jsonable({**result.to_json(), "divergence": divergence, "played": episodes}))
+    facts = {**result.to_json(), "divergence": divergence, "played": [_episode(episode) for episode in episodes]}
+    write_json(folder / "plan.json", jsonable(facts))
     return result
 
 
 def _lines(
-    study: PlanStudy,
-    played: PlayResult,
-    planner: Mapping[str, Figure],
-    random: Mapping[str, Figure],
-    points: Sequence[CurvePoint],
+    study: PlanStudy, played: PlannedEpisodes, planner: Mapping[str, Figure], random: Mapping[str, Figure]
 ) -> list[str]:
     """The outcome, for people."""
-    lines, count = [], len(played.episodes)
+    lines, episodes = [], played.planner.episodes
     if "success" in planner:
         beside = f"; at random {_share(random['success'])}" if random else ""
-        lines.append(f"reached in {_share(planner['success'])} of {count} episodes{beside}")
+        lines.append(f"reached in {_share(planner['success'])} of {len(episodes)} episodes{beside}")
     if "reward" in study.real.spec.channels or not lines:
         beside = f"; at random {random['return']}" if random else ""
         lines.append(f"return {planner['return']}{beside}")
-    if unreachable := sum(not one.steps for one in played.episodes):
+    if unreachable := sum(not one.steps for one in episodes):
         lines.append(f"to {unreachable} of the goals no way was known")
     if ms := planner.get("ms a decision"):
         imagined = f" for {planner['steps imagined'].value:,.0f} imagined steps" if "steps imagined" in planner else ""
         lines.append(f"a decision takes {ms.value:.0f} ms (95% within {ms.high:.0f}){imagined}")
-    if played.skipped:
-        lines.append(f"{played.skipped} starts were already solved and left out")
+    if skipped := played.planner.skipped:
+        lines.append(f"{skipped} starts were already solved and left out")
     if (study.goal or study.places) and planner.get("success") and not planner["success"].value:
-        lines.append(_never_reached(study, played.episodes))
+        lines.append(_never_reached(study, episodes))
     measure = "success" if "success" in planner else "return"
-    lines += [f"{point.imagined:>10,.0f} imagined steps, {point.label}: {measure} {point.score}" for point in points]
-    if len(points) > 1:
-        lines.append(conclusion(points, measure, study.config.seed))
+    lines += [
+        f"{point.imagined:>10,.0f} imagined steps, {point.label}: {measure} {point.score}" for point in played.curve
+    ]
+    if len(played.curve) > 1:
+        lines.append(conclusion(played.curve, measure, study.config.seed))
     if study.search.budget_ms is not None:
         lines.append("planned by the clock: another run may differ")
+    if played.stopped:
+        lines.append(f"stopped: {len(episodes)} of {study.config.episodes} episodes are done")
     return lines
 
 

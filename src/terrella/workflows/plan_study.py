@@ -81,6 +81,19 @@ class PlanConfig:
 
 
 @dataclass(frozen=True)
+class PlannedEpisodes:
+    """What `plan` played."""
+
+    planner: PlayResult
+    random: PlayResult | None = None
+    """Random actions from the same starts; None if it was stopped before."""
+    curve: tuple[CurvePoint, ...] = ()
+    """The planner with ever more compute."""
+    stopped: bool = False
+    """Whether Ctrl-C ended it early."""
+
+
+@dataclass(frozen=True)
 class PlanStudy:
     """The worlds of `plan`, opened and checked."""
 
@@ -110,8 +123,8 @@ class PlanStudy:
     def pictures(self) -> tuple[str, ...]:
         return ("rgb",) if "rgb" in self.real.spec.channels else ()
 
-    def run(self) -> tuple[PlayResult, PlayResult | None, list[CurvePoint], bool]:
-        """The planner's episodes, those of random actions from the same starts, the compute curve, and whether it was stopped."""
+    def run(self) -> PlannedEpisodes:
+        """Plays the planner, random actions from the same starts, and the compute curve. Ctrl-C ends it with what is done."""
         kept = (*self.sees, *comparable_channels(self.world.spec, self.real.spec), *self.pictures)
         what = "acting" if self.config.agent else "planning"
         try:
@@ -119,17 +132,17 @@ class PlanStudy:
         except PlayInterrupted as stop:
             if not stop.done.episodes:
                 raise KeyboardInterrupt("stopped before the first episode was done.") from None
-            return stop.done, None, [], True
-        floor, points = None, list[CurvePoint]()
+            return PlannedEpisodes(stop.done, stopped=True)
+        random, points = None, list[CurvePoint]()
         try:
             policy = Random(self.real.spec)
-            floor = self._play((lambda goal: policy) if self.places else policy, "acting at random")
+            random = self._play((lambda goal: policy) if self.places else policy, "acting at random")
             if self.config.curve and not self.config.agent:
                 for config in [*halved(self.search), self.search]:
                     self._add_point(points, config, played)
         except KeyboardInterrupt:
-            return played, floor, points, True
-        return played, floor, points, False
+            return PlannedEpisodes(played, random, tuple(points), stopped=True)
+        return PlannedEpisodes(played, random, tuple(points))
 
     def _add_point(self, points: list[CurvePoint], config: SearchConfig, whole: PlayResult) -> None:
         """The same starts with less compute. No point where a search imagines nothing."""

@@ -153,8 +153,7 @@ class _SeedRun:
             write_json(self.file, self.results)
 
     def _successes(self, world: World, policy: Policy) -> list[int]:
-        settings = PlaySettings(self.steps, self.criterion, tuple(getattr(policy, "sees", ())))
-        played = play(world, policy, self.experiment.episodes, settings, STARTS)
+        played = play(world, policy, self.experiment.episodes, PlaySettings(self.steps, self.criterion), STARTS)
         return [int(bool(episode.success)) for episode in played.episodes]
 
     def _gathered(self, policy: Path, count: int, number: int = 0) -> Trials:

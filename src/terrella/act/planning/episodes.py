@@ -112,27 +112,28 @@ def play(
     """
     criterion, spec, starts = settings.criterion, world.spec, make_rng(seed)
     played, skipped = list[PlayedEpisode](), 0
-    while len(played) < episodes:
-        batch = min(episodes - len(played), spec.max_batch or episodes) if spec.forkable else 1
-        state = world.start(batch, starts)
-        if criterion.defined:
-            succeeded = criterion.succeeded(world, world.render(state, criterion.channels)).cpu()
-            skipped += int(succeeded.sum())
-            if skipped > MAX_SKIPPED * episodes:
-                raise PlanningError(
-                    f"{skipped} of {skipped + len(played)} starts of {spec.name} are already solved; give a goal that is further "
-                    "away, or a smaller --within."
-                )
-            if succeeded.all():
-                continue
-            state = state.at((~succeeded).nonzero()[:, 0]) if succeeded.any() else state
-        kept = replace(settings, keep_episodes=max(0, settings.keep_episodes - len(played)))
-        try:
+    try:
+        while len(played) < episodes:
+            batch = min(episodes - len(played), spec.max_batch or episodes) if spec.forkable else 1
+            state = world.start(batch, starts)
+            if criterion.defined:
+                succeeded = criterion.succeeded(world, world.render(state, criterion.channels)).cpu()
+                skipped += int(succeeded.sum())
+                if skipped > MAX_SKIPPED * episodes:
+                    raise PlanningError(
+                        f"{skipped} of {skipped + len(played)} starts of {spec.name} are already solved; give a goal that is "
+                        "further away, or a smaller --within."
+                    )
+                if succeeded.all():
+                    continue
+                state = state.at((~succeeded).nonzero()[:, 0]) if succeeded.any() else state
+            kept = replace(settings, keep_episodes=max(0, settings.keep_episodes - len(played)))
             played += play_from(world, state, policy, kept, seed + 1 + len(played) + skipped)
-        except PlayInterrupted as stop:
-            raise PlayInterrupted(PlayResult(played + stop.done.episodes, skipped)) from None
-        if progress:
-            progress(len(played), episodes)
+            if progress:
+                progress(len(played), episodes)
+    except KeyboardInterrupt as stop:
+        done = stop.done.episodes if isinstance(stop, PlayInterrupted) else []
+        raise PlayInterrupted(PlayResult(played + done, skipped)) from None
     return PlayResult(played, skipped)
 
 
