@@ -28,10 +28,8 @@ _EXAMPLES = 3  # places of a kind of fault that a report names
 class Examination:
     """The result of an examination."""
 
-    faults: list[Fault]
-    """What is wrong; likely causes come before their consequences."""
-    notes: list[str]
-    """Sentences about what is unusual but no fault: numbers that never change, a recorder at work."""
+    faults: list[Fault]  # what is wrong; likely causes come before their consequences
+    notes: list[str]  # sentences about what is unusual but no fault: numbers that never change, a recorder at work
 
     @property
     def groups(self) -> list[list[Fault]]:

@@ -66,12 +66,9 @@ def suffix_of(channel: str) -> str:
 class Camera:
     """A pinhole camera."""
 
-    intrinsics: tuple[float, float, float, float]
-    """fx/W, fy/H, cx/W, cy/H."""
-    size: tuple[int, int]
-    """Height and width of its pictures, pixels."""
-    pose: str | None = "pose"
-    """The pose channel of the body that it is mounted on; None where its pose is unknown."""
+    intrinsics: tuple[float, float, float, float]  # fx/W, fy/H, cx/W, cy/H
+    size: tuple[int, int]  # height and width of its pictures, pixels
+    pose: str | None = "pose"  # the pose channel of the body that it is mounted on; None where its pose is unknown
     mount: tuple[float, float, float, float, float, float, float] = NO_MOUNT
     """T_pose_cam: x, y, z in metres and quaternion w, x, y, z; camera x forward, y left, z up."""
 
@@ -80,48 +77,33 @@ class Camera:
 class Spec:
     """The declaration of a world. Tools read it instead of asking `hasattr`."""
 
-    name: str
-    """Name of the world."""
-    action: spaces.Space
-    """Space of one action, without the batch axis."""
+    name: str  # name of the world
+    action: spaces.Space  # space of one action, without the batch axis
     channels: Mapping[str, spaces.Space]
     """What `render` can show: channel -> space of one entry, without the batch axis. A channel is named by its kind, or by its
     kind and a suffix: "rgb" and "rgb.wrist", "depth.wrist", "pose.wrist"."""
-    observes: tuple[str, ...]
-    """Channels that `observe` requires."""
-    dt_s: float
-    """Seconds of world time that one `imagine` advances."""
-    units: Mapping[str, str] = field(default_factory=dict)
-    """Channel -> unit ("m", "reward"), for channels that have one."""
+    observes: tuple[str, ...]  # channels that `observe` requires
+    dt_s: float  # seconds of world time that one `imagine` advances
+    units: Mapping[str, str] = field(
+        default_factory=dict
+    )  # channel -> unit ("m", "reward"), for channels that have one
     action_names: tuple[str, ...] = ()
     """One name for each button (MultiBinary), choice (Discrete, or one of a MultiDiscrete) or axis (Box); () for none."""
-    action_units: tuple[str, ...] = ()
-    """One unit for each axis ("m", "rad/s", "N m"); () for none."""
-    action_mode: str = ""
-    """Meaning of the numbers: one of MODES. "" takes it from the space."""
-    action_frame: str = ""
-    """Coordinate frame of the axes ("world", "body", "tool"); "" for none."""
+    action_units: tuple[str, ...] = ()  # one unit for each axis ("m", "rad/s", "N m"); () for none
+    action_mode: str = ""  # meaning of the numbers: one of MODES. "" takes it from the space
+    action_frame: str = ""  # coordinate frame of the axes ("world", "body", "tool"); "" for none
     keys: Mapping[str, list[float]] = field(default_factory=dict)
     """Browser key (`KeyboardEvent.code`) -> flat action while it is held. Buttons held together combine by element-wise
     maximum; of a choice, the key pressed last counts."""
-    cameras: Mapping[str, Camera] = field(default_factory=dict)
-    """Picture channel -> its camera."""
-    forkable: bool = True
-    """False where an earlier state cannot be used again (an external game process)."""
-    max_batch: int | None = None
-    """Largest batch that `start` accepts; None for no limit."""
-    max_episode_steps: int | None = None
-    """Steps after which training truncates an episode; None for no limit."""
-    differentiable: bool = False
-    """Whether gradients flow from the channels through `imagine` to the action."""
-    card: Mapping[str, object] = field(default_factory=dict)
-    """Facts for people: training data, hardware, scores."""
-    may_observe: tuple[str, ...] = ()
-    """Channels that `observe` uses where the observation has them."""
-    idle: tuple[float, ...] = ()
-    """The flat action that does nothing, where its name and mode do not say which one does."""
-    leap: int = 0
-    """Steps that `leap` advances at once (core/world.py); 0 for worlds without it."""
+    cameras: Mapping[str, Camera] = field(default_factory=dict)  # picture channel -> its camera
+    forkable: bool = True  # False where an earlier state cannot be used again (an external game process)
+    max_batch: int | None = None  # largest batch that `start` accepts; None for no limit
+    max_episode_steps: int | None = None  # steps after which training truncates an episode; None for no limit
+    differentiable: bool = False  # whether gradients flow from the channels through `imagine` to the action
+    card: Mapping[str, object] = field(default_factory=dict)  # facts for people: training data, hardware, scores
+    may_observe: tuple[str, ...] = ()  # channels that `observe` uses where the observation has them
+    idle: tuple[float, ...] = ()  # the flat action that does nothing, where its name and mode do not say which one does
+    leap: int = 0  # steps that `leap` advances at once (core/world.py); 0 for worlds without it
 
     def __post_init__(self):
         if not self.action_mode:

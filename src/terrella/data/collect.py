@@ -36,18 +36,12 @@ Open = Callable[[], tuple[World, Callable[[], Policy]]]
 class Job:
     """What workers are to record; it is sent to them, so it must be picklable."""
 
-    open: Open
-    """Opens the world; gives it and a function that makes the policy of an episode."""
-    layout: Layout
-    """Sensors and rate of the recording."""
-    task: str
-    """The instruction of every episode."""
-    base: int
-    """The number from which the seeds of all episodes follow."""
-    steps: int
-    """Steps after which an episode is cut off."""
-    scratch: str | None = None
-    """A folder for unfinished episodes, which its sender removes; None makes one."""
+    open: Open  # opens the world; gives it and a function that makes the policy of an episode
+    layout: Layout  # sensors and rate of the recording
+    task: str  # the instruction of every episode
+    base: int  # the number from which the seeds of all episodes follow
+    steps: int  # steps after which an episode is cut off
+    scratch: str | None = None  # a folder for unfinished episodes, which its sender removes; None makes one
 
     @staticmethod
     def of(open: Open, spec: Spec, rng: torch.Generator, layout: Layout | None = None) -> Job:

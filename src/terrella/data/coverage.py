@@ -21,18 +21,13 @@ _LEAST_ROWS = 20  # least rows of an action that is tested
 class Coverage:
     """Figures over a sample of rows: whole stretches from all over the recording."""
 
-    frames: int = 0
-    """Rows in the sample."""
-    changed: float = 0.0
-    """Share of them that differ from the row before, by more than 8 grey levels in any pixel."""
-    changed_much: float = 0.0
-    """Share of them that do so in more than one pixel of a hundred."""
-    places: int = 0
-    """Number of different small pictures (16 x 16 pixels, 8 levels of each colour)."""
+    frames: int = 0  # rows in the sample
+    changed: float = 0.0  # share of them that differ from the row before, by more than 8 grey levels in any pixel
+    changed_much: float = 0.0  # share of them that do so in more than one pixel of a hundred
+    places: int = 0  # number of different small pictures (16 x 16 pixels, 8 levels of each colour)
     shown: dict[str, bool] = field(default_factory=dict)
     """Action -> whether the change of the picture after it differs from that after other actions, beyond chance."""
-    rare: tuple[str, ...] = ()
-    """Actions that are too rare to be tested."""
+    rare: tuple[str, ...] = ()  # actions that are too rare to be tested
 
     def facts(self) -> dict[str, object]:
         """The figures as JSON values, for people."""

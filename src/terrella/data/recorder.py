@@ -32,8 +32,7 @@ _BROKEN = (OSError, av.FFmpegError, pa.ArrowException)
 class Watch(Protocol):
     """A live view of a recording."""
 
-    start_ns: int
-    """Wall-clock time of its time 0, nanoseconds since 1970."""
+    start_ns: int  # wall-clock time of its time 0, nanoseconds since 1970
 
     def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None: ...
 

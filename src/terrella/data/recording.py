@@ -23,16 +23,13 @@ LONGEST = 1050  # steps after which episodes of worlds without a limit are cut o
 class RecordOptions:
     """How `record` records."""
 
-    fps: float | None = None
-    """Rows a second that the recording states; None takes one over the world's step."""
-    max_episode_steps: int | None = None
-    """Steps after which an episode is cut off; None takes the world's own limit, or LONGEST."""
-    task: str | None = None
-    """The instruction of every episode; None makes one of the world's name."""
-    pictures: Literal["video", "png"] = "video"
-    """How pictures are stored."""
-    live: Watch | None = None
-    """A viewer that is sent every row while it is recorded."""
+    fps: float | None = None  # rows a second that the recording states; None takes one over the world's step
+    max_episode_steps: int | None = (
+        None  # steps after which an episode is cut off; None takes the world's own limit, or LONGEST
+    )
+    task: str | None = None  # the instruction of every episode; None makes one of the world's name
+    pictures: Literal["video", "png"] = "video"  # how pictures are stored
+    live: Watch | None = None  # a viewer that is sent every row while it is recorded
 
 
 def record(

@@ -50,10 +50,10 @@ class Sensor:
 class Readings:
     """The readings of a sensor: values[i] at time_s[i]."""
 
-    time_s: np.ndarray
-    """float64 [n], ascending, seconds since the take began."""
-    values: Sequence[np.ndarray] | np.ndarray
-    """[n, ...], or a sequence of n arrays, which may be decoded each time they are read."""
+    time_s: np.ndarray  # float64 [n], ascending, seconds since the take began
+    values: (
+        Sequence[np.ndarray] | np.ndarray
+    )  # [n, ...], or a sequence of n arrays, which may be decoded each time they are read
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,10 @@ class Take:
     observations has T - 1 actions where its format has a terminal observation, else T.
     """
 
-    readings: Mapping[str, Readings]
-    """Sensor -> its readings; sensors without a reading may be absent."""
-    task: str = ""
-    """The instruction, "" for none. Where it changes, facts["language"] is [[time_s, text], ...]."""
-    start_ns: int | None = None
-    """Wall-clock time of time_s = 0, nanoseconds since 1970 (UTC); None where unknown."""
-    facts: Mapping[str, object] = field(default_factory=dict)
-    """Further JSON values."""
+    readings: Mapping[str, Readings]  # sensor -> its readings; sensors without a reading may be absent
+    task: str = ""  # the instruction, "" for none. Where it changes, facts["language"] is [[time_s, text], ...]
+    start_ns: int | None = None  # wall-clock time of time_s = 0, nanoseconds since 1970 (UTC); None where unknown
+    facts: Mapping[str, object] = field(default_factory=dict)  # further JSON values
 
 
 @dataclass(frozen=True)
@@ -79,18 +75,13 @@ class Source:
     """A recording in any format."""
 
     name: str
-    sensors: Mapping[str, Sensor]
-    """Name -> Sensor."""
+    sensors: Mapping[str, Sensor]  # name -> Sensor
     takes: Callable[[], Iterable[Take]]
     """Gives the takes from the first on, at each call; a sequence where the format allows random access."""
-    fps: float | None = None
-    """Rows a second, for formats with rows; None where every sensor has a clock of its own."""
-    robot: str = ""
-    """Type of the robot ("terrella", "aloha", …), "" where unknown."""
-    notes: tuple[str, ...] = ()
-    """Sentences about parts of the original that could not be converted."""
-    facts: Mapping[str, object] = field(default_factory=dict)
-    """JSON values stored with the recording."""
+    fps: float | None = None  # rows a second, for formats with rows; None where every sensor has a clock of its own
+    robot: str = ""  # type of the robot ("terrella", "aloha", …), "" where unknown
+    notes: tuple[str, ...] = ()  # sentences about parts of the original that could not be converted
+    facts: Mapping[str, object] = field(default_factory=dict)  # JSON values stored with the recording
 
 
 def is_action(name: str) -> bool:

@@ -55,25 +55,18 @@ EPISODES_PER_TABLE = (
 class Draft:
     """One whole episode, ready to be committed."""
 
-    length: int
-    """Number of rows."""
+    length: int  # number of rows
     rows: Iterable[Mapping[str, np.ndarray]]
     """Columns, at most ROWS_PER_GROUP rows at a time, without videos and LeRobot's automatic columns. The action of the
     last row is stored as not valid, because its outcome was not recorded."""
-    videos: Mapping[str, Path]
-    """Camera -> finished mp4 of `length` frames, in the staging folder of the writer."""
-    pictures: Mapping[str, stats.Summary]
-    """Camera -> statistics of its pictures."""
-    task: str
-    """The instruction."""
+    videos: Mapping[str, Path]  # camera -> finished mp4 of `length` frames, in the staging folder of the writer
+    pictures: Mapping[str, stats.Summary]  # camera -> statistics of its pictures
+    task: str  # the instruction
     streams: Mapping[str, Iterable[tuple[float, np.ndarray | None]]] = field(default_factory=dict)
     """Stream -> its readings (time_s, value) in order; the value is None for cameras."""
-    films: Mapping[str, Path] = field(default_factory=dict)
-    """Camera stream -> finished mp4, one frame a reading."""
-    start_ns: int | None = None
-    """Wall-clock time of its time 0, nanoseconds since 1970; None where unknown."""
-    tasks: Sequence[str] = ()
-    """The instruction of each row, where they differ; else ()."""
+    films: Mapping[str, Path] = field(default_factory=dict)  # camera stream -> finished mp4, one frame a reading
+    start_ns: int | None = None  # wall-clock time of its time 0, nanoseconds since 1970; None where unknown
+    tasks: Sequence[str] = ()  # the instruction of each row, where they differ; else ()
     counts: Mapping[str, int] = field(default_factory=dict)
     """Sensor -> rows up to the last that has it, where that is not the last row."""
 

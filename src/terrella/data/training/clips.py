@@ -30,37 +30,27 @@ _PLACES: Kinds = {"episode": (np.dtype(np.int64), ()), "row": (np.dtype(np.int64
 class ClipsConfig:
     """Which clips to read, in which batches."""
 
-    length: int
-    """Rows of a clip."""
-    channels: Sequence[str] = ("rgb", "action")
-    """Channels to read, see `Clips`."""
-    batch: int = 16
-    """Clips in a batch."""
-    size: tuple[int, int] = (96, 128)
-    """Height and width of the pictures, pixels; a ClipCache has its own."""
-    stride: int = 1
-    """Rows from one row of a clip to the next."""
-    episodes: Sequence[int] | None = None
-    """Numbers of the episodes to read; None reads all of them."""
-    seed: int = 0
-    """Seed of the order, which (seed, epoch) alone decide."""
-    shuffle: bool = True
-    """Whether to shuffle the clips of an epoch."""
-    drop_last: bool = True
-    """Whether to leave out the clips of an epoch that do not fill a batch."""
-    workers: int = 0
-    """Threads that copy batches ahead, from one memory-mapped cache; their number does not change the order."""
-    rank: int = 0
-    """This process, of `world_size` that share each epoch."""
-    world_size: int = 1
-    """Processes that share each epoch."""
-    torch: bool = False
-    """Whether batches hold torch tensors instead of numpy arrays, over the same memory."""
+    length: int  # rows of a clip
+    channels: Sequence[str] = ("rgb", "action")  # channels to read, see `Clips`
+    batch: int = 16  # clips in a batch
+    size: tuple[int, int] = (96, 128)  # height and width of the pictures, pixels; a ClipCache has its own
+    stride: int = 1  # rows from one row of a clip to the next
+    episodes: Sequence[int] | None = None  # numbers of the episodes to read; None reads all of them
+    seed: int = 0  # seed of the order, which (seed, epoch) alone decide
+    shuffle: bool = True  # whether to shuffle the clips of an epoch
+    drop_last: bool = True  # whether to leave out the clips of an epoch that do not fill a batch
+    workers: int = (
+        0  # threads that copy batches ahead, from one memory-mapped cache; their number does not change the order
+    )
+    rank: int = 0  # this process, of `world_size` that share each epoch
+    world_size: int = 1  # processes that share each epoch
+    torch: bool = False  # whether batches hold torch tensors instead of numpy arrays, over the same memory
     budget_bytes: int = 8 << 30
     """For a URL, bytes that may be kept on this machine: half for files on the disk, a quarter for each of two windows in
     memory (one is read while the next is fetched). Windows come in shuffled order; clips are shuffled within a window."""
-    cache_dir: str | Path | None = None
-    """For a URL, the folder for its files; None takes one under $XDG_CACHE_HOME/terrella."""
+    cache_dir: str | Path | None = (
+        None  # for a URL, the folder for its files; None takes one under $XDG_CACHE_HOME/terrella
+    )
 
     def __post_init__(self):
         if isinstance(self.channels, str) or not self.channels:
