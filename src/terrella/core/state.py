@@ -241,10 +241,7 @@ class State(Mapping):
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _combined(
-        self,
-        states: Sequence[State],
-        combine: Callable[..., torch.Tensor],
-        pick: Callable[..., torch.Tensor],
+        self, states: Sequence[State], combine: Callable[..., torch.Tensor], pick: Callable[..., torch.Tensor]
     ) -> State:
         """`combine` of the computed tensors; for tensors deferred in any state, a Pick of the entries that `pick` selects."""
         if any(set(state) != set(self) for state in states):

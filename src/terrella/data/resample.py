@@ -61,11 +61,7 @@ def picked_rows(time_s: np.ndarray, at_s: np.ndarray, policy: Policy, max_gap_s:
 
 
 def resample(
-    readings: Readings,
-    sensor: Sensor,
-    at_s: np.ndarray,
-    policy: Policy = "previous",
-    max_gap_s: float | None = None,
+    readings: Readings, sensor: Sensor, at_s: np.ndarray, policy: Policy = "previous", max_gap_s: float | None = None
 ) -> tuple[np.ndarray | Lazy, np.ndarray]:
     """(values, valid): the readings of a sensor at the times `at_s` (float64 [T], any order).
 
