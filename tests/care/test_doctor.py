@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from layouts import layout_of
+from sweeps import sweep
 
 from terrella.care import doctor
 from terrella.care.doctor import being_written, examine
@@ -189,7 +190,7 @@ def test_a_sound_recording_has_no_fault(recording):
     assert examine(recording).notes == ["observation.state: z_m, qx, qy never change in 100 rows"]
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", sweep(FAULTS, *list(FAULTS)[::3]))
 def test_each_fault_is_named_with_its_place_and_mend(recording, name):
     inject, file, row, words = FAULTS[name]
     inject(recording)

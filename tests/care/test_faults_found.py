@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from layouts import layout_of
 from PIL import Image
+from sweeps import sweep
 from test_doctor import DATA
 
 from terrella.care import doctor, repair
@@ -74,7 +75,7 @@ def test_a_moving_set_is_sound(thirteen, tmp_path):
 # -- the rate --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrong", [30, 12.5, 26])
+@pytest.mark.parametrize("wrong", sweep([30, 12.5, 26], 26))
 def test_a_wrong_fps_is_named_as_one_fault_and_repaired_without_loss(thirteen, tmp_path, wrong):
     info(thirteen, fps=wrong)
     faults = doctor(thirteen)
@@ -124,7 +125,7 @@ def test_a_repair_that_would_lose_most_rows_asks_first(thirteen, tmp_path):
 # -- films -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("part", [(0, 1), (0.4, 0.6), (0.7, 1)])
+@pytest.mark.parametrize("part", sweep([(0, 1), (0.4, 0.6), (0.7, 1)], (0.4, 0.6)))
 def test_zeroed_bytes_of_a_film_are_named_and_left_out(thirteen, tmp_path, part):
     path = thirteen / video(1)
     raw = bytearray(path.read_bytes())
@@ -155,7 +156,9 @@ def _exchange(root: Path, a: str, b: str) -> None:
     (root / b).write_bytes(first)
 
 
-@pytest.mark.parametrize("one, two", [(0, 1), (3, 5), (6, 7)])
+@pytest.mark.parametrize(
+    "one, two", [(3, 5), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((0, 1), (6, 7)))]
+)
 def test_exchanged_films_are_named_and_put_back(thirteen, tmp_path, one, two):
     before = [Dataset(thirteen).episode(number)["rgb"] for number in (one, two)]
     _exchange(thirteen, video(one), video(two))
@@ -178,7 +181,7 @@ def test_exchanged_films_of_other_lengths_are_named_first(thirteen, tmp_path):
     assert [episode.length for episode in Dataset(tmp_path / "out").episodes] == LENGTHS
 
 
-@pytest.mark.parametrize("episodes", [[1], [0, 1, 2, 3, 4]])
+@pytest.mark.parametrize("episodes", sweep([[1], [0, 1, 2, 3, 4]], [1]))
 def test_films_exchanged_between_cameras_are_named_and_put_back(tmp_path, episodes):
     cameras = {name: Sensor(name, "image", (32, 32, 3), "uint8") for name in (CAMERA, OTHER)}
     action = {"action": Sensor("action", "vector", (1,), names=("go",))}
@@ -243,7 +246,7 @@ def test_a_body_at_rest_is_not_frozen(tmp_path):
     assert [fault for fault in doctor(tmp_path / "set") if "frozen" in fault.what] == []
 
 
-@pytest.mark.parametrize("length", [7, 300])
+@pytest.mark.parametrize("length", sweep([7, 300], 300))
 def test_a_wrong_length_in_the_table_of_episodes_is_named(thirteen, tmp_path, length):
     path = "meta/episodes/chunk-000/file-002.parquet"
     column(thirteen / path, "length", [length])
@@ -305,7 +308,7 @@ def deep(pictured) -> Path:
     return pictured
 
 
-@pytest.mark.parametrize("info_lost", [False, True])
+@pytest.mark.parametrize("info_lost", sweep([False, True], True))
 def test_depth_of_sixteen_bits_keeps_them(deep, tmp_path, info_lost):
     before = pq.read_table(deep / DATA)["observation.images.depth"].to_pylist()
     assert [fault for fault in doctor(deep) if fault.file != "meta/stats.json"] == []

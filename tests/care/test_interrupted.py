@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import layout_of
+from sweeps import sweep
 
 from terrella.care import repair
 from terrella.core.errors import DatasetError
@@ -72,7 +73,7 @@ def check(root: Path, number: int, least: int) -> int:
     return length
 
 
-@pytest.mark.parametrize("rows", [90, 300])
+@pytest.mark.parametrize("rows", sweep([90, 300], 90))
 def test_kill_9_keeps_every_whole_frame_of_the_episode_in_flight(tmp_path, rows):
     root = tmp_path / "killed"
     script = SCRIPT.format(
@@ -124,7 +125,7 @@ def test_a_write_cut_anywhere_costs_what_was_not_whole(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["rows.log", f"{RGB}.growing.mp4"])
-@pytest.mark.parametrize("zeros", [8192, 3])
+@pytest.mark.parametrize("zeros", sweep([8192, 3], 8192))
 def test_zeros_at_the_end_cost_nothing_that_was_whole(tmp_path, name, zeros):
     """What a power cut leaves on many file systems."""
     _left_in_flight(tmp_path, 12)

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from layouts import layout_of
 from strangers import killed, shared
+from sweeps import sweep
 from test_doctor import DATA, VIDEO, change, cut, put, small_video, twin
 from test_interrupted import LAYOUT, LIDAR, SIDE, drive
 
@@ -138,7 +139,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], list[tuple[int, int, int]], str
 }
 
 
-@pytest.mark.parametrize("name", DAMAGES)
+QUICK = ("info.json and meta/episodes", "a footer", "a cut video", "rows away", "a number that is none")
+
+
+@pytest.mark.parametrize("name", sweep(DAMAGES, *QUICK))
 def test_what_is_whole_is_kept_as_it_was(recording, sound, name, tmp_path):
     inject, kept, words = DAMAGES[name]
     inject(recording)
@@ -410,7 +414,7 @@ def test_a_full_disk_is_said_clearly(recording, tmp_path, monkeypatch):
         repair(recording, tmp_path / "out")
 
 
-@pytest.mark.parametrize("error", ["stopped", "full"])
+@pytest.mark.parametrize("error", sweep(["stopped", "full"], "full"))
 def test_a_repair_that_ends_early_leaves_nothing_and_can_be_done_again(recording, tmp_path, error):
     raised = KeyboardInterrupt() if error == "stopped" else OSError(28, "No space left on device")
     before = sorted(path.name for path in tmp_path.iterdir())

@@ -43,17 +43,13 @@ def assert_same(found: Dataset, never: Dataset) -> None:
     assert np.array_equal(found.rgb_at(rows), never.rgb_at(rows))
 
 
-def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, never):
+def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, never, monkeypatch):
     (tmp_path / "deaths").mkdir()
-    assert_same(gathered(tmp_path / "set", LocalWorkers(2), partial(dying, tmp_path / "deaths", 2)), never)
-    assert len(list((tmp_path / "deaths").iterdir())) == 2
-
-
-def test_nothing_is_left_among_temporary_files(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    gathered(tmp_path / "set", LocalWorkers(2))
-    assert not list((tmp_path / "temporary").glob("terrella-*"))
+    assert_same(gathered(tmp_path / "set", LocalWorkers(2), partial(dying, tmp_path / "deaths", 2)), never)
+    assert len(list((tmp_path / "deaths").iterdir())) == 2
+    assert not list((tmp_path / "temporary").glob("terrella-*"))  # nothing is left among temporary files
 
 
 def test_what_was_stopped_goes_on(tmp_path, never):

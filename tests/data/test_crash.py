@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from corridor import Corridor, keys
 from layouts import layout_of
+from sweeps import sweep
 
 from terrella.care import doctor
 from terrella.core import files, make_rng
@@ -56,7 +57,7 @@ record(Corridor(), keys, {root!r}, frames=100_000, rng=make_rng(3), progress=tel
 """
 
 
-@pytest.mark.parametrize("rows", [5, 75, 91])
+@pytest.mark.parametrize("rows", sweep([5, 75, 91], 75))
 def test_kill_9_loses_at_most_the_episode_in_flight(tmp_path, rows):
     root = tmp_path / "killed"
     script = SCRIPT.format(folder=str(Path(__file__).parent), root=str(root))
@@ -87,7 +88,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("name", ["sync_file", "move_into_place", "sync_folder"])
-@pytest.mark.parametrize("nth", range(1, 9))
+@pytest.mark.parametrize("nth", sweep(range(1, 9), 2, 5))
 def test_a_cut_at_any_point_of_a_commit_loses_nothing(tmp_path, monkeypatch, name, nth):
     recorder = Recorder(tmp_path, LAYOUT)
     _episode(recorder, 4, 1.0)
@@ -108,7 +109,7 @@ def test_a_cut_at_any_point_of_a_commit_loses_nothing(tmp_path, monkeypatch, nam
 
 
 @pytest.mark.parametrize("name", ["sync_file", "move_into_place", "write_json"])
-@pytest.mark.parametrize("nth", [1, 2, 3])
+@pytest.mark.parametrize("nth", sweep([1, 2, 3], 2))
 def test_a_full_disk_is_said_clearly_and_loses_nothing(tmp_path, monkeypatch, name, nth):
     with Recorder(tmp_path, LAYOUT) as recorder:
         _episode(recorder, 4)
@@ -254,7 +255,7 @@ def test_too_short_an_episode_is_dropped(tmp_path):
     assert [episode.length for episode in Dataset(tmp_path).episodes] == [2]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.85])
+@pytest.mark.parametrize("share", sweep([0.0, 0.1, 0.5, 0.85], 0.5))
 @pytest.mark.parametrize("kind", ["mp4", "parquet"])
 def test_truncated_files_are_named(recording, kind, share):
     folder = "videos" if kind == "mp4" else "data"

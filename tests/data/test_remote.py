@@ -124,7 +124,7 @@ def test_half_a_file_is_never_kept(remote, tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(MEMORY), "get_file", cut)
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
-    with pytest.raises(DatasetError, match="tried 3 times to fetch .*4 of 10000 bytes came"):
+    with pytest.raises(DatasetError, match="tried 3 times to fetch .*4 of 10000 bytes arrived"):
         files.local(name(1))
     assert len(calls) == 3 and kept(tmp_path) == 0 and not list((tmp_path / ".coming").iterdir())
     monkeypatch.setattr(type(MEMORY), "get_file", lambda *a, **o: cut(*a, **o) if len(calls) < 5 else real(*a, **o))
