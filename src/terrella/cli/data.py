@@ -78,10 +78,8 @@ class ConvertConfig:
     policy: Policy = "previous"
     pictures: Literal["video", "png"] = "video"
     """How a LeRobot dataset stores pictures: H.264 video, or PNG (lossless, larger)."""
-    episodes: int = 10
-    """Number of rollouts to record from "gym:ID"."""
-    seed: int = 0
-    """The same seed gives the same result."""
+    episodes: int = 10  # Number of rollouts to record from "gym:ID".
+    seed: int = 0  # The same seed gives the same result.
 
 
 def convert(

@@ -36,16 +36,11 @@ Stored = Literal["video", "png"]
 class RecordConfig:
     """Settings of every recording."""
 
-    out: Path
-    """Folder of the dataset (LeRobot v3). An unfinished recording there is continued."""
-    human: bool = False
-    """Play in the browser yourself; without it a script explores."""
-    live_mcap: str | None = None
-    """Also log to a file NAME.mcap, or to Foxglove at a port of this machine."""
-    seed: int = 0
-    """The same seed gives the same result."""
-    port: int = 8765
-    """Port of the page; 0 picks a free one."""
+    out: Path  # Folder of the dataset (LeRobot v3). An unfinished recording there is continued.
+    human: bool = False  # Play in the browser yourself; without it a script explores.
+    live_mcap: str | None = None  # Also log to a file NAME.mcap, or to Foxglove at a port of this machine.
+    seed: int = 0  # The same seed gives the same result.
+    port: int = 8765  # Port of the page; 0 picks a free one.
 
 
 @dataclass(frozen=True)
@@ -54,26 +49,21 @@ class DoomRecordConfig(RecordConfig):
 
     scenario: str = "my_way_home"
     """A ViZDoom scenario, or maps of a game: freedoom2/MAP01,MAP02 (each episode uses one of them)."""
-    skill: int | None = None
-    """Difficulty, 1 to 5; default: the scenario's own."""
-    frames: int = 100_000
-    """Frames to record in all. With --human there is no limit."""
-    height: int = 192
-    """Height of the pictures in pixels; the width is 4/3 of it."""
+    skill: int | None = None  # Difficulty, 1 to 5; default: the scenario's own.
+    frames: int = 100_000  # Frames to record in all. With --human there is no limit.
+    height: int = 192  # Height of the pictures in pixels; the width is 4/3 of it.
 
 
 @dataclass(frozen=True)
 class CollectConfig(RecordConfig):
     """Settings of a recording of any world."""
 
-    frames: int | None = None
-    """Frames to record in all; default 10,000. With --human there is no limit."""
+    frames: int | None = None  # Frames to record in all; default 10,000. With --human there is no limit.
     pictures: Pictures = "auto"
     """"png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above; "none" draws none."""
     policy: str | None = None
     """explorer, random, idle, plan, constant:VALUE, the folder of a learned policy, MODULE:NAME or FILE.py:NAME."""
-    episodes: int | None = None
-    """Whole episodes to record in all, in place of --frames."""
+    episodes: int | None = None  # Whole episodes to record in all, in place of --frames.
     workers: int | None = None
     """Processes that play at the same time, an episode each; the recording is the same with any number of them."""
     on: Literal["here", "ray"] = "here"

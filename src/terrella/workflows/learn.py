@@ -50,10 +50,8 @@ class LearnConfig:
     """Time for all of it, earlier runs included. With more than a finished world had, it is trained on."""
     out: Path | None = None
     """Folder for the recording, the run and the score; default: learned/ and the environment's name."""
-    frames: int = 20_000
-    """Frames to record at most; recording ends sooner after an eighth of the time."""
-    seed: int = 0
-    """The same seed gives the same result."""
+    frames: int = 20_000  # Frames to record at most; recording ends sooner after an eighth of the time.
+    seed: int = 0  # The same seed gives the same result.
     controls: ControlsConfig = ControlsConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
 
@@ -62,14 +60,10 @@ class LearnConfig:
 class LearnResult:
     """A world that was learned, and its score."""
 
-    verdict: tuple[str, ...]
-    """Sentences: is it better than copying the last frame, and how far can it be trusted?"""
-    world: Path
-    """Folder of the run: `load` and `terrella play` open it."""
-    card: Path | None
-    """The page of the scorecard; None where too little was recorded to score."""
-    spent_s: Mapping[str, float]
-    """Seconds of each stage: recording, training, scoring."""
+    verdict: tuple[str, ...]  # Sentences: is it better than copying the last frame, and how far can it be trusted?
+    world: Path  # Folder of the run: `load` and `terrella play` open it.
+    card: Path | None  # The page of the scorecard; None where too little was recorded to score.
+    spent_s: Mapping[str, float]  # Seconds of each stage: recording, training, scoring.
 
     @property
     def play(self) -> str:

@@ -23,10 +23,8 @@ class ControlsConfig:
 
     keys: tuple[str, ...] = ()
     """Keys and their actions, by name or number: a=left d=right space=2, up+space=5 for both at once, w=0,1,0 of axes."""
-    action_names: tuple[str, ...] = ()
-    """A name for every action, in order."""
-    idle: str | None = None
-    """The action that does nothing."""
+    action_names: tuple[str, ...] = ()  # A name for every action, in order.
+    idle: str | None = None  # The action that does nothing.
 
     def of(self, world: World) -> World:
         """A copy of the world with these settings in its spec."""

@@ -60,10 +60,8 @@ class PractiseConfig:
     """Time for all rounds, earlier runs included. With more than finished rounds had, the last round is trained on."""
     out: Path | None = None
     """Folder for the recording, the worlds and the policies; default: learned/ and the environment's name."""
-    frames: int = 20_000
-    """Frames to record at most, in all rounds."""
-    seed: int = 0
-    """The same seed gives the same result."""
+    frames: int = 20_000  # Frames to record at most, in all rounds.
+    seed: int = 0  # The same seed gives the same result.
     environment: EnvironmentConfig = EnvironmentConfig()
 
 
@@ -74,10 +72,8 @@ class PractiseResult:
     trial: PolicyTrial
     rounds: tuple[Mapping[str, Any], ...]
     """Of each round: real frames so far, the mean return of the episodes that it collected, steps of practice, minutes."""
-    policy: Path
-    """Folder of the policy."""
-    world: Path
-    """Folder of the world in which it practised."""
+    policy: Path  # Folder of the policy.
+    world: Path  # Folder of the world in which it practised.
 
     def to_json(self) -> dict[str, Any]:
         return jsonable({**self.trial.to_json(), "rounds": self.rounds, "policy": self.policy})

@@ -48,18 +48,13 @@ QUICK_CLIPS, QUICK_HORIZONS, HORIZONS = 6, (1, 8, 32), (1, 8, 32, 64)
 class ScoreConfig:
     """Settings of `score`."""
 
-    data: Path
-    """The recording on which the world was trained; only the episodes held out of training are used."""
+    data: Path  # The recording on which the world was trained; only the episodes held out of training are used.
     new: Path | None = None
     """A recording of places that training never saw; default: the part of the map that training kept out."""
-    fresh: bool = False
-    """Use every episode of `data`: another recording, of which training saw nothing."""
-    quick: bool = False
-    """An answer in about a minute: few clips, short horizons, one setting of the world."""
-    out: Path = Path("scores")
-    """Folder for scorecard.json and scorecard.html."""
-    clips: int | None = None
-    """Clips of each kind of place; default 50, quick 6. Intervals need 50 or more."""
+    fresh: bool = False  # Use every episode of `data`: another recording, of which training saw nothing.
+    quick: bool = False  # An answer in about a minute: few clips, short horizons, one setting of the world.
+    out: Path = Path("scores")  # Folder for scorecard.json and scorecard.html.
+    clips: int | None = None  # Clips of each kind of place; default 50, quick 6. Intervals need 50 or more.
     horizons: tuple[int, ...] = ()
     """Steps after which figures are given; default 1 8 32 64, quick 1 8 32. A clip is as long as the largest."""
     long_steps: int | None = None
@@ -69,8 +64,7 @@ class ScoreConfig:
     clips of that length, quick 0."""
     device: Device = "auto"
     fast: Fast = False
-    seed: int = 0
-    """The same seed gives the same result."""
+    seed: int = 0  # The same seed gives the same result.
 
     @property
     def exam(self) -> ExamConfig:
@@ -92,8 +86,7 @@ class ScoreResult:
     """A scorecard, and its files."""
 
     card: Scorecard
-    files: tuple[Path, ...]
-    """scorecard.json and scorecard.html."""
+    files: tuple[Path, ...]  # scorecard.json and scorecard.html.
 
     def to_json(self) -> dict[str, Any]:
         return {**as_dict(self.card), "files": jsonable(self.files)}
@@ -153,8 +146,7 @@ class ExamRequest:
     """The worlds and the recordings of an exam."""
 
     arms: Mapping[str, World]
-    closing: Mapping[str, World]
-    """Further arms that take the memory probe only."""
+    closing: Mapping[str, World]  # Further arms that take the memory probe only.
     data: Path
     new: Path | None = None
     fresh: bool = False

@@ -31,8 +31,7 @@ from .results import jsonable
 class TrainPolicyConfig:
     """Settings of `train policy`."""
 
-    out: Path
-    """Folder of the run: the policy, its checkpoint and a log."""
+    out: Path  # Folder of the run: the policy, its checkpoint and a log.
     practice: Practice = Practice()
     recording: Annotated[str | None, arg(name="from")] = None
     """A recording in whose states practice begins; default: where the world's own episodes begin."""
@@ -40,8 +39,7 @@ class TrainPolicyConfig:
     """Start with --randomise ranges of width zero and widen them to those of the file while the policy copes."""
     real: str | None = None
     """The environment in which the policy is tried afterwards (gym:Pendulum-v1), beside random actions from the same starts."""
-    episodes: int = 20
-    """Episodes of that trial."""
+    episodes: int = 20  # Episodes of that trial.
     device: Device = "auto"
     environment: EnvironmentConfig = EnvironmentConfig()
 
@@ -50,12 +48,9 @@ class TrainPolicyConfig:
 class TrainPolicyResult:
     """A policy that practised, and its trial in the real environment."""
 
-    world: str
-    """The world in which it practised."""
-    facts: Mapping[str, Any]
-    """Of the training run: policy (its folder), practised_steps, minutes, losses."""
-    trial: PolicyTrial | None
-    """None without a real environment."""
+    world: str  # The world in which it practised.
+    facts: Mapping[str, Any]  # Of the training run: policy (its folder), practised_steps, minutes, losses.
+    trial: PolicyTrial | None  # None without a real environment.
 
     def to_json(self) -> dict[str, Any]:
         if self.trial is None:
