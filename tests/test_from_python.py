@@ -10,7 +10,7 @@ from terrella.workflows import practise
 GUIDE = Path(__file__).parents[1] / "docs" / "from-python.md"
 SHORT = {
     '"gym:CarRacing-v3"': '"gym:tests.cli.tiny:TerrellaTiny-v0"',
-    "LearnConfig(minutes=30,": "LearnConfig(minutes=0.3, frames=300,",
+    "LearnConfig(minutes=30,": "LearnConfig(minutes=0.15, frames=300,",
     "frames=5000": "frames=600",
     "LatentTraining(steps=4000)": "LatentTraining(steps=2, batch=4, latent=4, rollout=2, leap=2, history=1, hidden=8)",
     "Practice(minutes=5)": "Practice(steps=2, batch=8, horizon=2, hidden=8)",

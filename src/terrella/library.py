@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .core.errors import TerrellaError
+from .core.similar import did_you_mean
 from .core.world import World
-from .similar import did_you_mean
 from .space.estimator import Estimator
 
 if TYPE_CHECKING:

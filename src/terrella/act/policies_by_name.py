@@ -17,9 +17,9 @@ import torch
 
 from ..core.errors import ActionError, TerrellaError
 from ..core.policy import Constant, Idle, Policy, Random, Reactive, observed_channels
+from ..core.similar import did_you_mean
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
-from ..similar import did_you_mean
 from .actor import policy_folder, read_policy
 from .belief import load_learned_policy
 from .explorer import Explorer

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from ..core.errors import TerrellaError
-from ..similar import did_you_mean
+from ..core.similar import did_you_mean
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from gymnasium import spaces
 
-from ..similar import did_you_mean
 from .errors import TerrellaError
+from .similar import did_you_mean
 from .spec import CHOICE, Spec, can_idle, idle_name, neutral_action, shape_of
 
 _CODES = {

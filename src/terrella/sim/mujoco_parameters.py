@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import TerrellaError
-from ..similar import did_you_mean
+from ..core.similar import did_you_mean
 from .mujoco_model import mujoco
 
 Model = Any  # mujoco.MjModel

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import TerrellaError
-from ..similar import did_you_mean
+from ..core.similar import did_you_mean
 from .mujoco_model import FREE, add_floor, mujoco, read
 from .mujoco_pilot import Multirotor
 from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracking

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import TerrellaError
-from ..similar import did_you_mean
+from ..core.similar import did_you_mean
 
 Tensors = Mapping[str, torch.Tensor]
 _START, _GOAL = 1, 2  # streams of chance

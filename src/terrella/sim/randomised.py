@@ -16,10 +16,10 @@ from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import TerrellaError
+from ..core.similar import did_you_mean
 from ..core.spec import Spec, dtype_of, kind_of, neutral_action
 from ..core.state import State
 from ..core.world import World
-from ..similar import did_you_mean
 from .wrapper import WorldWrapper
 
 PARAMETERS = "parameters"  # the channel of what an episode drew

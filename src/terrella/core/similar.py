@@ -1,4 +1,4 @@
-"""Says which known name a misspelt one is likest, for messages."""
+"""Finds the known name that is most like a misspelt one, for messages."""
 
 from __future__ import annotations
 
