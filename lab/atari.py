@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella.data import record
+from terrella.data import RecordOptions, record
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,9 @@ def record_game(name: str, out: Path, frames: int = 100_000, held_out: int = 12_
         world = terrella.load(court.game, size=(64, 64), forkable=False)  # twice as fast
         player = BallPlayers(court, world.spec.action_names)
         rng = terrella.make_rng(seed)
-        done = record(world, player, out / folder, rows, rng, max_episode_steps=3000, pictures="png")
+        done = record(
+            world, player, out / folder, rows, rng, options=RecordOptions(max_episode_steps=3000, pictures="png")
+        )
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella.data import record
+from terrella.data import RecordOptions, record
 
 
 class Drivers:
@@ -78,7 +78,9 @@ def record_driving(out: Path, frames: int = 20_000, held_out: int = 5_000) -> No
     world = terrella.load("gym:CarRacing-v3", size=(64, 64))
     for folder, seed, rows in (("test", 1, held_out), ("rec", 0, frames)):
         rng = terrella.make_rng(seed)
-        done = record(world, Drivers(), out / folder, rows, rng, max_episode_steps=900, pictures="png")
+        done = record(
+            world, Drivers(), out / folder, rows, rng, options=RecordOptions(max_episode_steps=900, pictures="png")
+        )
         print(out / folder, done.rows, "rows", done.episodes, "episodes", flush=True)
 
 
