@@ -14,9 +14,9 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 from terrella.core import make_rng
 from terrella.learn.moves import mosaics
-from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans
-from terrella.learn.objectives.scroll import LENGTH, Piece, Scrolling
-from terrella.learn.trainer import Now
+from terrella.learn.objectives.codec import RECORDED, CodecClips, CodecObjective, Spans
+from terrella.learn.objectives.scroll import LENGTH, ScrollClips, ScrollObjective
+from terrella.learn.trainer import TrainStep
 from terrella.worlds.codec import Codec, CodecConfig
 
 _setup_privateuseone_for_python_backend("other")
@@ -70,14 +70,18 @@ def _run(op, args, kwargs):
 def main() -> None:
     size, moves = (32, 40), torch.tensor([[0, 0], [1, 0], [0, -2]])
     over = (torch.arange(size[0]) < 5)[:, None].expand(size)
-    now = Now(RECORDED, 0.0, OTHER, np.random.default_rng(0), make_rng(0))
+    now = TrainStep(RECORDED, 0.0, OTHER, np.random.default_rng(0), make_rng(0))
     codec = Codec(CodecConfig(size, 4, 36 + 4 * 2, 2, 4, (8, 8)))
     codec.moves[:] = moves
     truth = torch.randint(0, 256, (4, 7, 3, *size), dtype=torch.uint8, generator=make_rng(0))
-    clip = Clip(truth, torch.zeros(4, 7, 2), mosaics(truth[:, :3], moves, over, torch.ones(4, 3, dtype=torch.bool)))
-    piece = Piece(torch.cat([truth, truth[:, :1]], 1), torch.zeros(4, LENGTH, 36 + 4 * 2), torch.rand(4, 3 + LENGTH, 3))
+    clip = CodecClips(
+        truth, torch.zeros(4, 7, 2), mosaics(truth[:, :3], moves, over, torch.ones(4, 3, dtype=torch.bool))
+    )
+    piece = ScrollClips(
+        torch.cat([truth, truth[:, :1]], 1), torch.zeros(4, LENGTH, 36 + 4 * 2), torch.rand(4, 3 + LENGTH, 3)
+    )
     objective = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, over)
-    scrolling = object.__new__(Scrolling)  # without a recording
+    scrolling = object.__new__(ScrollObjective)  # without a recording
     scrolling.scroll, scrolling.moves, scrolling.slots = objective.scroll, moves, 4
     with Pretended():
         for module in objective.modules.values():

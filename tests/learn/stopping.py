@@ -1,4 +1,4 @@
-"""Runs that are stopped by Ctrl-C within a step and go on: what they leave is what an unbroken run leaves."""
+"""Runs that are stopped by Ctrl-C within a step and resumed: they leave what an unbroken run leaves."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 from terrella.learn.trainer import Trainer
@@ -18,9 +19,8 @@ def quiet(done, total, words=""):
     pass
 
 
-def goes_on_exactly(train: Callable[[Path], object], whole: Path, cut: Path, stages: dict[str, int]) -> None:
-    """Trains to the end in `whole`, and in `cut` with Ctrl-C within the given step of each of the stages."""
-    train(whole)
+def resumes_exactly(train: Callable[[Path], object], whole: Path, cut: Path, stages: dict[str, int]) -> None:
+    """Trains in `cut` with Ctrl-C within the given step of each of the stages, as the unbroken run in `whole` did."""
     for stage, step in stages.items():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Trainer, "_step", _interrupting(Trainer._step, stage, step))
@@ -34,6 +34,12 @@ def goes_on_exactly(train: Callable[[Path], object], whole: Path, cut: Path, sta
         same_run(whole, cut, stage)
 
 
+def goes_on_exactly(train: Callable[[Path], object], whole: Path, cut: Path, stages: dict[str, int]) -> None:
+    """The same, with the unbroken run trained first."""
+    train(whole)
+    resumes_exactly(train, whole, cut, stages)
+
+
 def _interrupting(whole_step, stage: str, at: int):
     def step(self, number):
         if self.stage == stage and number == at:
@@ -44,8 +50,6 @@ def _interrupting(whole_step, stage: str, at: int):
 
 
 def saved_facts(run: Path, stage: str) -> dict:
-    from safetensors import safe_open
-
     with safe_open(run / f"resume-{stage}.safetensors", "pt") as file:
         return json.loads(file.metadata()["facts"])
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from terrella.learn.feeds import Drawn
-from terrella.learn.objectives.adaptation import Adaptation, Encoder, Pictures, _reversed
+from terrella.learn.feeds import RandomBatches
+from terrella.learn.objectives.adaptation import Adaptation, KeypointEncoder, LabelledPictures, _reversed
 from terrella.learn.trainer import Run, Trainer
 
 
@@ -29,9 +29,9 @@ def test_gradients_are_turned_round():
 def test_an_encoder_reads_where_a_spot_is(tmp_path):
     shown, at = spots(256, 0)
     torch.manual_seed(0)
-    encoder = Encoder(2)
+    encoder = KeypointEncoder(2)
     encoder.settle(at)
-    feed = Drawn(Pictures(shown, at, 255 - shown[:32]).batch)
+    feed = RandomBatches(LabelledPictures(shown, at, 255 - shown[:32]).batch)
     Trainer(Run(tmp_path, {}, lambda *_: None, 0), "encoder", feed, Adaptation(encoder), 150).train()
     others, truth = spots(64, 1)
     with torch.inference_mode():

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from terrella.learn.budget import Budget
-from terrella.learn.feeds import Drawn
-from terrella.learn.trainer import Loss, Run, Trainer, adamw, warmed
+from terrella.learn.feeds import RandomBatches
+from terrella.learn.trainer import Loss, Run, Trainer, adamw, warmup_cosine
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ class Shares:
     def __init__(self):
         self.seen, self.layer = [], nn.Linear(1, 1)
         self.modules = {"layer": self.layer}
-        self.learners = {"layer": adamw((self.layer,), warmed(1e-3, 1))}
+        self.learners = {"layer": adamw((self.layer,), warmup_cosine(1e-3, 1))}
 
     def losses(self, batch, now):
         self.seen.append(now.share)
@@ -44,7 +44,7 @@ class Shares:
 def trained(out: Path, steps: int, hours: float, **shares: float) -> tuple[Trainer, Shares]:
     run = Run(out, {}, lambda *_: None, budget=Budget(out, hours, shares))
     objective = Shares()
-    trainer = Trainer(run, "stage", Drawn(lambda now: None), objective, steps)
+    trainer = Trainer(run, "stage", RandomBatches(lambda now: None), objective, steps)
     trainer.train()
     return trainer, objective
 

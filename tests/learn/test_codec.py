@@ -11,9 +11,9 @@ import torch
 from terrella.core import make_rng
 from terrella.core.errors import DatasetError
 from terrella.learn import feeds
-from terrella.learn.moves import LOOKS, Looks, frequent_moves, mosaics, overlay, palette
-from terrella.learn.objectives.codec import RECORDED, Clip, CodecObjective, Spans, clip
-from terrella.learn.trainer import Now
+from terrella.learn.moves import STATISTICS, CodecStatistics, frequent_moves, mosaics, overlay, palette
+from terrella.learn.objectives.codec import RECORDED, ClipMaker, CodecClips, CodecObjective, Spans
+from terrella.learn.trainer import TrainStep
 from terrella.space.mosaic import recalled
 from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.controls import Controls
@@ -64,16 +64,18 @@ def test_what_stays_while_the_picture_scrolls_is_found():
 
 
 def test_a_run_keeps_its_moves_and_palette_and_only_its_own(tmp_path):
-    found = Looks(torch.tensor([[0, -2], [3, 0]]), torch.tensor([[0, 9, 255]], dtype=torch.uint8), 2.5, NONE.clone())
+    found = CodecStatistics(
+        torch.tensor([[0, -2], [3, 0]]), torch.tensor([[0, 9, 255]], dtype=torch.uint8), 2.5, NONE.clone()
+    )
     found.over[:3, 5] = True
-    assert Looks.read(tmp_path, {}) is None
+    assert CodecStatistics.read(tmp_path, {}) is None
     found.write(tmp_path, {"size": (64, 64)})
-    kept = Looks.read(tmp_path, {"size": (64, 64)})
+    kept = CodecStatistics.read(tmp_path, {"size": (64, 64)})
     assert kept is not None and kept.stress == 2.5 and kept.palette.dtype == torch.uint8
     assert torch.equal(kept.moves, found.moves) and torch.equal(kept.palette, found.palette)
     assert torch.equal(kept.over, found.over)
-    assert Looks.read(tmp_path, {"size": (32, 32)}) is None, "that of another recipe"
-    text = (tmp_path / LOOKS).read_text()
+    assert CodecStatistics.read(tmp_path, {"size": (32, 32)}) is None, "that of another recipe"
+    text = (tmp_path / STATISTICS).read_text()
     for damage in (
         text[:40],
         text.replace("255", "256"),
@@ -82,8 +84,8 @@ def test_a_run_keeps_its_moves_and_palette_and_only_its_own(tmp_path):
         text.replace("#", "?"),
         "[]",
     ):
-        (tmp_path / LOOKS).write_text(damage)
-        assert Looks.read(tmp_path, {"size": (64, 64)}) is None
+        (tmp_path / STATISTICS).write_text(damage)
+        assert CodecStatistics.read(tmp_path, {"size": (64, 64)}) is None
 
 
 def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
@@ -121,10 +123,10 @@ def test_episodes_of_a_few_rows_make_no_clip():
 def test_of_few_clips_some_are_taken_twice():
     rgb = np.zeros((3, 7, 8, 8, 3), np.uint8)
     rgb[:, :, 0, 0, 0] = np.arange(3)[:, None]
-    now = Now(0, 0.0, torch.device("cpu"), np.random.default_rng(0), torch.Generator())
+    now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), torch.Generator())
     found = {"rgb": rgb, "action": np.zeros((3, 7, 2), np.float32)}
     still, none = torch.zeros(1, 2, dtype=torch.int64), torch.zeros(8, 8, dtype=torch.bool)
-    made = clip(found, Controls.buttons(2), still, none, Spans(0, 4, 3), 5, now)
+    made = ClipMaker(Controls.buttons(2), still, none, Spans(0, 4, 3), 5)(found, now)
     assert made.frames.shape == (5, 7, 3, 8, 8) and made.actions.shape[:2] == (5, 7)
     assert set(made.frames[:, 0, 0, 0, 0].tolist()) <= {0, 1, 2}
 
@@ -136,7 +138,7 @@ def test_clips_are_made_on_the_cpu_wherever_the_codec_learns(monkeypatch):
     recording = SimpleNamespace(controls=Controls.buttons(2))
     feed = feeds.codec_feed(recording, None, objective, 2, 0)  # type: ignore[arg-type]
     objective.generator.to("meta")  # stands for a GPU
-    made = feed.batch(Now(0, 0.0, torch.device("meta"), np.random.default_rng(0), make_rng(0)))
+    made = feed.batch(TrainStep(0, 0.0, torch.device("meta"), np.random.default_rng(0), make_rng(0)))
     assert made.mosaic.device.type == made.frames.device.type == "cpu"
 
 
@@ -162,6 +164,6 @@ def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, b
 
     monkeypatch.setattr(objective, "_loss", loss)
     mosaic = mosaics(truth[:, :3], codec.moves, LINE, torch.ones(batch, 3, dtype=torch.bool))
-    now = Now(step, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
-    list(objective.losses(Clip(truth, torch.zeros(batch, 7, 2), mosaic), now))
+    now = TrainStep(step, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
+    list(objective.losses(CodecClips(truth, torch.zeros(batch, 7, 2), mosaic), now))
     assert seen == dreamt

@@ -58,7 +58,7 @@ def made(tmp_path_factory):
 
 def test_what_is_drawn_is_what_happened():
     latents, ends = torch.arange(20.0)[:, None], np.repeat([9, 19], 10)
-    drawn = Trajectories(latents, -latents, ends, np.arange(20), farthest=6).drawn(500, np.random.default_rng(0))
+    drawn = Trajectories(latents, -latents, ends, np.arange(20), farthest=6).sample(500, np.random.default_rng(0))
     ahead = (drawn.goal - drawn.latent)[:, 0]
     assert torch.equal(ahead, drawn.steps) and torch.equal(drawn.action, -drawn.latent)
     assert set(ahead.tolist()) == set(map(float, range(1, 7)))

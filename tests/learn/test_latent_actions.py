@@ -17,11 +17,11 @@ from terrella.exchange.formats.lerobot import LeRobotRows
 from terrella.learn.latent_codes import labelled, map_keys
 from terrella.learn.objectives.latent_actions import posterior
 from terrella.learn.objectives.latent_model import Forward, warped
-from terrella.learn.recipes.latent_actions import LatentConfig, load_latent, train_latent_actions
+from terrella.learn.recipes.latent_actions import LatentActionsConfig, load_latent, train_latent_actions
 
 from ..data.layouts import layout_of
 
-CONFIG = LatentConfig(codes=4, stride=1, size=(32, 32), steps=100, batch=8, strip_every_s=1e9)
+CONFIG = LatentActionsConfig(codes=4, stride=1, size=(32, 32), steps=100, batch=8, strip_every_s=1e9)
 MOVES = {"up": (-2, 0), "down": (2, 0), "left": (0, -2), "right": (0, 2)}
 
 

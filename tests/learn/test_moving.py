@@ -2,86 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
-from tests.data.corridor import DEPTH, Corridor
+from tests.data.corridor import DEPTH
+from tests.learn.haunted import Peopled
+from tests.learn.small import BARE
+from tests.learn.stopping import quiet
 
 from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.data import ClipCache, RecordOptions, record
 from terrella.learn import moving_batches
-from terrella.learn.moving_batches import mirrored, moving_batch, other_side
+from terrella.learn.moving_batches import mirrored, mirrored_buttons, moving_batch
 from terrella.learn.recipes.parts import ObjectsTraining, train_objects
-from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
-from terrella.learn.trainer import Now
-from terrella.space.camera import yaw
+from terrella.learn.trainer import TrainStep
 from terrella.worlds.body import climbed
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
 
-CONFIG = TrainConfig(
-    size=(24, 32),
-    steps=3,
-    batch=2,
-    motion_steps=20,
-    outcome_steps=5,
-    keyframes=8,
-    critic_from=1,
-    estimator_steps=0,
-    uncertainty_frames=0,
-    strip_every_s=1e9,
-)
 
-
-def now(seed: int) -> Now:
-    return Now(0, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
-
-
-class Haunted(Corridor):
-    """The corridor with a thing before the middle of the picture, 1.5 m away, and a health that falls as one walks."""
-
-    def __init__(self):
-        super().__init__(goal_m=12.0)
-        mask = spaces.Box(0, 1, DEPTH, np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
-        more = {"things": mask, "health": spaces.Box(0, 100, (), np.float32)}
-        self.spec = replace(self.spec, channels={**self.spec.channels, **more})
-
-    def render(self, state, channels):
-        seen = super().render(state, [name for name in channels if name not in ("things", "health")])
-        mark = torch.zeros(1, *DEPTH, dtype=torch.bool)
-        mark[:, 4:8, 6:10] = True
-        if "depth" in seen:
-            seen["depth"] = torch.where(mark, 1.5, seen["depth"])
-        told = {"things": mark, "health": (100 - (state["walked"] * 8).round()).float()}
-        return {name: told[name] if name in told else seen[name] for name in channels}
-
-
-class Peopled(Haunted):
-    """The same, told apart: the thing keeps 1.5 m before the eye."""
-
-    def __init__(self):
-        super().__init__()
-        marks = spaces.Box(0, ROWS, DEPTH, np.uint8)  # pyright: ignore[reportCallIssue, reportArgumentType]
-        more = {"instances": marks, "objects": spaces.Box(-np.inf, np.inf, (ROWS, 4), np.float32)}
-        self.spec = replace(self.spec, channels={**self.spec.channels, **more})
-
-    def render(self, state, channels):
-        seen = super().render(state, [*{*channels, "things", "pose"} - {"objects", "instances"}])
-        x, y, z, *_ = seen["pose"][0].tolist()
-        heading = float(yaw(seen["pose"])[0])
-        seen["instances"] = seen["things"].to(torch.uint8)
-        seen["objects"] = torch.zeros(1, ROWS, 4)
-        there = [5.0, x + 1.5 * math.cos(heading), y + 1.5 * math.sin(heading), z - 0.5]
-        seen["objects"][0, 0] = torch.tensor(there)
-        return {name: seen[name] for name in channels}
+def now(seed: int) -> TrainStep:
+    return TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -89,38 +37,35 @@ def peopled(tmp_path_factory):
     """A world learned of the same, and its recording."""
     folder, world = tmp_path_factory.mktemp("peopled"), Peopled()
     record(world, Explorer(world.spec), folder / "set", 300, make_rng(0), options=RecordOptions(max_episode_steps=80))
-    train_video(folder / "set", folder / "run", replace(CONFIG, objects_steps=20), lambda *told: None)
+    train_video(folder / "set", folder / "run", replace(BARE, objects_steps=20), quiet)
     return load_world(folder / "run" / "world"), folder
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("moving") / "set"
-    world = Haunted()
-    record(world, Explorer(world.spec), folder, 300, make_rng(0), options=RecordOptions(max_episode_steps=80))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def rows(recording):
-    cache = ClipCache.open(recording, CONFIG.size)
+def rows(haunted):
+    cache = ClipCache.open(haunted, BARE.size)
     start = np.zeros(cache.length, np.int64)
     for first, last in cache.episodes:
         start[first:last] = first
     return Recording(cache, start, np.ones(cache.length, bool))
 
 
-def test_a_world_learned_of_moving_things_keeps_the_contract(recording, tmp_path):
-    train_video(recording, tmp_path, CONFIG, lambda *told: None)
+@pytest.fixture(scope="module")
+def still_run(haunted, tmp_path_factory):
+    """The same recording, learned as if nothing moved in it."""
+    out = tmp_path_factory.mktemp("still")
+    return out, train_video(haunted, out, replace(BARE, moving=False), quiet)
+
+
+def test_a_world_learned_of_moving_things_keeps_the_contract(haunted_run, still_run):
     for memory in (True, False):
-        world = load_world(tmp_path / "world", memory=memory)
+        world = load_world(haunted_run[0] / "world", memory=memory)
         assert (world.starts.depth == 0).any(), "what moves is in no keyframe"
         assert world.config.moving and {"things", "health", "reward", "done"} <= set(world.spec.channels)
         assert "observes" in check_world(world) and world.spec.may_observe == ("things", "health")
     state = world.start(2, make_rng(0))
     assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
-    still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
-    assert not load_world(still["world"]).config.moving
+    assert not load_world(still_run[1]["world"]).config.moving
 
 
 def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
@@ -146,9 +91,7 @@ def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
 
 def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
     world, folder = peopled
-    told = train_objects(
-        folder / "run" / "world", folder / "set", tmp_path / "new", ObjectsTraining(5, seed=1), lambda *told: None
-    )
+    told = train_objects(folder / "run" / "world", folder / "set", tmp_path / "new", ObjectsTraining(5, seed=1), quiet)
     new = load_world(told["world"])
     assert torch.equal(new.memory.rgb, world.memory.rgb) and new.spec.may_observe == world.spec.may_observe
     assert torch.equal(new.generator.enter.weight, world.generator.enter.weight)
@@ -156,13 +99,14 @@ def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
     assert torch.equal(new.objects.begun[..., NUMBER], world.objects.begun[..., NUMBER])
 
 
-def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(peopled, recording, tmp_path):
+def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(
+    peopled, haunted, still_run, tmp_path
+):
     _, folder = peopled
     with pytest.raises(DatasetError, match="holds no observation.objects"):
-        train_objects(folder / "run" / "world", recording, tmp_path / "x", ObjectsTraining(5), lambda *told: None)
-    still = train_video(recording, tmp_path / "still", replace(CONFIG, moving=False), lambda *told: None)
-    with pytest.raises(TrainingError, match="knows of no things"):
-        train_objects(still["world"], folder / "set", tmp_path / "x", ObjectsTraining(5), lambda *told: None)
+        train_objects(folder / "run" / "world", haunted, tmp_path / "x", ObjectsTraining(5), quiet)
+    with pytest.raises(TrainingError, match="knows no things"):
+        train_objects(still_run[1]["world"], folder / "set", tmp_path / "x", ObjectsTraining(5), quiet)
 
 
 def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
@@ -193,7 +137,7 @@ def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
 
 def test_a_batch_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled, monkeypatch):
     world, folder = peopled
-    cache = ClipCache.open(folder / "set", CONFIG.size)
+    cache = ClipCache.open(folder / "set", BARE.size)
     marks, told = (cache.arrays[f"observation.{name}"] for name in ("instances", "objects"))
     assert (
         marks.dtype == np.uint8
@@ -217,9 +161,8 @@ def test_a_batch_of_cards_hides_them_and_asks_nothing_of_what_they_cover(peopled
     assert (judged[:, :3].movedim(1, -1)[~covered] == 0).all()
 
 
-def test_evidence_of_vitals_and_things_is_taken(recording, tmp_path):
-    train_video(recording, tmp_path, CONFIG, lambda *told: None)
-    world, rng = load_world(tmp_path / "world"), make_rng(0)
+def test_evidence_of_vitals_and_things_is_taken(haunted_run):
+    world, rng = load_world(haunted_run[0] / "world"), make_rng(0)
     state = world.start(1, rng)
     seen = world.render(state, ("rgb", "depth", "pose"))
     things = torch.zeros(1, 24, 32, dtype=torch.bool)
@@ -230,7 +173,7 @@ def test_evidence_of_vitals_and_things_is_taken(recording, tmp_path):
 
 
 def test_a_batch_masks_memory_and_shows_the_thing_in_the_last_frame(rows):
-    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
+    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, BARE.size, moving=True)
     picks = choose_keyframes(np.asarray(rows.cache.pose), np.flatnonzero(rows.usable), 12)
     memory = rows.keyframes(picks, config.camera)
     assert (memory.depth == 0).float().mean() == pytest.approx(10 * 10 / (24 * 32), abs=0.005)  # the thing and its rim
@@ -243,7 +186,7 @@ def test_a_batch_masks_memory_and_shows_the_thing_in_the_last_frame(rows):
 
 
 def test_a_mirrored_batch_mirrored_again_is_itself(rows):
-    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, CONFIG.size, moving=True)
+    config = VideoConfig(tuple(rows.cache.world["camera"]), 6, BARE.size, moving=True)
     memory = rows.keyframes(np.arange(4), config.camera)
     batch = moving_batch(rows, memory, config, 2, now(0), None)
     names = rows.cache.action_names
@@ -255,7 +198,7 @@ def test_a_mirrored_batch_mirrored_again_is_itself(rows):
 
 def test_the_other_side_of_a_button():
     names = ("MOVE_FORWARD", "MOVE_LEFT", "TURN_LEFT", "MOVE_RIGHT", "TURN_RIGHT", "ATTACK")
-    assert other_side(names) == [0, 3, 4, 1, 2, 5]
+    assert mirrored_buttons(names) == [0, 3, 4, 1, 2, 5]
     assert THINGS == "observation.things"
 
 

@@ -12,11 +12,11 @@ from tests.learn.stopping import quiet
 
 from terrella.core import check_world, make_rng
 from terrella.data import ClipCache, Recorder
-from terrella.learn.history_batches import changing, clips_at, history_batch
-from terrella.learn.objectives.outcome import Happenings, Pieces, learn_outcome, levels, two_hot
+from terrella.learn.history_batches import change_weight, clips_at, history_batch
+from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, controls_of
-from terrella.learn.trainer import Now, Run
+from terrella.learn.trainer import Run, TrainStep
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world
 from terrella.worlds.frame_history import FrameHistory, StartClips
@@ -70,7 +70,7 @@ def learned(recording, tmp_path_factory):
     torch.manual_seed(0)
     outcome = FrameOutcome(happened.config())
     run = Run(tmp_path_factory.mktemp("run"), {}, quiet)
-    learn_outcome(run, Pieces(outcome, seen.rgb, happened, batch=6, learning_rate=5e-3), 300)
+    learn_outcome(run, OutcomeObjective(outcome, seen.rgb, happened, batch=6, learning_rate=5e-3), 300)
     return cache, seen, happened, outcome
 
 
@@ -154,7 +154,7 @@ def test_a_clip_that_is_shown_as_a_beginning_stood_still_and_nobody_had_acted(le
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, slots=4, geometry=False)
     found, thumbnail = [], 36
     for number in range(40):
-        now = Now(0, 0.0, torch.device("cpu"), np.random.default_rng(number), make_rng(number))
+        now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(number), make_rng(number))
         clips = clips_at(seen, config, 8, now.rng)
         batch = history_batch(clips, seen.controls, config, now, None)
         actions = batch.shown.context[:, thumbnail:].unflatten(1, (4, 3))
@@ -172,7 +172,7 @@ def test_pixels_that_change_count_for_more_and_one_in_the_mean():
     before = torch.full((2, 1, 3, 16, 16), 10, dtype=torch.uint8)
     found = before[:, 0].clone()
     found[0, :, 3, 4] = 200
-    weight = changing(found, before, often=20.0)
+    weight = change_weight(found, before, often=20.0)
     assert weight.mean().item() == pytest.approx(1.0, abs=1e-5)
     assert weight[0, 0, 3, 4] / weight[0, 0, 0, 0] == pytest.approx(21.0, rel=1e-4)
     assert (weight[1] == weight[1, 0, 0, 0]).all()

@@ -9,21 +9,19 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tests.data.corridor import Corridor
-from tests.learn.stopping import goes_on_exactly, quiet
-from tests.learn.test_moving import Haunted
+from tests.learn.small import BARE, DREAMS, STUDENT
+from tests.learn.stopping import goes_on_exactly, quiet, resumes_exactly
 
-from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
-from terrella.data import Recorder, RecordOptions, record
+from terrella.data import Recorder
 from terrella.learn.objectives import distillation
-from terrella.learn.objectives.distillation import Matching, drawn
-from terrella.learn.objectives.dreams import Rollouts, beginnings
-from terrella.learn.paired import paired
-from terrella.learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
-from terrella.learn.recipes.video import TrainConfig, train_video
-from terrella.learn.trainer import Now
+from terrella.learn.objectives.distillation import Matching, draw_with_random_exit
+from terrella.learn.objectives.dreams import DreamRollouts, dream_starts
+from terrella.learn.paired import open_paired
+from terrella.learn.recipes.post_training import distil, train_dreams
+from terrella.learn.recipes.video import train_video
+from terrella.learn.trainer import TrainStep
 from terrella.worlds.checkpoint import data_file
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate
@@ -31,61 +29,24 @@ from terrella.worlds.uncertainty import UncertaintyProbe
 
 from ..data.layouts import layout_of
 
-TEACHER = TrainConfig(
-    size=(24, 32),
-    channels=(8, 8, 8),
-    geometry=False,
-    flow_steps=4,
-    steps=3,
-    batch=2,
-    estimator_steps=0,
-    uncertainty_frames=0,
-    outcome_steps=2,
-)
-PLACES = replace(TEACHER, geometry=True, flow_steps=1, motion_steps=5, keyframes=6, critic_from=9)
-FEW = DistilConfig(steps=3, batch=2)
-DREAMS = DreamsConfig(steps=2, horizon=3, batch=2)
+
+@pytest.fixture(scope="module")
+def places(bare_run):
+    return load_world(bare_run[0] / "world")
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("post") / "set"
-    world = Corridor()
-    record(world, Explorer(world.spec), folder, 240, make_rng(0), options=RecordOptions(max_episode_steps=80))
-    return folder
+def moving(haunted_run):
+    return load_world(haunted_run[0] / "world")
 
 
 @pytest.fixture(scope="module")
-def teacher(recording, tmp_path_factory):
-    out = tmp_path_factory.mktemp("teacher")
-    train_video(recording, out, TEACHER, quiet)
-    return load_world(out / "world")
+def student(student_run):
+    return load_world(student_run[0] / "world")
 
 
-@pytest.fixture(scope="module")
-def places(recording, tmp_path_factory):
-    out = tmp_path_factory.mktemp("places")
-    train_video(recording, out, PLACES, quiet)
-    return load_world(out / "world")
-
-
-@pytest.fixture(scope="module")
-def haunted(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("haunted") / "set"
-    world = Haunted()
-    record(world, Explorer(world.spec), folder, 240, make_rng(0), options=RecordOptions(max_episode_steps=80))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def moving(haunted, tmp_path_factory):
-    out = tmp_path_factory.mktemp("moving")
-    train_video(haunted, out, PLACES, quiet)
-    return load_world(out / "world")
-
-
-def now(seed: int, step: int = 0) -> Now:
-    return Now(step, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
+def now(seed: int, step: int = 0) -> TrainStep:
+    return TrainStep(step, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))
 
 
 def tame(world):
@@ -103,50 +64,47 @@ def test_a_teacher_is_a_history_world_of_many_steps(teacher):
     assert teacher.config.channels == (8, 8, 8)
 
 
-def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(recording, teacher, tmp_path):
-    facts = distil(teacher, recording, tmp_path, FEW, quiet)
-    student = load_world(tmp_path / "world")
+def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(student_run, student, teacher):
+    out, facts = student_run
     assert facts["step"] == 3 and student.config.steps == 1
     assert "observes" in check_world(student)
     assert "4 to 1 steps" in str(student.spec.card["distilled"])
     changed = zip(student.generator.parameters(), teacher.generator.parameters())
     assert any(not torch.equal(a, b) for a, b in changed)
-    assert list(tmp_path.glob("strip-*.png"))
+    assert list(out.glob("strip-*.png"))
 
 
-@pytest.mark.parametrize("stage", ["distil", "dreams"])
-def test_a_stopped_run_goes_on_exactly(stage, recording, teacher, tmp_path):
+def test_a_stopped_distillation_goes_on_exactly(corridor, teacher, student_run, tmp_path):
+    resumes_exactly(lambda out: distil(teacher, corridor, out, STUDENT, quiet), student_run[0], tmp_path, {"distil": 0})
+
+
+def test_a_stopped_training_on_dreams_goes_on_exactly(corridor, teacher, dreams_run, tmp_path):
+    resumes_exactly(
+        lambda out: train_dreams(teacher, corridor, out, DREAMS, quiet), dreams_run[0], tmp_path, {"dreams": 0}
+    )
+
+
+@pytest.mark.slow
+def test_a_student_of_dreams_with_a_teacher_goes_on_exactly(corridor, teacher, student, tmp_path):
     def train(out):
-        run = {"distil": (distil, FEW), "dreams": (train_dreams, DREAMS)}[stage]
-        return run[0](teacher, recording, out, run[1], quiet)
-
-    goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {stage: 0})
-
-
-def test_a_student_of_dreams_with_a_teacher_goes_on_exactly(recording, teacher, tmp_path):
-    distil(teacher, recording, tmp_path / "student", FEW, quiet)
-    student = load_world(tmp_path / "student" / "world")
-
-    def train(out):
-        return train_dreams(student, recording, out, DREAMS, quiet, teacher)
+        return train_dreams(student, corridor, out, DREAMS, quiet, teacher)
 
     goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"dreams": 0})
 
 
-def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(recording, teacher, places, tmp_path):
-    train_dreams(teacher, recording, tmp_path, DREAMS, quiet)
+def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(corridor, teacher, places, dreams_run):
     with pytest.raises(TrainingError, match="other settings"):
-        train_dreams(teacher, recording, tmp_path, replace(DREAMS, horizon=2), quiet)
+        train_dreams(teacher, corridor, dreams_run[0], replace(DREAMS, horizon=2), quiet)
     with pytest.raises(TrainingError, match="other settings"):
-        train_dreams(places, recording, tmp_path, DREAMS, quiet)
+        train_dreams(places, corridor, dreams_run[0], DREAMS, quiet)
 
 
-@pytest.mark.parametrize("kind, data, seed", [("teacher", "recording", 0), ("places", "recording", 0),
-                                              ("places", "recording", 1), ("moving", "haunted", 0)])  # fmt: skip
+@pytest.mark.parametrize("kind, data, seed", [("teacher", "corridor", 0), ("places", "corridor", 0),
+                                              ("places", "corridor", 1), ("moving", "haunted", 0)])  # fmt: skip
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
     world = tame(request.getfixturevalue(kind))
-    pair = paired(world, request.getfixturevalue(data), None, quiet)
-    dreams, noted = Rollouts(world, pair.recording, 4, 2, now(seed)), []
+    pair = open_paired(world, request.getfixturevalue(data), None, quiet)
+    dreams, noted = DreamRollouts(world, pair.recording, 4, 2, now(seed)), []
     playing = dreams.world.replaced(
         uncertainty=UncertaintyProbe(lambda shown, clean, situation: noted.append((shown, clean)))
     )
@@ -169,17 +127,15 @@ def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, reque
         assert torch.equal(batch.truth[:, :3], truth)
 
 
-def test_a_teacher_may_watch_the_dreams(recording, teacher, places, tmp_path):
-    distil(teacher, recording, tmp_path / "few", FEW, quiet)
-    student = load_world(tmp_path / "few" / "world")
-    train_dreams(student, recording, tmp_path / "watched", DREAMS, quiet, teacher)
-    train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet)
+def test_a_teacher_may_watch_the_dreams(corridor, teacher, student, places, tmp_path):
+    train_dreams(student, corridor, tmp_path / "watched", DREAMS, quiet, teacher)
+    train_dreams(student, corridor, tmp_path / "alone", DREAMS, quiet)
     watched, alone = (load_file(data_file(tmp_path / name / "world", "weights")) for name in ("watched", "alone"))
     assert any(not torch.equal(watched[name], alone[name]) for name in alone)
     with pytest.raises(TrainingError, match="other settings"):
-        train_dreams(student, recording, tmp_path / "alone", DREAMS, quiet, teacher)
+        train_dreams(student, corridor, tmp_path / "alone", DREAMS, quiet, teacher)
     with pytest.raises(TrainingError, match="cannot teach"):
-        train_dreams(student, recording, tmp_path / "run", DREAMS, quiet, places)
+        train_dreams(student, corridor, tmp_path / "run", DREAMS, quiet, places)
 
 
 def test_a_world_in_which_things_move_learns_from_its_dreams(haunted, moving, tmp_path):
@@ -188,34 +144,35 @@ def test_a_world_in_which_things_move_learns_from_its_dreams(haunted, moving, tm
     assert "observes" in check_world(load_world(tmp_path / "world"))
 
 
+@pytest.mark.slow
 def test_a_many_step_world_of_moving_things_teaches_a_student_and_its_dreams(haunted, tmp_path):
-    train_video(haunted, tmp_path / "teacher", replace(PLACES, flow_steps=4), quiet)
+    train_video(haunted, tmp_path / "teacher", replace(BARE, flow_steps=4), quiet)
     teacher = load_world(tmp_path / "teacher" / "world")
     assert teacher.config.moving and teacher.config.steps == 4
-    distil(teacher, haunted, tmp_path / "student", FEW, quiet)
+    distil(teacher, haunted, tmp_path / "student", STUDENT, quiet)
     student = load_world(tmp_path / "student" / "world")
     assert student.config.moving and student.config.steps == 1
     train_dreams(student, haunted, tmp_path / "dreams", DREAMS, quiet, teacher)
     assert "observes" in check_world(load_world(tmp_path / "dreams" / "world"))
 
 
-def test_dreams_begin_where_the_episode_lasts(recording, teacher):
-    pair = paired(teacher, recording, None, quiet)
-    rows = beginnings(pair.recording, 20)
+def test_dreams_begin_where_the_episode_lasts(corridor, teacher):
+    pair = open_paired(teacher, corridor, None, quiet)
+    rows = dream_starts(pair.recording, 20)
     start = pair.recording.start
     assert len(rows) and all(start[row - 9] == start[row + 20] for row in rows)
     assert pair.recording.usable[np.concatenate([rows - 9, rows + 20])].all()
     with pytest.raises(DatasetError, match="shorter --horizon"):
-        beginnings(pair.recording, 200)
+        dream_starts(pair.recording, 200)
 
 
 @pytest.mark.parametrize("half", [False, True])  # where bfloat16 is native, training uses it
-def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, recording, teacher, monkeypatch):
+def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, corridor, teacher, monkeypatch):
     def precision(device):
         return torch.autocast(device.type, torch.bfloat16, enabled=half)
 
     monkeypatch.setattr(distillation, "half_precision", precision)
-    pair = paired(tame(teacher), recording, None, quiet)
+    pair = open_paired(tame(teacher), corridor, None, quiet)
     generator = copy.deepcopy(pair.world.generator).requires_grad_(True)
     batch = pair.real(2, now(0))
     noise, exits = torch.randn(batch.truth.shape, generator=make_rng(1)), set()
@@ -232,7 +189,7 @@ def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, rec
             for step in range(exit_at):
                 x = x + (clean_at(x, step) - x) / (4 - step)
         (alone,) = torch.autograd.grad(clean_at(x, exit_at).sum(), generator.enter.weight)
-        clean = drawn(generator, noise, batch.shown, 4, np.random.default_rng(seed))
+        clean = draw_with_random_exit(generator, noise, batch.shown, 4, np.random.default_rng(seed))
         (found,) = torch.autograd.grad(clean.sum(), generator.enter.weight)
         assert float((found - alone).norm()) < 1e-2 * float(alone.norm()), "relative: as near as rounding allows"
         if exit_at == 3 and not half:
@@ -240,8 +197,8 @@ def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, rec
     assert exits == {0, 1, 2, 3}
 
 
-def test_where_the_student_draws_as_the_teacher_nothing_pulls(recording, teacher):
-    pair = paired(tame(teacher), recording, None, quiet)
+def test_where_the_student_draws_as_the_teacher_nothing_pulls(corridor, teacher):
+    pair = open_paired(tame(teacher), corridor, None, quiet)
     batch, matching = pair.real(2, now(0)), Matching(teacher.generator)
     clean = batch.truth.clone().requires_grad_()
     (still,) = torch.autograd.grad(matching.towards_teacher(clean, batch.shown, make_rng(2)), clean)
@@ -253,12 +210,12 @@ def test_where_the_student_draws_as_the_teacher_nothing_pulls(recording, teacher
     assert pull.abs().sum() > 0
 
 
-def test_a_world_of_one_step_teaches_nobody(recording, places, tmp_path):
+def test_a_world_of_one_step_teaches_nobody(corridor, places, tmp_path):
     with pytest.raises(TrainingError, match="--flow-steps 8"):
-        distil(places, recording, tmp_path, FEW, quiet)
+        distil(places, corridor, tmp_path, STUDENT, quiet)
 
 
-def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
+def test_what_does_not_fit_is_refused(teacher, corridor, tmp_path):
     with Recorder(tmp_path / "other", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
         for _ in range(2):
             for step in range(60):
@@ -268,4 +225,4 @@ def test_what_does_not_fit_is_refused(teacher, recording, tmp_path):
     with pytest.raises(DatasetError, match="the actions left, which are not those of .*its own game"):
         train_dreams(teacher, tmp_path / "other", tmp_path / "run", DREAMS, quiet)
     with pytest.raises(TrainingError, match="1 or more"):
-        train_dreams(teacher, recording, tmp_path / "run", replace(DREAMS, horizon=0), quiet)
+        train_dreams(teacher, corridor, tmp_path / "run", replace(DREAMS, horizon=0), quiet)

@@ -16,7 +16,7 @@ from terrella.core import Spec, State, make_rng, rollout
 from terrella.core.errors import TerrellaError
 from terrella.core.spec import REWARD
 from terrella.learn.growth import Growth
-from terrella.learn.objectives.ppo import PARTS, PASSES, Pace
+from terrella.learn.objectives.ppo import EPOCHS, MINIBATCHES, AdaptiveRate
 from terrella.learn.recipes.policy import Practice, train_policy
 
 
@@ -68,22 +68,22 @@ def test_it_learns_what_pays_and_goes_on_exactly(tmp_path):
 
 
 def test_a_rate_that_moves_the_policy_too_far_is_lowered_and_comes_back():
-    pace = Pace()
+    adaptive = AdaptiveRate()
     for _ in range(3):
-        pace.change(parts=1)
-    assert float(pace.share) == pytest.approx(1.5**-3)
-    pace.change(parts=2 * PARTS)
-    assert float(pace.share) == pytest.approx(1.5**-3), "some passes are what is wanted"
+        adaptive.update(minibatches=1)
+    assert float(adaptive.share) == pytest.approx(1.5**-3)
+    adaptive.update(minibatches=2 * MINIBATCHES)
+    assert float(adaptive.share) == pytest.approx(1.5**-3), "some epochs are as they should be"
     for _ in range(100):
-        pace.change(PASSES * PARTS)
-    assert float(pace.share) == 1.0
+        adaptive.update(EPOCHS * MINIBATCHES)
+    assert float(adaptive.share) == 1.0
 
 
 def test_a_rate_far_too_high_does_not_stay_so(tmp_path):
     config = Practice(method="ppo", steps=12, batch=64, horizon=8, hidden=32, learning_rate=0.3)
     train_policy(Hold(), "hold", tmp_path / "run", config, lambda *_: None)
     log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert log[-1]["pace"] < 0.7
+    assert log[-1]["rate"] < 0.7
 
 
 def test_it_is_exported_with_its_normalisation(tmp_path):
@@ -110,14 +110,14 @@ def test_ranges_grow_while_the_policy_copes_and_wait_where_it_does_not():
     growth.set()
     assert world.scale == 0.0
     for reward in [0.0] * 10 + [1.0] * 60:
-        growth.follow(torch.full((3,), reward))
+        growth.update(torch.full((3,), reward))
     growth.set()
     grown = world.scale
     assert 0.5 < grown <= 1.0
     for _ in range(40):
-        growth.follow(torch.zeros(3))
+        growth.update(torch.zeros(3))
     stopped = float(growth.scale)
-    growth.follow(torch.zeros(3))
+    growth.update(torch.zeros(3))
     assert float(growth.scale) == stopped
 
 

@@ -17,22 +17,22 @@ from terrella.core.policy import Idle
 from terrella.core.rollouts import rollout
 from terrella.core.state import State
 from terrella.core.world import make_rng
-from terrella.learn.imagination import Continued
-from terrella.learn.objectives.actor_critic import Critic, Range, Wanted, lambda_returns, weights_of
+from terrella.learn.imagination import ContinuedEpisodes
+from terrella.learn.objectives.actor_critic import Critic, Range, ReturnConfig, lambda_returns, step_weights
 from terrella.learn.objectives.outcome import two_hot
 from terrella.learn.recipes.policy import Practice, train_policy
-from terrella.learn.trainer import Now
+from terrella.learn.trainer import TrainStep
 
 QUICK = Practice(steps=80, batch=64, horizon=5, hidden=32, learning_rate=1e-2, save_every_s=1e9)
 
 
-def now(step: int = 0) -> Now:
+def now(step: int = 0) -> TrainStep:
     import numpy as np
 
-    return Now(step, 0.0, torch.device("cpu"), np.random.default_rng([0, step]), make_rng(step))
+    return TrainStep(step, 0.0, torch.device("cpu"), np.random.default_rng([0, step]), make_rng(step))
 
 
-def slowly(reward, goes_on, value, known, wanted):
+def slowly(reward, continues, value, known, wanted):
     """Lambda-returns as they are defined: n-step returns, mixed; a step after which nothing is known ends all of them."""
     steps, batch = reward.shape
     found = torch.zeros(steps, batch, dtype=reward.dtype)
@@ -44,7 +44,7 @@ def slowly(reward, goes_on, value, known, wanted):
                 total, share = 0.0, 1.0
                 for t in range(start, end + 1):
                     total += share * reward[t, entry]
-                    share *= wanted.discount * goes_on[t, entry]
+                    share *= wanted.discount * continues[t, entry]
                 n_step.append(total + share * value[end + 1, entry])
             mix = wanted.td_lambda
             whole = sum((1 - mix) * mix**n * part for n, part in enumerate(n_step[:-1]))
@@ -61,29 +61,29 @@ def paid(world, state, policy, steps: int) -> float:
 def test_lambda_returns_are_what_they_are_defined_to_be(td_lambda: float) -> None:
     rng = make_rng(0)
     reward, value = (torch.randn(n, 6, generator=rng, dtype=torch.float64) for n in (7, 8))
-    goes_on = torch.rand(7, 6, generator=rng, dtype=torch.float64)
-    goes_on[3, 2] = 0.0
+    continues = torch.rand(7, 6, generator=rng, dtype=torch.float64)
+    continues[3, 2] = 0.0
     known = torch.rand(7, 6, generator=rng) > 0.2
-    wanted = Wanted(0.9, td_lambda)
-    fast = lambda_returns(reward, goes_on, value, known, wanted)
-    torch.testing.assert_close(fast, slowly(reward, goes_on, value, known, wanted))
+    wanted = ReturnConfig(0.9, td_lambda)
+    fast = lambda_returns(reward, continues, value, known, wanted)
+    torch.testing.assert_close(fast, slowly(reward, continues, value, known, wanted))
 
 
 def test_the_cautious_count_the_unknown_as_the_worst_that_is_expected_anywhere() -> None:
-    reward, goes_on = torch.zeros(3, 2), torch.ones(3, 2)
+    reward, continues = torch.zeros(3, 2), torch.ones(3, 2)
     value = torch.tensor([[5.0, 4.0], [5.0, 4.0], [90.0, 4.0], [90.0, 4.0]])
     known = torch.tensor([[True, True], [False, True], [False, True]])
     plain, cautious = (
-        lambda_returns(reward, goes_on, value, known, Wanted(0.5, 1.0, cautious=said)) for said in (False, True)
+        lambda_returns(reward, continues, value, known, ReturnConfig(0.5, 1.0, cautious=said)) for said in (False, True)
     )
     assert plain[:2, 0].tolist() == [22.5, 45.0] and cautious[:2, 0].tolist() == [1.0, 2.0]
     assert torch.equal(plain[:, 1], cautious[:, 1])
 
 
 def test_what_comes_after_an_end_or_the_unknown_counts_for_nothing() -> None:
-    goes_on = torch.tensor([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    continues = torch.tensor([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     known = torch.tensor([[True, False, True], [True, True, True], [True, True, True]])
-    assert weights_of(goes_on, known).tolist() == [[1, 1, 1], [1, 0, 0.5], [0, 0, 0.5]]
+    assert step_weights(continues, known).tolist() == [[1, 1, 1], [1, 0, 0.5], [0, 0, 0.5]]
 
 
 def test_the_critic_says_back_what_it_is_told() -> None:
@@ -102,8 +102,8 @@ def test_a_critic_that_knows_nothing_says_nothing() -> None:
 
 def test_the_range_of_returns_is_never_below_one() -> None:
     narrow, wide = Range(), Range()
-    assert float(narrow.follow(torch.linspace(0, 0.1, 101))) == 1.0
-    assert float(wide.follow(torch.linspace(0, 1000, 101))) == pytest.approx(900)
+    assert float(narrow.update(torch.linspace(0, 0.1, 101))) == 1.0
+    assert float(wide.update(torch.linspace(0, 1000, 101))) == pytest.approx(900)
 
 
 @pytest.mark.parametrize("gradients", [True, False])
@@ -147,7 +147,7 @@ def test_a_stopped_run_goes_on_exactly(tmp_path) -> None:
 
 def test_episodes_go_on_from_batch_to_batch_and_begin_anew_when_they_are_long() -> None:
     world = Point()
-    starts = Continued(world, 4, 6, 0)
+    starts = ContinuedEpisodes(world, 4, 6, 0)
     starts.held.age[:] = torch.tensor([0, 2, 4, 6])
     first = starts.begin(now())
     moved = world.imagine(first, torch.ones(4, 2), make_rng(0))

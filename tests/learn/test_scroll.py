@@ -10,7 +10,7 @@ from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.core import make_rng
 from terrella.learn.objectives import scroll as stage
-from terrella.learn.objectives.scroll import Scrolling, learn_scroll
+from terrella.learn.objectives.scroll import ScrollObjective, learn_scroll
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run
 from terrella.worlds.codec import CodecConfig, Scroll, least_off
@@ -45,12 +45,12 @@ def test_what_a_button_does_to_the_picture_is_learned(tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "STEPS", 200)
     made, seen = scroll(), walks()
     learn_scroll(Run(tmp_path, {}, quiet), made, seen, MOVES, SLOTS)
-    objective = Scrolling(made, seen, MOVES, SLOTS)
-    piece = objective.piece(objective.rows[::7])
-    went = piece.found[:, : SLOTS - 1].flip(1)
+    objective = ScrollObjective(made, seen, MOVES, SLOTS)
+    piece = objective.clips_at(objective.rows[::7])
+    went = piece.explained[:, : SLOTS - 1].flip(1)
     with torch.no_grad():
         guess = least_off(made(made.glanced(piece.frames[:, 0]), piece.context[:, 0], went), MOVES)
-    right = guess == piece.found[:, SLOTS - 1].argmax(1)
+    right = guess == piece.explained[:, SLOTS - 1].argmax(1)
     assert right.float().mean() > 0.85, "going on as before would be right in two of three"
 
 

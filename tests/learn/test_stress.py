@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from terrella.learn.objectives import stress
-from terrella.learn.objectives.stress import POWERS, USUAL, balanced
+from terrella.learn.objectives.stress import POWERS, USUAL, choose_stress
 
 SIZE = (4, 4)
 ROWS = 100  # of an episode
@@ -51,7 +51,7 @@ def recording(episodes: int, rows: int = ROWS) -> Any:
         start=np.repeat(np.arange(episodes) * rows, rows),
         cache=SimpleNamespace(action_valid=np.ones(count, bool), done=None),
         evidence=lambda config, rows: rows,
-        played=lambda spec, rows: rows,
+        recorded_actions=lambda spec, rows: rows,
         rgb=lambda rows: torch.from_numpy(rows % ROWS).float()[:, None, None, None].expand(-1, 3, *SIZE),
     )
 
@@ -59,13 +59,13 @@ def recording(episodes: int, rows: int = ROWS) -> Any:
 @pytest.mark.parametrize("power", POWERS)
 def test_the_power_whose_dreams_come_nearest_is_found(power):
     world, codec = made(9.0**power)
-    assert balanced(world, codec, recording(3), 9.0, 0) == power
+    assert choose_stress(world, codec, recording(3), 9.0, 0) == power
     assert codec.stress == pytest.approx(9.0**power)
 
 
 def test_of_powers_that_are_alike_the_smallest_is_taken():
     world, codec = made(None)
-    assert balanced(world, codec, recording(3), 9.0, 0) == POWERS[0]
+    assert choose_stress(world, codec, recording(3), 9.0, 0) == POWERS[0]
 
 
 class Sleepy(World):
@@ -85,13 +85,13 @@ def test_half_a_decibel_is_not_worth_a_world_that_stands_still(db, power, monkey
     monkeypatch.setattr(stress, "CHANGED", 0.5)
     codec: Any = SimpleNamespace(stress=torch.tensor(3.0))
     world: Any = Sleepy(codec, db)
-    assert balanced(world, codec, recording(3), 9.0, 0) == power
+    assert choose_stress(world, codec, recording(3), 9.0, 0) == power
 
 
 @pytest.mark.parametrize(("rows", "weight"), [(6, 9.0), (ROWS, 1.2)])
 def test_where_nothing_can_be_told_it_is_the_usual_one(rows, weight):
     world, codec = made(1.0)
-    assert balanced(world, codec, recording(3, rows), weight, 0) == USUAL
+    assert choose_stress(world, codec, recording(3, rows), weight, 0) == USUAL
     assert codec.stress == pytest.approx(weight**USUAL)
 
 
@@ -103,5 +103,5 @@ def test_one_long_episode_among_short_ones_does_not_decide(monkeypatch):
     found.evidence = lambda config, rows: asked.append(rows) or rows
     monkeypatch.setattr(stress, "SHOWN", 4)
     world, codec = made(9.0)
-    balanced(world, codec, found, 9.0, 0)
+    choose_stress(world, codec, found, 9.0, 0)
     assert len(np.unique(asked[0])) == stress.CLIPS and (asked[0] < 380).sum() > stress.CLIPS // 2

@@ -15,8 +15,9 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.core.rollouts import advance
 from terrella.data import Recorder
-from terrella.learn.latent_validation import effective_rank, encoded, folded, linear_probe
+from terrella.learn.latent_validation import effective_rank, encode_rows, linear_probe, state_at
 from terrella.learn.objectives.latent_prediction import sigreg
+from terrella.learn.recipes import latent
 from terrella.learn.recipes.latent import LatentTraining, train_latent
 from terrella.learn.recording import Recording
 
@@ -79,11 +80,11 @@ def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
     world = terrella.load(tmp_path)
     assert world.spec.leap == 5
     data = Recording.open(vectors, (64, 64), quiet, needs=("action",))
-    rows = data.within(2, 5, acted=True)
-    state = folded(world, data, rows, 2)
-    acts = torch.stack([data.played(world.spec, rows + step) for step in range(5)], 1)
+    rows = data.rows_within(2, 5, acted=True)
+    state = state_at(world, data, rows, 2)
+    acts = torch.stack([data.recorded_actions(world.spec, rows + step) for step in range(5)], 1)
     ended = advance(world, state, acts, make_rng(0))["window"][:, -1]
-    truth = encoded(world, data, rows + 5)
+    truth = encode_rows(world, data, rows + 5)
     error, still = ((found - truth).square().mean() for found in (ended, state["window"][:, -1]))
     assert error < 0.6 * still
 
@@ -141,6 +142,21 @@ def test_a_stopped_run_goes_on_exactly(vectors, tmp_path):
     goes_on_exactly(
         lambda out: train_latent(vectors, out, config, quiet), tmp_path / "a", tmp_path / "b", {"latent": 9}
     )
+
+
+def test_a_kill_while_validating_leaves_the_trained_world(vectors, tmp_path, monkeypatch):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    config = replace(QUICK, steps=6)
+    with monkeypatch.context() as patch:
+        patch.setattr(latent, "calibrate", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_latent(vectors, tmp_path, config, quiet)
+    world = terrella.load(tmp_path)
+    assert world.spec.card["steps"] == 6 and "validation" not in world.spec.card
+    facts = train_latent(vectors, tmp_path, config, quiet)
+    assert facts["step"] == 6 and terrella.load(tmp_path).spec.card["validation"]["errors"] == facts["errors"]
 
 
 def test_a_finished_run_says_again_what_it_found(run, vectors):

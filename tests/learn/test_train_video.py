@@ -11,20 +11,19 @@ import pytest
 import torch
 from gymnasium import spaces
 from safetensors.torch import load_file
-from tests.data.corridor import Corridor
-from tests.learn.stopping import goes_on_exactly, quiet, same_run
+from tests.learn.small import BARE, FLAT, POSED
+from tests.learn.stopping import quiet, resumes_exactly, same_run
 
-from terrella.act import Explorer
 from terrella.core import Spec, check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.core.spec import Camera
-from terrella.data import ClipCache, Dataset, Layout, Recorder, RecordOptions, record
-from terrella.learn.batches import Batch, varied
-from terrella.learn.feeds import frames_feed
-from terrella.learn.recipes import video
-from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.data import ClipCache, Dataset, Layout, Recorder
+from terrella.learn.batches import Batch, augmented
+from terrella.learn.feeds import clips_of, frames_feed
+from terrella.learn.recipes import video_flat
+from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import Recording, choose_keyframes, usable_rows
-from terrella.learn.trainer import Now, Trainer
+from terrella.learn.trainer import TrainStep
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.checkpoint import data_file
 from terrella.worlds.config import VideoConfig
@@ -33,28 +32,11 @@ from terrella.worlds.generator import Conditioning, context_thumbnail
 
 from ..data.layouts import layout_of
 
-CONFIG = TrainConfig(
-    size=(24, 32), steps=4, batch=2, motion_steps=20, keyframes=8, critic_from=1, strip_every_s=1e9, estimator_steps=0,
-    uncertainty_frames=0,
-)  # fmt: skip
+QUICK_FLAT = replace(FLAT, outcome_steps=0, steps=2, uncertainty_frames=0)  # one batch of six gradient steps
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("learn") / "set"
-    world = Corridor()
-    record(world, Explorer(world.spec), folder, 360, make_rng(0), options=RecordOptions(max_episode_steps=120))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trained(recording, tmp_path_factory):
-    out = tmp_path_factory.mktemp("run")
-    return out, train_video(recording, out, replace(CONFIG, estimator_steps=4, uncertainty_frames=60), quiet)
-
-
-def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
-    out, facts = trained
+def test_a_trained_world_keeps_the_contract_with_memory_and_without(posed_run):
+    out, facts = posed_run
     assert facts["step"] == 4
     for memory in (True, False):
         world = load_world(out / "world", memory=memory)
@@ -65,101 +47,69 @@ def test_a_trained_world_keeps_the_contract_with_memory_and_without(trained):
     assert list(out.glob("strip-*.png"))
 
 
-def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
-    """Within the motion model, the generator, the estimator and the uncertainty; in the first step, too."""
-    config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
-    stages = {"motion": 7, "estimator": 1, "flow": 0, "uncertainty": 3}
-    goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
-    worlds = [load_file(data_file(tmp_path / run / "world", "weights")) for run in ("a", "b")]
+def test_a_stopped_run_goes_on_exactly(corridor, bare_run, tmp_path):
+    resumes_exactly(lambda out: train_video(corridor, out, BARE, quiet), bare_run[0], tmp_path, {"flow": 1})
+
+
+def test_a_stopped_run_without_geometry_goes_on_exactly(corridor, flat_run, tmp_path):
+    resumes_exactly(lambda out: train_video(corridor, out, FLAT, quiet), flat_run[0], tmp_path, {"flow": 0})
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_in_each_of_its_stages_goes_on_exactly(corridor, posed_run, flat_run, tmp_path):
+    stages = {"motion": 7, "outcome": 1, "estimator": 1, "flow": 0, "uncertainty": 3}
+    resumes_exactly(lambda out: train_video(corridor, out, POSED, quiet), posed_run[0], tmp_path / "posed", stages)
+    worlds = [load_file(data_file(run / "world", "weights")) for run in (posed_run[0], tmp_path / "posed")]
     assert all(torch.allclose(worlds[0][name].float(), worlds[1][name].float(), atol=1e-4) for name in worlds[0])
-
-
-def test_a_run_without_geometry_reads_clips_and_goes_on_exactly(recording, tmp_path):
-    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=3, steps=36)
     stages = {"outcome": 1, "flow": 1}
-    goes_on_exactly(lambda out: train_video(recording, out, config, quiet), tmp_path / "a", tmp_path / "b", stages)
+    resumes_exactly(lambda out: train_video(corridor, out, FLAT, quiet), flat_run[0], tmp_path / "flat", stages)
 
 
-def test_a_world_without_geometry_draws_with_the_stress_that_its_dreams_told(recording, tmp_path, monkeypatch):
-    def told(world, codec, recording, stress, seed):
+def test_a_kill_while_a_finished_generator_is_tuned_leaves_its_world(corridor, tmp_path, monkeypatch):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(video_flat, "choose_stress", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_video(corridor, tmp_path, QUICK_FLAT, quiet)
+    assert load_world(tmp_path / "world").spec.card["steps"] == 6
+    facts = train_video(corridor, tmp_path, QUICK_FLAT, quiet)
+    assert facts["step"] == 6 and "taken_back" in facts, "the same command finishes it"
+
+
+def test_a_world_without_geometry_draws_with_the_stress_that_its_rollouts_chose(corridor, tmp_path, monkeypatch):
+    def chosen(world, codec, recording, stress, seed):
         codec.stress.fill_(5.0)
         return 1.4
 
-    monkeypatch.setattr(video, "balanced", told)
-    config = replace(CONFIG, geometry=False, channels=(8, 8, 8), outcome_steps=0, steps=2)
-    first = train_video(recording, tmp_path, config, quiet)
+    monkeypatch.setattr(video_flat, "choose_stress", chosen)
+    first = train_video(corridor, tmp_path, QUICK_FLAT, quiet)
     assert first["taken_back"] == 1.4 and load_world(tmp_path / "world").generator.stress == 5
     assert '"taken_back": 1.4' in (tmp_path / "world" / "world.json").read_text()
-    again = train_video(recording, tmp_path, config, quiet)
+    again = train_video(corridor, tmp_path, QUICK_FLAT, quiet)
     assert again["taken_back"] == 1.4 and load_world(tmp_path / "world").generator.stress == 5
 
 
-def test_a_step_that_a_second_ctrl_c_cuts_is_done_again(recording, trained, tmp_path, monkeypatch):
-    original, steps = Trainer._step, []
-
-    def cut_in_the_third(self, number):
-        if self.stage == "flow":
-            steps.append(number)
-        result = original(self, number)
-        if self.stage == "flow" and len(steps) == 3:
-            raise KeyboardInterrupt
-        return result
-
-    monkeypatch.setattr(Trainer, "_step", cut_in_the_third)
-    config = replace(CONFIG, estimator_steps=4, uncertainty_frames=60)
-    with pytest.raises(KeyboardInterrupt):
-        train_video(recording, tmp_path, replace(config, save_every_s=-1.0), quiet)
-    train_video(recording, tmp_path, config, quiet)
-    assert steps == [0, 1, 2, 2, 3], "the step that was cut is done again"
-    same_run(trained[0], tmp_path, "flow")
-
-
-def test_the_log_repeats_no_step_after_a_kill(recording, tmp_path):
-    """What a killed run logged after its last save is dropped, and a line that was cut."""
-    train_video(recording, tmp_path, CONFIG, quiet)
-    path = tmp_path / "log.jsonl"
-    lines = path.read_text()
-    path.write_text(lines + json.dumps({"stage": "flow", "step": 9, "rgb": 0.5}) + '\n{"stage": "fl')
-    train_video(recording, tmp_path, CONFIG, quiet)
-    assert path.read_text() == lines
-
-
-def test_a_training_that_fails_leaves_no_folder(recording, tmp_path):
+def test_a_training_that_fails_leaves_no_folder(corridor, tmp_path):
     with pytest.raises(TrainingError, match="multiples of 8"):
-        train_video(recording, tmp_path / "run", replace(CONFIG, size=(20, 30)), quiet)
+        train_video(corridor, tmp_path / "run", replace(BARE, size=(20, 30)), quiet)
     with pytest.raises(DatasetError, match="leaves 0 frames"):
-        train_video(recording, tmp_path / "run", replace(CONFIG, keep_out=(-99, -99, 99, 99)), quiet)
+        train_video(corridor, tmp_path / "run", replace(BARE, keep_out=(-99, -99, 99, 99)), quiet)
     with pytest.raises(TrainingError, match="--device tpu: PyTorch has no such device here"):
-        train_video(recording, tmp_path / "run", replace(CONFIG, device="tpu"), quiet)
+        train_video(corridor, tmp_path / "run", replace(BARE, device="tpu"), quiet)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_with_other_settings_is_refused(recording, trained):
+def test_a_run_with_other_settings_is_refused(corridor, posed_run):
     with pytest.raises(TrainingError, match=r"other settings \(keyframes \d+, not 7"):
-        train_video(recording, trained[0], replace(CONFIG, keyframes=7), quiet)
+        train_video(corridor, posed_run[0], replace(POSED, keyframes=7), quiet)
 
 
-def test_a_foreign_resume_file_is_refused(recording, tmp_path):
-    (tmp_path / "resume-flow.safetensors").write_bytes(b"not a run at all")
-    with pytest.raises(TrainingError, match="resume-flow.safetensors"):
-        train_video(recording, tmp_path, CONFIG, quiet)
-
-
-def test_training_ends_after_its_hours_and_says_where(recording, tmp_path):
-    facts = train_video(recording, tmp_path, replace(CONFIG, hours=1e-9), quiet)
-    assert facts["step"] == 1 and facts["step"] < CONFIG.steps
+def test_training_ends_after_its_hours_and_says_where(corridor, tmp_path):
+    facts = train_video(corridor, tmp_path, replace(BARE, hours=1e-9), quiet)
+    assert facts["step"] == 1 and facts["step"] < BARE.steps
     assert json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])["step"] == 1
-
-
-def test_a_loss_that_is_not_a_number_stops_and_leaves_a_good_save(recording, tmp_path, monkeypatch):
-    from terrella.learn import losses as module
-
-    monkeypatch.setattr(module, "_l1", lambda a, b: (a - b).abs().mean() * float("nan"))
-    with pytest.raises(TrainingError, match="not a number at step 0"):
-        train_video(recording, tmp_path, CONFIG, quiet)
-    assert not (tmp_path / "resume-flow.safetensors").exists()
-    saved = load_file(tmp_path / "resume-motion.safetensors")
-    assert all(torch.isfinite(value.float()).all() for value in saved.values())
 
 
 def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path, monkeypatch):
@@ -169,13 +119,13 @@ def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path, monke
                 picture = np.full((24, 32, 3), 40 + step, np.uint8)
                 recorder.add({"rgb": picture}, np.array([step % 2]) if step < 59 else None, 0.5, False)
             recorder.end_episode()
-    facts = train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    facts = train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)
     world = load_world(tmp_path / "run" / "world")
     steps = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])["step"]
     assert facts["step"] == steps == world.spec.card["steps"] == 6, "each loss that is descended is a step, everywhere"
     assert (tmp_path / "run" / "strip-000006.png").exists()
-    monkeypatch.delattr("terrella.learn.recipes.video.frequent_moves")  # what was found is not searched again
-    assert train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)["step"] == steps
+    monkeypatch.delattr(video_flat, "frequent_moves")  # what was found is not searched again
+    assert train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)["step"] == steps
     assert set(world.spec.channels) == {"rgb", "reward", "done"}
     assert "batches" in check_world(world)
     rng = make_rng(0)
@@ -183,11 +133,11 @@ def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path, monke
     still, left = (world.imagine(state, torch.tensor([[held]], dtype=torch.int8), make_rng(1)) for held in (0, 1))
     assert not torch.equal(still["actions"], left["actions"])
     with pytest.raises(DatasetError, match="without depth and poses"):
-        train_video(tmp_path / "set", tmp_path / "other", replace(CONFIG, keep_out=(0, 0, 1, 1)), quiet)
+        train_video(tmp_path / "set", tmp_path / "other", replace(BARE, keep_out=(0, 0, 1, 1)), quiet)
 
 
-def test_rows_in_the_box_are_kept_out(recording):
-    cache = ClipCache.open(Dataset(recording), (24, 32))
+def test_rows_in_the_box_are_kept_out(corridor):
+    cache = ClipCache.open(Dataset(corridor), (24, 32))
     every = list(range(len(cache.episodes)))
     free = usable_rows(cache, every, None, (0.5, 0.8, 0.5, 0.5))
     assert free.all()
@@ -205,10 +155,10 @@ def test_keyframes_cover_the_recording_evenly():
     assert {tuple(p) for p in place[picks]} == {tuple(c) for c in corners}
 
 
-def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
+def test_checkpoints_of_another_kind_or_version_are_refused(posed_run, tmp_path):
     with pytest.raises(CheckpointError, match="world.json"):
         load_world(tmp_path)
-    source = trained[0] / "world"
+    source = posed_run[0] / "world"
     for change, words in (({"kind": "latent"}, "kind"), ({"version": 99}, "version")):
         folder = tmp_path / words
         folder.mkdir()
@@ -226,15 +176,15 @@ def test_checkpoints_of_another_kind_or_version_are_refused(trained, tmp_path):
         load_world(broken)
 
 
-def test_a_world_without_memory_can_be_saved_and_loaded(trained, tmp_path):
-    world = load_world(trained[0] / "world")
+def test_a_world_without_memory_can_be_saved_and_loaded(posed_run, tmp_path):
+    world = load_world(posed_run[0] / "world")
     save_world(world.without_memory(), tmp_path / "bare")
     bare = load_world(tmp_path / "bare")
     assert len(bare.memory) == 0 and len(bare.starts.pose) == len(world.starts.pose)  # pyright: ignore
     assert bare.start(1, make_rng(0))["rgb"].shape == (1, 3, 24, 32)
 
 
-@pytest.mark.parametrize("posed", [False, True])
+@pytest.mark.parametrize("posed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
     layout = layout_of(10.0, ("steer",), rgb=(24, 32), depth=(24, 32) if posed else None, pose=posed)
     layout = replace(layout, world={"camera": [0.5, 0.8, 0.5, 0.5]} if posed else {})
@@ -248,7 +198,7 @@ def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
                     seen |= {"depth": np.full((24, 32), 3.0), "pose": pose}
                 recorder.add(seen, np.array([0.37 - step / 50]) if step < 79 else None, 0.0, False)
             recorder.end_episode()
-    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)
     world = load_world(tmp_path / "run" / "world")
     space = world.spec.action
     assert isinstance(space, spaces.Box) and space.low[0] < -1 and space.high[0] == np.float32(0.37)
@@ -256,19 +206,42 @@ def test_axes_are_learned_from_pictures_and_beside_poses(posed, tmp_path):
     assert "batches" in check_world(world)
 
 
-@pytest.mark.parametrize("scheme", ["file", "memory"])
-def test_a_recording_far_away_is_learned_like_a_near_one(scheme, recording, tmp_path, monkeypatch):
+@pytest.fixture(params=["file", "memory"])
+def far(request, corridor, tmp_path, monkeypatch):
+    """The address of the same recording elsewhere."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    address = f"file://{recording}"
-    if scheme == "memory":
-        system, address = fsspec.filesystem("memory"), f"memory://{tmp_path.name}"
-        system.put(str(recording), address, recursive=True)
-    for geometry in (True, False):
-        config = replace(CONFIG, geometry=geometry, steps=2, outcome_steps=2, motion_steps=3)
-        runs = tmp_path / f"near-{geometry}", tmp_path / f"far-{geometry}"
-        for source, run in zip((recording, address), runs):
-            train_video(source, run, config, quiet)
-        same_run(*runs, "flow")
+    if request.param == "file":
+        return f"file://{corridor}"
+    address = f"memory://{tmp_path.name}"
+    fsspec.filesystem("memory").put(str(corridor), address, recursive=True)
+    return address
+
+
+def test_a_recording_far_away_gives_training_what_a_near_one_does(far, corridor):
+    """All rows, what may be trained on, and clips in their order; the rest of a run is seeded."""
+    near, other = (
+        Recording.open(source, (24, 32), quiet, needs=("rgb", "action", "depth")) for source in (corridor, far)
+    )
+    assert near.controls == other.controls and near.held_out == other.held_out and near.seen == other.seen
+    assert np.array_equal(near.usable, other.usable) and np.array_equal(near.start, other.start)
+    assert near.cache.world == other.cache.world and near.cache.arrays.keys() == other.cache.arrays.keys()
+    for name, array in near.cache.arrays.items():
+        assert np.array_equal(np.asarray(array), np.asarray(other.cache.arrays[name])), name
+    rows = np.arange(0, near.cache.length, 7)
+    assert np.array_equal(near.dataset.rgb_at(rows), other.dataset.rgb_at(rows)), "pictures at their full size"
+    clips = [clips_of(one, 5, 4, VideoConfig((1, 1, 0.5, 0.5), 6, (24, 32)), 0).forever() for one in (near, other)]
+    for _ in range(6):
+        one, two = map(next, clips)
+        assert one.keys() == two.keys() and all(np.array_equal(one[name], two[name]) for name in one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("geometry", [True, False])
+def test_a_recording_far_away_is_learned_like_a_near_one(geometry, far, corridor, tmp_path):
+    config = replace(BARE, geometry=geometry, steps=2, outcome_steps=2, motion_steps=3)
+    for source, run in ((corridor, "near"), (far, "far")):
+        train_video(source, tmp_path / run, config, quiet)
+    same_run(tmp_path / "near", tmp_path / "far", "flow")
 
 
 def test_of_two_cameras_the_main_one_is_learned_and_the_other_named_as_ignored(tmp_path):
@@ -284,7 +257,7 @@ def test_of_two_cameras_the_main_one_is_learned_and_the_other_named_as_ignored(t
                 seen["pose"] = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
                 recorder.add(seen, np.array([step / 90, -step / 90], np.float32) if step < 89 else None, 0.0, False)
             recorder.end_episode()
-    train_video(tmp_path / "set", tmp_path / "run", CONFIG, quiet)
+    train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)
     world = load_world(tmp_path / "run" / "world")
     assert "wrist" in str(world.spec.card["ignored channels"]) and world.spec.action_names == ("reach", "turn")
     assert isinstance(world.spec.action, spaces.Box) and world.spec.action.high.tolist() == [1, 2]
@@ -300,7 +273,7 @@ def test_what_was_asked_for_reaches_training(tmp_path):
             recorder.end_episode()
     known = Recording.open(tmp_path / "set", (24, 32), quiet)
     feed = frames_feed(known, None, VideoConfig((1, 1, 0.5, 0.5), 1, (24, 32), slots=4, geometry=False), 8, 0, None)
-    asked = feed.batch(Now(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))).instruction
+    asked = feed.batch(TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))).instruction
     assert asked.shape[0] == 8 and len(asked.unique(dim=0)) == 2
 
 
@@ -313,7 +286,7 @@ def test_a_varied_batch_is_the_same_batch_in_another_world():
     changed = set()
     for seed in range(12):
         shown = Conditioning(glimpse, truth, context_thumbnail(pixels))
-        batch = varied(Batch(shown, truth), np.random.default_rng(seed))
+        batch = augmented(Batch(shown, truth), np.random.default_rng(seed))
         seen, last, context = batch.shown.glimpse, batch.shown.last, batch.shown.context
         assert torch.equal(seen.rgb[:, 0], batch.truth[:, :3]) and torch.equal(last, batch.truth)
         assert torch.equal(seen.depth, batch.truth[:, 3])

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from tests.data.corridor import Corridor
-from tests.learn.stopping import goes_on_exactly, quiet
+from tests.learn.small import POSED
+from tests.learn.stopping import goes_on_exactly, quiet, resumes_exactly
 from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 
-from terrella.act import Explorer
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
-from terrella.data import ClipCache, Dataset, Recorder, RecordOptions, record, split
-from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative
-from terrella.learn.objectives.uncertainty import ARMS, Dreamt, Rollout, answers, calibrate, dream, fit, pooled
+from terrella.data import ClipCache, Dataset, Recorder, split
+from terrella.learn.objectives import uncertainty as uncertainty_module
+from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative_motion
+from terrella.learn.objectives.uncertainty import (
+    ARMS,
+    DreamFrames,
+    DreamSettings,
+    calibrate,
+    dream,
+    expected_error,
+    fit_uncertainty,
+    pool_adjacent_violators,
+)
+from terrella.learn.recipes import video
 from terrella.learn.recipes.parts import EstimatorTraining, SensesConfig, train_estimator, train_uncertainty
-from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import Recording
-from terrella.learn.trainer import Run
+from terrella.learn.trainer import Run, Trainer
 from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
 from terrella.worlds.checkpoint import data_file
@@ -30,31 +39,10 @@ from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
 
 from ..data.layouts import layout_of
 
-BARE = TrainConfig(
-    size=(24, 32),
-    steps=2,
-    batch=2,
-    motion_steps=20,
-    keyframes=8,
-    strip_every_s=1e9,
-    estimator_steps=0,
-    uncertainty_frames=0,
-)
-
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("senses") / "set"
-    world = Corridor()
-    record(world, Explorer(world.spec), folder, 360, make_rng(0), options=RecordOptions(max_episode_steps=120))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def bare(recording, tmp_path_factory):
-    out = tmp_path_factory.mktemp("bare")
-    train_video(recording, out, BARE, quiet)
-    return out / "world"
+def bare(bare_run):
+    return bare_run[0] / "world"
 
 
 def test_an_estimator_learns(tmp_path):
@@ -73,9 +61,9 @@ def test_an_estimator_learns(tmp_path):
     assert off[1] < 0.8 * off[0], off
 
 
-def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
+def test_a_stopped_run_goes_on_exactly(corridor, tmp_path):
     def train(out):
-        facts = train_estimator(recording, out, EstimatorTraining((16, 32), 3, 2), quiet)
+        facts = train_estimator(corridor, out, EstimatorTraining((16, 32), 3, 2), quiet)
         assert load_estimator(facts["estimator"]) and facts["recorded"]["frames"]
 
     goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"estimator": 1})
@@ -85,8 +73,8 @@ def test_motion_is_in_the_frame_of_the_first_pose():
     zero, height = torch.zeros(1), torch.ones(1)
     before = planar_pose(height, height, height, torch.tensor([torch.pi / 2]))
     after = planar_pose(height - 0.5, height + 2.0, height, torch.tensor([torch.pi / 2 + 0.1]))
-    assert torch.allclose(relative(before, after), torch.tensor([[2.0, 0.5, 0.1]]), atol=1e-5)
-    assert torch.allclose(relative(before, before), torch.cat([zero, zero, zero])[None])
+    assert torch.allclose(relative_motion(before, after), torch.tensor([[2.0, 0.5, 0.1]]), atol=1e-5)
+    assert torch.allclose(relative_motion(before, before), torch.cat([zero, zero, zero])[None])
 
 
 def test_pictures_are_recoloured_now_and_then():
@@ -108,9 +96,9 @@ def test_a_recording_without_poses_is_refused(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def sensing(recording, bare, tmp_path_factory):
+def sensing(corridor, bare, tmp_path_factory):
     out = tmp_path_factory.mktemp("sensing")
-    return out / "world", train_uncertainty(bare, recording, out, SensesConfig(2, 60), quiet)
+    return out / "world", train_uncertainty(bare, corridor, out, SensesConfig(2, 60), quiet)
 
 
 def test_a_world_is_given_an_estimator_and_an_uncertainty(bare, sensing):
@@ -156,11 +144,11 @@ def test_a_picture_seen_on_the_way_keeps_the_pose(sensing):
     assert torch.equal(seen["pose"], state["pose"]) and torch.equal(world.render(seen, ("rgb",))["rgb"], noise)
 
 
-def test_dreams_are_those_of_the_seed_and_of_all_kinds(recording, bare):
+def test_dreams_are_those_of_the_seed_and_of_all_kinds(corridor, bare):
     world = load_world(bare)
-    cache = ClipCache.open(Dataset(recording), (24, 32))
+    cache = ClipCache.open(Dataset(corridor), (24, 32))
     seen = Recording.of(cache, split(len(cache.episodes))[0], None)
-    rollout = Rollout(horizon=3, batch=2)
+    rollout = DreamSettings(horizon=3, batch=2)
     first, second = ([dream(world, seen, rollout, number) for number in range(3)] for _ in range(2))
     assert [ARMS[int(part.arm[0])] for part in first] == ["memory", "holes", "no memory"]
     for one, two in zip(first, second):
@@ -170,19 +158,42 @@ def test_dreams_are_those_of_the_seed_and_of_all_kinds(recording, bare):
     assert first[2].episode.tolist() == [4, 5] * 3
 
 
-def test_a_world_without_geometry_is_given_an_uncertainty_and_a_stopped_run_goes_on(recording, tmp_path):
-    config = replace(BARE, geometry=False, channels=(8, 8, 8), outcome_steps=2)
-    train_video(recording, tmp_path / "flat", config, quiet)
-    settings = SensesConfig(2, 60)
+def test_a_stopped_training_of_an_uncertainty_goes_on_exactly(corridor, bare, sensing, tmp_path):
+    resumes_exactly(
+        lambda out: train_uncertainty(bare, corridor, out, SensesConfig(2, 60), quiet),
+        sensing[0].parent, tmp_path, {"uncertainty": 1},
+    )  # fmt: skip
 
+
+def test_a_world_without_geometry_is_given_an_uncertainty(flat_run):
+    world = load_world(flat_run[0] / "world")
+    assert "uncertainty" in world.spec.channels and world.spec.card["uncertainty"] == flat_run[1]["uncertainty"]
+
+
+@pytest.mark.slow
+def test_a_stopped_uncertainty_of_a_world_without_geometry_goes_on_exactly(corridor, flat_run, tmp_path):
     def train(out):
-        facts = train_uncertainty(tmp_path / "flat" / "world", recording, out, settings, quiet)
-        assert "uncertainty" in load_world(facts["world"]).spec.channels
+        train_uncertainty(flat_run[0] / "world", corridor, out, SensesConfig(2, 60), quiet)
 
     goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"uncertainty": 1})
 
 
-def made_up(count: int, seed: int) -> Dreamt:
+def in_episodes(*lengths: int) -> Recording:
+    """A recording of episodes of these lengths, without anything else in it."""
+    start = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+    cache = SimpleNamespace(action_valid=np.ones(len(start), bool), done=None)
+    return Recording(cache, start, np.ones(len(start), bool))  # pyright: ignore
+
+
+def test_the_horizon_of_rollouts_is_not_that_of_the_longest_episode_alone():
+    horizon = lambda *lengths: uncertainty_module._horizon(in_episodes(*lengths), 9000)  # noqa: E731
+    assert horizon(*[120] * 3) == 64 and horizon(40, 40) == 30
+    assert horizon(*[30] * 20, 200) == 20, "else all would begin in the one long episode"
+    assert horizon(5, 5, 40) == 30, "episodes that are too short for any do not count"
+    assert horizon(17, 17) == 0, "too short for any"
+
+
+def made_up(count: int, seed: int) -> DreamFrames:
     """Frames whose error is told by one number of their situation, and noise."""
     rng = make_rng(seed)
     level = torch.rand(count, generator=rng)
@@ -191,14 +202,14 @@ def made_up(count: int, seed: int) -> Dreamt:
     error = (0.01 + 0.2 * level**2) * (0.7 + 0.6 * torch.rand(count, generator=rng))
     maps = torch.rand(count, CLUES, 6, 8, generator=rng).half()
     arms = torch.where(level < 0.5, ARMS.index("memory"), ARMS.index("no memory"))
-    return Dreamt(maps, situation, error[:, None, None].expand(-1, 3, 4), error, torch.arange(count), arms)
+    return DreamFrames(maps, situation, error[:, None, None].expand(-1, 3, 4), error, torch.arange(count), arms)
 
 
 def test_an_uncertainty_learns_the_error_to_expect(tmp_path):
-    uncertainty = fit(Run(tmp_path, {}, quiet), made_up(600, 0), 150)
+    uncertainty = fit_uncertainty(Run(tmp_path, {}, quiet), made_up(600, 0), 150)
     calibrate(uncertainty, made_up(400, 1))
     others = made_up(400, 2)
-    expected = answers(uncertainty, others)
+    expected = expected_error(uncertainty, others)
     truth = 0.01 + 0.2 * others.situation[:, 0] ** 2
     assert float((expected - truth).abs().mean()) < 0.012
     assert float(uncertainty.sure) < float(uncertainty.invents)
@@ -206,7 +217,7 @@ def test_an_uncertainty_learns_the_error_to_expect(tmp_path):
 
 
 def test_calibration_never_turns_the_order(tmp_path):
-    uncertainty = fit(Run(tmp_path, {}, quiet), made_up(64, 0), 2)
+    uncertainty = fit_uncertainty(Run(tmp_path, {}, quiet), made_up(64, 0), 2)
     calibrate(uncertainty, made_up(64, 1))
     answer = torch.linspace(0, 2, 500)
     meant = uncertainty.calibrated(answer)
@@ -214,18 +225,15 @@ def test_calibration_never_turns_the_order(tmp_path):
 
 
 def test_neighbours_that_fall_are_pooled():
-    assert pooled([1.0, 3.0, 2.0, 4.0], [1, 1, 3, 1]) == pytest.approx([1.0, 2.25, 2.25, 4.0])
-    assert pooled([3.0, 2.0, 1.0], [1, 1, 1]) == pytest.approx([2.0, 2.0, 2.0])
+    assert pool_adjacent_violators([1.0, 3.0, 2.0, 4.0], [1, 1, 3, 1]) == pytest.approx([1.0, 2.25, 2.25, 4.0])
+    assert pool_adjacent_violators([3.0, 2.0, 1.0], [1, 1, 1]) == pytest.approx([2.0, 2.0, 2.0])
 
 
-def test_a_finished_run_is_not_taught_again(recording, tmp_path, monkeypatch):
-    config = replace(BARE, estimator_steps=2, uncertainty_frames=60)
-    train_video(recording, tmp_path, config, quiet)
-    from terrella.learn.recipes import video as module
-
+def test_a_finished_run_is_not_taught_again(corridor, posed_run, monkeypatch):
     def fail(*_):
         raise AssertionError("it was taught again")
 
-    monkeypatch.setattr(module, "learn_senses", fail)
-    facts = train_video(recording, tmp_path, config, quiet)
-    assert "uncertainty" in facts and load_world(tmp_path / "world").uncertainty is not None
+    monkeypatch.setattr(video, "learn_senses", fail)
+    monkeypatch.setattr(Trainer, "_step", fail)
+    facts = train_video(corridor, posed_run[0], POSED, quiet)
+    assert facts == posed_run[1] and load_world(posed_run[0] / "world").uncertainty is not None

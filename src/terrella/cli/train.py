@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining
-from ..learn.recipes.latent_actions import LatentConfig, train_latent_actions
+from ..learn.recipes.latent_actions import LatentActionsConfig, train_latent_actions
 from ..learn.recipes.parts import (
     EstimatorTraining,
     ObjectsTraining,
@@ -104,7 +104,7 @@ def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining,
     _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json)
 
 
-def latent_actions(data: Positional[str], out: str, config: LatentConfig, json: Json = False) -> None:
+def latent_actions(data: Positional[str], out: str, config: LatentActionsConfig, json: Json = False) -> None:
     """Learn a few latent actions from pictures alone. `terrella data label` then writes them into a recording.
 
     Args:

@@ -1,4 +1,4 @@
-"""Ranges that grow by themselves: what is randomised widens while the policy earns nearly what it has earned at best.
+"""A curriculum of randomisation ranges: they widen as long as the policy earns nearly its best reward so far.
 
 After automatic domain randomisation (OpenAI et al. 2019), with one scale for all parameters in place of two limits for each.
 """
@@ -10,20 +10,20 @@ from typing import Protocol
 import torch
 from torch import nn
 
-STEP = 0.02  # by which ranges grow after a batch
-STEADY = 0.9  # how much of the mean reward is kept in a batch
-HOLDS = 0.8  # of what was gained at best, with which a policy copes
-FIRST = 10  # batches that say what a policy earns that has learned nothing
+STEP = 0.02  # by which the scale grows after a batch
+DECAY = 0.9  # of the moving average of rewards
+SUCCESS = 0.8  # the part of the best gain in reward at which ranges grow
+FIRST = 10  # batches by which the reward of the untrained policy is estimated
 
 
 class Scaled(Protocol):
-    """A world whose episodes draw from ranges: none at a scale of 0, the whole ones at 1 (sim/randomised.py)."""
+    """A world that draws parameters of episodes from ranges: empty at scale 0, whole at 1 (sim/randomised.py)."""
 
     scale: float
 
 
 class Growth(nn.Module):
-    """The scale of a world's ranges, from 0 up; kept as buffers, so that a run that was stopped goes on with it."""
+    """The scale of a world's ranges, from 0 up to 1; kept as buffers, so that a resumed run continues with it."""
 
     scale: torch.Tensor
     recent: torch.Tensor
@@ -38,13 +38,13 @@ class Growth(nn.Module):
             self.register_buffer(name, torch.zeros((), dtype=torch.float64))
 
     def set(self) -> None:
-        """Lets the episodes that begin from now on draw at this scale."""
+        """Episodes that begin from now on draw at this scale."""
         self._world[0].scale = float(self.scale)
 
-    def follow(self, reward: torch.Tensor) -> None:
-        """Grows, or waits, after a batch of these rewards."""
+    def update(self, reward: torch.Tensor) -> None:
+        """Grows the scale, or keeps it, after a batch of these rewards."""
         self.seen += 1
-        keep = min(STEADY, 1 - 1 / float(self.seen))  # a mean at first
+        keep = min(DECAY, 1 - 1 / float(self.seen))  # a plain mean at first
         self.recent.lerp_(reward.double().mean(), 1 - keep)
         if self.seen <= FIRST:
             self.first.copy_(self.recent)
@@ -52,5 +52,5 @@ class Growth(nn.Module):
             return
         self.best.copy_(torch.maximum(self.best, self.recent))
         gained = self.best - self.first
-        if gained > 0 and self.recent - self.first >= HOLDS * gained:
+        if gained > 0 and self.recent - self.first >= SUCCESS * gained:
             self.scale.add_(STEP).clamp_(max=1.0)

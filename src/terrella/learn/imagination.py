@@ -1,7 +1,7 @@
-"""Imagination as a feed: a policy acts in a world, by the hundred episodes at once, and what came of it is the batch.
+"""Imagination as a feed: a policy acts in a batch of imagined episodes, and its rollouts are the training batch.
 
-Where dreams begin: in states that a recording's rows lead to (`Recorded`), or in the world's own starts, each episode then going
-on from batch to batch until it ends (`Continued`), which is how a simulator is practised in.
+Rollouts begin in states that a recording leads to (`RecordedStarts`), or at the world's own starts, from which episodes continue
+from batch to batch (`ContinuedEpisodes`); a simulator is practised in that way.
 """
 
 from __future__ import annotations
@@ -23,60 +23,61 @@ from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
 from .growth import Growth
-from .latent_validation import folded
+from .latent_validation import state_at
 from .recording import Recording
-from .trainer import Now
+from .trainer import TrainStep
 
-MOST_STARTS = 8192  # states of a recording in which dreams begin
-CONTEXT = 2  # rows before them that the world is shown
-USUAL = 16, 32  # episodes and steps of random play that say how large numbers are, where there is no recording
+MOST_STARTS = 8192  # states of a recording in which rollouts begin
+CONTEXT = 2  # rows before them that the world observes
+SAMPLE = 16, 32  # episodes and steps of random play by which observations are scaled, where there is no recording
 
 
 @dataclass(frozen=True)
-class Imagined:
-    """T steps of B episodes. seen: [T + 1, B, ...] by channel; drawn [T, B, D], what the policy meant; reward [T, B]; goes_on
-    [T, B]: how likely the episode is not over after the step; known [T, B]: False where the world no longer knew what came."""
+class ImaginedRollouts:
+    """T steps of B episodes. observations: [T + 1, B, ...] by channel; actions [T, B, D] as drawn from the policy's distribution;
+    reward [T, B]; continues [T, B]: the probability that the episode is not over after the step; trusted [T, B]: whether the
+    world's uncertainty is within the limit after the step."""
 
-    seen: Mapping[str, torch.Tensor]
-    drawn: torch.Tensor
+    observations: Mapping[str, torch.Tensor]
+    actions: torch.Tensor
     reward: torch.Tensor
-    goes_on: torch.Tensor
-    known: torch.Tensor
+    continues: torch.Tensor
+    trusted: torch.Tensor
 
 
-class Starts(Protocol):
-    """Where dreams begin, and what is kept of how they ended. `modules` are saved with the run."""
+class RolloutStarts(Protocol):
+    """The states in which rollouts begin. `modules` are saved with the run."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]: ...
-    def begin(self, now: Now) -> State: ...
-    def end(self, state: State, steps: int, now: Now) -> None: ...
-    def usual(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]: ...
+    def begin(self, now: TrainStep) -> State: ...
+    def end(self, state: State, steps: int, now: TrainStep) -> None: ...
+    def sample(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]: ...
 
 
-class Recorded:
-    """Each dream begins in one of `states`, drawn evenly, and ends with the batch."""
+class RecordedStarts:
+    """Each rollout begins in one of `states`, drawn uniformly, and ends with the batch."""
 
     def __init__(self, world: World, states: State, batch: int):
         self.world, self.states, self.batch = world, states, batch
         self.modules: dict[str, nn.Module] = {}
 
-    def begin(self, now: Now) -> State:
+    def begin(self, now: TrainStep) -> State:
         picked = now.rng.integers(self.states.batch, size=self.batch)
         return self.states.at(torch.from_numpy(picked).to(self.states.device))
 
-    def end(self, state: State, steps: int, now: Now) -> None:
+    def end(self, state: State, steps: int, now: TrainStep) -> None:
         pass
 
-    def usual(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]:
-        """What is seen in the states."""
+    def sample(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]:
+        """Observations of the states."""
         return self.world.render(self.states, channels)
 
 
-class Continued:
-    """Episodes begin where the world has them begin, and go on from batch to batch until they are over or `longest` steps long.
-    They are kept as buffers, so that a run that was stopped goes on with them. Where states point into an arena, which no buffer
-    holds, each batch begins anew and nothing is kept."""
+class ContinuedEpisodes:
+    """Episodes begin at the world's own starts and continue from batch to batch until they end or are `longest` steps long. They
+    are kept as buffers, so that a resumed run continues them. States that point into an arena cannot be kept in buffers: there
+    each batch begins new episodes."""
 
     def __init__(self, world: World, batch: int, longest: int, seed: int):
         self.world, self.longest, self.seed = world, longest, seed
@@ -85,7 +86,7 @@ class Continued:
         self.anew = bool(state.arenas)
         self.modules = {} if self.anew else {"episodes": self.held}
 
-    def begin(self, now: Now) -> State:
+    def begin(self, now: TrainStep) -> State:
         if self.anew:
             return self.world.start(len(self.held.age), now.noise)
         state, over = self.held.state(), self.held.age >= self.longest
@@ -95,7 +96,7 @@ class Continued:
             self.held.age[over] = 0
         return state
 
-    def end(self, state: State, steps: int, now: Now) -> None:
+    def end(self, state: State, steps: int, now: TrainStep) -> None:
         if self.anew:
             return
         over = self.world.render(state, ("done",))["done"] if "done" in self.world.spec.channels else None
@@ -104,9 +105,9 @@ class Continued:
         if over is not None:
             self.held.age[over.to(self.held.age.device)] = self.longest
 
-    def usual(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]:
-        """What is seen in some episodes of random play."""
-        batch, steps = USUAL
+    def sample(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]:
+        """Observations of some episodes of random play."""
+        batch, steps = SAMPLE
         rng = make_rng(self.seed)
         state = self.world.start(batch, rng)
         policy = Random(self.world.spec, (1, 8))
@@ -135,17 +136,17 @@ class _Held(nn.Module):
 
 
 class Imagination:
-    """A feed of what `network` does in `world` over `steps` steps from `starts`.
+    """A feed of rollouts of `network` in `world`, `steps` steps from `starts`.
 
-    gradients: whether they flow from what came of it to the actions. trust: the uncertainty from which the world no longer knows:
-    a dream counts up to there. growth: how far the world's ranges have grown.
+    gradients: whether rewards and observations are differentiable by the actions. trust: the uncertainty up to which a rollout is
+    used. growth: the curriculum of the world's randomisation ranges.
     """
 
     def __init__(
         self,
         world: World,
         network: ActorNetwork,
-        starts: Starts,
+        starts: RolloutStarts,
         steps: int,
         gradients: bool,
         trust: float | None,
@@ -155,15 +156,15 @@ class Imagination:
         self.world, self.network, self.starts, self.steps = world, network, starts, steps
         self.gradients, self.trust, self.growth = gradients, trust, growth
 
-    def batch(self, now: Now) -> Imagined:
+    def batch(self, now: TrainStep) -> ImaginedRollouts:
         if self.growth is not None:
             self.growth.set()
         with nullcontext() if self.gradients else torch.no_grad():
-            found, state = self._imagined(self.starts.begin(now), now)
+            rollouts, state = self._rollout(self.starts.begin(now), now)
         self.starts.end(state, self.steps, now)
         if self.growth is not None:
-            self.growth.follow(found.reward)
-        return found
+            self.growth.update(rollouts.reward)
+        return rollouts
 
     def state(self) -> dict:
         return {}
@@ -171,38 +172,39 @@ class Imagination:
     def resume(self, state: Mapping) -> None:
         pass
 
-    def _imagined(self, state: State, now: Now) -> tuple[Imagined, State]:
+    def _rollout(self, state: State, now: TrainStep) -> tuple[ImaginedRollouts, State]:
         world, config, spec = self.world, self.network.config, self.world.spec
-        sees = tuple(name for name, _ in config.sees)
-        told = [name for name in ("reward", "done", "done_probability") if name in spec.channels]
-        told += ["uncertainty"] if self.trust is not None else []
-        channels = tuple(dict.fromkeys((*sees, *told)))
-        seen, drawn, brought = [dict(world.render(state, channels))], [], []
+        observed = tuple(name for name, _ in config.sees)
+        outcomes = [name for name in ("reward", "done", "done_probability") if name in spec.channels]
+        outcomes += ["uncertainty"] if self.trust is not None else []
+        channels = tuple(dict.fromkeys((*observed, *outcomes)))
+        frames, actions, steps = [dict(world.render(state, channels))], [], []
         for _ in range(self.steps):
-            drawn.append(self.network(seen[-1]).sample(now.noise))
-            state = world.imagine(state, config.actions(drawn[-1], spec).to(state.device), now.noise)
-            seen.append(dict(world.render(state, channels)))
-            brought.append(self._brought(seen[-1], now.device))
-        reward, goes_on, known = (torch.stack(parts) for parts in zip(*brought))
-        shown = {name: torch.stack([frame[name] for frame in seen]).to(now.device) for name in sees}
-        return Imagined(shown, torch.stack(drawn), reward, goes_on, known), state
+            actions.append(self.network(frames[-1]).sample(now.noise))
+            state = world.imagine(state, config.actions(actions[-1], spec).to(state.device), now.noise)
+            frames.append(dict(world.render(state, channels)))
+            steps.append(self._outcome(frames[-1], now.device))
+        reward, continues, trusted = (torch.stack(parts) for parts in zip(*steps))
+        observations = {name: torch.stack([frame[name] for frame in frames]).to(now.device) for name in observed}
+        return ImaginedRollouts(observations, torch.stack(actions), reward, continues, trusted), state
 
-    def _brought(
-        self, seen: Mapping[str, torch.Tensor], device: torch.device
+    def _outcome(
+        self, frame: Mapping[str, torch.Tensor], device: torch.device
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        reward = seen["reward"].to(device).float()
-        goes_on, known = torch.ones_like(reward), torch.ones_like(reward, dtype=torch.bool)
-        if "done_probability" in seen:
-            goes_on = goes_on - seen["done_probability"].to(device)
-        if "done" in seen:
-            goes_on = goes_on * ~seen["done"].to(device)
+        """Reward, continuation and trust [B] of one step."""
+        reward = frame["reward"].to(device).float()
+        continues, trusted = torch.ones_like(reward), torch.ones_like(reward, dtype=torch.bool)
+        if "done_probability" in frame:
+            continues = continues - frame["done_probability"].to(device)
+        if "done" in frame:
+            continues = continues * ~frame["done"].to(device)
         if self.trust is not None:
-            known = seen["uncertainty"].to(device).detach() <= self.trust
-        return reward, goes_on, known
+            trusted = frame["uncertainty"].to(device).detach() <= self.trust
+        return reward, continues, trusted
 
 
 def check_practised(spec: Spec) -> None:
-    """ChannelError or ObservationError where nobody can practise in a world, by the hundred episodes and for a reward."""
+    """ChannelError or ObservationError for a world without a reward, or one that cannot imagine a batch of episodes."""
     if "reward" not in spec.channels:
         raise ChannelError(
             f"{spec.name} has no channel 'reward', and practice is for a reward; record one and train the world on it, "
@@ -210,33 +212,32 @@ def check_practised(spec: Spec) -> None:
         )
     if not spec.forkable:
         raise ObservationError(
-            f"{spec.name} plays one episode at a time and cannot return to a state, so nobody can practise in it by the "
-            "hundred: train a world on a recording of it (`terrella train latent`) and practise there."
+            f"{spec.name} plays one episode at a time and cannot return to a state, so no policy can practise in a batch of its "
+            "episodes: train a world on a recording of it (`terrella train latent`) and practise there."
         )
 
 
 @torch.no_grad()
 def recorded_starts(world: World, recording: Recording) -> State:
-    """States to which rows of a recording lead, MOST_STARTS at most: with CONTEXT rows before them where there are as many, and
-    the first of its episodes."""
+    """At most MOST_STARTS states of a recording: of rows with CONTEXT rows before them, and of the first rows of episodes."""
     spec = world.spec
     wanted = (*spec.observes, *spec.may_observe)
-    there = {"rgb"} if recording.cache.rgb is not None else set[str]()
-    there |= {name for name, key in recording.cache.keys.items() if key in recording.cache.arrays}
-    lacks = [name for name in spec.observes if name not in there]
+    recorded = {name for name, key in recording.cache.keys.items() if key in recording.cache.arrays}
+    recorded |= {"rgb"} if recording.cache.rgb is not None else set[str]()
+    lacks = [name for name in spec.observes if name not in recorded]
     if lacks or not wanted:
         raise DatasetError(
-            f"{recording.name} does not hold {', '.join(lacks) or 'anything'} that {spec.name} can be shown; give the recording "
-            "that it was learned from, or leave --from out: then dreams begin at the world's own starts."
+            f"{recording.name} does not hold {', '.join(lacks) or 'anything'} that {spec.name} can observe; give the "
+            "recording that it was learned from, or leave --from out: then rollouts begin at the world's own starts."
         )
-    rows = recording.within(CONTEXT, 1, acted=True)
-    first = np.intersect1d(recording.start, recording.within(0, 1, acted=True))
+    rows = recording.rows_within(CONTEXT, 1, acted=True)
+    first = np.intersect1d(recording.start, recording.rows_within(0, 1, acted=True))
     if not len(first):
-        raise DatasetError(f"no episode of {recording.name} can be dreamt on; record longer ones.")
+        raise DatasetError(f"no episode of {recording.name} is long enough for a rollout; record longer ones.")
     some = rows[:: max(1, -(-len(rows) // MOST_STARTS))]
     few = first[:: max(1, -(-4 * len(first) // max(len(some), 1)))] if len(some) else first
     parts = [
-        folded(world, recording, part, context)
+        state_at(world, recording, part, context)
         for which, context in ((some, CONTEXT), (few, 0))
         for part in np.array_split(which, max(1, -(-len(which) // 512)))
         if len(part)

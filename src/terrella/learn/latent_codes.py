@@ -1,4 +1,4 @@
-"""What latent actions are good for: labelling a recording with codes, and mapping keys to codes."""
+"""Uses of latent actions: labelling a recording with codes, and mapping keys to codes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .trainer import Report
 
 def infer_codes(model: LatentModel, cache: ClipCache, rows: np.ndarray) -> np.ndarray:
     """Codes int64 [n] of the motion from each of `rows` to `stride` rows later."""
-    found = [
+    codes = [
         model.infer(frames_at(cache, some), frames_at(cache, some + model.stride))
         for some in np.array_split(rows, max(1, -(-len(rows) // 256)))
     ]
-    return torch.cat(found).numpy()
+    return torch.cat(codes).numpy()
 
 
 @dataclass(frozen=True)
 class Labels:
-    """A recording whose action is the inferred code: what to write, whether its pictures are kept exactly, and facts."""
+    """A recording with inferred codes as actions: its source, whether its pictures are lossless, and facts."""
 
     source: Source
     exact: bool
@@ -35,10 +35,9 @@ class Labels:
 
 
 def labelled(run: str | Path, data: str | Path, report: Report, keys: KeyMap | None = None) -> Labels:
-    """A copy of a recording with inferred codes for actions, so that any training that reads recordings makes a world of it
-    that is played with codes. An action has a number, 0 or 1, for each code but the stillest, which is what happens while
-    no key is held. Actions that were recorded are left out; the digits 1, 2, ... stand for codes (and so do the keys of
-    the recorded world, where `keys` says which code an action is).
+    """A copy of a recording with inferred codes as actions, so that any training on recordings gives a world that is played with
+    codes. An action has a number, 0 or 1, for each code but the stillest, which is what happens while no key is pressed. Recorded
+    actions are dropped; the digit keys 1, 2, ... stand for codes, and so do the recorded world's keys, if `keys` maps them.
 
     The code of a row is that of the motion over the next `stride` rows; near an episode's end, that of its last ones.
     """
@@ -49,7 +48,7 @@ def labelled(run: str | Path, data: str | Path, report: Report, keys: KeyMap | N
     buttons = np.delete(np.eye(codes, dtype=np.float32), still, 1)
     short = [number for number, (first, stop) in enumerate(cache.episodes) if stop - first <= stride]
     if short:
-        raise DatasetError(f"episode {short[0]} of {data} has no more than {stride} rows: too few to tell a motion.")
+        raise DatasetError(f"episode {short[0]} of {data} has no more than {stride} rows: too few to infer a motion.")
 
     def take(number: int, recorded: Take) -> Take:
         first, stop = cache.episodes[number]
@@ -73,7 +72,7 @@ def labelled(run: str | Path, data: str | Path, report: Report, keys: KeyMap | N
 
 
 def stillest(model: LatentModel, cache: ClipCache) -> int:
-    """The code that moves least what is seen, over 32 frames of a recording."""
+    """The code with the smallest flow over 32 frames of a recording."""
     before = frames_at(cache, np.linspace(0, cache.length - 1, 32).astype(int))
     codes = range(model.codes)
     flows = [model.predict(before, torch.full((32,), code))[1].norm(dim=1).mean() for code in codes]
@@ -82,26 +81,28 @@ def stillest(model: LatentModel, cache: ClipCache) -> int:
 
 def _keys_of_codes(buttons: np.ndarray, dataset: Dataset, keys: KeyMap | None) -> dict[str, list[float]]:
     """Browser keys -> actions, rows of `buttons` [K, K - 1]."""
-    found = {f"Digit{code + 1}": buttons[code].tolist() for code in range(min(len(buttons), 9)) if buttons[code].any()}
+    key_actions = {
+        f"Digit{code + 1}": buttons[code].tolist() for code in range(min(len(buttons), 9)) if buttons[code].any()
+    }
     if keys is not None and set(keys.names) <= set(dataset.action_names):
         columns = [dataset.action_names.index(name) for name in keys.names]
         for key, action in dataset.world.get("keys", {}).items():
             code = keys.code_of(np.asarray(action, np.float32).reshape(-1)[columns])
             if code is not None:
-                found[key] = buttons[code].tolist()
-    return found
+                key_actions[key] = buttons[code].tolist()
+    return key_actions
 
 
 @dataclass(frozen=True)
 class KeyMap:
-    """Which recorded action each code stands for, as a few labelled frames say, and how often that is right elsewhere.
+    """The recorded action of each code, from a few labelled frames, and its accuracy on other frames.
 
     names:      of the numbers of an action.
-    actions:    float32 [K, A]: what was most often recorded where code k was inferred.
-    pairs:      recorded action -> the code that was most often inferred where it was recorded.
+    actions:    float32 [K, A]: the commonest recorded action where code k was inferred.
+    pairs:      recorded action -> the code that was inferred most often for it.
     used:       labelled frames.
     accuracy:   share of held-out frames whose whole action is that of their code.
-    commonest:  share that the commonest action alone would get right.
+    commonest:  the accuracy of the commonest action alone, as a baseline.
     """
 
     names: tuple[str, ...]
@@ -112,13 +113,13 @@ class KeyMap:
     commonest: float
 
     def code_of(self, action: np.ndarray) -> int | None:
-        """The code for the numbers of an action; None where they were never seen together."""
+        """The code of an action; None if it was never recorded."""
         return self.pairs.get(tuple(float(number) for number in np.asarray(action).reshape(-1)))
 
 
 def map_keys(run: str | Path, data: str | Path, report: Report, frames: int = 200, seed: int = 0) -> KeyMap:
-    """Maps recorded actions to codes by `frames` labelled frames in clips of 10 from the training episodes of `data`, and tests
-    the map on its held-out episodes. DatasetError where the recording has no actions, or too few."""
+    """Maps recorded actions to codes by `frames` labelled frames, in clips of 10 from the training episodes of `data`, and tests
+    the map on its held-out episodes. DatasetError if the recording has no actions, or too few."""
     model = load_latent(run)
     cache = pictures(data, model.size, report)
     if cache.action is None or not cache.action_names:
@@ -144,7 +145,7 @@ def map_keys(run: str | Path, data: str | Path, report: Report, frames: int = 20
 
 
 def clips_of(rows: np.ndarray, length: int) -> list[np.ndarray]:
-    """Runs of `length` rows that follow each other."""
+    """Stretches of `length` consecutive rows."""
     breaks = np.flatnonzero(np.diff(rows) != 1) + 1
     return [run[at : at + length] for run in np.split(rows, breaks) for at in range(0, len(run) - length + 1, length)]
 

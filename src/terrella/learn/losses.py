@@ -1,4 +1,4 @@
-"""What frames are held against while a generator learns: the truth, and a critic that knows blur from detail."""
+"""Losses of generated frames: against recorded frames, and by a critic that tells blur from detail."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .batches import Batch
 from .trainer import Learner, half_precision
 
 
-class Critic(nn.Module):
-    """Judges 16-pixel patches: real or dreamt, given what memory knew (hinge loss)."""
+class PatchCritic(nn.Module):
+    """Classifies 16-pixel patches as recorded or generated, given the glimpse of memory (hinge loss)."""
 
     def __init__(self):
         super().__init__()
@@ -29,17 +29,19 @@ class Critic(nn.Module):
         return self.judge(x)
 
 
-def sharpened(critic: Critic, clean: torch.Tensor, loss: torch.Tensor, glimpse: Glimpse, weight: float) -> torch.Tensor:
-    """The critic's pull on dreamt frames, `weight` times as strong as the loss's own (Esser et al. 2021), and strongest
-    where memory knows nothing: there the loss alone would draw a mean of all that could be."""
-    dreamt = clean.detach()[:, :3].requires_grad_()
+def critic_pull(
+    critic: PatchCritic, clean: torch.Tensor, loss: torch.Tensor, glimpse: Glimpse, weight: float
+) -> torch.Tensor:
+    """A loss with the critic's gradient by generated frames, scaled to `weight` times that of the loss (Esser et al. 2021), and
+    strongest where memory knows nothing: there the loss alone would draw a mean of all that is possible."""
+    drawn = clean.detach()[:, :3].requires_grad_()
     with half_precision(clean.device):
-        praise = critic(dreamt, glimpse).float()
+        realness = critic(drawn, glimpse).float()
     known = glimpse.known[:, None]
     if clean.shape[1] > 4:  # what moves is not known
         known = known * (1 - clean.detach()[:, 4:].sigmoid())
-    invented = 1 - F.adaptive_avg_pool2d(known, praise.shape[-2:])
-    (pull,) = torch.autograd.grad(-(praise * (0.2 + 0.8 * invented)).mean(), dreamt)
+    invented = 1 - F.adaptive_avg_pool2d(known, realness.shape[-2:])
+    (pull,) = torch.autograd.grad(-(realness * (0.2 + 0.8 * invented)).mean(), drawn)
     (own,) = torch.autograd.grad(loss, clean, retain_graph=True)
     return (clean[:, :3] * (weight * own[:, :3].norm() / pull.norm().clamp_min(1e-12) * pull)).sum()
 
@@ -47,10 +49,10 @@ def sharpened(critic: Critic, clean: torch.Tensor, loss: torch.Tensor, glimpse: 
 def frame_losses(
     clean: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor | None = None
 ) -> dict[str, torch.Tensor]:
-    """Mean absolute errors of frames [B, 4, H, W] in the generator's code: colour, depth, and colour's steps (edges).
+    """Mean absolute errors of encoded frames [B, 4, H, W]: colour, depth, and gradients of colour (edges).
 
-    Where pixels count by `weight` [B, 1, H, W] (history_batches.changing), colour's squared errors are added: absolute ones alone
-    are least where nothing ever changes, for most pixels do not.
+    With pixel weights [B, 1, H, W] (history_batches.change_weight) squared errors of colour are added: the minimum of absolute
+    errors alone is a frame in which nothing changes, as most pixels do not.
     """
     losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}
     if weight is not None:
@@ -62,8 +64,8 @@ def frame_losses(
 
 
 def flow_losses(clean: torch.Tensor, truth: torch.Tensor, time: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Squared errors, which alone make the flow end in the true distribution (Lipman et al. 2023), of frames predicted at
-    flow time [B]; late ones count for more, for they are small and are the detail."""
+    """Squared errors of frames predicted at flow time [B], as flow matching requires (Lipman et al. 2023); late times weigh more,
+    for their errors are small and carry the detail."""
     error = (clean - truth).square() / (1 - time).clamp_min(0.1)[:, None, None, None]
     return {"rgb": error[:, :3].mean(), "depth": error[:, 3:].mean()}
 
@@ -73,7 +75,7 @@ def _l1(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def truth_losses(clean: torch.Tensor, batch: Batch) -> dict[str, torch.Tensor]:
-    """See `frame_losses`; pixels count as the batch says. Where things move, where they are counts too."""
+    """`frame_losses` with the weights of the batch, and the classification of moving pixels, if the world has any."""
     counts = 1.0 if batch.weight is None else batch.weight
     losses = frame_losses(clean[:, :4] * counts, batch.truth[:, :4] * counts)
     if clean.shape[1] > 4:
@@ -81,18 +83,20 @@ def truth_losses(clean: torch.Tensor, batch: Batch) -> dict[str, torch.Tensor]:
     return losses
 
 
-def total(losses: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Their sum as generators weigh them."""
+def weighted_total(losses: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The weighted sum of the losses of a generator."""
     weights = {"rgb": 1.0, "depth": 0.5, "edges": 0.5, "things": 0.2}
     return torch.stack([weights[name] * loss for name, loss in losses.items()]).sum()
 
 
-def critic_loss(critic: Critic, fake: torch.Tensor, shown: Glimpse, real: torch.Tensor, led: Glimpse) -> torch.Tensor:
-    """Hinge loss on drawn frames and what was `shown`, and on true ones and what `led` to them; frames [B, 3 or more, H, W]."""
+def critic_loss(
+    critic: PatchCritic, fake: torch.Tensor, shown: Glimpse, real: torch.Tensor, led: Glimpse
+) -> torch.Tensor:
+    """Hinge loss on generated frames, given `shown`, and recorded ones, given `led`; frames [B, 3 or more, H, W]."""
     with half_precision(fake.device):
         true, drawn = critic(real[:, :3], led), critic(fake.detach()[:, :3], shown)
         return F.relu(1 - true).mean() + F.relu(1 + drawn).mean()
 
 
-def critic_learner(critic: Critic) -> Learner:
+def critic_learner(critic: PatchCritic) -> Learner:
     return Learner(torch.optim.Adam(critic.parameters(), 3e-4, (0.0, 0.99)), (critic,))

@@ -1,4 +1,4 @@
-"""Muon: an optimiser whose step down every matrix is orthogonal, so that no direction of it is learned late."""
+"""Muon: an optimiser with orthogonalised steps of weight matrices, so that all their directions are learned at one rate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from .trainer import Average, Learner, Now
+from .trainer import Ema, Learner, TrainStep
 
 ROUNDS, QUINTIC = 5, (3.4445, -4.7750, 2.0315)  # of Newton and Schulz; the polynomial is Jordan's
 MOMENTUM = 0.95
@@ -17,10 +17,10 @@ BETAS, EPSILON = (0.9, 0.99), 1e-8
 
 
 class Muon(torch.optim.Optimizer):
-    """Momentum, made orthogonal, for `matrices` (weights of convolutions as matrices, one row for each output); AdamW for
-    `others`. Jordan et al. 2024, https://kellerjordan.github.io/posts/muon. A rate means to both what it means to AdamW.
+    """Orthogonalised momentum for `matrices` (weights of convolutions as matrices, one row for each output), AdamW for `others`.
+    Jordan et al. 2024, https://kellerjordan.github.io/posts/muon. The learning rate is on the scale of AdamW for both.
 
-    PyTorch's own Muon takes matrices of two dimensions alone, and wants another optimiser beside it.
+    PyTorch's own Muon takes two-dimensional matrices alone, and needs another optimiser beside it.
     """
 
     def __init__(
@@ -31,12 +31,14 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        assert closure is None, "nothing here evaluates a loss again."
+        assert closure is None, "closures are not supported."
         for group in self.param_groups:
-            moved = self._momentum if group["matrices"] else self._adam
+            direction = self._momentum if group["matrices"] else self._adam
             for weight in group["params"]:
                 if weight.grad is not None:
-                    weight.mul_(1 - group["lr"] * group["decay"]).sub_(moved(weight, weight.grad), alpha=group["lr"])
+                    weight.mul_(1 - group["lr"] * group["decay"]).sub_(
+                        direction(weight, weight.grad), alpha=group["lr"]
+                    )
 
     def _momentum(self, weight: nn.Parameter, gradient: torch.Tensor) -> torch.Tensor:
         state = self.state[weight]
@@ -59,7 +61,7 @@ class Muon(torch.optim.Optimizer):
 
 
 def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
-    """Nearly U V^T, where `matrix` [m, n] is U S V^T: its singular values become 0.7 to 1.2, at whatever scale they were."""
+    """Approximately U V^T of `matrix` [m, n] = U S V^T: singular values become 0.7 to 1.2, whatever their scale was."""
     first, third, fifth = QUINTIC
     x = matrix / (matrix.norm() + 1e-7)
     x = x.T if len(x) > x.shape[1] else x
@@ -75,11 +77,11 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
 
 def muon(
     modules: Sequence[nn.Module],
-    rate: Callable[[Now], float],
+    rate: Callable[[TrainStep], float],
     heads: Sequence[nn.Module] = (),
-    average: Average[Any] | None = None,
+    average: Ema[Any] | None = None,
 ) -> Learner:
-    """Muon for the matrices of the modules, AdamW for their vectors and for `heads`, the layers of which losses are made."""
+    """Muon for the matrices of the modules, AdamW for their vectors and for `heads`, the last layers."""
     own = {id(weight) for head in heads for weight in head.parameters()}
     weights = [weight for module in modules for weight in module.parameters()]
     matrices = [weight for weight in weights if weight.ndim > 1 and id(weight) not in own]

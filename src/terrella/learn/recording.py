@@ -1,4 +1,4 @@
-"""Recording: the rows of a recording as tensors on demand, which of them training may see, and which become a memory."""
+"""Recording: rows of a recording as tensors on demand, which of them may be trained on, and keyframes of them."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from ..worlds.config import VideoConfig
 from ..worlds.controls import AXES, CHOICE, Controls
 from .trainer import Report
 
-THINGS = "observation.things"  # the channel that marks what may move or vanish
-OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # those that tell it apart
-FEWEST = 64  # frames that can be trained on
-MOST = 96 * 128  # pixels of a frame, unless more are asked for
+THINGS = "observation.things"  # the mask of what may move or vanish
+OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # the table of objects, and their segmentation
+FEWEST = 64  # rows that can be trained on
+MOST = 96 * 128  # pixels of a frame by default
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Rows of a clip cache as tensors on demand; `start[row]` is the first row of its episode."""
+    """Rows of a clip cache as tensors on demand; `start[row]` is the first row of the episode of `row`."""
 
     cache: ClipCache
     start: np.ndarray
-    usable: np.ndarray  # rows that training may see
-    controls: Controls | None = None  # what its actions mean; None: buttons
-    dataset: Dataset | None = None  # where its pictures lie at their full size
-    held_out: tuple[int, ...] = ()  # episodes that training does not see
+    usable: np.ndarray  # bool: rows that may be trained on
+    controls: Controls | None = None  # the meaning of its actions; None: buttons
+    dataset: Dataset | None = None  # its pictures at full size
+    held_out: tuple[int, ...] = ()  # episodes for validation
 
     @staticmethod
     def open(
@@ -49,33 +49,32 @@ class Recording:
         needs: tuple[str, ...] = ("rgb",),
         why: str = "a world of pictures is learned from them",
     ) -> Recording:
-        """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitting`); of what is
-        far a clip cache within its budget is kept here, for places are read in any order. Every 20th episode is held out, and so
-        are the rows from which something in the box `keep_out` is seen. DatasetError where it lacks a channel of `needs`, or
-        rows."""
+        """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitted_size`). A clip
+        cache of it is kept on this machine, for rows are read in random order. Every 20th episode is held out, and so are the
+        rows in which something in the box `keep_out` is visible. DatasetError if it lacks a channel of `needs`, or rows."""
         dataset = data if isinstance(data, Dataset) else Dataset(data)
-        size = size or fitting(dataset)
+        size = size or fitted_size(dataset)
         cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
-        lacks = [name for name in needs if not there(cache, name)]
+        lacks = [name for name in needs if not has_channel(cache, name)]
         if lacks:
             raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
-        if keep_out is not None and not there(cache, "pose"):
+        if keep_out is not None and not has_channel(cache, "pose"):
             raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
         train, held_out = split(len(cache.episodes))
-        found = Recording.of(cache, train, keep_out)
-        return replace(found, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+        recording = Recording.of(cache, train, keep_out)
+        return replace(recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
 
     @staticmethod
     def of(cache: ClipCache, episodes: list[int], keep_out: Box | None) -> Recording:
-        """The rows of `episodes` from which nothing in the box `keep_out` is seen."""
+        """The rows of `episodes` in which nothing in the box `keep_out` is visible."""
         start = np.zeros(cache.length, np.int64)
         for first, last in cache.episodes:
             start[first:last] = first
         fx, fy, cx, cy = cache.world.get("camera") or (1.0, 1.0, 0.5, 0.5)
         return Recording(cache, start, usable_rows(cache, episodes, keep_out, (fx, fy, cx, cy)))
 
-    def enough(self) -> Recording:
-        """The same; DatasetError where too little of it may be trained on."""
+    def require_rows(self) -> Recording:
+        """The recording itself; DatasetError if it has too few rows to train on."""
         if self.usable.sum() < FEWEST:
             raise DatasetError(
                 f"{self.name} leaves {self.usable.sum()} frames to train on; record more, or a smaller keep_out."
@@ -88,22 +87,22 @@ class Recording:
 
     @property
     def seen(self) -> list[int]:
-        """The episodes that training sees."""
+        """The episodes for training."""
         return [number for number in range(len(self.cache.episodes)) if number not in self.held_out]
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Cameras of the recording that training does not see: it learns from the main one."""
+        """Cameras of the recording that are not used: training uses the main one."""
         source = self.dataset
         return () if source is None else tuple(name for name in source.cameras if name != source.rgb_key)
 
     @property
     def posed(self) -> bool:
         """Whether it has depth, poses and a camera."""
-        return all(there(self.cache, name) for name in ("depth", "pose", "camera"))
+        return all(has_channel(self.cache, name) for name in ("depth", "pose", "camera"))
 
-    def within(self, before: int, after: int, acted: bool = False) -> np.ndarray:
-        """Rows that may be seen together with so many `before` and `after` them in their episode, by valid actions if `acted`."""
+    def rows_within(self, before: int, after: int, acted: bool = False) -> np.ndarray:
+        """Rows with `before` usable rows before them and `after` after them in their episode, all with valid actions if `acted`."""
         seen = self.usable & np.asarray(self.cache.action_valid) if acted else self.usable
         upto, rows = np.append(0, np.cumsum(seen)), np.arange(before, len(seen) - after)
         whole = upto[rows + after + 1] - upto[rows - before] == before + after + 1
@@ -114,18 +113,18 @@ class Recording:
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()
 
     def action(self, rows) -> torch.Tensor:
-        """float32 [n, A], as networks are given it."""
+        """float32 [n, A], encoded for networks."""
         action = torch.from_numpy(np.array(self.cache.action[rows], np.float32))
         return action if self.controls is None else self.controls.encode(action)
 
     def actions_before(self, rows: np.ndarray, back: np.ndarray) -> torch.Tensor:
         """float32 [n, len(back), A]: the actions `back` rows before `rows`; zero before an episode's first."""
-        wanted = rows[:, None] - back
-        action = self.action(np.maximum(wanted, 0).ravel()).view(*wanted.shape, -1)
-        return torch.where(torch.from_numpy(wanted >= self.start[rows][:, None])[..., None], action, 0.0)
+        at = rows[:, None] - back
+        action = self.action(np.maximum(at, 0).ravel()).view(*at.shape, -1)
+        return torch.where(torch.from_numpy(at >= self.start[rows][:, None])[..., None], action, 0.0)
 
     def depth(self, rows) -> torch.Tensor:
-        """float32 [n, H, W] metres at the size of the frames, whatever size was recorded."""
+        """float32 [n, H, W] in metres, resized to the frames."""
         depth = torch.from_numpy(np.asarray(self.cache.depth[rows], np.float32)).clamp(0.1, 60.0)
         return F.interpolate(depth[:, None], self.cache.rgb.shape[1:3], mode="nearest-exact")[:, 0]
 
@@ -133,7 +132,7 @@ class Recording:
         return torch.from_numpy(np.asarray(self.cache.pose[rows], np.float32))
 
     def things(self, rows) -> torch.Tensor:
-        """float32 [n, H, W], 1 where something is that may move or vanish; 0 everywhere where that was not recorded."""
+        """float32 [n, H, W], 1 for pixels of what may move or vanish; 0 everywhere if that was not recorded."""
         recorded = self.cache.arrays.get(THINGS)
         height, width = self.cache.rgb.shape[1:3]
         if recorded is None:
@@ -142,21 +141,21 @@ class Recording:
         return F.adaptive_max_pool2d(things[:, None], (height, width))[:, 0]
 
     def instances(self, rows) -> torch.Tensor:
-        """uint8 [n, H, W], which row of `objects` is seen at a pixel, counted from 1 (0: none)."""
+        """uint8 [n, H, W], the row of the object table that is visible at a pixel, counted from 1 (0: none)."""
         recorded = torch.from_numpy(np.asarray(self.cache.arrays[INSTANCES][rows], np.float32))
         return F.adaptive_max_pool2d(recorded[:, None], self.cache.rgb.shape[1:3])[:, 0].to(torch.uint8)
 
     def covered(self, rows) -> torch.Tensor:
-        """bool [n, H, W], see worlds/moving.covering."""
+        """bool [n, H, W], see worlds/carried_frames.covering."""
         return covering(self.instances(rows), self.things(rows))
 
-    def lasting(self, rows) -> torch.Tensor:
-        """The depth [n, H, W] that a keyframe may hold: 0 where things are and right beside them, where a film bleeds."""
+    def static_depth(self, rows) -> torch.Tensor:
+        """The depth [n, H, W] for keyframes: 0 at moving things and right beside them, where compressed video bleeds."""
         kept = still(self.depth(rows), self.things(rows))
         return torch.where(least_around(kept) > 0, kept, 0.0)
 
     def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:
-        """What a world of this make observes of `rows`."""
+        """Observations of `rows` for a world of this config."""
         seen = {"rgb": self.rgb(rows).permute(0, 2, 3, 1).contiguous()}
         if config.geometry:
             seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
@@ -167,45 +166,44 @@ class Recording:
             seen["objects"] = torch.from_numpy(np.array(self.cache.arrays[OBJECTS][rows], np.float32))
         return seen
 
-    def played(self, spec: Spec, rows) -> torch.Tensor:
-        """The actions of `rows` as the world of `spec` takes them: [n, *spec.action.shape]."""
+    def recorded_actions(self, spec: Spec, rows) -> torch.Tensor:
+        """The actions of `rows` in the space of `spec`: [n, *spec.action.shape]."""
         actions = np.asarray(self.cache.action[rows]).astype(spec.action.dtype)
         return torch.from_numpy(actions).view(len(rows), *(spec.action.shape or ()))
 
     def keyframes(self, rows, camera: Intrinsics) -> Keyframes:
-        """As a dream keeps its own."""
-        return Keyframes.of(doubled(self.rgb(rows)), self.lasting(rows), self.pose(rows), camera)
+        """Keyframes of `rows`, made as in play."""
+        return Keyframes.of(doubled(self.rgb(rows)), self.static_depth(rows), self.pose(rows), camera)
 
     def sharp_keyframes(self, rows: np.ndarray, camera: Intrinsics) -> Keyframes:
-        """Twice the size of the frames, like those of a dream, from the pictures as they were recorded."""
+        """Keyframes at twice the size of the frames, as in play, from the pictures at full size."""
         rgb = torch.from_numpy(self.dataset.rgb_at(rows)).permute(0, 3, 1, 2).float()
         size = [2 * length for length in self.cache.rgb.shape[1:3]]
         rgb = F.interpolate(rgb, size, mode="area" if rgb.shape[-1] >= size[1] else "nearest-exact")
-        return Keyframes.of(rgb.round().to(torch.uint8), self.lasting(rows), self.pose(rows), camera)
+        return Keyframes.of(rgb.round().to(torch.uint8), self.static_depth(rows), self.pose(rows), camera)
 
 
-def there(cache: ClipCache, name: str) -> bool:
-    """Whether a recording has a channel, by its name or by its key ("observation.things")."""
+def has_channel(cache: ClipCache, name: str) -> bool:
+    """Whether a recording has a channel, given by name or key ("observation.things")."""
     if name == "camera":
         return bool(cache.world.get("camera"))
     return getattr(cache, name, None) is not None or name in cache.arrays
 
 
-def fitting(dataset: Dataset) -> tuple[int, int]:
-    """Height and width in multiples of 8 at which a recording's pictures are learned: their own, or smaller ones of that shape
-    that have at most MOST pixels."""
+def fitted_size(dataset: Dataset) -> tuple[int, int]:
+    """Height and width of a recording's frames in multiples of 8: their own, or scaled down to at most MOST pixels."""
     return (96, 128) if dataset.rgb_key is None else learned_size(*dataset.sensors[dataset.rgb_key].shape[:2])
 
 
 def learned_size(height: int, width: int, most: int = MOST) -> tuple[int, int]:
-    """The size at which pictures of so many pixels are learned, see `fitting`."""
+    """The size at which pictures are learned, scaled down to at most `most` pixels."""
     scale = min(1.0, math.sqrt(most / (height * width)))
     return max(16, 8 * round(scale * height / 8)), max(16, 8 * round(scale * width / 8))
 
 
 def controls_of(cache: ClipCache) -> Controls | None:
-    """What the actions of a recording mean: as its world said, else as they look (buttons where all are 0 or 1); None where
-    it has none."""
+    """The meaning of a recording's actions: from its world's facts, else inferred (buttons if all are 0 or 1); None if it has no
+    actions."""
     if cache.action is None:
         return None
     low, high = cache.world.get("action_low"), cache.world.get("action_high")
@@ -227,7 +225,7 @@ def controls_of(cache: ClipCache) -> Controls | None:
 
 
 def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, camera: Intrinsics) -> np.ndarray:
-    """Rows of `episodes` in which the camera neither stands in the box `keep_out` nor sees into it by more than 0.5 m."""
+    """bool: rows of `episodes` in which the camera is not in the box `keep_out`, nor sees more than 0.5 m into it."""
     usable = np.zeros(cache.length, bool)
     for episode in episodes:
         usable[slice(*cache.episodes[episode])] = True
@@ -245,7 +243,7 @@ def usable_rows(cache: ClipCache, episodes: list[int], keep_out: Box | None, cam
 
 
 def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_turn: float = 6.0) -> np.ndarray:
-    """`count` of `rows` that cover places and headings evenly: farthest-point sampling of (x, y, heading)."""
+    """`count` of `rows` that cover places and headings evenly, by farthest-point sampling of (x, y, heading)."""
     turn = yaw(torch.from_numpy(np.array(pose[rows]))).numpy()
     scale = metres_per_turn / (2 * np.pi)
     points = np.concatenate([pose[rows][:, :2], scale * np.cos(turn)[:, None], scale * np.sin(turn)[:, None]], 1)
@@ -257,11 +255,11 @@ def choose_keyframes(pose: np.ndarray, rows: np.ndarray, count: int, metres_per_
 
 
 def open_views(memory: Keyframes, count: int) -> Keyframes:
-    """`count` of the keyframes, spread over the map, among the quarter that looks farthest: a good place to begin."""
+    """`count` keyframes to start from, spread over the map, among the quarter with the farthest views."""
     far = memory.depth.flatten(1).median(1).values.argsort(descending=True)[: max(count, len(memory) // 4)]
     return memory.at(torch.from_numpy(choose_keyframes(memory.pose.numpy(), far.sort().values.numpy(), count)))
 
 
 def box_of(card: Any) -> Box | None:
-    """The box x0 y0 x1 y1 that a world's card says was kept out of its training."""
+    """The box x0 y0 x1 y1 on a world's card that was kept out of its training."""
     return (float(card[0]), float(card[1]), float(card[2]), float(card[3])) if isinstance(card, (list, tuple)) else None

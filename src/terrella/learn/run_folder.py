@@ -1,4 +1,4 @@
-"""A training run on disk: what is needed to go on exactly where it stopped, replaced whole at every save; and its log."""
+"""A training run on disk: the state from which it resumes exactly, replaced as a whole at every save; and its log."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def load_run(
     modules: Mapping[str, torch.nn.Module],
     optimisers: Mapping[str, torch.optim.Optimizer],
 ) -> dict | None:
-    """Restores what `save_run` wrote and returns its facts; None where there is no such file yet."""
+    """Restores what `save_run` wrote and returns its facts; None if there is no such file yet."""
     if not path.exists():
         return None
     try:
@@ -69,7 +69,7 @@ def load_run(
 
 
 def stages_of(folder: Path) -> Iterator[dict]:
-    """The facts of each stage of a run that can be read."""
+    """The facts of those stages of a run whose files can be read."""
     for path in sorted(folder.glob("resume-*.safetensors")):
         try:
             yield _facts(path)
@@ -94,7 +94,7 @@ def write_log(folder: Path, line: Mapping[str, object]) -> None:
 
 
 def trim_log(folder: Path, stage: str, step: int) -> None:
-    """Drops what the log says of `stage` beyond `step`, the last that was saved: those steps are done again."""
+    """Drops the lines of `stage` after `step`, the last saved one, from the log: those steps will be done again."""
     path = folder / LOG
     if not path.exists():
         return
@@ -104,7 +104,7 @@ def trim_log(folder: Path, stage: str, step: int) -> None:
 
 def _before(line: str, stage: str, step: int) -> bool:
     try:
-        noted = json.loads(line)
-        return noted.get("stage") != stage or noted["step"] <= step
+        entry = json.loads(line)
+        return entry.get("stage") != stage or entry["step"] <= step
     except (ValueError, KeyError, AttributeError):
         return False  # a line that was cut by a kill

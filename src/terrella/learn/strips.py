@@ -1,4 +1,4 @@
-"""Strips: the truth of a held-out stretch of a recording above what worlds dream of it, to look at while they learn."""
+"""Strips: pictures of a held-out stretch of a recording above rollouts of worlds, to look at while they train."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .recording import Recording
 
 
 def draw_strip(worlds: Sequence[LearnedWorld], recording: Recording, path: Path) -> None:
-    """64 steps of the first episode that training does not see, every 8th frame: the truth above a dream of each world."""
+    """64 steps of the first held-out episode, every 8th frame: the truth above a rollout of each world."""
     first, last = recording.cache.episodes[(recording.held_out or (0,))[0]]
     rows = np.arange(max(first, min(first + 40, last - 65)), last)[:65]
     lines = [recording.rgb(rows[::8]), *(_dream(world, recording, rows) for world in worlds)]
@@ -23,22 +23,22 @@ def draw_strip(worlds: Sequence[LearnedWorld], recording: Recording, path: Path)
 
 
 def write_lines(lines: Sequence[torch.Tensor], path: Path) -> None:
-    """Each of `lines`, uint8 [n, 3, H, W], beneath the one before it, as one picture."""
+    """Writes `lines`, uint8 [n, 3, H, W] each, one below the other, as one picture."""
     picture = torch.cat([torch.cat(list(line), 2) for line in lines], 1).permute(1, 2, 0).numpy()
     Image.fromarray(picture).save(path)
 
 
 @torch.inference_mode()
 def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    """Every 8th frame of a dream from the first of `rows` on, along the recorded poses or, where there are none or things
-    move, the recorded actions."""
+    """Every 8th frame of a rollout from the first of `rows`, along the recorded poses or, in a world without poses or with moving
+    things, under the recorded actions."""
     rng, config = make_rng(1), world.config
     state = world.observe(recording.evidence(config, rows[:1]), None, rng)
     frames = [world.render(state, ("rgb",))["rgb"]]
     for row in rows[1:]:
-        if config.geometry and not config.moving:  # what moves answers to actions
+        if config.geometry and not config.moving:  # what moves depends on actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
-            state = world.imagine(state, recording.played(world.spec, [row - 1]), rng)
+            state = world.imagine(state, recording.recorded_actions(world.spec, [row - 1]), rng)
         frames.append(world.render(state, ("rgb",))["rgb"])
     return torch.cat(frames)[::8].permute(0, 3, 1, 2).cpu()

@@ -1,7 +1,7 @@
 """Trainer: the one training loop. A feed gives batches, an objective gives losses.
 
-All of a step's randomness comes from (seed, step), so a run that was stopped sees what an unbroken one would. Ctrl-C
-lets the step that is under way end, saves it and stops; the same command goes on exactly from there.
+All randomness of a step is seeded by (seed, step), so a stopped and resumed run sees what an unbroken one does. On Ctrl-C the
+step under way ends, the run is saved and stops; the same command resumes exactly there.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
-class Now:
-    """One step: its number, the share of the training before it (of its steps or of its time, whichever is more), and its
-    randomness, which (seed, step) alone decides."""
+class TrainStep:
+    """One training step. share: the part of the training that lies before it, by steps or by time, whichever is more;
+    rng, noise: its randomness, seeded by (seed, step)."""
 
     step: int
     share: float
@@ -45,16 +45,16 @@ class Now:
     noise: torch.Generator = field(repr=False)
 
     def randn(self, *shape: int) -> torch.Tensor:
-        """Normal noise on the device, drawn on the CPU: the same on any device."""
+        """Standard normal noise on the device; drawn on the CPU, so that it is the same on any device."""
         return torch.randn(*shape, generator=self.noise).to(self.device)
 
     def half(self) -> torch.autocast:
-        """Within it networks compute in half precision, where that is native."""
+        """A context in which networks compute in half precision, where that is native."""
         return half_precision(self.device)
 
 
-class Average(nn.Module, Generic[Module]):
-    """The moving average of a module's weights, which play will use; it follows slowly, at most by `limit`."""
+class Ema(nn.Module, Generic[Module]):
+    """An exponential moving average of a module's weights, which play uses; its decay ramps up to `limit`."""
 
     updates: torch.Tensor
     module: Module
@@ -65,7 +65,7 @@ class Average(nn.Module, Generic[Module]):
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
 
     @torch.no_grad()
-    def follow(self, raw: nn.Module) -> None:
+    def update(self, raw: nn.Module) -> None:
         number = int(self.updates)
         keep = min(self.limit, (number + 1) / (number + 20))
         for mean, weight in zip(self.module.parameters(), raw.parameters()):
@@ -75,45 +75,45 @@ class Average(nn.Module, Generic[Module]):
 
 @dataclass(frozen=True)
 class Learner:
-    """An optimiser and the modules that it moves.
+    """An optimiser and the modules whose parameters it updates.
 
-    rate:    the learning rate at a step, times the "pace" of each group of parameters that has one; None: as it is.
-    average: follows the first of the modules.
-    clip:    the norm at which the gradient of each module is cut.
+    rate:    the learning rate at a step, times the "pace" of each parameter group that has one; None: constant.
+    average: of the first module's weights.
+    clip:    the norm to which each module's gradient is clipped.
     """
 
     optimiser: torch.optim.Optimizer
     modules: Sequence[nn.Module]
-    rate: Callable[[Now], float] | None = None
-    average: Average[Any] | None = None
+    rate: Callable[[TrainStep], float] | None = None
+    average: Ema[Any] | None = None
     clip: float = 1.0
 
 
 def adamw(
     modules: Sequence[nn.Module],
-    rate: Callable[[Now], float],
+    rate: Callable[[TrainStep], float],
     decay: float = 1e-4,
     betas: tuple[float, float] = (0.9, 0.99),
-    average: Average[Any] | None = None,
+    average: Ema[Any] | None = None,
 ) -> Learner:
-    """AdamW for all weights of the modules, which moves them by `rate`."""
+    """AdamW for all parameters of the modules."""
     weights = [weight for module in modules for weight in module.parameters()]
     return Learner(torch.optim.AdamW(weights, betas=betas, weight_decay=decay), modules, rate, average)
 
 
-def warmed(peak: float, steps: int, low: float = 0.0) -> Callable[[Now], float]:
-    """A rate that goes up to `peak` over so many steps, and down to `low` of it along a cosine over the training."""
-    return lambda now: peak * min(1, (now.step + 1) / steps) * cosine(now.share, low)
+def warmup_cosine(peak: float, steps: int, low: float = 0.0) -> Callable[[TrainStep], float]:
+    """Linear warm-up to `peak` over `steps` steps, then cosine decay to `low` times it over the training."""
+    return lambda now: peak * min(1, (now.step + 1) / steps) * cosine_decay(now.share, low)
 
 
-def held(peak: float, steps: int) -> Callable[[Now], float]:
-    """A rate that goes up to `peak` over so many steps, stays there, and goes down to 0 over the last 30% of the training."""
+def hold_then_decay(peak: float, steps: int) -> Callable[[TrainStep], float]:
+    """Linear warm-up to `peak` over `steps` steps, constant, then linear decay to 0 over the last 30% of the training."""
     return lambda now: peak * min(1, (now.step + 1) / steps, (1 - now.share) / 0.3)
 
 
 @dataclass(frozen=True)
 class Loss:
-    """What the learner of this name descends next; `parts` are what the log tells of it."""
+    """The loss that the learner of this name minimises next; `parts` are its terms, for the log."""
 
     learner: str
     value: torch.Tensor
@@ -121,20 +121,20 @@ class Loss:
 
 
 class Objective(Protocol):
-    """What is learned. `modules` are saved with the run and moved to its device; `losses` yields a step's losses one by
-    one, each of which is descended before the next is asked for."""
+    """What is learned. `modules` are saved with the run and moved to its device. `losses` yields the losses of a step one by
+    one; each is minimised by a gradient step before the next is computed."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]: ...
     @property
     def learners(self) -> Mapping[str, Learner]: ...
-    def losses(self, batch: Any, now: Now) -> Iterator[Loss]: ...
+    def losses(self, batch: Any, now: TrainStep) -> Iterator[Loss]: ...
 
 
 class Feed(Protocol):
-    """What is learned from. `state` are JSON values after the batch that was given last; `resume` goes on from them."""
+    """What is learned from. `state` gives JSON values that describe the position after the last batch; `resume` restores it."""
 
-    def batch(self, now: Now, /) -> Any: ...
+    def batch(self, now: TrainStep, /) -> Any: ...
     def state(self) -> dict: ...
     def resume(self, state: Mapping) -> None: ...
 
@@ -143,7 +143,7 @@ class Feed(Protocol):
 class Run:
     """The folder of a training run, and what its stages share.
 
-    recipe: JSON values that must not change within the run.
+    recipe: JSON values that must stay the same for the run to be resumed.
     budget: the time that all stages share.
     """
 
@@ -163,21 +163,20 @@ class Run:
         report: Report,
         device: torch.device = CPU,
         free: Sequence[str] = (),
-        shares: Mapping[str, float] | None = None,
         **facts: Any,
     ) -> Run:
-        """The run of a recipe's settings, a dataclass, of which all but `free` and where and how often it is saved must not
-        change, nor may `facts`; `shares` of the settings' `hours`, if they have any, are the most that stages may take."""
+        """The run of `config`, a dataclass. A resumed run must have the same settings and `facts`; the device, how often is saved
+        and the settings in `free` may change. The stages share the `hours` of the settings, if they have any."""
         settings = asdict(config)
         times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
-        budget = Budget(Path(out), settings.get("hours", math.inf), shares)
+        budget = Budget(Path(out), settings.get("hours", math.inf))
         return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times, budget=budget)
 
-    def found(self, stage: str) -> dict | None:
-        """The facts of a stage that was begun; TrainingError where that had other settings, or was of another recording."""
-        found, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
-        old = recipe if found is None else found.get("recipe", {})
+    def saved_facts(self, stage: str) -> dict | None:
+        """The facts of a stage that was begun; TrainingError if it had other settings, or another recording."""
+        saved, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
+        old = recipe if saved is None else saved.get("recipe", {})
         both = {**old, **recipe}
         other = [
             f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)
@@ -186,19 +185,17 @@ class Run:
             raise TrainingError(
                 f"{self.out} holds a run with other settings ({'; '.join(other)}); repeat them, or give another --out."
             )
-        return found
+        return saved
 
 
 class Trainer:
-    """A stage of a run; it goes on where it was stopped, and ends after `steps` or when the share of the run's time is over that
-    it may take; what earlier runs did counts.
+    """One stage of a run. It resumes where it was stopped, and ends after `steps`, or after its share of the run's time,
+    earlier runs included. TrainingError if the run's folder holds a run with another recipe.
 
-    TrainingError where the run's folder holds one with another recipe.
-
-    device:  where it is to run, if not where the others do.
-    strides: losses of a batch, each of which is descended. People count them: `steps`, `taken`, the log and the summary do.
+    device:  where it runs, if not on the run's device.
+    strides: gradient steps of the main learner per batch. `steps`, `steps_done`, the log and the summary count gradient steps.
     limit_s: seconds after which it ends.
-    facts:   recipe, step (batches), seconds, and what `once` added; saved with the rest.
+    facts:   recipe, step (batches), seconds, and what `compute_once` added; saved with the run.
     """
 
     def __init__(
@@ -217,13 +214,13 @@ class Trainer:
         self.facts: dict[str, Any] = {"recipe": json.loads(json.dumps(run.recipe)), "step": 0}
         self.facts |= {"seconds": 0.0, "recent": []}
         self._file = resume_file(run.out, stage)
-        found = run.found(stage)
+        saved = run.saved_facts(stage)
         for module in objective.modules.values():
             module.to(self.device)
-        if found:
+        if saved:
             self.facts |= load_run(self._file, objective.modules, self._optimisers) or {}
             feed.resume(self.facts["feed"])
-        trim_log(run.out, stage, self.taken)
+        trim_log(run.out, stage, self.steps_done)
 
     @property
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -231,13 +228,13 @@ class Trainer:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The facts that people read."""
+        """The facts without those that only a resumed run needs."""
         inner = ("recipe", "recent", "feed", "spent", "asked")
-        return {name: fact for name, fact in self.facts.items() if name not in inner} | {"step": self.taken}
+        return {name: fact for name, fact in self.facts.items() if name not in inner} | {"step": self.steps_done}
 
     @property
-    def taken(self) -> int:
-        """Steps that were taken, of all runs."""
+    def steps_done(self) -> int:
+        """Gradient steps so far, earlier runs included."""
         return self.facts["step"] * self.strides
 
     @property
@@ -246,12 +243,12 @@ class Trainer:
 
     @property
     def share(self) -> float:
-        """How much of the training is done, of its steps or of its time, whichever is more."""
+        """The part of the training that is done, by steps or by time, whichever is more."""
         by_time = self.facts["seconds"] / self.limit_s if self.limit_s > 0 else 1.0
         return max(self.facts["step"] / self.batches if self.batches > 0 else 1.0, by_time)
 
-    def train(self, draw: Callable[[], None] | None = None) -> None:
-        """Trains to the end; `draw()` now and then, which leaves what there is to look at."""
+    def train(self, draw: Callable[[], object] | None = None) -> None:
+        """Trains to the end; calls `draw()` every strip_every_s seconds, which leaves pictures to look at."""
         if self.finished:
             return
         for learner in self.objective.learners.values():
@@ -260,10 +257,10 @@ class Trainer:
         with _stoppable() as stop:
             self._train(draw, stop)
 
-    def _train(self, draw: Callable[[], None] | None, stop: threading.Event) -> None:
+    def _train(self, draw: Callable[[], object] | None, stop: threading.Event) -> None:
         facts, run = self.facts, self.run
         began = saved = drawn = time.monotonic()
-        before = facts["seconds"]
+        before, first = facts["seconds"], self.steps_done
         while not self.finished and not stop.is_set():
             parts = self._step(facts["step"])
             facts["step"] += 1
@@ -271,7 +268,7 @@ class Trainer:
             now = time.monotonic()
             facts["seconds"] = before + now - began
             if len(facts["recent"]) == LOG_EVERY or self.finished:
-                self._log()
+                self._log((self.steps_done - first) / max(now - began, 1e-9))
             if now - saved > run.save_every_s:
                 self.save()
                 saved = now
@@ -280,29 +277,29 @@ class Trainer:
                 drawn = time.monotonic()
         self.save()
         if stop.is_set():
-            done = f"{self.taken} steps of '{self.stage}' are saved in {run.out}"
+            done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"
             raise KeyboardInterrupt(f"{done}; the same command goes on from there.")
 
     def _step(self, step: int) -> dict[str, float]:
-        """One whole round: a batch, and down each of its losses in turn. Returns the means of their parts."""
+        """One batch, and one gradient step for each of its losses in turn. Returns the means of the losses' parts."""
         rng = np.random.default_rng([self.run.seed, step])
         noise = make_rng(int(rng.integers(2**62)))
-        now = Now(step, self.share, self.device, rng, noise)
+        now = TrainStep(step, self.share, self.device, rng, noise)
         for learner in self.objective.learners.values():
             if learner.rate is not None:
                 for group in learner.optimiser.param_groups:
                     group["lr"] = learner.rate(now) * group.get("pace", 1.0)
-        found: dict[str, list[float]] = {}
+        parts: dict[str, list[float]] = {}
         with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
-            torch.manual_seed(int(rng.integers(2**62)))  # dropout knows no generator of its own
+            torch.manual_seed(int(rng.integers(2**62)))  # dropout takes no generator
             for loss in self.objective.losses(self.feed.batch(now), now):
                 self._descend(loss, step * self.strides)
                 for name, part in loss.parts.items():
-                    found.setdefault(name, []).append(float(part.detach()))
-        return {name: float(np.mean(values)) for name, values in found.items()}
+                    parts.setdefault(name, []).append(float(part.detach()))
+        return {name: float(np.mean(values)) for name, values in parts.items()}
 
     def _descend(self, loss: Loss, step: int) -> None:
-        """One step down the gradient."""
+        """One gradient step."""
         learner = self.objective.learners[loss.learner]
         if not torch.isfinite(loss.value):
             raise TrainingError(_not_a_number("the loss", step))
@@ -313,29 +310,30 @@ class Trainer:
                 raise TrainingError(_not_a_number("a gradient", step))
         learner.optimiser.step()
         if learner.average is not None:
-            learner.average.follow(learner.modules[0])
+            learner.average.update(learner.modules[0])
 
     def save(self) -> None:
-        """The run as it is after its last whole step."""
+        """Saves the run as it is after its last whole step."""
         self.run.out.mkdir(parents=True, exist_ok=True)
         self.facts |= {"feed": self.feed.state(), "spent": self.run.budget.spent_s}
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)
 
-    def once(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` finds once the training is over (JSON values), kept with the run."""
+    def compute_once(self, name: str, make: Callable[[], Any]) -> Any:
+        """The result of `make()` (JSON values), computed the first time and kept with the run."""
         if name not in self.facts:
             self.facts[name] = make()
             self.save()
         return self.facts[name]
 
-    def _log(self) -> None:
+    def _log(self, steps_per_s: float) -> None:
         facts, recent = self.facts, self.facts["recent"]
         mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
-        line = {"stage": self.stage, "step": self.taken, "seconds": round(facts["seconds"]), **mean}
+        line = {"stage": self.stage, "step": self.steps_done, "seconds": round(facts["seconds"]), **mean}
         write_log(self.run.out, line)
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
-        self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: {words}")
+        pace = f"{steps_per_s:.1f} steps/s" if steps_per_s >= 1 else f"{1 / steps_per_s:.1f} s a step"
+        self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: step {self.steps_done:,}, {pace}, {words}")
 
 
 def _not_a_number(what: str, step: int) -> str:
@@ -346,25 +344,25 @@ def _not_a_number(what: str, step: int) -> str:
 
 @contextmanager
 def _stoppable() -> Iterator[threading.Event]:
-    """Within it the first Ctrl-C sets the event, and only a second one interrupts what is under way."""
+    """A context in which the first Ctrl-C sets the event; only a second one interrupts at once."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
     before = signal.getsignal(signal.SIGINT)
 
-    def asked(number, frame) -> None:
+    def on_signal(number, frame) -> None:
         stop.set()
         signal.signal(signal.SIGINT, before)
 
-    signal.signal(signal.SIGINT, asked)
+    signal.signal(signal.SIGINT, on_signal)
     try:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def cosine(share: float, low: float = 0.0) -> float:
+def cosine_decay(share: float, low: float = 0.0) -> float:
     """From 1 down to `low` as `share` goes from 0 to 1."""
     return low + (1 - low) * (0.5 + 0.5 * float(np.cos(np.pi * min(share, 1.0))))
 
@@ -376,12 +374,12 @@ def half_precision(device: torch.device) -> torch.autocast:
 
 
 def _cpu_has_bf16() -> bool:
-    """In hardware: where oneDNN only emulates it, it is 2.7 times slower than float32."""
+    """Whether in hardware: emulated by oneDNN it is 2.7 times slower than float32."""
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def device_named(name: str) -> torch.device:
-    """cpu, cuda, or auto: a GPU where there is one. TrainingError for what PyTorch does not know or has not here."""
+    """cpu, cuda, or auto (a GPU if there is one). TrainingError for a device that PyTorch does not have here."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

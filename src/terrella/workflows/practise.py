@@ -28,7 +28,7 @@ from ..core.spec import AXES, shape_of
 from ..core.world import World, make_rng
 from ..data import Dataset, RecordOptions, record
 from ..learn.recipes.latent import LatentTraining, train_latent
-from ..learn.recipes.policy import Practice, seen_unless_said, train_policy
+from ..learn.recipes.policy import Practice, default_channels, train_policy
 from ..measure.statistics import mean_interval
 from .collect import explore, storage_of
 from .learn import check_budget
@@ -202,7 +202,7 @@ def _round(
             practice = replace(practice, batch=BATCH)
         else:
             practice = replace(practice, method="ppo", cautious=True, trust=TRUST)
-        transferable = number and "latent" not in seen_unless_said(world.spec)  # another world has other latents
+        transferable = number and "latent" not in default_channels(world.spec)  # another world has other latents
         earlier = rounds.policy(best_round([*done, notes])) if transferable else None
         policy = rounds.policy(number)
         facts = train_policy(world, name, policy, practice, report, rounds.recording, earlier)

@@ -17,7 +17,7 @@ from ..act.policies_by_name import NoisyPolicy
 from ..core.files import write_json
 from ..core.policy import Idle, Policy, Random
 from ..core.world import World
-from ..learn.feeds import Drawn
+from ..learn.feeds import RandomBatches
 from ..learn.objectives.regression import Regression, drawn_rows
 from ..learn.recipes.policy import Practice, train_policy
 from ..learn.trainer import Run, Trainer
@@ -204,6 +204,6 @@ def fit_residual(sim: MujocoWorld, trials: Trials, folder: Path, seed: int, mark
         **({"mark": mark} if mark else {}),
     }
     run = Run(folder, facts, lambda *_: None, seed)
-    feed = Drawn(lambda now: drawn_rows(inputs, targets, now))
+    feed = RandomBatches(lambda now: drawn_rows(inputs, targets, now))
     Trainer(run, "residual", feed, Regression(network, network.unit, network.scale, LEARNING_RATE), FITTED).train()
     return Corrected(sim, network)

@@ -11,8 +11,8 @@ import torch
 
 from .. import library
 from ..core.world import World, make_rng
-from ..learn.feeds import Drawn
-from ..learn.objectives.adaptation import Adaptation, Encoder, Pictures
+from ..learn.feeds import RandomBatches
+from ..learn.objectives.adaptation import Adaptation, KeypointEncoder, LabelledPictures
 from ..learn.trainer import Run, Trainer
 from ..sim.perceived import GOAL, Perceived
 from ..sim.randomised import Randomised, read
@@ -38,25 +38,25 @@ class Encoders:
     def _looks(self) -> tuple[torch.Tensor, torch.Tensor]:
         return pictures(Randomised(self.sim, read(self.looks)), LABELLED, LABELLED_SEED + self.seed)
 
-    def __getitem__(self, name: str) -> Encoder:
+    def __getitem__(self, name: str) -> KeypointEncoder:
         """The encoder of this name, trained or loaded."""
         if name == "randomised":
-            shown = Pictures(*self._looks)
+            shown = LabelledPictures(*self._looks)
         elif name == "adversarial":
-            shown = Pictures(*self._looks, pictures(self.real, UNLABELLED, UNLABELLED_SEED + self.seed)[0])
+            shown = LabelledPictures(*self._looks, pictures(self.real, UNLABELLED, UNLABELLED_SEED + self.seed)[0])
         else:
             world = self.real if name == "oracle" else self.sim
-            shown = Pictures(*pictures(world, LABELLED, LABELLED_SEED + self.seed))
+            shown = LabelledPictures(*pictures(world, LABELLED, LABELLED_SEED + self.seed))
         torch.manual_seed(self.seed)
-        encoder = Encoder(shown.numbers.shape[1])
+        encoder = KeypointEncoder(shown.numbers.shape[1])
         encoder.settle(shown.numbers)
         facts: Mapping[str, Any] = {"encoder": name}
         run = Run(self.folder / f"encoder {name}", facts, lambda *_: None, self.seed)
-        Trainer(run, "encoder", Drawn(shown.batch), Adaptation(encoder), STEPS).train()
+        Trainer(run, "encoder", RandomBatches(shown.batch), Adaptation(encoder), STEPS).train()
         self.progress(f"seed {self.seed}: the {name} encoder is trained")
         return encoder.eval()
 
-    def error(self, encoder: Encoder) -> float:
+    def error(self, encoder: KeypointEncoder) -> float:
         """Mean distance between the goal that it reads off real pictures and the true one, in the goal's units."""
         shown, goals = pictures(self.real, 256, UNLABELLED_SEED - 1)
         with torch.inference_mode():
@@ -73,7 +73,7 @@ def pictures(world: World, count: int, seed: int) -> tuple[torch.Tensor, torch.T
     return shown, goals
 
 
-def with_encoder(world: World, encoder: Encoder) -> Perceived:
+def with_encoder(world: World, encoder: KeypointEncoder) -> Perceived:
     """The world, in which policies see the goal that the encoder reads off a picture."""
 
     @torch.inference_mode()

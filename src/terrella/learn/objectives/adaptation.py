@@ -1,4 +1,4 @@
-"""Adaptation: an encoder reads numbers off labelled pictures, and is blind to whether a picture is of an unlabelled set.
+"""Adaptation: an encoder regresses numbers from labelled pictures, with features that do not tell them from unlabelled ones.
 
 Domain-adversarial training by gradient reversal (Ganin et al. 2016); keypoints by a spatial softmax (Levine et al. 2016).
 """
@@ -14,14 +14,14 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from ..trainer import Loss, Now, adamw, warmed
+from ..trainer import Loss, TrainStep, adamw, warmup_cosine
 
 WIDTHS, HIDDEN = (16, 24, 32), 128
 BATCH = 64
 
 
-class Encoder(nn.Module):
-    """Pictures uint8 [B, H, W, 3] to numbers [B, n]; `settle` tells their mean and deviation."""
+class KeypointEncoder(nn.Module):
+    """Pictures uint8 [B, H, W, 3] to numbers [B, n]; `settle` sets the mean and standard deviation of the numbers."""
 
     mean: torch.Tensor
     scale: torch.Tensor
@@ -45,11 +45,11 @@ class Encoder(nn.Module):
         self.scale.copy_(numbers.std(0).clamp_min(1e-6))
 
     def features(self, pictures: torch.Tensor) -> torch.Tensor:
-        """Keypoints [B, 2 * channels]: where each channel is strongest, -1 to 1."""
-        found = self.look(pictures.permute(0, 3, 1, 2).float() / 127.5 - 1)
-        height, width = found.shape[2:]
-        share = found.flatten(2).softmax(2).unflatten(2, (height, width))
-        down, right = (torch.linspace(-1, 1, side, device=found.device) for side in (height, width))
+        """Keypoints [B, 2 * channels]: the expected position of each channel, -1 to 1."""
+        maps = self.look(pictures.permute(0, 3, 1, 2).float() / 127.5 - 1)
+        height, width = maps.shape[2:]
+        share = maps.flatten(2).softmax(2).unflatten(2, (height, width))
+        down, right = (torch.linspace(-1, 1, side, device=maps.device) for side in (height, width))
         return torch.cat([(share.sum(3) * down).sum(2), (share.sum(2) * right).sum(2)], 1)
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
@@ -57,14 +57,14 @@ class Encoder(nn.Module):
 
 
 @dataclass(frozen=True)
-class Pictures:
+class LabelledPictures:
     """labelled: uint8 [N, H, W, 3] with numbers [N, n]; unlabelled: uint8 [M, H, W, 3], or none."""
 
     labelled: torch.Tensor
     numbers: torch.Tensor
     unlabelled: torch.Tensor | None = None
 
-    def batch(self, now: Now) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    def batch(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         rows = torch.from_numpy(now.rng.integers(len(self.labelled), size=BATCH))
         if self.unlabelled is None:
             return self.labelled[rows], self.numbers[rows], None
@@ -73,33 +73,33 @@ class Pictures:
 
 
 class Adaptation:
-    """Squared error of the numbers; with unlabelled pictures a judge tells the two sets apart by the encoder's features, and
-    the encoder goes against the judge, by `weight` in the end."""
+    """Squared error of the numbers; with unlabelled pictures also a domain classifier on the encoder's features, whose gradient is
+    reversed for the encoder, with a factor that grows to `weight`."""
 
-    def __init__(self, encoder: Encoder, learning_rate: float = 2e-3, weight: float = 0.03):
+    def __init__(self, encoder: KeypointEncoder, learning_rate: float = 2e-3, weight: float = 0.03):
         self.encoder, self.weight = encoder, weight
         self.judge = nn.Sequential(nn.Linear(2 * WIDTHS[-1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1))
         self.modules = {"encoder": encoder, "judge": self.judge}
-        self.learners = {"all": adamw((encoder, self.judge), warmed(learning_rate, 50, 0.02))}
+        self.learners = {"all": adamw((encoder, self.judge), warmup_cosine(learning_rate, 50, 0.02))}
 
-    def losses(self, batch: tuple[torch.Tensor, torch.Tensor, torch.Tensor | None], now: Now) -> Iterator[Loss]:
+    def losses(self, batch: tuple[torch.Tensor, torch.Tensor, torch.Tensor | None], now: TrainStep) -> Iterator[Loss]:
         pictures, numbers, others = batch
         encoder = self.encoder
         features = encoder.features(pictures)
-        away = (encoder.tell(features) - (numbers - encoder.mean) / encoder.scale).square().mean()
-        parts = {"away": away.detach()}
+        loss = (encoder.tell(features) - (numbers - encoder.mean) / encoder.scale).square().mean()
+        parts = {"mse": loss.detach()}
         if others is not None:
             grown = 2 / (1 + math.exp(-10 * now.share)) - 1
             both = torch.cat([features, encoder.features(others)])
             guess = self.judge(_reversed(both, self.weight * grown))[:, 0]
             truth = (torch.arange(len(guess), device=guess.device) < len(features)).float()
-            away = away + F.binary_cross_entropy_with_logits(guess, truth)
-            parts["told apart"] = ((guess > 0) == (truth > 0.5)).float().mean()
-        yield Loss("all", away, parts)
+            loss = loss + F.binary_cross_entropy_with_logits(guess, truth)
+            parts["domain accuracy"] = ((guess > 0) == (truth > 0.5)).float().mean()
+        yield Loss("all", loss, parts)
 
 
 class _Reverse(torch.autograd.Function):
-    """As it is forwards, times a negative number backwards."""
+    """Identity forwards; backwards the gradient times -weight."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: float) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Distillation: a world that draws a frame in many steps teaches one that draws it in one or two, without blur."""
+"""Distillation: a world that draws a frame in many flow steps teaches one that draws it in one or two, without blur."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 import torch
 
 from ...worlds.generator import Conditioning, UNet
-from ..batches import Batch, drawn_now
-from ..losses import Critic, critic_learner, critic_loss, flow_losses, sharpened, total, truth_losses
-from ..trainer import Average, Learner, Loss, Now, adamw, half_precision
+from ..batches import Batch, generate_now
+from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, truth_losses, weighted_total
+from ..trainer import Ema, Learner, Loss, TrainStep, adamw, half_precision
 
 
 class Matching:
-    """Pulls drawn frames towards a teacher's distribution (DMD2: Yin et al. 2024).
+    """Distribution matching (DMD2, Yin et al. 2024): moves generated frames towards a teacher's distribution.
 
-    Where a frame of the student's, with noise added, is denoised by the teacher and by a network of the student's own
-    frames, the difference says which way frames become likelier in the game and less likely in the dream. Both are
-    shown what the student was shown, so it is the distribution of this very frame that is matched.
+    Generated frames with noise are denoised by the teacher and by a mimic, a network of the student's own distribution. The
+    difference is the direction in which frames become likelier for the teacher and less likely for the student. Both networks get
+    the student's conditioning, so that it is the conditional distribution that is matched.
     """
 
     def __init__(self, teacher: UNet):
@@ -30,8 +30,8 @@ class Matching:
         self.learner = Learner(optimiser, (self.mimic,))
 
     def towards_teacher(self, clean: torch.Tensor, shown: Conditioning, rng: torch.Generator) -> torch.Tensor:
-        """A loss whose gradient by `clean` [B, 4, H, W] is the difference of the two denoised frames over the mean
-        distance from the teacher's."""
+        """A loss whose gradient by `clean` [B, 4, H, W] is the difference of the two denoised frames over the mean distance from
+        the teacher's."""
         clean = clean[:, :4]
         with torch.no_grad(), half_precision(clean.device):
             noisy, time = _noised(clean.detach(), rng)
@@ -41,7 +41,7 @@ class Matching:
         return (clean * pull).mean()
 
     def loss(self, clean: torch.Tensor, shown: Conditioning, rng: torch.Generator) -> Loss:
-        """Of the mimic, on drawn frames."""
+        """The mimic's loss on generated frames."""
         with half_precision(clean.device):
             noisy, time = _noised(clean.detach()[:, :4], rng)
             again = self.mimic(noisy, time, shown)[:, :4].float()
@@ -49,9 +49,11 @@ class Matching:
         return Loss("mimic", losses["rgb"] + 0.5 * losses["depth"], {"mimic": losses["rgb"]})
 
 
-def drawn(generator: UNet, noise: torch.Tensor, shown: Conditioning, steps: int, rng: np.random.Generator):
-    """A frame [B, 4, H, W] as the generator has it after some of `steps`, drawn at random; only the last has a gradient
-    (Self-Forcing: Huang et al. 2025)."""
+def draw_with_random_exit(
+    generator: UNet, noise: torch.Tensor, shown: Conditioning, steps: int, rng: np.random.Generator
+):
+    """The generator's estimate of the frame [B, 4, H, W] after a random number of its `steps`; only the last has a gradient
+    (Self-Forcing, Huang et al. 2025)."""
     x, exit_at = noise, int(rng.integers(steps))
     for step in range(exit_at + 1):
         now = step / steps
@@ -62,22 +64,22 @@ def drawn(generator: UNet, noise: torch.Tensor, shown: Conditioning, steps: int,
 
 
 class Student:
-    """A copy of a generator, called `name` in its run, that draws a frame in `flow_steps`. `weights` say how hard the recorded
-    frames, the distribution of a `teacher`, where there is one, and a critic of small patches pull."""
+    """A copy of a generator, called `name` in its run, that draws a frame in `flow_steps`. weights: of the recorded frames, of the
+    distribution of a `teacher`, if there is one, and of a patch critic."""
 
     def __init__(
         self,
         name: str,
         generator: UNet,
         flow_steps: int,
-        rate: Callable[[Now], float],
+        rate: Callable[[TrainStep], float],
         momentum: float,
         weights: tuple[float, float, float],
         teacher: UNet | None,
     ):
         self.name, self.flow_steps, self.weights = name, flow_steps, weights
         self.generator = copy.deepcopy(generator).train().requires_grad_(True)
-        self.smooth, self.critic = Average(self.generator, 0.995), Critic()
+        self.smooth, self.critic = Ema(self.generator, 0.995), PatchCritic()
         self.matching = None if teacher is None else Matching(teacher)
         self.modules = {name: self.generator, "smooth": self.smooth, "critic": self.critic}
         generating = adamw((self.generator,), rate, betas=(momentum, 0.99), average=self.smooth)
@@ -86,43 +88,44 @@ class Student:
             self.modules["mimic"] = self.matching.mimic
             self.learners["mimic"] = self.matching.learner
 
-    def dream(self, shown: Conditioning, now: Now) -> torch.Tensor:
-        """A frame as it is now drawn."""
-        return drawn_now(self.generator, shown, now, self.flow_steps)
+    def dream(self, shown: Conditioning, now: TrainStep) -> torch.Tensor:
+        """Frames as the student now draws them."""
+        return generate_now(self.generator, shown, now, self.flow_steps)
 
-    def descent(
-        self, asked: Batch, real: Callable[[], Batch], heeded: int, now: Now
+    def update(
+        self, batch: Batch, real: Callable[[], Batch], updates: int, now: TrainStep
     ) -> Generating[Loss, None, torch.Tensor]:
-        """The losses of one batch, whose frames as they were drawn are returned; `real` gives what the critic is shown as
-        true, and it has judged `heeded` batches before."""
-        truth, matching, critic = self.weights
-        noise = now.randn(len(asked.truth), 4, *asked.truth.shape[2:])
-        fresh = drawn(self.generator, noise, asked.shown, self.flow_steps, now.rng)
-        clean = asked.judged(fresh)
-        parts = truth_losses(clean, asked)
-        loss = truth * total(parts)
+        """The losses of one batch; returns its frames as they were drawn. `real` gives recorded frames for the critic, which has
+        been updated `updates` times before."""
+        truth_weight, matching_weight, critic_weight = self.weights
+        noise = now.randn(len(batch.truth), 4, *batch.truth.shape[2:])
+        drawn = draw_with_random_exit(self.generator, noise, batch.shown, self.flow_steps, now.rng)
+        clean = batch.judged(drawn)
+        parts = truth_losses(clean, batch)
+        loss = truth_weight * weighted_total(parts)
         if self.matching is not None:
-            parts["teacher"] = self.matching.towards_teacher(clean, asked.shown, now.noise)
-            loss = loss + matching * parts["teacher"]
-        if critic:
-            loss = loss + sharpened(self.critic, clean, loss, asked.shown.glimpse, critic * trusted(heeded))
+            parts["teacher"] = self.matching.towards_teacher(clean, batch.shown, now.noise)
+            loss = loss + matching_weight * parts["teacher"]
+        if critic_weight:
+            pull = critic_weight * critic_ramp(updates)
+            loss = loss + critic_pull(self.critic, clean, loss, batch.shown.glimpse, pull)
         yield Loss(self.name, loss, parts)
         if self.matching is not None:
-            yield self.matching.loss(clean, asked.shown, now.noise)
-        found = real()
-        judged = critic_loss(self.critic, clean, asked.shown.glimpse, found.truth, found.shown.glimpse)
-        yield Loss("critic", judged, {"critic": judged})
-        return fresh
+            yield self.matching.loss(clean, batch.shown, now.noise)
+        recorded = real()
+        hinge = critic_loss(self.critic, clean, batch.shown.glimpse, recorded.truth, recorded.shown.glimpse)
+        yield Loss("critic", hinge, {"critic": hinge})
+        return drawn
 
-    def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
-        """Those of a distillation: the critic sees the same recorded frames."""
+    def losses(self, batch: Batch, now: TrainStep) -> Iterator[Loss]:
+        """The losses of a distillation; the critic sees the same recorded frames."""
         batch = batch.to(now.device)
-        yield from self.descent(batch, lambda: batch, now.step, now)
+        yield from self.update(batch, lambda: batch, now.step, now)
 
 
-def trusted(step: int) -> float:
-    """How far a critic is heeded: not at all at first, for it knows nothing yet."""
-    return min(1.0, step / 200)
+def critic_ramp(updates: int) -> float:
+    """The factor of the critic's weight: it rises from 0 as the critic is trained."""
+    return min(1.0, updates / 200)
 
 
 def _noised(clean: torch.Tensor, rng: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

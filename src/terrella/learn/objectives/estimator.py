@@ -1,4 +1,4 @@
-"""Estimator: depth in one picture (and from it motion between two) from recordings with depth, mirrored and recoloured."""
+"""Estimator: depth from one picture, and from it motion between two, trained on recordings with depth and augmented pictures."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from ...data import ClipCache
 from ...space.camera import yaw
 from ...space.estimator import Estimator, EstimatorConfig, normalised
 from ...space.floorplan import Box
-from ..feeds import Drawn
+from ..feeds import RandomBatches
 from ..recording import Recording
-from ..trainer import CPU, Loss, Now, Run, Trainer, adamw, warmed
+from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
 
-DRIFT = 64  # steps over which odometry is summed when it is judged
+DRIFT = 64  # steps over which odometry is integrated to measure drift
 
 
-class Depths:
-    """By L1 on the logarithm of depth and on its slopes. (Motion follows from depth, by space/align.py.)"""
+class EstimatorObjective:
+    """L1 loss of the logarithm of depth and of its gradients. (Motion is computed from depth by space/align.py.)"""
 
     def __init__(self, recording: Recording, batch: int, learning_rate: float, seed: int):
-        self.recording, self.size, self.rows = recording, batch, recording.within(0, 1)
+        self.recording, self.size, self.rows = recording, batch, recording.rows_within(0, 1)
         if len(self.rows) < 64:
             raise DatasetError(
                 f"the recording leaves {len(self.rows)} pairs of pictures to learn an estimator from; record more."
@@ -35,10 +35,10 @@ class Depths:
         self.some = np.random.default_rng(seed).choice(self.rows, min(len(self.rows), 2000), replace=False)
         self.estimator = _fresh(recording, self.some, seed)
         self.modules = {"estimator": self.estimator}
-        self.learners = {"estimator": adamw((self.estimator,), warmed(learning_rate, 50, 0.02))}
+        self.learners = {"estimator": adamw((self.estimator,), warmup_cosine(learning_rate, 50, 0.02))}
 
-    def picked(self, now: Now) -> tuple[torch.Tensor, torch.Tensor]:
-        """Pictures [n, 3, H, W] in 0..1 and their depth: mirrored, and in other colours."""
+    def picked(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
+        """Pictures [n, 3, H, W] in 0..1 and their depth, some mirrored, some recoloured."""
         rows = now.rng.choice(self.rows, self.size)
         recording, size = self.recording, _size(self.recording)
         pictures, depth = recording.rgb(rows).float() / 255, recording.depth(rows)
@@ -49,7 +49,7 @@ class Depths:
             pictures, depth = pictures.flip(-1), depth.flip(-1)
         return recoloured(pictures, now.rng), depth
 
-    def losses(self, batch: tuple[torch.Tensor, torch.Tensor], now: Now) -> Iterator[Loss]:
+    def losses(self, batch: tuple[torch.Tensor, torch.Tensor], now: TrainStep) -> Iterator[Loss]:
         picture, depth = (part.to(now.device) for part in batch)
         off = self.estimator.depth_code(normalised(picture)) - self.estimator.code(depth)
         slopes = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
@@ -58,7 +58,7 @@ class Depths:
 
 
 def _fresh(recording: Recording, some: np.ndarray, seed: int) -> Estimator:
-    """One that sees the mean depth of the rows `some` everywhere."""
+    """An untrained estimator, which gives the mean depth of the rows `some` everywhere."""
     near, far = recording.depth(some[:500]).flatten()[::7].quantile(torch.tensor([0.0005, 0.9995])).tolist()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -76,8 +76,8 @@ def learn_estimator(
     run: Run, recording: Recording, steps: int, batch: int = 16, learning_rate: float = 3e-3
 ) -> Estimator:
     """A depth and odometry estimator, learned on the CPU."""
-    objective = Depths(recording, batch, learning_rate, run.seed)
-    trainer = Trainer(run, "estimator", Drawn(objective.picked), objective, steps, device=CPU)
+    objective = EstimatorObjective(recording, batch, learning_rate, run.seed)
+    trainer = Trainer(run, "estimator", RandomBatches(objective.picked), objective, steps, device=CPU)
     trainer.train()
     estimator = objective.estimator.eval().requires_grad_(False)
     with torch.inference_mode():
@@ -88,24 +88,26 @@ def learn_estimator(
 
 def motion_between(recording: Recording, rows: np.ndarray) -> torch.Tensor:
     """The true motion from each of `rows` to the next, [n, 3]: metres forward and left, radians to the left."""
-    return relative(recording.pose(rows), recording.pose(rows + 1))
+    return relative_motion(recording.pose(rows), recording.pose(rows + 1))
 
 
-def relative(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-    """Level motion between poses [n, 7]: [n, 3] metres forward and left in the frame of `before`, radians to the left."""
-    heading, moved = yaw(before), after[:, :2] - before[:, :2]
+def relative_motion(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """Planar motion between poses [n, 7]: [n, 3] metres forward and left in the frame of `before`, radians to the left."""
+    heading, way = yaw(before), after[:, :2] - before[:, :2]
     turn = yaw(after) - heading
     c, s = heading.cos(), heading.sin()
-    forward, left = moved[:, 0] * c + moved[:, 1] * s, moved[:, 1] * c - moved[:, 0] * s
+    forward, left = way[:, 0] * c + way[:, 1] * s, way[:, 1] * c - way[:, 0] * s
     return torch.stack([forward, left, torch.atan2(turn.sin(), turn.cos())], 1)
 
 
-def sight(estimator: Estimator, cache: ClipCache, episodes: list[int], keep_out: Box | None, frames: int = 400) -> dict:
-    """What the estimator gets wrong on `episodes`, where nothing of the box is seen ("recorded") and inside it ("new").
+def estimator_errors(
+    estimator: Estimator, cache: ClipCache, episodes: list[int], keep_out: Box | None, frames: int = 400
+) -> dict:
+    """Errors of the estimator on `episodes`, outside the box ("recorded") and inside it ("new").
 
-    Depth: abs_rel, the mean of |error| / truth, and delta_125, the share of pixels within a factor of 1.25. Odometry:
-    moved_off, the sum of errors over the sum of the way; turned_off_deg a step; drift_off, how far off the place is after
-    DRIFT summed steps over the length of the way (mean; way longer than half a metre), drift_deg the heading.
+    Depth: abs_rel, the mean of |error| / truth, and delta_125, the share of pixels within a factor of 1.25. Odometry: moved_off,
+    the sum of errors over the distance travelled; turned_off_deg per step; drift_off, the mean position error after DRIFT steps
+    over the distance travelled (of stretches longer than half a metre), and drift_deg, that of the heading.
     """
     places = {"recorded": Recording.of(cache, episodes, keep_out)}
     if keep_out is not None:
@@ -119,7 +121,7 @@ def sight(estimator: Estimator, cache: ClipCache, episodes: list[int], keep_out:
 
 @torch.inference_mode()
 def _errors(estimator: Estimator, recording: Recording, frames: int) -> dict[str, float]:
-    pairs = recording.within(0, 1)
+    pairs = recording.rows_within(0, 1)
     if not len(pairs):
         return {}
     rows = pairs[:: max(1, len(pairs) // frames)]
@@ -131,9 +133,9 @@ def _errors(estimator: Estimator, recording: Recording, frames: int) -> dict[str
         within.append((torch.maximum(ratio, 1 / ratio) < 1.25).float().mean((1, 2)))
     facts = {"frames": len(rows), "abs_rel": float(torch.cat(relative_error).mean())}
     facts["delta_125"] = float(torch.cat(within).mean())
-    there = np.zeros(len(recording.usable), bool)
-    there[pairs] = True
-    whole = np.convolve(there, np.ones(DRIFT, int))[DRIFT - 1 :] == DRIFT
+    usable = np.zeros(len(recording.usable), bool)
+    usable[pairs] = True
+    whole = np.convolve(usable, np.ones(DRIFT, int))[DRIFT - 1 :] == DRIFT
     begins = np.flatnonzero(whole)
     if not len(begins):
         return facts
@@ -143,12 +145,12 @@ def _errors(estimator: Estimator, recording: Recording, frames: int) -> dict[str
         walk = np.arange(begin, begin + DRIFT)
         seen.append(estimator.motion(recording.rgb(walk), recording.rgb(walk + 1)))
         truth.append(motion_between(recording, walk))
-    found, true = torch.stack(seen), torch.stack(truth)
+    estimated, true = torch.stack(seen), torch.stack(truth)
     way = true[..., :2].norm(dim=-1)
-    off = (found - true)[..., :2].norm(dim=-1)
+    off = (estimated - true)[..., :2].norm(dim=-1)
     facts |= {"walks": len(begins), "moved_off": float(off.sum() / way.sum())}
-    facts["turned_off_deg"] = float((found - true)[..., 2].abs().mean().rad2deg())
-    ends, true_ends = _summed(found), _summed(true)
+    facts["turned_off_deg"] = float((estimated - true)[..., 2].abs().mean().rad2deg())
+    ends, true_ends = _integrated(estimated), _integrated(true)
     walked = way.sum(1)
     went = walked > 0.5
     if went.any():
@@ -157,8 +159,8 @@ def _errors(estimator: Estimator, recording: Recording, frames: int) -> dict[str
     return facts
 
 
-def _summed(steps: torch.Tensor) -> torch.Tensor:
-    """Motions [n, T, 3], each in the frame of the one before -> where they lead from the first [n, 3]."""
+def _integrated(steps: torch.Tensor) -> torch.Tensor:
+    """The whole motion [n, 3] in the first frame, of motions [n, T, 3], each in the frame of the step before."""
     heading = torch.cat([torch.zeros_like(steps[:, :1, 2]), steps[:, :-1, 2]], 1).cumsum(1)
     c, s = heading.cos(), heading.sin()
     x = (steps[..., 0] * c - steps[..., 1] * s).sum(1)
@@ -167,7 +169,7 @@ def _summed(steps: torch.Tensor) -> torch.Tensor:
 
 
 def _size(recording: Recording) -> tuple[int, int]:
-    """Half of the frames', or what multiples of 16 come nearest."""
+    """Half the size of the frames, in multiples of 16."""
     height, width = recording.cache.rgb.shape[1:3]
     return max(16, round(height / 32) * 16), max(16, round(width / 32) * 16)
 
@@ -177,8 +179,8 @@ def _sized(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 
 
 def recoloured(pictures: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-    """Pictures [n, 3, H, W] in 0..1 in other colours, each in its own: channels exchanged and mixed, gamma, a soft stain of
-    light, sometimes the negative, noise. Three batches in five are left as they are."""
+    """Pictures [n, 3, H, W] in 0..1 with random colours: channels permuted and mixed, gamma, a smooth light pattern, sometimes
+    inverted, noise. Three batches in five are left unchanged."""
     if rng.random() < 0.6:
         return pictures
     count, chance = len(pictures), make_rng(int(rng.integers(2**62)))

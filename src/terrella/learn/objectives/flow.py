@@ -1,4 +1,4 @@
-"""Flow: a generator learns to draw recorded frames (flow matching), the last frame dreamt by itself, with a critic of sharpness."""
+"""Flow matching: a generator learns to draw recorded frames after its own predictions, with a critic of sharpness."""
 
 from __future__ import annotations
 
@@ -8,52 +8,52 @@ import numpy as np
 import torch
 
 from ...worlds.generator import Conditioning, UNet, channels_last
-from ..batches import Batch, drawn_now
-from ..losses import Critic, critic_learner, critic_loss, flow_losses, frame_losses, sharpened, total
-from ..trainer import Average, Loss, Now, adamw, warmed
+from ..batches import Batch, generate_now
+from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, frame_losses, weighted_total
+from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
 
-CRITIC_AHEAD = 200  # steps that the critic learns before it is heeded
+CRITIC_AHEAD = 200  # steps that the critic trains before the generator uses it
 
 
 class Flow:
-    """Where a frame is drawn in one step a critic judges it, from the step `critic_from` on, `critic_weight` times as hard
-    as the loss itself. With more steps the whole flow from noise to frame is learned."""
+    """With one flow step, regression with a critic from the step `critic_from` on, its gradient `critic_weight` times that of the
+    loss. With more flow steps, the whole flow from noise to frame is learned."""
 
-    strides = 1  # losses of a batch that the generator descends
+    losses_per_batch = 1  # gradient steps of the generator per batch
 
     def __init__(self, generator: UNet, flow_steps: int, learning_rate: float, critic_from: int, critic_weight: float):
-        self.generator, self.critic = channels_last(generator), Critic()
+        self.generator, self.critic = channels_last(generator), PatchCritic()
         self.one_step, self.critic_from, self.critic_weight = flow_steps == 1, critic_from, critic_weight
-        self.smooth = Average(self.generator, 0.999)
+        self.smooth = Ema(self.generator, 0.999)
         self.modules = {"generator": self.generator, "smooth": self.smooth, "critic": self.critic}
-        generating = adamw((self.generator,), warmed(learning_rate, 200, 0.05), average=self.smooth)
+        generating = adamw((self.generator,), warmup_cosine(learning_rate, 200, 0.05), average=self.smooth)
         self.learners = {"generator": generating, "critic": critic_learner(self.critic)}
 
-    def dream(self, shown: Conditioning, now: Now) -> torch.Tensor:
-        """A frame [B, 4 or 5, H, W] as the generator now draws it."""
-        return drawn_now(self.generator, shown, now)
+    def dream(self, shown: Conditioning, now: TrainStep) -> torch.Tensor:
+        """Frames [B, 4 or 5, H, W] as the generator now draws them."""
+        return generate_now(self.generator, shown, now)
 
-    def losses(self, batch: Batch, now: Now) -> Iterator[Loss]:
+    def losses(self, batch: Batch, now: TrainStep) -> Iterator[Loss]:
         batch = batch.to(now.device)
         truth, shown = batch.truth, batch.shown
         noisy, time = self._noisy(batch, now)
         with now.half():
             clean = batch.judged(self.generator(noisy, time, shown).float())
-            drawn, found = clean[:, :4], truth[:, :4]
-            parts = frame_losses(drawn, found, batch.weight) if self.one_step else flow_losses(drawn, found, time)
+            drawn, target = clean[:, :4], truth[:, :4]
+            parts = frame_losses(drawn, target, batch.weight) if self.one_step else flow_losses(drawn, target, time)
         if clean.shape[1] > 4:
             logits = torch.nn.functional.binary_cross_entropy_with_logits
             parts["things"] = logits(clean[:, 4], truth[:, 4])
-        loss = total(parts)
+        loss = weighted_total(parts)
         if self.one_step and now.step >= self.critic_from:
-            loss = loss + sharpened(self.critic, clean, loss, shown.glimpse, self.critic_weight)
+            loss = loss + critic_pull(self.critic, clean, loss, shown.glimpse, self.critic_weight)
         yield Loss("generator", loss, parts)
         if self.one_step and now.step >= self.critic_from - CRITIC_AHEAD:
-            judged = critic_loss(self.critic, clean, shown.glimpse, truth, shown.glimpse)
-            yield Loss("critic", judged, {"critic": judged})
+            hinge = critic_loss(self.critic, clean, shown.glimpse, truth, shown.glimpse)
+            yield Loss("critic", hinge, {"critic": hinge})
 
-    def _noisy(self, batch: Batch, now: Now) -> tuple[torch.Tensor, torch.Tensor]:
-        """True frames somewhere on the way from noise, and where [B]; pure noise where no pixel counts."""
+    def _noisy(self, batch: Batch, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
+        """True frames mixed with noise, and their flow times [B]; pure noise where a pixel has no weight."""
         truth, count = batch.truth, len(batch.truth)
         noise = now.randn(*truth.shape)
         from_noise = 0.75 if self.one_step else 0.0

@@ -1,5 +1,5 @@
-"""Goals in hindsight: whatever an episode came to was a goal that it reached, by the actions that it took (HER, Andrychowicz et al.
-2017; GCSL, Ghosh et al. 2019)."""
+"""Hindsight goals: every state that an episode reached is a goal that its actions reached (HER, Andrychowicz et al. 2017; GCSL,
+Ghosh et al. 2019)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import torch
 
 from ...act.distributions import SquashedGaussian
 from ...act.goal_network import GoalNetwork
-from ..trainer import Loss, Now, adamw, warmed
+from ..trainer import Loss, TrainStep, adamw, warmup_cosine
 
-QUICK = 0.2  # the quantile of the steps that hindsight found: how long who is quick takes
+QUANTILE = 0.2  # of the steps to a goal, which estimates a short way to it
 
 
 @dataclass(frozen=True)
 class Hindsight:
-    """N moves: latents [N, D], the goals [N, D] to which they led after steps [N], and actions [N, A] as networks have them."""
+    """N samples: latents [N, D], goals [N, D] reached steps [N] later, and actions [N, A] encoded for networks."""
 
     latent: torch.Tensor
     goal: torch.Tensor
@@ -29,14 +29,14 @@ class Hindsight:
 
 class Trajectories:
     """Latents [R, D] and encoded actions [R, A] of a recording. ends [R]: the last row of each row's episode; rows: those with a
-    valid action, from which moves are drawn, with goals up to `farthest` steps later."""
+    valid action, which are sampled, with goals up to `farthest` steps later."""
 
     def __init__(self, latents: torch.Tensor, actions: torch.Tensor, ends: np.ndarray, rows: np.ndarray, farthest: int):
         self.latents, self.actions, self.ends, self.farthest = latents, actions, ends, farthest
         self.rows = rows[ends[rows] > rows]
 
-    def drawn(self, count: int, rng: np.random.Generator, steps: int | None = None) -> Hindsight:
-        """`count` moves; steps to the goal even in what the episode leaves, half of the time in its logarithm; or so many."""
+    def sample(self, count: int, rng: np.random.Generator, steps: int | None = None) -> Hindsight:
+        """`count` samples with goals `steps` steps later, or uniformly up to the end of the episode, half of them log-uniformly."""
         rows = self.rows if steps is None else self.rows[self.ends[self.rows] - self.rows >= steps]
         picked = rng.choice(rows, count)
         most = np.minimum(self.ends[picked] - picked, self.farthest)
@@ -54,21 +54,22 @@ class GoalReaching:
     def __init__(self, network: GoalNetwork, learning_rate: float):
         self.network = network
         self.modules = {"network": network}
-        self.learners = {"goals": adamw((network,), warmed(learning_rate, 100, 0.02))}
+        self.learners = {"goals": adamw((network,), warmup_cosine(learning_rate, 100, 0.02))}
 
-    def losses(self, batch: Hindsight, now: Now) -> Iterator[Loss]:
-        found = self.network(batch.latent, batch.goal, batch.steps)
-        action = action_error(found, batch.action, self.network.config.actor.counts)
+    def losses(self, batch: Hindsight, now: TrainStep) -> Iterator[Loss]:
+        distribution = self.network(batch.latent, batch.goal, batch.steps)
+        action = action_error(distribution, batch.action, self.network.config.actor.counts)
         scale = math.log(self.network.config.farthest)
         short = batch.steps.log() / scale - self.network.share(batch.latent, batch.goal)
-        steps = torch.maximum(QUICK * short, (QUICK - 1) * short).mean()
+        steps = torch.maximum(QUANTILE * short, (QUANTILE - 1) * short).mean()
         yield Loss("goals", action + steps, {"action": action, "steps": steps})
 
 
-def action_error(found, action: torch.Tensor, counts: tuple[int, ...]) -> torch.Tensor:
-    """How far the likeliest is from actions [N, A] as networks have them: of axes the square, of the rest in nats."""
-    if isinstance(found, SquashedGaussian):
-        return (torch.tanh(found.mode()) - action).square().mean()
+def action_error(distribution, action: torch.Tensor, counts: tuple[int, ...]) -> torch.Tensor:
+    """The loss of actions [N, A], encoded for networks: squared error of the mode for axes, negative log-likelihood for the
+    rest."""
+    if isinstance(distribution, SquashedGaussian):
+        return (torch.tanh(distribution.mode()) - action).square().mean()
     if action.shape[1] != len(counts):  # one-hot
         action = torch.stack([part.argmax(1) for part in action.split(list(counts), 1)], 1).float()
-    return -found.log_prob(action).mean()
+    return -distribution.log_prob(action).mean()

@@ -1,7 +1,7 @@
-"""The two halves of a latent-action model: which code leads from one frame to another, and what a code does to a frame.
+"""The two halves of a latent-action model: the code that leads from one frame to another, and the effect of a code on a frame.
 
-`Inverse` compares two frames and says which of K codes took the first to the second; `Forward` moves a frame by a code.
-Codes are a few whole numbers, so what passes between the halves is little more than the motion (Genie, Bruce et al. 2024).
+`Inverse` classifies which of K codes leads from one frame to the next; `Forward` predicts the next frame from a frame and a code.
+Codes are a few integers, so that they carry little more than the motion (Genie, Bruce et al. 2024).
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-SWEEP = (3, 4)  # rows and columns of the flow that a code has of its own
-REACH = 2  # cells of 4 pixels by which features are compared, each way
+SWEEP = (3, 4)  # rows and columns of the coarse flow of a code
+REACH = 2  # cells of 4 pixels, each way, within which features are correlated
 
 
 class Inverse(nn.Module):
-    """Logits over codes from how the features of the second frame lie beside those of the first (a local correlation)."""
+    """Logits over codes from the local correlation of the features of two frames."""
 
     def __init__(self, codes: int):
         super().__init__()
@@ -41,12 +41,11 @@ class Inverse(nn.Module):
 
 
 class Forward(nn.Module):
-    """A U-Net at half size that says for each pixel where it comes from and what is added, as the code says.
+    """A U-Net at half size that predicts, for each pixel, a flow to its source and an additive change, conditioned on a code.
 
-    It sees one frame alone: whatever moves must be said by the code, so that a code means a motion, not its change. Each
-    code has a sweep of its own, a coarse flow that is the same for every frame; the frame only bends it (and training
-    holds the bending small), so that a code means the same everywhere. What depends on the code comes last, so that
-    the outcomes of all K codes cost little more than that of one.
+    It sees one frame alone, so that a code means a motion, not a change of motion. Each code has a coarse flow of its own, the
+    same for every frame, to which the frame adds a small bend (penalised in training), so that a code means the same everywhere.
+    The code enters last, so that the predictions of all K codes cost little more than one.
     """
 
     def __init__(self, codes: int, widths: tuple[int, int, int] = (32, 48, 64)):
@@ -65,7 +64,7 @@ class Forward(nn.Module):
         self.output.bias.data = torch.zeros(2 + 12)
 
     def features(self, before: torch.Tensor) -> torch.Tensor:
-        """[B, 3, H, W] in [0, 1] -> what every code's outcome is drawn from."""
+        """[B, 3, H, W] in [0, 1] -> features that the predictions of all codes share."""
         fine = self.fine(before)
         middle = self.middle(fine)
         coarse = self.coarse(middle)
@@ -75,11 +74,10 @@ class Forward(nn.Module):
     def outcome(
         self, features: torch.Tensor, before: torch.Tensor, code: torch.Tensor, half: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The frame that follows under `code` [B, K] (one-hot): [B, 3, H, W]; the flow [B, 2, H/2, W/2] in pixels of the
-        whole frame, from each pixel of the outcome to where it comes from (x to the right, y down); and the part of it
-        by which the frame bends the code's own sweep.
+        """The next frame under one-hot `code` [B, K]: [B, 3, H, W]; the flow [B, 2, H/2, W/2] in pixels of the whole frame, from
+        each pixel to its source (x to the right, y down); and the bend, the part of the flow that the frame adds to the code's own.
 
-        half: `before` and the outcome have half the size."""
+        half: `before` and the next frame have half the size."""
         scale, shift = self.condition(code)[:, :, None, None].chunk(2, 1)
         out = self.output(F.silu(self.mix(features) * (1 + scale) + shift))
         bend, added = 4 * out[:, :2], out[:, 2:]
@@ -94,7 +92,7 @@ class Forward(nn.Module):
         return self.outcome(self.features(before), before, code)[0]
 
     def errors(self, features: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-        """[B, K]: how far (mean absolute, at half size) each code's outcome is from what really followed."""
+        """[B, K]: mean absolute error, at half size, of each code's prediction of `after`."""
         codes = self.condition.in_features
         small, truth = F.avg_pool2d(before, 2), F.avg_pool2d(after, 2)
         every = torch.eye(codes, device=before.device).repeat(len(before), 1)
@@ -104,7 +102,7 @@ class Forward(nn.Module):
 
 
 def warped(frame: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
-    """frame [B, C, H, W] read at each pixel's place + flow [B, 2, H, W] (pixels, x then y), bilinear, held at the edge."""
+    """frame [B, C, H, W] sampled at each pixel + flow [B, 2, H, W] (pixels, x then y), bilinear, with border padding."""
     height, width = frame.shape[-2:]
     x = torch.arange(width, device=frame.device) + 0.5
     y = torch.arange(height, device=frame.device)[:, None] + 0.5
@@ -117,7 +115,7 @@ def _layer(into: int, out: int, stride: int = 1) -> nn.Sequential:
 
 
 class LatentModel:
-    """What was learned: `inverse` names codes, `forward` carries them out; `stride` rows lie between the two frames."""
+    """The `inverse` and the `forward` model; the two frames are `stride` rows apart."""
 
     def __init__(self, codes: int, stride: int, size: tuple[int, int], device: torch.device):
         self.codes, self.stride, self.size, self.device = codes, stride, size, device

@@ -1,7 +1,7 @@
-"""Latent prediction: the next latents foretold from the last ones and the actions, kept from collapsing by SIGReg.
+"""Latent prediction: the next latents from the last ones and the actions, kept from collapsing by SIGReg.
 
-The encoder makes its own targets, without a moving average and without a stopped gradient: what keeps all latents from being
-one is that their projections are held to be normal (LeJEPA, Balestriero & LeCun 2025; LeWorldModel, Maes et al. 2026).
+The encoder makes its own targets, without a moving average or a stopped gradient: collapse is prevented by a penalty on
+projections of the latents that are not standard normal (LeJEPA, Balestriero & LeCun 2025; LeWorldModel, Maes et al. 2026).
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ from torch import nn
 
 from ...worlds.controls import AXES, BUTTONS, Controls
 from ...worlds.latent_network import LatentConfig, LatentNetwork
-from ..trainer import Loss, Now, adamw, warmed
+from ..trainer import Loss, TrainStep, adamw, warmup_cosine
 from .outcome import two_hot
 
-KNOTS, REACH = 17, 3.0  # where the characteristic function is compared, from 0 to so many
-PROJECTIONS, SAMPLE = 128, 256  # of latents, of which SIGReg takes as many as these at a time
-SIGREG = 0.09
-LONE, BLIND = 0.2, 0.3  # shares of clips that begin without a past, and of those whose numbers are not seen
-LEAST_UNIT = 1e-3  # deviations, that a number counts as changing in a step
-DRAWN = 24  # latents a step that the decoder learns from
-# Shares of the loss.
-OF_NUMBERS, OF_OUTCOME, OF_INVERSE = 1.0, 0.3, 1.0
+KNOTS, REACH = 17, 3.0  # points at which characteristic functions are compared, from 0 to REACH
+PROJECTIONS, SAMPLE = 128, 256  # random directions, and latents, of one evaluation of SIGReg
+SIGREG = 0.09  # weight
+NO_PAST, NO_VECTORS = (
+    0.2,
+    0.3,
+)  # parts of the clips that begin without a past, and whose vectors are hidden beside pictures
+BAGGING = 0.75  # the part of the clips from which an ensemble member learns
+LEAST_UNIT = 1e-3  # standard deviations: the smallest change in a step by which errors are scaled
+DECODED = 24  # latents a step that the decoder learns from
+NUMBERS_WEIGHT, OUTCOME_WEIGHT, INVERSE_WEIGHT = 1.0, 0.3, 1.0
 
 
 @dataclass(frozen=True)
 class LatentClips:
-    """B clips of L rows: rgb uint8 [B, L, 3, H, W] or None; numbers [B, L, V]; actions [B, L, A] as networks are given them, of
-    row t those that led to row t + 1; reward [B, L]; done [B, L]."""
+    """B clips of L rows: rgb uint8 [B, L, 3, H, W] or None; numbers [B, L, V], the state vectors; actions [B, L, A], encoded for
+    networks, action t leading from row t to row t + 1; reward [B, L]; done [B, L]."""
 
     rgb: torch.Tensor | None
     numbers: torch.Tensor
@@ -42,18 +45,18 @@ class LatentClips:
 
 
 def latent_clips(
-    found: Mapping[str, np.ndarray], controls: Controls, config: LatentConfig, device: torch.device
+    clips: Mapping[str, np.ndarray], controls: Controls, config: LatentConfig, device: torch.device
 ) -> LatentClips:
-    """Clips of a recording, as `Clips` gives them, for a latent world of this make."""
-    actions = torch.from_numpy(np.asarray(found["action"], np.float32))
+    """A batch of `data.Clips` as a latent world of this config trains on it."""
+    actions = torch.from_numpy(np.asarray(clips["action"], np.float32))
     shape = actions.shape[:2]
     rgb = None
-    if "rgb" in found:
-        rgb = torch.from_numpy(found["rgb"]).to(device).permute(0, 1, 4, 2, 3)
-    parts = [torch.from_numpy(np.array(found[name], np.float32)).reshape(*shape, -1) for name, _ in config.vectors]
+    if "rgb" in clips:
+        rgb = torch.from_numpy(clips["rgb"]).to(device).permute(0, 1, 4, 2, 3)
+    parts = [torch.from_numpy(np.array(clips[name], np.float32)).reshape(*shape, -1) for name, _ in config.vectors]
     numbers = torch.cat([torch.zeros(*shape, 0), *parts], 2).nan_to_num(0.0, 0.0, 0.0)
     reward, done = (
-        torch.from_numpy(np.array(found[name], np.float32)).reshape(shape) if name in found else torch.zeros(shape)
+        torch.from_numpy(np.array(clips[name], np.float32)).reshape(shape) if name in clips else torch.zeros(shape)
         for name in ("reward", "done")
     )
     encoded = controls.encode(actions.flatten(0, 1)).unflatten(0, shape)
@@ -61,8 +64,8 @@ def latent_clips(
 
 
 def sigreg(latents: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """How far projections of latents [N, D] on directions [D, P] of length 1 are from standard normal: the Epps-Pulley statistic
-    (1983), N times the squared distance of the characteristic functions under a normal window; its mean over directions."""
+    """The Epps-Pulley statistic (1983) of latents [N, D], projected on unit directions [D, P], against a standard normal: N times
+    the squared distance of the characteristic functions under a Gaussian window; its mean over directions."""
     knots = torch.linspace(0, REACH, KNOTS, dtype=latents.dtype, device=latents.device)
     normal = (-knots.square() / 2).exp()
     weights = torch.full_like(knots, 2 * REACH / (KNOTS - 1)) * normal  # both halves of a symmetric integral
@@ -73,162 +76,163 @@ def sigreg(latents: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
 
 
 class LatentPrediction:
-    """Foretells `steps` steps beyond the history, each from what was foretold before it."""
+    """Predicts `steps` steps beyond the history, each from the predictions before it."""
 
     def __init__(self, network: LatentNetwork, controls: Controls, learning_rate: float, steps: int):
         self.network, self.controls, self.steps = network, controls, steps
         self.modules = {"network": network}
         parts = (network.encoder, network.predictor, network.heads, network.leaper)
         trained = [part for part in parts if parameters(part)]
-        self.learners = {"latent": adamw(trained, warmed(learning_rate, 100, 0.02))}
+        self.learners = {"latent": adamw(trained, warmup_cosine(learning_rate, 100, 0.02))}
         if network.config.size:
-            self.learners["decoder"] = adamw((network.decoder,), warmed(learning_rate, 100, 0.02))
+            self.learners["decoder"] = adamw((network.decoder,), warmup_cosine(learning_rate, 100, 0.02))
 
-    def losses(self, batch: LatentClips, now: Now) -> Iterator[Loss]:
+    def losses(self, batch: LatentClips, now: TrainStep) -> Iterator[Loss]:
         network, config = self.network, self.network.config
-        latents = self._encoded(batch, now)
-        windows, foretold, away = self._rolled(latents, batch, now)
-        parts = {"prediction": away}
+        latents = self._encode(batch, now)
+        windows, predicted, error = self._rollout(latents, batch, now)
+        parts = {"prediction": error}
         if not config.identity:  # which cannot collapse
-            parts["sigreg"] = self._regular(latents, now)
+            parts["sigreg"] = self._sigreg(latents, now)
         if config.leap:
-            parts["leap"] = self._leapt(latents, batch, now)
+            parts["leap"] = self._leap_error(latents, batch, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
-        parts |= self._read(real, torch.stack(windows, 1), torch.stack(foretold, 1), latents, batch)
-        shares = {
+        parts |= self._head_losses(real, torch.stack(windows, 1), torch.stack(predicted, 1), latents, batch)
+        weights = {
             "sigreg": SIGREG,
-            "numbers": OF_NUMBERS,
-            "reward": OF_OUTCOME,
-            "done": OF_OUTCOME,
-            "inverse": OF_INVERSE,
+            "numbers": NUMBERS_WEIGHT,
+            "reward": OUTCOME_WEIGHT,
+            "done": OUTCOME_WEIGHT,
+            "inverse": INVERSE_WEIGHT,
         }
-        yield Loss(
-            "latent", sum((shares.get(name, 1.0) * part for name, part in parts.items()), away.new_zeros(())), parts
-        )
+        terms = (weights.get(name, 1.0) * part for name, part in parts.items())
+        yield Loss("latent", sum(terms, error.new_zeros(())), parts)
         if batch.rgb is not None:
-            some = now.rng.permutation(latents.shape[0] * latents.shape[1])[:DRAWN]
+            some = now.rng.permutation(latents.shape[0] * latents.shape[1])[:DECODED]
             picked = torch.from_numpy(some).to(now.device)
-            drawn = network.decoder(latents.detach().flatten(0, 1)[picked])
-            parts = {"picture": picture_loss(drawn, batch.rgb.flatten(0, 1)[picked].float() / 255)}
+            decoded = network.decoder(latents.detach().flatten(0, 1)[picked])
+            parts = {"picture": picture_loss(decoded, batch.rgb.flatten(0, 1)[picked].float() / 255)}
             yield Loss("decoder", parts["picture"], parts)
 
-    def _encoded(self, batch: LatentClips, now: Now) -> torch.Tensor:
-        """Latents [B, L, D]; beside pictures the numbers of some clips are not seen."""
+    def _encode(self, batch: LatentClips, now: TrainStep) -> torch.Tensor:
+        """Latents [B, L, D]; beside pictures the vectors of some clips are hidden."""
         shape, config = batch.reward.shape, self.network.config
-        there = None
+        visible = None
         if config.pictured and config.columns:
-            seen = torch.from_numpy(now.rng.random(shape[0]) >= BLIND).to(now.device)
-            there = seen[:, None].expand(shape).flatten()
+            seen = torch.from_numpy(now.rng.random(shape[0]) >= NO_VECTORS).to(now.device)
+            visible = seen[:, None].expand(shape).flatten()
         rgb = None if batch.rgb is None else batch.rgb.flatten(0, 1)
-        return self.network.encode(rgb, batch.numbers.flatten(0, 1), there).unflatten(0, shape)
+        return self.network.encode(rgb, batch.numbers.flatten(0, 1), visible).unflatten(0, shape)
 
-    def _rolled(
-        self, latents: torch.Tensor, batch: LatentClips, now: Now
+    def _rollout(
+        self, latents: torch.Tensor, batch: LatentClips, now: TrainStep
     ) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor]:
-        """The windows [B, K, D] before each step, the latents [B, D] foretold by it, and how far all members were from the truth;
-        a member does not learn from every clip, so that members differ where recordings say little."""
+        """The windows [B, K, D] before each step and after the last, the ensemble's mean prediction [B, D] of each step, and the
+        mean error of the members. Each member learns from clips of its own draw, so that members differ where data is scarce."""
         network, history = self.network, self.network.config.history
-        lone = torch.from_numpy(now.rng.random((len(latents), 1, 1)) < LONE).to(now.device)
-        window = torch.where(lone, latents[:, history - 1 : history], latents[:, :history])
-        past = torch.where(lone, 0.0, batch.actions[:, : history - 1])
+        alone = torch.from_numpy(now.rng.random((len(latents), 1, 1)) < NO_PAST).to(now.device)
+        window = torch.where(alone, latents[:, history - 1 : history], latents[:, :history])
+        past = torch.where(alone, 0.0, batch.actions[:, : history - 1])
         members = network.config.members
-        learns = torch.from_numpy(now.rng.random((members, len(latents), 1)) < 0.75).to(now.device).float()
-        windows, foretold, away = [], [], latents.new_zeros(())
+        mask = torch.from_numpy(now.rng.random((members, len(latents), 1)) < BAGGING).to(now.device).float()
+        windows, predicted, error = [], [], latents.new_zeros(())
         for step in range(self.steps):
             actions = torch.cat([past, batch.actions[:, history - 1 + step, None]], 1)
-            found = network.predict(window, actions)
-            away = away + (learns * self._missed(found, latents[:, history + step])).mean() / 0.75
+            prediction = network.predict(window, actions)
+            error = error + (mask * self._errors(prediction, latents[:, history + step])).mean() / BAGGING
             windows.append(window)
-            foretold.append(found.mean(0))
-            window, past = torch.cat([window[:, 1:], foretold[-1][:, None]], 1), actions[:, 1:]
+            predicted.append(prediction.mean(0))
+            window, past = torch.cat([window[:, 1:], predicted[-1][:, None]], 1), actions[:, 1:]
         windows.append(window)
-        return windows, foretold, away / self.steps
+        return windows, predicted, error / self.steps
 
-    def _leapt(self, latents: torch.Tensor, batch: LatentClips, now: Now) -> torch.Tensor:
-        """How far a leap from one row of each clip is from the truth."""
+    def _leap_error(self, latents: torch.Tensor, batch: LatentClips, now: TrainStep) -> torch.Tensor:
+        """The mean error of a leap from one row of each clip."""
         network, config = self.network, self.network.config
-        long = config.history + config.leap
-        at = int(now.rng.integers(latents.shape[1] - long + 1))
-        spans, acts = latents[:, at : at + long], batch.actions[:, at : at + long - 1]
-        lone = torch.from_numpy(now.rng.random((len(spans), 1, 1)) < LONE).to(now.device)
+        length = config.history + config.leap
+        at = int(now.rng.integers(latents.shape[1] - length + 1))
+        spans, actions = latents[:, at : at + length], batch.actions[:, at : at + length - 1]
+        alone = torch.from_numpy(now.rng.random((len(spans), 1, 1)) < NO_PAST).to(now.device)
         first = config.history - 1
-        window = torch.where(lone, spans[:, first : first + 1], spans[:, : config.history])
-        acts = torch.cat([torch.where(lone, 0.0, acts[:, :first]), acts[:, first:]], 1)
-        return self._missed(network.leap(window, acts), spans[:, config.leap :]).mean()
+        window = torch.where(alone, spans[:, first : first + 1], spans[:, : config.history])
+        actions = torch.cat([torch.where(alone, 0.0, actions[:, :first]), actions[:, first:]], 1)
+        return self._errors(network.leap(window, actions), spans[:, config.leap :]).mean()
 
-    def _missed(self, found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-        """The error of each number: squared; where the latent is the vectors themselves, in units of a step, and less steep where
-        it is large (Huber), for a rollout that went astray says little."""
+    def _errors(self, prediction: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        """Squared errors. Where the latent is the vectors themselves, Huber losses in units of the usual change in a step: there a
+        rollout that has diverged should not dominate."""
         if not self.network.config.identity:
-            return (found - truth).square()
+            return (prediction - truth).square()
         unit = self.network.unit
-        return F.smooth_l1_loss(found / unit, (truth / unit).expand_as(found), reduction="none")
+        return F.smooth_l1_loss(prediction / unit, (truth / unit).expand_as(prediction), reduction="none")
 
-    def _regular(self, latents: torch.Tensor, now: Now) -> torch.Tensor:
+    def _sigreg(self, latents: torch.Tensor, now: TrainStep) -> torch.Tensor:
         flat = latents.flatten(0, 1)
         some = torch.from_numpy(now.rng.permutation(len(flat))[:SAMPLE]).to(now.device)
         return sigreg(flat[some].float(), F.normalize(now.randn(flat.shape[1], PROJECTIONS), dim=0))
 
-    def _read(
+    def _head_losses(
         self,
         real: torch.Tensor,
         windows: torch.Tensor,
-        foretold: torch.Tensor,
+        predicted: torch.Tensor,
         latents: torch.Tensor,
         batch: LatentClips,
     ) -> dict[str, torch.Tensor]:
-        """What heads read off real windows and off foretold ones [B, T + 1, K, D], held to what was recorded."""
+        """Losses of the heads for vectors, reward, termination and inverse dynamics, on encoded windows and on predicted ones
+        [B, T + 1, K, D]."""
         network, first = self.network, self.network.config.history - 1
-        acts = batch.actions[:, first:-1].flatten(0, 1)
+        actions = batch.actions[:, first:-1].flatten(0, 1)
         reward, done = (part[:, first:-1].flatten() for part in (batch.reward, batch.done))
         parts: dict[str, torch.Tensor] = {}
         if network.config.width and not network.config.identity:
-            told = network.scaled(batch.numbers[:, first:])
-            found = network.numbers(torch.stack([real, windows]).flatten(0, 2)).view(2, *told.shape)
-            parts["numbers"] = F.smooth_l1_loss(found, told.expand_as(found))
+            target = network.scaled(batch.numbers[:, first:])
+            numbers = network.numbers(torch.stack([real, windows]).flatten(0, 2)).view(2, *target.shape)
+            parts["numbers"] = F.smooth_l1_loss(numbers, target.expand_as(numbers))
         after = latents[:, first + 1 :]
-        for before, next_ in ((real[:, :-1], after), (windows[:, :-1], foretold)):
-            found = network.outcome(before.flatten(0, 1), acts, next_.flatten(0, 1))
-            costs = {"reward": -(two_hot(reward, network.rewards) * found.reward.log_softmax(1)).sum(1).mean()}
-            costs["done"] = F.binary_cross_entropy_with_logits(found.done, done)
+        for before, next_ in ((real[:, :-1], after), (windows[:, :-1], predicted)):
+            outcome = network.outcome(before.flatten(0, 1), actions, next_.flatten(0, 1))
+            costs = {"reward": -(two_hot(reward, network.rewards) * outcome.reward.log_softmax(1)).sum(1).mean()}
+            costs["done"] = F.binary_cross_entropy_with_logits(outcome.done, done)
             parts |= {name: parts.get(name, 0.0) + cost / 2 for name, cost in costs.items()}
-        found = network.inverse(real[:, :-1].flatten(0, 1), after.flatten(0, 1))
-        return parts | {"inverse": action_loss(found, acts, self.controls) / self._blind(acts)}
+        inferred = network.inverse(real[:, :-1].flatten(0, 1), after.flatten(0, 1))
+        return parts | {"inverse": action_loss(inferred, actions, self.controls) / self._baseline(actions)}
 
-    def _blind(self, acts: torch.Tensor) -> torch.Tensor | float:
-        """What `action_loss` is of axes for who does not look: small where actions are, and yet all there is to know of them."""
-        return acts.var(0).mean().clamp_min(1e-4) if self.controls.kind == AXES else 1.0
+    def _baseline(self, actions: torch.Tensor) -> torch.Tensor | float:
+        """The `action_loss` of the mean action, for axes; by it the loss of small actions is scaled."""
+        return actions.var(0).mean().clamp_min(1e-4) if self.controls.kind == AXES else 1.0
 
 
-def action_loss(found: torch.Tensor, acts: torch.Tensor, controls: Controls) -> torch.Tensor:
-    """How far `found` [N, A] is from actions [N, A], both as networks have them: of axes the square, of the rest in nats."""
+def action_loss(prediction: torch.Tensor, actions: torch.Tensor, controls: Controls) -> torch.Tensor:
+    """The loss of predicted actions [N, A], encoded for networks: mean squared error of axes, cross-entropy of the rest."""
     if controls.kind == AXES:
-        return F.mse_loss(found, acts)
+        return F.mse_loss(prediction, actions)
     if controls.kind == BUTTONS:
-        return F.binary_cross_entropy_with_logits(found, acts)
+        return F.binary_cross_entropy_with_logits(prediction, actions)
     counts = controls.counts
-    pairs = zip(found.split(counts, 1), acts.split(counts, 1))
-    costs = [F.cross_entropy(logits, picked.argmax(1)) for logits, picked in pairs]
+    pairs = zip(prediction.split(counts, 1), actions.split(counts, 1))
+    costs = [F.cross_entropy(logits, chosen.argmax(1)) for logits, chosen in pairs]
     return torch.stack(costs).sum()
 
 
-def picture_loss(drawn: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Squared error of pictures [N, 3, H, W]; what differs from one to the other counts more, for it is little and matters."""
+def picture_loss(decoded: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Squared error of pictures [N, 3, H, W]; pixels that differ from the mean picture weigh more, for they are few."""
     differs = (truth - truth.mean(0)).abs().amax(1, keepdim=True)
-    return ((1 + 8 * differs) * (drawn - truth).square()).mean()
+    return ((1 + 8 * differs) * (decoded - truth).square()).mean()
 
 
-def settle_scale(network: LatentNetwork, numbers: np.ndarray, follows: np.ndarray) -> None:
-    """Tells the network the mean and the standard deviation of the numbers [N, width] of its vectors, and by how much they change
-    in a step; follows bool [N - 1]: whether the next row comes after the row."""
+def set_scale(network: LatentNetwork, numbers: np.ndarray, follows: np.ndarray) -> None:
+    """Sets the mean and standard deviation of the network's vectors, and their usual change in a step, from numbers [N, width];
+    follows bool [N - 1]: whether a row and the next are consecutive steps."""
     if not network.config.width:
         return
-    found = torch.from_numpy(np.nan_to_num(numbers.astype(np.float64), posinf=0.0, neginf=0.0))
-    network.mean.copy_(found.mean(0))
-    spread = found.std(0, correction=0)
-    network.scale.copy_(torch.where(spread <= 1e-6 * found.abs().amax(0).clamp_min(1e-6), 1.0, spread))
+    values = torch.from_numpy(np.nan_to_num(numbers.astype(np.float64), posinf=0.0, neginf=0.0))
+    network.mean.copy_(values.mean(0))
+    deviation = values.std(0, correction=0)
+    constant = deviation <= 1e-6 * values.abs().amax(0).clamp_min(1e-6)
+    network.scale.copy_(torch.where(constant, 1.0, deviation))
     if network.config.identity:
-        scaled = found / network.scale
+        scaled = values / network.scale
         network.unit.copy_(scaled.diff(dim=0)[torch.from_numpy(follows)].square().mean(0).sqrt().clamp_min(LEAST_UNIT))
 
 

@@ -1,4 +1,4 @@
-"""Objects: the looks and moves that a recording's things have, and which follow which."""
+"""Objects: a vocabulary of looks and moves of a recording's objects, and a model of which follows which."""
 
 from __future__ import annotations
 
@@ -16,27 +16,30 @@ from ...data import ClipCache
 from ...space.billboards import cut_out
 from ...space.camera import Intrinsics, project
 from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Billboards, fresh, likest, marks, noted
-from ..feeds import Drawn
+from ..feeds import RandomBatches
 from ..recording import INSTANCES, OBJECTS, Recording
-from ..trainer import CPU, Loss, Now, Report, Run, Trainer, adamw, warmed
+from ..trainer import CPU, Loss, Report, Run, Trainer, TrainStep, adamw, warmup_cosine
 
-CLEAR, LARGE = 0.0008, 0.016  # shares of a frame from which a thing's look is known; from which it may stand for a look
-FORGETS = 8  # steps after which a thing that was not seen well may look otherwise
-TWICE = 2  # times that a look was seen to follow another, below which that was a mistake
-SELDOM = 4  # sightings below which a look is none
-UPRIGHT_M = 1.0  # height of what may stand in the way
-BODY_M, FEWEST = 0.4, 1000  # metres and sightings below which it is not known to
-NEVER_M = 1e3  # boxes of looks that are not used
-WAITS = 300  # steps from an episode's beginning in which things are found that waited there
-SAME_M, OFTEN = 1.5, 0.08  # metres within which, and share of the episodes in which, it is one that waits there
-LASTS = 15  # steps in which a thing must have been seen to be one that waits
-CHUNK = 1.5e6  # pixels of frames that are cut at once
+CLEAR, LARGE = (
+    0.0008,
+    0.016,
+)  # shares of a frame from which an object's look is classified, and from which it may exemplify one
+FORGETS = 8  # steps without a clear view after which an object's last look no longer counts
+TWICE = 2  # observed transitions from one look to another below which they count as mistakes
+SELDOM = 4  # sightings below which a cluster is no look
+UPRIGHT_M = 1.0  # height of an object that may be an obstacle
+BODY_M, FEWEST = 0.4, 1000  # metres of distance and number of sightings below which no object is an obstacle
+NEVER_M = 1e3  # height of the boxes of unused looks
+WAITS = 300  # steps from an episode's beginning in which objects are searched that were there from the start
+SAME_M, OFTEN = 1.5, 0.08  # metres within which, and share of episodes in which, such an object is the same one
+LASTS = 15  # steps in which such an object must have been seen
+CHUNK = 1.5e6  # pixels of frames that are cut out at once
 WITHOUT = ", or train without (train video --objects-steps 0)"
 
 
 class Sightings(NamedTuple):
-    """The n things that frames show: frame and row of its list [n]; marks [n, D] (worlds/objects.py) and box [n, 4]; share [n]
-    of the frame that shows it; whole [n], all of it is seen. clear [m], those that may stand for a look, and their
+    """n objects in frames: frame and row of its object table [n]; marks [n, D] (worlds/objects.py) and box [n, 4]; share [n] of the
+    frame's pixels; whole [n], whether all of it is visible. clear [m]: indices of those that may exemplify a look, and their
     pictures uint8 [m, 4, *PICTURE]."""
 
     frame: np.ndarray
@@ -50,9 +53,8 @@ class Sightings(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """What was seen to follow what: billboards [n, COLUMNS], and the pose [n, 7] from which they were seen a step later; their
-    next look [n] (NONE: not known) and move [n], and whether they were gone [n]; acts [n, history], rows of the last actions
-    (-1: none)."""
+    """n observed transitions: billboards [n, COLUMNS], and the camera pose [n, 7] a step later; the next look [n] (NONE: unknown)
+    and move [n], and whether the object was gone [n]; acts [n, history], rows of the last actions (-1: none)."""
 
     billboards: torch.Tensor
     pose: torch.Tensor
@@ -71,9 +73,8 @@ def learn_objects(
     camera: Intrinsics,
     steps: int,
 ) -> dict:
-    """Trains `objects` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording; an episode that
-    begins at one of the poses `starts` [S, 7] begins with the billboards that waited in the episodes that began there.
-    Returns facts."""
+    """Trains `objects` in place; `rgb(rows)` gives pictures uint8 [n, h, w, 3] at the size of the recording. Each of the poses
+    `starts` [S, 7] gets the billboards that were there at the start of the recorded episodes nearest to it. Returns facts."""
     seed, report = run.seed, run.report
     cache, rows = recording.cache, np.flatnonzero(recording.usable)
     seen = _cut(cache, rgb, rows, camera, report)
@@ -85,25 +86,25 @@ def learn_objects(
     objects.boxes[: len(heads)] = seen.box[seen.clear[heads]]
     moves = _moves(cache, rows, objects.config.moves, seed)
     objects.moves[: len(moves)] = moves
-    known = _settled(off, seen, cache)
-    tokens, waiting = _followed(objects, recording, seen, known, camera)
+    known = _classified(off, seen, cache)
+    tokens, waiting = _transitions(objects, recording, seen, known, camera)
     objects.solid[:] = _reach(objects, tokens)
     objects.follows[:] = _follows(objects, tokens)
     begun = [first for first, _ in cache.episodes if recording.usable[first]]
     for episode, start in enumerate(starts if begun else []):
         off = (recording.pose(begun) - start).norm(dim=1)
-        billboards = _gathered([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
+        billboards = _shared_starts([waiting[begun[at]] for at in (off <= off.min() + 0.05).nonzero()[:, 0]])
         for row, billboard in enumerate(billboards[: objects.config.rows]):
             objects.begun[episode, row] = billboard
-    objective = Next(objects, tokens, recording)
-    trainer = Trainer(run, "objects", Drawn(objective.picked), objective, steps, device=CPU)
+    objective = ObjectsObjective(objects, tokens, recording)
+    trainer = Trainer(run, "objects", RandomBatches(objective.picked), objective, steps, device=CPU)
     trainer.train()
     objects.eval()
     facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
     return {**facts, "objects_steps": trainer.facts["step"]}
 
 
-def listed(cache: ClipCache) -> np.ndarray:
+def object_table(cache: ClipCache) -> np.ndarray:
     """float32 [N, K, 4]: number and place of each thing of each row."""
     return np.asarray(cache.arrays[OBJECTS], np.float32).reshape(cache.length, -1, 4)
 
@@ -115,22 +116,22 @@ def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Re
         frames = torch.from_numpy(np.ascontiguousarray(rgb(some))).permute(0, 3, 1, 2)
         instances = torch.from_numpy(np.asarray(cache.arrays[INSTANCES][some]))
         depth, pose = (torch.from_numpy(np.asarray(array[some], np.float32)) for array in (cache.depth, cache.pose))
-        cut = cut_out(frames, instances, depth, torch.from_numpy(listed(cache)[some, :, 1:]), pose, camera)
+        cut = cut_out(frames, instances, depth, torch.from_numpy(object_table(cache)[some, :, 1:]), pose, camera)
         share = cut.pixels / (frames.shape[2] * frames.shape[3])
         clear = cut.whole & (share >= LARGE)
         picture = (cut.picture[clear] * 255).round().clamp(0, 255).byte()
         frame = torch.from_numpy(some)[cut.view]
         parts.append((frame, cut.row, marks(cut.picture, cut.box), cut.box, share, cut.whole, clear, picture))
         if first // chunk % 16 == 0:
-            report(first / len(rows), 1.0, "cutting out what stands in the frames")
+            report(first / len(rows), 1.0, "cutting out objects")
     frame, row, marked, box, share, whole, clear, picture = map(torch.cat, zip(*parts))
     shares = share.numpy(), whole.numpy(), clear.numpy().nonzero()[0]
     return Sightings(frame.numpy(), row.numpy(), marked, box, *shares, picture)
 
 
 def _looks(seen: Sightings, count: int, seed: int) -> tuple[np.ndarray, torch.Tensor]:
-    """Which of the clear sightings [looks] show a look best, and how far from each every sighting is [n, looks]: k-means, each
-    look shown by the largest of its more typical half."""
+    """For each look the clear sighting that exemplifies it [looks], and the distance of every sighting to each [n, looks].
+    Looks are k-means clusters, each exemplified by the largest of the half nearest to its centre."""
     rng, some = np.random.default_rng(seed), np.arange(len(seen.clear))
     some = some if len(some) <= 12000 else np.sort(rng.choice(some, 12000, replace=False))
     known = seen.marks[seen.clear[some]]
@@ -147,11 +148,10 @@ def _looks(seen: Sightings, count: int, seed: int) -> tuple[np.ndarray, torch.Te
     return heads, torch.cat([torch.cdist(part, shown) for part in seen.marks.split(4096)])
 
 
-def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray:
-    """The look of each sighting [n], `off` [n, looks] being how far it is from each; NONE where it is like none or not seen
-    well."""
+def _classified(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray:
+    """The look of each sighting [n], from its distances `off` [n, looks]; NONE if it is like none or not clearly visible."""
     episode = np.searchsorted([first for first, _ in cache.episodes], seen.frame, side="right")
-    numbers, clear = listed(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
+    numbers, clear = object_table(cache)[seen.frame, seen.row, 0], seen.whole & (seen.share >= CLEAR)
     look, last = np.full(len(off), NONE), {}
     for one in np.argsort(seen.frame, kind="stable"):
         if not clear[one]:
@@ -165,7 +165,7 @@ def _settled(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndarray
 
 
 def _follows(objects: Billboards, tokens: Tokens) -> torch.Tensor:
-    """bool [looks + 1, looks]: a look follows itself, and what it was seen to more than by mistake."""
+    """bool [looks + 1, looks]: whether a look may follow another; each follows itself, and those that it was seen to follow."""
     looks, known = objects.config.looks, tokens.look != NONE
     pair = (tokens.billboards[known, LOOK].long() + 1) * looks + tokens.look[known]
     seen = torch.bincount(pair, minlength=(looks + 1) * looks).view(looks + 1, looks) >= TWICE
@@ -174,8 +174,8 @@ def _follows(objects: Billboards, tokens: Tokens) -> torch.Tensor:
 
 
 def _reach(objects: Billboards, tokens: Tokens) -> torch.Tensor:
-    """How near [looks], along x or y in metres, a camera can come to what looks upright: as near as it ever did (the nearest
-    few of a thousand left out); 0 for what is low, and for all where it came into them."""
+    """The distance [looks], along x or y in metres, to which a camera can approach upright objects: the smallest one recorded
+    (its 0.2% quantile); 0 for low objects, and for all if the camera passed through them."""
     look = tokens.billboards[:, LOOK].long()
     upright = (objects.boxes[:, 3] >= UPRIGHT_M) & (objects.boxes[:, 3] < NEVER_M)
     off = (tokens.billboards[:, PLACE] - tokens.pose[:, :3])[:, :2].abs().amax(1)
@@ -185,22 +185,22 @@ def _reach(objects: Billboards, tokens: Tokens) -> torch.Tensor:
 
 
 def _moves(cache: ClipCache, rows: np.ndarray, count: int, seed: int) -> torch.Tensor:
-    """The moves [m, 3] that things make in a step, in metres, the first of them none: k-means."""
-    things = listed(cache)
+    """The moves [m, 3] of objects in a step, in metres, by k-means; the first is no move."""
+    things = object_table(cache)
     follows = rows[:-1][np.diff(rows) == 1]
     follows = follows[~np.isin(follows + 1, [first for first, _ in cache.episodes])]
     number, later = things[follows, :, 0], things[follows + 1, :, 0]
     same = (number[:, :, None] == later[:, None]) & (number > 0)[:, :, None]
     index, slot, after = same.nonzero()
-    moved = things[follows[index] + 1, after, 1:] - things[follows[index], slot, 1:]
-    far = np.linalg.norm(moved, axis=1)
-    moved = torch.from_numpy(moved[(far > 1e-3) & (far < 2)])
-    moved = moved[torch.randperm(len(moved), generator=make_rng(seed))[:20000]]
-    return torch.cat([torch.zeros(1, 3), _means(moved, count - 1, seed) if len(moved) else moved])
+    steps = things[follows[index] + 1, after, 1:] - things[follows[index], slot, 1:]
+    length = np.linalg.norm(steps, axis=1)
+    steps = torch.from_numpy(steps[(length > 1e-3) & (length < 2)])
+    steps = steps[torch.randperm(len(steps), generator=make_rng(seed))[:20000]]
+    return torch.cat([torch.zeros(1, 3), _means(steps, count - 1, seed) if len(steps) else steps])
 
 
 def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
-    """k-means of [n, D], begun with points far from each other (k-means++): at most [count, D]."""
+    """k-means of points [n, D], initialised by k-means++: at most [count, D]."""
     rng = make_rng(seed)
     picks = [int(torch.randint(len(points), (1,), generator=rng))]
     gap = (points - points[picks[0]]).square().sum(1)
@@ -216,19 +216,17 @@ def _means(points: torch.Tensor, count: int, seed: int) -> torch.Tensor:
     return centres
 
 
-def _followed(
+def _transitions(
     objects: Billboards, recording: Recording, seen: Sightings, known: np.ndarray, camera: Intrinsics
 ) -> tuple[Tokens, dict[int, list[torch.Tensor]]]:
-    """The tokens, `known` [n] being the looks of what was seen; and by the first row of each episode the billboards that
-    waited in it. The recording is walked through as a dream is, one billboard after another."""
+    """The transitions, from the looks `known` [n] of the sightings; and, by the first row of each episode, the billboards that were
+    there from the start. Billboards are updated row by row as in a rollout."""
     cache, back = recording.cache, np.arange(objects.config.history)[::-1]
-    things, poses = torch.from_numpy(listed(cache).copy()), torch.from_numpy(np.array(cache.pose, np.float32))
+    things, poses = torch.from_numpy(object_table(cache).copy()), torch.from_numpy(np.array(cache.pose, np.float32))
     looks, share = torch.full(things.shape[:2], float(NONE)), np.zeros(things.shape[:2])
     looks[seen.frame, seen.row] = torch.from_numpy(known).float()
     share[seen.frame, seen.row] = seen.share
-    steps: list[
-        tuple
-    ] = []  # a billboard, the row after, the look, place and end that it then has, and rows of last actions
+    steps: list[tuple] = []  # a billboard, the row after, its look, place and end there, and rows of the last actions
     waiting: dict[int, list[torch.Tensor]] = {}
     for first, stop in cache.episodes:
         were: dict[float, torch.Tensor] = {}  # billboards by number, and the row of the list in which each was
@@ -262,16 +260,16 @@ def _followed(
     if not steps:
         raise DatasetError(f"the recording shows no thing in two frames that follow each other{WITHOUT}.")
     before, at, look, place, gone, acts = zip(*steps)
-    moved = torch.stack(place) - torch.stack(before)[:, PLACE]
-    move = torch.cdist(moved, objects.moves).argmin(1)
-    move[moved.norm(dim=1) <= 1e-3] = 0
+    way = torch.stack(place) - torch.stack(before)[:, PLACE]
+    move = torch.cdist(way, objects.moves).argmin(1)
+    move[way.norm(dim=1) <= 1e-3] = 0
     follows = torch.stack(look).long(), move, torch.tensor(gone), np.stack(acts)
     return Tokens(torch.stack(before), poses[list(at)], *follows), waiting
 
 
 @dataclass
 class _Met:
-    """A thing of an episode: its billboard as it was first seen, and whether it was seen to come into being."""
+    """An object of an episode: its billboard when it was first seen, and whether it appeared in view."""
 
     billboard: torch.Tensor
     born: bool
@@ -284,28 +282,29 @@ class _Met:
 
     @property
     def waited(self) -> bool:
+        """Whether it was there from the start of the episode."""
         return self.often >= LASTS and not self.born and bool(self.billboard[LOOK] != NONE)
 
 
-def _gathered(episodes: list[list[torch.Tensor]]) -> list[torch.Tensor]:
-    """The billboards [COLUMNS] that waited in episodes which began alike, those of one place as one, the most frequent first: no
-    episode sees all of them."""
-    found: list[list[torch.Tensor]] = []
+def _shared_starts(episodes: list[list[torch.Tensor]]) -> list[torch.Tensor]:
+    """The billboards [COLUMNS] that were there at the start of `episodes` which began alike: those of one place count as one, and
+    the most frequent come first. No episode sees all of them."""
+    groups: list[list[torch.Tensor]] = []
     for billboard in (one for billboards in episodes for one in billboards):
-        alike = [some for some in found if (some[0] - billboard)[PLACE].norm() < SAME_M]
-        if alike:
-            alike[0].append(billboard)
+        same = [group for group in groups if (group[0] - billboard)[PLACE].norm() < SAME_M]
+        if same:
+            same[0].append(billboard)
         else:
-            found.append([billboard])
-    often = sorted((some for some in found if len(some) >= OFTEN * len(episodes)), key=len, reverse=True)
-    first = [some[0].clone() for some in often]
+            groups.append([billboard])
+    often = sorted((group for group in groups if len(group) >= OFTEN * len(episodes)), key=len, reverse=True)
+    first = [group[0].clone() for group in often]
     for number, billboard in enumerate(first):
         billboard[NUMBER] = number + 1
     return first
 
 
 def _in_sight(numbers: list[float], billboards: dict[float, torch.Tensor], pose: torch.Tensor, camera: Intrinsics):
-    """Those of `numbers` whose billboards should be well in sight from `pose` [7]."""
+    """Those of `numbers` whose billboards project well into the frame from `pose` [7]."""
     if not numbers:
         return []
     where, ahead = project(torch.stack([billboards[number][PLACE] for number in numbers]), pose, camera)
@@ -314,7 +313,7 @@ def _in_sight(numbers: list[float], billboards: dict[float, torch.Tensor], pose:
 
 
 def _open(billboard: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsics) -> bool:
-    """Whether the camera of `row` saw as far as the place of `billboard`, a little above the ground."""
+    """Whether the place of `billboard`, a little above the ground, was not occluded at `row`."""
     pose = torch.from_numpy(np.array(cache.pose[row], np.float32))
     where, ahead = project(billboard[None, PLACE] + torch.tensor([0, 0, 0.3]), pose, camera)
     (u, v), far = where[0].tolist(), float(ahead[0])
@@ -324,9 +323,9 @@ def _open(billboard: torch.Tensor, row: int, cache: ClipCache, camera: Intrinsic
     return float(cache.depth[row, int(v * height), int(u * width)]) > far - 0.5
 
 
-class Next:
-    """What comes next of a thing: another look, a move, an end. Half of each batch are tokens in which something happens; each
-    counts by how much likelier than evenly it was drawn, so that what is rare stays as rare as it is."""
+class ObjectsObjective:
+    """The likelihood of an object's next look, its move and its end. Half of each batch are transitions in which something happens;
+    importance weights keep the probabilities of rare events unbiased."""
 
     def __init__(self, objects: Billboards, tokens: Tokens, recording: Recording, batch: int = 512):
         self.objects, self.tokens, self.size = objects, tokens, batch
@@ -337,18 +336,18 @@ class Next:
         self.actions = recording.action(np.maximum(tokens.acts, 0).ravel()).view(*tokens.acts.shape, -1)
         self.actions[torch.from_numpy(tokens.acts < 0)] = 0
         self.modules = {"objects": objects}
-        self.learners = {"objects": adamw((objects,), warmed(2e-3, 100, 0.02), decay=1e-2, betas=(0.9, 0.999))}
+        self.learners = {"objects": adamw((objects,), warmup_cosine(2e-3, 100, 0.02), decay=1e-2, betas=(0.9, 0.999))}
 
-    def picked(self, now: Now) -> torch.Tensor:
+    def picked(self, now: TrainStep) -> torch.Tensor:
         return torch.multinomial(self.often, self.size, replacement=True, generator=now.noise)
 
-    def losses(self, batch: torch.Tensor, now: Now) -> Iterator[Loss]:
+    def losses(self, batch: torch.Tensor, now: TrainStep) -> Iterator[Loss]:
         weight = 1 / len(self.often) / self.often[batch]
         billboards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
-        said = self.objects.foresee(billboards, pose, self.actions[batch])
+        logits = self.objects.foresee(billboards, pose, self.actions[batch])
         possible = (look != NONE) & self.objects.follows[billboards[:, LOOK].long() + 1, look.clamp_min(0)]
-        error = F.cross_entropy(said.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
-        error = error + F.cross_entropy(said.move, move, reduction="none") * ~gone
-        error = error + F.binary_cross_entropy_with_logits(said.gone, gone.float(), reduction="none")
+        error = F.cross_entropy(logits.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
+        error = error + F.cross_entropy(logits.move, move, reduction="none") * ~gone
+        error = error + F.binary_cross_entropy_with_logits(logits.gone, gone.float(), reduction="none")
         loss = (weight * error).mean()
         yield Loss("objects", loss, {"objects": loss})

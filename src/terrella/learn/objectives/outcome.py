@@ -1,4 +1,4 @@
-"""Outcome: the rewards, ends and vitals of a recording, learned on short pieces of its episodes."""
+"""Outcome: rewards, terminations and vitals of a recording, learned on short clips of its episodes."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import torch.nn.functional as F
 
 from ...data import ClipCache
 from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
-from ..feeds import Drawn
-from ..trainer import Learner, Loss, Now, Run, Trainer, warmed
+from ..feeds import RandomBatches
+from ..trainer import Learner, Loss, Run, Trainer, TrainStep, warmup_cosine
 
-PIECE = 8  # steps that are learned from at a time
-_LEVELS = 33  # values, at most, that a reward or a change is told apart into
+LENGTH = 8  # steps of a clip
+_LEVELS = 33  # values at most into which rewards and changes are discretised
 
 
 @dataclass(frozen=True)
 class Happenings:
-    """What followed each row of a recording: action as networks are given it [N, A]; reward [N]; done [N]; vitals [N, V] at
-    the row; change [N, V] by its step; real bool [N]: rows whose step was recorded and may be learned from."""
+    """The outcomes of the steps of a recording: action encoded for networks [N, A]; reward [N]; done [N]; vitals [N, V] before the
+    step; change [N, V] of the vitals; real bool [N]: whether the step was recorded and may be trained on."""
 
     action: np.ndarray
     reward: np.ndarray
@@ -33,7 +33,7 @@ class Happenings:
 
     @staticmethod
     def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray) -> Happenings:
-        """`action`: float [N, A] as networks are given it; `usable`: bool [N], rows that training may see."""
+        """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see."""
         names = tuple(cache.vitals)
         vitals = np.zeros((cache.length, len(names)), np.float32)
         for column, name in enumerate(names):
@@ -41,17 +41,17 @@ class Happenings:
         real = usable & np.roll(usable, -1) & np.asarray(cache.action_valid, bool)
         real[[stop - 1 for _, stop in cache.episodes]] = False  # nothing follows an episode's last row
         change = np.where(real[:, None], np.roll(vitals, -1, 0) - vitals, 0.0)
-        found = (cache.reward, cache.done)  # what a recording lacks is none of either
-        reward, done = (np.zeros(cache.length, np.float32) if part is None else np.array(part) for part in found)
+        nothing = np.zeros(cache.length, np.float32)
+        reward, done = (nothing if part is None else np.array(part) for part in (cache.reward, cache.done))
         return Happenings(action, reward.astype(np.float32), done.astype(bool), vitals, change, real, names)
 
     @property
-    def tells_something(self) -> bool:
-        """Whether there is anything to learn: a reward that differs, an end, a vital."""
+    def is_informative(self) -> bool:
+        """Whether there is anything to learn: rewards that differ, terminations, vitals."""
         return bool(self.names) or bool(np.ptp(self.reward[self.real])) or bool(self.done[self.real].any())
 
     def events(self) -> np.ndarray:
-        """bool [N]: steps after which something is otherwise than it mostly is."""
+        """bool [N]: steps with an unusual reward, a termination or a change of vitals."""
         usual = np.median(self.reward[self.real])
         return self.real & ((self.reward != usual) | self.done | (self.change != 0).any(1))
 
@@ -64,17 +64,17 @@ class Happenings:
 
 
 def levels(values: np.ndarray) -> tuple[float, ...]:
-    """The distinct values, ascending, two or more; of many, those that part them evenly, with the rarest kept: the ends."""
-    found = np.unique(values.astype(np.float32))
-    if len(found) > _LEVELS:
-        found = np.unique(np.quantile(found, np.linspace(0, 1, _LEVELS)).astype(np.float32))
-    if len(found) < 2:
-        found = np.append(found, found[-1:] + 1 if len(found) else [0.0, 1.0]).astype(np.float32)
-    return tuple(float(value) for value in found)
+    """The distinct values, ascending, at least two; if there are many, their quantiles, extremes included."""
+    distinct = np.unique(values.astype(np.float32))
+    if len(distinct) > _LEVELS:
+        distinct = np.unique(np.quantile(distinct, np.linspace(0, 1, _LEVELS)).astype(np.float32))
+    if len(distinct) < 2:
+        distinct = np.append(distinct, distinct[-1:] + 1 if len(distinct) else [0.0, 1.0]).astype(np.float32)
+    return tuple(float(value) for value in distinct)
 
 
 def two_hot(values: torch.Tensor, among: torch.Tensor) -> torch.Tensor:
-    """values [n] as shares of the two nearest of `among` [L], ascending: [n, L]; what lies outside is the nearest end."""
+    """Two-hot encoding [n, L] of values [n] over the ascending bins `among` [L]; values outside are clipped."""
     values, among = values.clamp(float(among[0]), float(among[-1])), among.to(values.device)
     above = torch.searchsorted(among, values.contiguous()).clamp(1, len(among) - 1)
     share = (values - among[above - 1]) / (among[above] - among[above - 1])
@@ -84,9 +84,9 @@ def two_hot(values: torch.Tensor, among: torch.Tensor) -> torch.Tensor:
     return shares
 
 
-class Pieces:
-    """Half of the pieces hold an event; each counts by how much likelier than evenly it was drawn, so that what is rare stays
-    as rare as it is. `rgb(rows)` gives uint8 [n, 3, H, W]."""
+class OutcomeObjective:
+    """The likelihood of outcomes in clips, half of which contain an event; importance weights keep the probabilities of rare events
+    unbiased. `rgb(rows)` gives uint8 [n, 3, H, W]."""
 
     def __init__(
         self,
@@ -97,56 +97,58 @@ class Pieces:
         learning_rate: float = 2e-3,
     ):
         self.outcome, self.rgb, self.happened, self.size = outcome, rgb, happened, batch
-        real = np.lib.stride_tricks.sliding_window_view(happened.real, PIECE).all(1)
+        real = np.lib.stride_tricks.sliding_window_view(happened.real, LENGTH).all(1)
         self.starts = np.flatnonzero(real)
         sums = np.concatenate([[0], np.cumsum(happened.events())])
-        eventful = (sums[self.starts + PIECE] - sums[self.starts]).astype(float)
+        eventful = (sums[self.starts + LENGTH] - sums[self.starts]).astype(float)
         self.even = np.full(len(self.starts), 1 / max(1, len(self.starts)))
         self.often = 0.5 * self.even + 0.5 * (eventful / eventful.sum() if eventful.any() else self.even)
         heads = [weight for head in (outcome.paid, outcome.ending, *outcome.changed) for weight in head.parameters()]
         known = {id(weight) for weight in heads}
         body = [weight for weight in outcome.parameters() if id(weight) not in known]
-        groups = [{"params": body}, {"params": heads, "pace": 8.0}]  # what is rare is heard by the heads alone
+        groups = [{"params": body}, {"params": heads, "pace": 8.0}]  # only the heads learn from rare events at first
         optimiser = torch.optim.AdamW(groups, weight_decay=1e-3)
         self.modules = {"outcome": outcome}
-        self.learners = {"outcome": Learner(optimiser, (outcome,), warmed(learning_rate, 50, 0.03))}
+        self.learners = {"outcome": Learner(optimiser, (outcome,), warmup_cosine(learning_rate, 50, 0.03))}
 
-    def picked(self, now: Now) -> tuple[np.ndarray, torch.Tensor]:
-        """The first rows of a batch of pieces, and how much each counts."""
+    def picked(self, now: TrainStep) -> tuple[np.ndarray, torch.Tensor]:
+        """The first rows of a batch of clips, and their importance weights."""
         picks = now.rng.choice(len(self.starts), self.size, p=self.often)
         return self.starts[picks], torch.from_numpy(self.even[picks] / self.often[picks]).float()
 
-    def losses(self, batch: tuple[np.ndarray, torch.Tensor], now: Now) -> Iterator[Loss]:
+    def losses(self, batch: tuple[np.ndarray, torch.Tensor], now: TrainStep) -> Iterator[Loss]:
         starts, weight = batch
         outcome, happened, device = self.outcome, self.happened, now.device
-        rows = starts[:, None] + np.arange(PIECE)
-        frames = self.rgb((starts[:, None] + np.arange(PIECE + 1)).ravel()).to(device)
-        frames = _spoilt(frames, now).unflatten(0, (len(starts), PIECE + 1))
+        rows = starts[:, None] + np.arange(LENGTH)
+        frames = self.rgb((starts[:, None] + np.arange(LENGTH + 1)).ravel()).to(device)
+        frames = _degraded(frames, now).unflatten(0, (len(starts), LENGTH + 1))
         seen = outcome.seen(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1)).unflatten(0, rows.shape)
         names = ("action", "reward", "done", "change", "vitals")
         at = {name: torch.from_numpy(getattr(happened, name)[rows]).float().to(device) for name in names}
         hidden, total = outcome.begin(len(starts)).to(device), torch.zeros((), device=device)
-        for step in range(PIECE):
+        for step in range(LENGTH):
             vitals, change = at["vitals"][:, step], at["change"][:, step]
             predicted = outcome.judge(seen[:, step], at["action"][:, step], vitals, hidden)
             hidden = predicted.hidden
             ends = outcome.ends(predicted.known, vitals + change)
-            error = surprise(outcome.config, predicted, ends, at["reward"][:, step], at["done"][:, step], change)
-            total = total + (weight.to(device) * error).mean() / PIECE
+            error = negative_log_likelihood(
+                outcome.config, predicted, ends, at["reward"][:, step], at["done"][:, step], change
+            )
+            total = total + (weight.to(device) * error).mean() / LENGTH
         yield Loss("outcome", total, {"outcome": total})
 
 
-def learn_outcome(run: Run, objective: Pieces, steps: int) -> dict:
+def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:
     """Trains the objective's FrameOutcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    trainer = Trainer(run, "outcome", Drawn(objective.picked), objective, steps)
+    trainer = Trainer(run, "outcome", RandomBatches(objective.picked), objective, steps)
     trainer.train()
     objective.outcome.eval()
     return {"outcome_steps": trainer.facts["step"]}
 
 
-def surprise(
+def negative_log_likelihood(
     config: OutcomeConfig,
     predicted: OutcomeLogits,
     ends: torch.Tensor,
@@ -154,7 +156,7 @@ def surprise(
     done: torch.Tensor,
     change: torch.Tensor,
 ) -> torch.Tensor:
-    """How unlikely what happened was: [B], in nats; ends [B], the logit; reward and done [B], change [B, V] as they were."""
+    """[B], in nats, of recorded reward [B], done [B] and change [B, V]; ends [B] is the logit of termination."""
     total = F.cross_entropy(predicted.reward, two_hot(reward, torch.tensor(config.rewards)), reduction="none")
     total = total + F.binary_cross_entropy_with_logits(ends, done, reduction="none")
     for column, (logits, values) in enumerate(zip(predicted.changes, config.changes)):
@@ -163,8 +165,8 @@ def surprise(
     return total
 
 
-def _spoilt(frames: torch.Tensor, now: Now) -> torch.Tensor:
-    """Half of the batches a little soft and noisy, as dreamt frames are: uint8 to uint8."""
+def _degraded(frames: torch.Tensor, now: TrainStep) -> torch.Tensor:
+    """Half of the batches blurred and noisy, as generated frames are: uint8 to uint8."""
     if now.rng.random() < 0.5:
         return frames
     soft = F.avg_pool2d(frames.float(), 3, 1, 1, count_include_pad=False)

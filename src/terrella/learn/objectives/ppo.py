@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017): several passes over what a policy has just done in a fast simulator."""
+"""Proximal policy optimisation (Schulman et al. 2017): several epochs over the rollouts of a policy in a fast simulator."""
 
 from __future__ import annotations
 
@@ -8,24 +8,20 @@ import torch
 from torch import nn
 
 from ...act.actor_network import ActorNetwork
-from ..imagination import Imagined
-from ..trainer import Loss, Now, adamw, warmed
-from .actor_critic import Critic, Wanted, lambda_returns, weights_of
+from ..imagination import ImaginedRollouts
+from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from .actor_critic import Critic, ReturnConfig, lambda_returns, step_weights
 from .outcome import two_hot
 
-CLIP = 0.2  # how far the share of an action may move within a batch
-PASSES, PARTS = 5, 4  # over a batch, in so many parts
-FARTHEST = 0.03  # nats that the policy may have moved from what it was (its KL divergence), after which the passes end
-SLOWER, FASTER, SLOWEST = (
-    1 / 1.5,
-    1.05,
-    0.02,
-)  # of the learning rate, where it moved too far in the first pass, or not in any
+CLIP = 0.2  # range of the probability ratio
+EPOCHS, MINIBATCHES = 5, 4
+TARGET_KL = 0.03  # nats: the epochs end once the policy has moved further from the one that acted
+DECREASE, INCREASE, LOWEST = 1 / 1.5, 1.05, 0.02  # of the learning rate, see AdaptiveRate
 
 
-class Pace(nn.Module):
-    """The share of the learning rate that is taken: less after a batch whose first pass already moved the policy too far (as in
-    Rudin et al. 2021, "Learning to walk in minutes"), more again after one that moved it little."""
+class AdaptiveRate(nn.Module):
+    """The factor of the learning rate: it falls after a batch whose first epoch reached the target KL, and rises again after one
+    that never did (as in Rudin et al. 2021, "Learning to walk in minutes")."""
 
     share: torch.Tensor
 
@@ -33,64 +29,70 @@ class Pace(nn.Module):
         super().__init__()
         self.register_buffer("share", torch.ones(()))
 
-    def change(self, parts: int) -> None:
-        """After a batch that ended after so many of its parts."""
-        factor = SLOWER if parts < PARTS else FASTER if parts == PASSES * PARTS else 1.0
-        self.share.mul_(factor).clamp_(SLOWEST, 1.0)
+    def update(self, minibatches: int) -> None:
+        """After a batch from which `minibatches` gradient steps were taken."""
+        factor = DECREASE if minibatches < MINIBATCHES else INCREASE if minibatches == EPOCHS * MINIBATCHES else 1.0
+        self.share.mul_(factor).clamp_(LOWEST, 1.0)
 
 
 class Ppo:
-    """The policy is moved towards what paid more than the critic expected, but not far. `more` are modules that are saved with the
-    run."""
+    """The clipped surrogate objective with an entropy bonus, and a two-hot critic. `more` are modules saved with the run."""
 
     def __init__(
-        self, actor: ActorNetwork, critic: Critic, wanted: Wanted, learning_rate: float, more: Mapping[str, nn.Module]
+        self,
+        actor: ActorNetwork,
+        critic: Critic,
+        returns: ReturnConfig,
+        learning_rate: float,
+        more: Mapping[str, nn.Module],
     ):
-        self.actor, self.critic, self.wanted = actor, critic, wanted
-        self.pace = Pace()
-        self.modules = {"actor": actor, "critic": critic, "pace": self.pace, **more}
-        whole = warmed(learning_rate, 10, 0.1)
-        rate = lambda now: whole(now) * float(self.pace.share)  # noqa: E731
+        self.actor, self.critic, self.returns = actor, critic, returns
+        self.adaptive = AdaptiveRate()
+        self.modules = {"actor": actor, "critic": critic, "pace": self.adaptive, **more}
+        schedule = warmup_cosine(learning_rate, 10, 0.1)
+        rate = lambda now: schedule(now) * float(self.adaptive.share)  # noqa: E731
         self.learners = {"actor": adamw((actor,), rate), "critic": adamw((critic,), rate)}
 
-    def losses(self, batch: Imagined, now: Now) -> Iterator[Loss]:
-        seen, drawn, returns, better, weights, before = self._judged(batch)
-        count = len(drawn)
+    def losses(self, batch: ImaginedRollouts, now: TrainStep) -> Iterator[Loss]:
+        observations, actions, returns, advantages, weights, old_logprob = self._advantages(batch)
+        count = len(actions)
         facts = {
             "reward": (batch.reward.flatten() * weights).sum() / weights.sum(),
             "steps": weights.sum() / count,
-            "pace": self.pace.share.clone(),
+            "rate": self.adaptive.share.clone(),
         }
-        for done in range(PASSES):
-            for at, part in enumerate(torch.from_numpy(now.rng.permutation(count)).to(drawn.device).chunk(PARTS)):
-                here = {name: value[part] for name, value in seen.items()}
-                share, distribution = weights[part] / weights[part].sum().clamp_min(1.0), self.actor(here)
-                moved = distribution.log_prob(drawn[part]) - before[part]
-                ratio = moved.clamp(-20, 20).exp()
-                far = ((ratio.detach() - 1 - moved.detach()) * share).sum()
-                if far > FARTHEST:
-                    return self.pace.change(done * PARTS + at)
-                worth = torch.minimum(ratio * better[part], ratio.clamp(1 - CLIP, 1 + CLIP) * better[part])
-                entropy = distribution.entropy(drawn[part])
-                parts = {**facts, "entropy": (entropy.detach() * share).sum(), "moved": far}
-                yield Loss("actor", -((worth + self.wanted.entropy * entropy) * share).sum(), parts)
-                target = two_hot(returns[part], self.critic.bins)
-                surprise = -((target * self.critic(here).log_softmax(1)).sum(1) * share).sum()
-                yield Loss("critic", surprise, {"critic": surprise})
-        self.pace.change(PASSES * PARTS)
+        for epoch in range(EPOCHS):
+            order = torch.from_numpy(now.rng.permutation(count)).to(actions.device)
+            for at, rows in enumerate(order.chunk(MINIBATCHES)):
+                seen = {name: value[rows] for name, value in observations.items()}
+                weight, distribution = weights[rows] / weights[rows].sum().clamp_min(1.0), self.actor(seen)
+                log_ratio = distribution.log_prob(actions[rows]) - old_logprob[rows]
+                ratio = log_ratio.clamp(-20, 20).exp()
+                approx_kl = ((ratio.detach() - 1 - log_ratio.detach()) * weight).sum()
+                if approx_kl > TARGET_KL:
+                    return self.adaptive.update(epoch * MINIBATCHES + at)
+                advantage = advantages[rows]
+                surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
+                entropy = distribution.entropy(actions[rows])
+                parts = {**facts, "entropy": (entropy.detach() * weight).sum(), "approx_kl": approx_kl}
+                yield Loss("actor", -((surrogate + self.returns.entropy * entropy) * weight).sum(), parts)
+                target = two_hot(returns[rows], self.critic.bins)
+                value_loss = -((target * self.critic(seen).log_softmax(1)).sum(1) * weight).sum()
+                yield Loss("critic", value_loss, {"critic": value_loss})
+        self.adaptive.update(EPOCHS * MINIBATCHES)
 
     @torch.no_grad()
-    def _judged(self, batch: Imagined) -> tuple:
-        """Flat over steps and episodes: what was seen, what was drawn, its returns, how much better than expected in deviations,
-        how likely the step happened, and the log-probability of what was drawn."""
-        flat = {name: value.flatten(0, 1) for name, value in batch.seen.items()}
+    def _advantages(self, batch: ImaginedRollouts) -> tuple:
+        """Flat over steps and episodes: observations, actions, returns, normalised advantages, step weights and log-probabilities
+        of the actions under the policy that drew them."""
+        flat = {name: value.flatten(0, 1) for name, value in batch.observations.items()}
         value = self.critic.value(flat).unflatten(0, (len(batch.reward) + 1, -1))
-        returns = lambda_returns(batch.reward, batch.goes_on, value, batch.known, self.wanted)
-        weights = weights_of(batch.goes_on, batch.known).flatten()
-        better, total = (returns - value[:-1]).flatten(), weights.sum().clamp_min(1.0)
-        mean = (better * weights).sum() / total
-        spread = ((better - mean).square() * weights).sum().div(total).sqrt()
-        past = {name: seen[:-1].flatten(0, 1) for name, seen in batch.seen.items()}
-        drawn = batch.drawn.flatten(0, 1)
-        before = self.actor(past).log_prob(drawn)
-        return past, drawn, returns.flatten(), (better - mean) / (spread + 1e-6), weights, before
+        returns = lambda_returns(batch.reward, batch.continues, value, batch.trusted, self.returns)
+        weights = step_weights(batch.continues, batch.trusted).flatten()
+        advantages, total = (returns - value[:-1]).flatten(), weights.sum().clamp_min(1.0)
+        mean = (advantages * weights).sum() / total
+        deviation = ((advantages - mean).square() * weights).sum().div(total).sqrt()
+        past = {name: seen[:-1].flatten(0, 1) for name, seen in batch.observations.items()}
+        actions = batch.actions.flatten(0, 1)
+        old_logprob = self.actor(past).log_prob(actions)
+        return past, actions, returns.flatten(), (advantages - mean) / (deviation + 1e-6), weights, old_logprob

@@ -1,4 +1,4 @@
-"""Scroll: by which displacement most of the picture goes on, from how it went on before, what is seen and what is done."""
+"""Scroll: the displacement of most of the picture in a step, predicted from earlier ones, frames and actions."""
 
 from __future__ import annotations
 
@@ -12,83 +12,87 @@ import torch.nn.functional as F
 from ...space.matching import clearest, explains
 from ...worlds.codec import Scroll, least_off
 from ...worlds.generator import context_thumbnail
-from ..feeds import Drawn
+from ..feeds import RandomBatches
 from ..recording import Recording
-from ..trainer import Loss, Now, Run, Trainer, adamw, warmed
+from ..trainer import Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
 
-STEPS, BATCH, LENGTH = 600, 24, 8  # pieces a step, and steps of each, which are guessed one after another
-DREAMT = 0.5  # the share of pieces that go on from what was guessed: there pictures go by whole pixels, as in dreams
-RARELY = 0.3  # as likely is a piece drawn in which the picture does not scroll, as one in which it always does
-ALIKE = 0.03  # how much less a displacement may explain to be less right by e: pictures scroll by parts of pixels
+STEPS, BATCH, LENGTH = 600, 24, 8  # training steps, clips of each, and steps of a clip, which are predicted in turn
+ROLLED_OUT = (
+    0.5  # the part of the clips that continue from predictions: there pictures move by whole pixels, as in play
+)
+STILL_WEIGHT = 0.3  # sampling weight of a clip that does not scroll, relative to one that always does
+TOLERANCE = (
+    0.03  # how much less a displacement may explain to be less likely by a factor e: pictures scroll by parts of pixels
+)
 _ROWS = 512  # that are read at a time
 
 
-class Piece(NamedTuple):
-    """LENGTH steps on end: frames uint8 [B, LENGTH, 3, H, W], the newest before each; context [B, LENGTH, n];
-    found [B, slots - 1 + LENGTH, moves], how well each of the moves explains a picture (matching.explains), the oldest first."""
+class ScrollClips(NamedTuple):
+    """Clips of LENGTH steps: frames uint8 [B, LENGTH, 3, H, W], the newest before each step; context [B, LENGTH, n];
+    explained [B, slots - 1 + LENGTH, moves], how well each move explains a picture (matching.explains), the oldest first."""
 
     frames: torch.Tensor
     context: torch.Tensor
-    found: torch.Tensor
+    explained: torch.Tensor
 
 
 def learn_scroll(run: Run, scroll: Scroll, recording: Recording, moves: torch.Tensor, slots: int) -> None:
-    """Fits `scroll` in place, where pictures of the recording scroll at all."""
-    objective = Scrolling(scroll, recording, moves, slots)
+    """Trains `scroll` in place, if pictures of the recording scroll at all."""
+    objective = ScrollObjective(scroll, recording, moves, slots)
     if objective.scrolls.any():
-        Trainer(run, "scroll", Drawn(objective.drawn), objective, STEPS).train()
+        Trainer(run, "scroll", RandomBatches(objective.sample), objective, STEPS).train()
 
 
-class Scrolling:
-    """The likelihood of any displacement that explains the next picture about as well as the best does."""
+class ScrollObjective:
+    """The likelihood of the displacements that explain the next picture about as well as the best."""
 
     def __init__(self, scroll: Scroll, recording: Recording, moves: torch.Tensor, slots: int):
         self.scroll, self.recording, self.moves, self.slots = scroll, recording, moves, slots
         rows = np.arange(1, recording.cache.length)
         parts = [rows[first : first + _ROWS] for first in range(0, len(rows), _ROWS)]
-        found = [explains(recording.rgb(part - 1), recording.rgb(part), moves) for part in parts]
-        self.found = torch.cat([torch.zeros(1, len(moves)), *found])
-        self.rows = recording.within(slots, LENGTH - 1)  # those that begin a piece
-        scrolls = clearest(self.found).numpy() > 0
+        explained = [explains(recording.rgb(part - 1), recording.rgb(part), moves) for part in parts]
+        self.explained = torch.cat([torch.zeros(1, len(moves)), *explained])
+        self.rows = recording.rows_within(slots, LENGTH - 1)  # at which a clip may begin
+        scrolls = clearest(self.explained).numpy() > 0
         self.scrolls = np.lib.stride_tricks.sliding_window_view(scrolls, LENGTH).mean(1)[self.rows]
         self.modules = {"scroll": scroll}
-        self.learners = {"scroll": adamw((scroll,), warmed(2e-3, 20), decay=0.05)}
+        self.learners = {"scroll": adamw((scroll,), warmup_cosine(2e-3, 20), decay=0.05)}
 
-    def drawn(self, now: Now) -> Piece:
-        weight = RARELY + (1 - RARELY) * self.scrolls
-        return self.piece(now.rng.choice(self.rows, BATCH, p=weight / weight.sum()))
+    def sample(self, now: TrainStep) -> ScrollClips:
+        weight = STILL_WEIGHT + (1 - STILL_WEIGHT) * self.scrolls
+        return self.clips_at(now.rng.choice(self.rows, BATCH, p=weight / weight.sum()))
 
-    def piece(self, rows: np.ndarray) -> Piece:
-        """The pieces that begin with the pictures `rows`."""
+    def clips_at(self, rows: np.ndarray) -> ScrollClips:
+        """The clips whose first steps are `rows`."""
         recording, slots = self.recording, self.slots
         shown = rows[:, None] + np.arange(-1, LENGTH - 1)
         frames = recording.rgb(shown.ravel())
         steps = rows[:, None] + np.arange(LENGTH)
         acts = recording.actions_before(steps.ravel(), np.arange(1, slots + 1)).flatten(1).unflatten(0, steps.shape)
         thumbnail = context_thumbnail(frames).unflatten(0, steps.shape)
-        found = self.found[rows[:, None] + np.arange(1 - slots, LENGTH)]
-        return Piece(frames.unflatten(0, steps.shape), torch.cat([thumbnail, acts], 2), found)
+        explained = self.explained[rows[:, None] + np.arange(1 - slots, LENGTH)]
+        return ScrollClips(frames.unflatten(0, steps.shape), torch.cat([thumbnail, acts], 2), explained)
 
-    def losses(self, batch: Piece, now: Now) -> Iterator[Loss]:
-        frames, context, found = (part.to(now.device) for part in batch)
+    def losses(self, batch: ScrollClips, now: TrainStep) -> Iterator[Loss]:
+        frames, context, explained = (part.to(now.device) for part in batch)
         seen = self.scroll.glanced(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         ages, losses, right = self.slots - 1, [], []
-        dreamt = torch.from_numpy(now.rng.random(len(found)) < DREAMT).to(now.device)[:, None]
-        first = torch.where(dreamt[..., None], one_of(found[:, :ages]), found[:, :ages])
+        rolled_out = torch.from_numpy(now.rng.random(len(explained)) < ROLLED_OUT).to(now.device)[:, None]
+        first = torch.where(rolled_out[..., None], one_hot_clearest(explained[:, :ages]), explained[:, :ages])
         went = list(first.unbind(1))[::-1]  # the newest first
         for step in range(LENGTH):
             logits = self.scroll(seen[:, step], context[:, step], torch.stack(went[:ages], 1))
-            wanted = found[:, ages + step]
-            near = (wanted - wanted.amax(1, keepdim=True)) / ALIKE
-            known = (wanted.amax(1) > 0.2).float()
-            losses.append(-((logits.log_softmax(1) + near).logsumexp(1) * known).sum() / known.sum().clamp_min(1))
+            target = explained[:, ages + step]
+            near = (target - target.amax(1, keepdim=True)) / TOLERANCE
+            valid = (target.amax(1) > 0.2).float()
+            losses.append(-((logits.log_softmax(1) + near).logsumexp(1) * valid).sum() / valid.sum().clamp_min(1))
             guess = least_off(logits.detach(), self.moves.to(now.device))
-            right.append((wanted.gather(1, guess[:, None]) > wanted.amax(1, keepdim=True) - ALIKE).float().mean())
-            went.insert(0, torch.where(dreamt, F.one_hot(guess, wanted.shape[1]).float(), wanted))
+            right.append((target.gather(1, guess[:, None]) > target.amax(1, keepdim=True) - TOLERANCE).float().mean())
+            went.insert(0, torch.where(rolled_out, F.one_hot(guess, target.shape[1]).float(), target))
         loss = torch.stack(losses).mean()
         yield Loss("scroll", loss, {"scroll": loss, "right": torch.stack(right).mean()})
 
 
-def one_of(found: torch.Tensor) -> torch.Tensor:
+def one_hot_clearest(explained: torch.Tensor) -> torch.Tensor:
     """What moves explain [B, n, moves], as if the clearest explained all."""
-    return F.one_hot(clearest(found.flatten(0, 1)), found.shape[2]).float().unflatten(0, found.shape[:2])
+    return F.one_hot(clearest(explained.flatten(0, 1)), explained.shape[2]).float().unflatten(0, explained.shape[:2])

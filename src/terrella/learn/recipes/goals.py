@@ -1,5 +1,4 @@
-"""train goals: a goal-conditioned policy in the latents of a world, from the recording that the world was learned of; see
-objectives/goals.py."""
+"""train goals: a goal-conditioned policy in the latents of a world, from the recording of the world; see objectives/goals.py."""
 
 from __future__ import annotations
 
@@ -16,55 +15,52 @@ from ...act.goal_network import GoalActor, GoalConfig, GoalNetwork
 from ...core.errors import TrainingError
 from ...core.world import World, make_rng
 from ...data import Dataset
-from ..feeds import Drawn
-from ..latent_validation import evidence
+from ..feeds import RandomBatches
+from ..latent_validation import observation_at
 from ..objectives.goals import GoalReaching, Trajectories, action_error
 from ..recording import Recording
 from ..trainer import Report, Run, Trainer
 from .policy import device_of
 
 STAGE = "goals"
-AT_ONCE, TRIED = 256, 2048
-HELD_AHEAD = (1, 5, 25)  # steps to goals of held-out episodes
+BATCH, TESTED = 256, 2048  # rows that are encoded at once, and samples of a test
+TEST_STEPS = (1, 5, 25)  # to goals in held-out episodes
 
 
 @dataclass(frozen=True)
 class GoalTraining:
-    """Settings of a goal-conditioned policy.
+    """Settings of a goal-conditioned policy."""
 
-    Args:
-        farthest: Steps to a goal at most.
-        hidden: Width of the networks' layers.
-        steps: Training steps.
-        batch: Moves per step.
-        learning_rate: Highest learning rate.
-        save_every_s: Seconds between saves.
-        seed: Random seed.
-    """
-
+    # Steps to a goal at most.
     farthest: int = 50
+    # Width of the networks' layers.
     hidden: int = 256
+    # Training steps.
     steps: int = 4000
+    # Samples per step.
     batch: int = 512
+    # Peak learning rate.
     learning_rate: float = 1e-3
+    # Seconds between saves.
     save_every_s: float = 60.0
+    # Random seed.
     seed: int = 0
 
 
 def train_goals(
     world: World, name: str, recording: str | Path, out: str | Path, config: GoalTraining, report: Report
 ) -> dict[str, Any]:
-    """Trains, or goes on with, the policy in `out`/policy. Returns its facts."""
+    """Trains, or resumes, the policy in `out`/policy. Returns the facts of the run."""
     if min(config.farthest - 1, config.hidden, config.steps, config.batch) < 1:
         raise TrainingError("--farthest is 2 or more; --hidden, --steps and --batch are 1 or more.")
     run = Run.of(out, config, report, device_of(world), practised_in=name, recording=str(recording))
-    run.found(STAGE)
+    run.saved_facts(STAGE)
     torch.manual_seed(config.seed)
     network = GoalNetwork(GoalConfig.of(world.spec, config.farthest, config.hidden)).to(run.device)
     opened = _opened(world, recording, report)
     latents = _latents(world, opened, report)
     seen, held = (_trajectories(opened, latents, which, config.farthest) for which in (opened.seen, opened.held_out))
-    feed = Drawn(lambda now: seen.drawn(config.batch, now.rng))
+    feed = RandomBatches(lambda now: seen.sample(config.batch, now.rng))
     trainer = Trainer(run, STAGE, feed, GoalReaching(network, config.learning_rate), config.steps)
     card = {"what": f"A goal-conditioned policy in the latents of {world.spec.name}", "learned_in": name}
 
@@ -82,19 +78,21 @@ def train_goals(
 def _opened(world: World, recording: str | Path, report: Report) -> Recording:
     dataset, shape = Dataset(recording), world.spec.channels["rgb"].shape if "rgb" in world.spec.channels else None
     size = (shape[0], shape[1]) if shape else (64, 64)
-    return Recording.open(dataset, size, report, needs=("action",), why="hindsight needs what was done").enough()
+    return Recording.open(
+        dataset, size, report, needs=("action",), why="a policy is learned from the actions that reached goals"
+    ).require_rows()
 
 
 @torch.inference_mode()
 def _latents(world: World, recording: Recording, report: Report) -> torch.Tensor:
-    """Of all rows, each seen alone, as goals are: [R, D]."""
-    length, found = recording.cache.length, []
-    for first in range(0, length, AT_ONCE):
-        rows = np.arange(first, min(first + AT_ONCE, length))
-        state = world.observe(evidence(world, recording, rows), None, make_rng(0))
-        found.append(world.render(state, ("latent",))["latent"])
-        report(rows[-1] + 1, length, "showing the world what was recorded")
-    return torch.cat(found).clone()
+    """The latents of all rows [R, D], each encoded alone, as goals are."""
+    length, parts = recording.cache.length, []
+    for first in range(0, length, BATCH):
+        rows = np.arange(first, min(first + BATCH, length))
+        state = world.observe(observation_at(world, recording, rows), None, make_rng(0))
+        parts.append(world.render(state, ("latent",))["latent"])
+        report(rows[-1] + 1, length, "encoding the recording")
+    return torch.cat(parts).clone()
 
 
 def _trajectories(recording: Recording, latents: torch.Tensor, episodes, farthest: int) -> Trajectories:
@@ -111,18 +109,18 @@ def _trajectories(recording: Recording, latents: torch.Tensor, episodes, farthes
 
 @torch.no_grad()
 def _explained(network: GoalNetwork, held: Trajectories) -> dict[str, float]:
-    """By steps to the goal, the share of held-out actions' variance (of choices: of their nats) that the policy explains."""
-    found = {}
-    for steps in HELD_AHEAD:
+    """By steps to the goal, the share of the variance of held-out actions (of the entropy of choices) that the policy explains."""
+    explained = {}
+    for steps in TEST_STEPS:
         if (held.ends[held.rows] - held.rows < steps).all() or steps > network.config.farthest:
             continue
-        batch = held.drawn(TRIED, np.random.default_rng(0), steps)
-        told = network(batch.latent, batch.goal, batch.steps)
-        error = float(action_error(told, batch.action, network.config.actor.counts))
-        usual = batch.action.mean(0)
-        if isinstance(told, SquashedGaussian):
-            blind = float((batch.action - usual).square().mean())
+        batch = held.sample(TESTED, np.random.default_rng(0), steps)
+        distribution = network(batch.latent, batch.goal, batch.steps)
+        error = float(action_error(distribution, batch.action, network.config.actor.counts))
+        mean = batch.action.mean(0)
+        if isinstance(distribution, SquashedGaussian):
+            baseline = float((batch.action - mean).square().mean())
         else:
-            blind = float(torch.special.entr(usual).sum())
-        found[str(steps)] = round(1 - error / max(blind, 1e-9), 4)
-    return found
+            baseline = float(torch.special.entr(mean).sum())
+        explained[str(steps)] = round(1 - error / max(baseline, 1e-9), 4)
+    return explained

@@ -20,20 +20,20 @@ from ...worlds.folder import save_latent, with_kept
 from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
-from ..feeds import Streamed
-from ..latent_validation import ARMS, calibrate, encoded, foreseen, validate
-from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, settle_scale
+from ..feeds import ClipStream
+from ..latent_validation import ARMS, calibrate, encode_rows, rollout_frames, validate
+from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, set_scale
 from ..objectives.outcome import levels
 from ..recording import Recording
 from ..strips import write_lines
 from ..trainer import Report, Run, Trainer, device_named
 
 STAGE = "latent"
-SIDE, COARSE = 64, 16  # pixels: of the larger side at most, and what sides are multiples of
-WIDEST = 512  # numbers of a channel that is a vector
-LATENT_WIDEST = 64  # numbers of all vectors that may be the latent themselves
+SIDE, COARSE = 64, 16  # pixels: the longer side at most, and of what sides are multiples
+WIDEST = 512  # numbers of a channel at most, to be treated as a vector
+LATENT_WIDEST = 64  # numbers of all vectors at most, to be the latent themselves
 STARTS = 64
-LEAP = 5  # steps at once, unless it is said
+LEAP = 5  # steps at once, by default
 NOT_NUMBERS = (
     "rgb",
     "depth",
@@ -47,71 +47,68 @@ NOT_NUMBERS = (
     "latent",
     "done_probability",
 )
-WHY = "a latent world is learned from actions and what follows them (`terrella train latent-actions` finds actions in pictures)"
+WHY = "a latent world is learned from actions and observations (`terrella train latent-actions` finds actions in pictures)"
 
 
 @dataclass(frozen=True)
 class LatentTraining:
-    """Settings of a training run.
+    """Settings of a training run."""
 
-    Args:
-        name: Name of the world.
-        pictures: See the recording's pictures. --no-pictures sees its state vectors alone, and draws nothing.
-        vectors: See the recording's state vectors. --no-vectors sees its pictures alone, and predicts the vectors all the same.
-        channels: Vectors of the recording that it learns, such as observation. Default: all.
-        size: Height and width at which pictures are seen, multiples of 16. Default: their own shape, within 64 x 64.
-        latent: Width of the latent. Default: 64 with pictures; without, the state vectors themselves, scaled, where they have 64
-            numbers or fewer, else 32.
-        history: Last latents and actions that the predictor sees. 1 is enough, and fast, where the vectors tell speeds.
-        hidden: Width of the layers.
-        members: Predictors, whose disagreement says how wrong they may be; with 1 it says nothing.
-        rollout: Steps that are predicted one from another. Default: 12, and with pictures 6; fewer where episodes are short.
-        leap: Steps that a leap takes at once, for planners that hold or try moves of so many; 0 learns none. Default: 5, where
-            the rollout has room for it.
-        steps: Training steps. Training ends after these or after `hours`. Default: 4000, and with pictures 2500.
-        hours: Hours of training, earlier runs included.
-        batch: Clips per step. Default: 128, and with pictures 32.
-        learning_rate: Highest learning rate.
-        save_every_s: Seconds between saves.
-        strip_every_s: Seconds between pictures of truth and prediction.
-        seed: Random seed.
-        device: cpu, cuda or auto.
-    """
-
+    # Name of the world.
     name: str = "latent"
+    # Observe the recording's pictures. --no-pictures observes its state vectors alone, and renders nothing.
     pictures: bool = True
+    # Observe the recording's state vectors. --no-vectors observes its pictures alone, and still predicts the vectors.
     vectors: bool = True
+    # State vectors of the recording to learn, such as observation. Default: all.
     channels: tuple[str, ...] = ()
+    # Height and width of pictures, multiples of 16. Default: their own shape, scaled to fit within 64 x 64.
     size: tuple[int, int] | None = None
+    # Dimensions of the latent. Default: 64 with pictures; without, the scaled state vectors themselves where they have 64 numbers
+    # or fewer, else 32.
     latent: int | None = None
+    # Past latents and actions that the predictor sees. 1 is enough, and fast, where the vectors contain velocities.
     history: int = 3
+    # Width of the hidden layers.
     hidden: int = 192
+    # Predictors in the ensemble, whose disagreement is the uncertainty; with 1 there is none.
     members: int = 3
+    # Horizon in steps of the training rollouts. Default: 12, and with pictures 6; fewer where episodes are short.
     rollout: int | None = None
+    # Steps that one leap of the predictor covers, for planners that repeat an action or plan in strides of this length; 0 learns
+    # no leap. Default: 5, if the rollout is that long.
     leap: int | None = None
+    # Training steps. Training ends after these or after `hours`, whichever comes first. Default: 4000, and with pictures 2500.
     steps: int | None = None
+    # Hours of training, earlier runs included.
     hours: float = 24.0
+    # Clips per step. Default: 128, and with pictures 32.
     batch: int | None = None
+    # Peak learning rate.
     learning_rate: float = 1e-3
+    # Seconds between saves.
     save_every_s: float = 60.0
+    # Seconds between pictures of truth and prediction.
     strip_every_s: float = 300.0
+    # Random seed.
     seed: int = 0
+    # cpu, cuda or auto.
     device: str = "auto"
 
 
 def train_latent(data: str | Path, out: str | Path, config: LatentTraining, report: Report) -> dict:
-    """Trains, or goes on with, the run in `out`; the finished world lies in `out`/world. Returns its facts."""
+    """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run."""
     _check(config)
     dataset = Dataset(data)
-    size = config.size or fitting(dataset)
+    size = config.size or fitted_size(dataset)
     run = Run.of(
         out, config, report, device_named(config.device), ("hours",),
         **{"frames": dataset.length, "recording of": dataset.world.get("name")},
     )  # fmt: skip
-    run.found(STAGE)
-    recording = Recording.open(dataset, size, report, needs=("action",), why=WHY).enough()
+    run.saved_facts(STAGE)
+    recording = Recording.open(dataset, size, report, needs=("action",), why=WHY).require_rows()
     torch.manual_seed(config.seed)
-    return _Learned(run, recording, config).learn()
+    return _Training(run, recording, config).learn()
 
 
 def _check(config: LatentTraining) -> None:
@@ -128,8 +125,8 @@ def _check(config: LatentTraining) -> None:
         raise TrainingError("--no-pictures --no-vectors leaves nothing to see; leave one of them out.")
 
 
-def fitting(dataset: Dataset) -> tuple[int, int]:
-    """Height and width in multiples of 16 at which pictures are seen: their own shape, the longer side at most 64."""
+def fitted_size(dataset: Dataset) -> tuple[int, int]:
+    """Height and width of pictures in multiples of 16: their own shape, scaled so that the longer side is at most 64."""
     if dataset.rgb_key is None:
         return SIDE, SIDE
     sides = dataset.sensors[dataset.rgb_key].shape[:2]
@@ -139,8 +136,8 @@ def fitting(dataset: Dataset) -> tuple[int, int]:
 
 
 def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
-    """(channel, width) of what a recording holds in numbers: state vectors, poses, vitals; of all, or of those that are wanted."""
-    cache, found = recording.cache, {}
+    """(channel, width) of the vectors of a recording, such as state, pose and vitals: all, or those in `wanted`."""
+    cache, widths = recording.cache, {}
     for channel, key in cache.keys.items():
         array = cache.arrays.get(key)
         if (
@@ -151,16 +148,16 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
         ):
             continue
         if (width := int(np.prod(array.shape[1:]))) <= WIDEST:
-            found[channel] = width
-    if lacks := [name for name in wanted if name not in found]:
+            widths[channel] = width
+    if lacks := [name for name in wanted if name not in widths]:
         raise DatasetError(
-            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(found)) or 'none'}."
+            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(widths)) or 'none'}."
         )
-    return tuple((name, width) for name, width in sorted(found.items()) if not wanted or name in wanted)
+    return tuple((name, width) for name, width in sorted(widths.items()) if not wanted or name in wanted)
 
 
-class _Learned:
-    """The network of a latent world, and the trainer's stage that it takes."""
+class _Training:
+    """The network of a latent world and its training."""
 
     def __init__(self, run: Run, recording: Recording, config: LatentTraining):
         self.run, self.recording, self.config = run, recording, config
@@ -173,7 +170,7 @@ class _Learned:
         rows = np.flatnonzero(recording.usable)
         flat = [np.asarray(array[rows], np.float32).reshape(len(rows), -1) for array in arrays]
         follows = (np.diff(recording.start[rows]) == 0) & (np.diff(rows) == 1)
-        settle_scale(self.network, np.concatenate(flat, 1) if flat else np.zeros((len(rows), 0)), follows)
+        set_scale(self.network, np.concatenate(flat, 1) if flat else np.zeros((len(rows), 0)), follows)
 
     def _array(self, channel: str) -> np.ndarray:
         return self.recording.cache.arrays[self.recording.cache.keys[channel]]
@@ -207,13 +204,14 @@ class _Learned:
         )
 
     def _leap(self) -> int:
-        rollout, asked = self._rollout(), self.config.leap
-        if asked is not None and asked > rollout:
-            raise TrainingError(f"--leap {asked} needs a --rollout of as many steps or more; it is {rollout}.")
-        return asked if asked is not None else LEAP if rollout >= LEAP else 0
+        rollout, leap = self._rollout(), self.config.leap
+        if leap is not None and leap > rollout:
+            raise TrainingError(f"--leap {leap} needs a --rollout of {leap} steps or more; it is {rollout}.")
+        return leap if leap is not None else LEAP if rollout >= LEAP else 0
 
     def _rollout(self) -> int:
-        """Steps of a rollout: as many as are asked for, or as leave nine tenths of the clips that a single step would have."""
+        """Horizon of a rollout: the one in the settings, or the longest for which the episodes that are long enough hold nine
+        tenths of all rows."""
         recording, history = self.recording, self.config.history
         lengths = np.array([np.subtract(*recording.cache.episodes[number][::-1]) for number in recording.seen])
         clips = [np.maximum(lengths - history - steps + 1, 0).sum() for steps in range(1, 65)]
@@ -239,15 +237,11 @@ class _Learned:
         batch = config.batch or (32 if self.sees_pictures else 128)
         names = [name for name in ("action", "reward", "done") if getattr(recording.cache, name) is not None]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
-        clips = Clips(
-            recording.cache,
-            ClipsConfig(config.history + steps, names, batch, seed=config.seed, episodes=recording.seen),
-        )
-        make = lambda found, now: latent_clips(found, self.controls, self.network.config, now.device)  # noqa: E731
+        settings = ClipsConfig(config.history + steps, names, batch, seed=config.seed, episodes=recording.seen)
+        make = lambda rows, now: latent_clips(rows, self.controls, self.network.config, now.device)  # noqa: E731
         objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps)
         total = config.steps or (2500 if self.sees_pictures else 4000)
-        trainer = Trainer(self.run, STAGE, Streamed(clips, make), objective, total)
-        trainer.limit_s = 3600 * config.hours
+        trainer = Trainer(self.run, STAGE, ClipStream(Clips(recording.cache, settings), make), objective, total)
         done = (self.run.out / "world" / WORLD_FILE).exists() and "validation" in trainer.facts
         if not trainer.finished:
             trainer.facts.pop("validation", None)
@@ -255,29 +249,26 @@ class _Learned:
         trainer.train(lambda: self.draw_strip(trainer))
         if not done:
             self._finish(trainer)
-        found = trainer.facts["validation"]
-        return {
-            "world": str(self.run.out / "world"),
-            **{k: v for k, v in trainer.summary.items() if k != "validation"},
-            **found,
-        }
+        summary = {name: fact for name, fact in trainer.summary.items() if name != "validation"}
+        return {"world": str(self.run.out / "world"), **summary, **trainer.facts["validation"]}
 
     def _finish(self, trainer: Trainer) -> None:
-        """The uncertainty, the figures of the finished world, and the world."""
-        self.run.report(1, 1, "validating on held-out episodes")
+        """Saves the trained world, then calibrates and validates it, and saves it again with its figures."""
         world = self.world(trainer)
+        save_latent(world, self.run.out / "world")  # it can be used, should a kill come before it is validated
+        self.run.report(1, 1, "validating on held-out episodes")
         calibrate(world, self.recording)
-        found = validate(world, self.recording)
-        about = LatentWorld(_with(world.about, found), world.network, world.starts)
-        save_latent(about, self.run.out / "world")
-        (self.run.out / "validation.json").write_text(json.dumps(found, indent=1) + "\n")
+        figures = validate(world, self.recording)
+        validated = LatentWorld(_with_figures(world.about, figures), world.network, world.starts)
+        save_latent(validated, self.run.out / "world")
+        (self.run.out / "validation.json").write_text(json.dumps(figures, indent=1) + "\n")
         self._strip(world, trainer)
         self.network.spread.copy_(world.network.spread)
         self.network.error.copy_(world.network.error)
-        trainer.once("validation", lambda: found)
+        trainer.compute_once("validation", lambda: figures)
 
     def world(self, trainer: Trainer) -> LatentWorld:
-        """The world as it now is, on the CPU, of copies."""
+        """The world as it now is, on the CPU; a copy."""
         recording, cache = self.recording, self.recording.cache
         about = with_kept(cache.world, self.run.out / "world")
         names = about.get("action_names") or cache.action_names
@@ -288,7 +279,7 @@ class _Learned:
         bare = LatentWorld(what, network, torch.zeros(1, network.config.latent))
         first = np.intersect1d(recording.start, np.flatnonzero(recording.usable))
         first = first[:: max(1, math.ceil(len(first) / STARTS))]
-        return LatentWorld(what, network, encoded(bare, recording, first))
+        return LatentWorld(what, network, encode_rows(bare, recording, first))
 
     def _card(self, trainer: Trainer) -> dict[str, Any]:
         recording, shape = self.recording, self.network.config
@@ -305,19 +296,22 @@ class _Learned:
         }
 
     def draw_strip(self, trainer: Trainer) -> None:
-        """The world as it now is, so that it can be played while it learns, and truth above what it imagines."""
+        """Saves the world as it now is, so that it can be used while it trains, and a picture of truth above a rollout."""
         world = self.world(trainer)
         save_latent(world, self.run.out / "world")
         self._strip(world, trainer)
 
     @torch.inference_mode()
     def _strip(self, world: LatentWorld, trainer: Trainer) -> None:
-        lines = foreseen(world, self.recording)
+        lines = rollout_frames(world, self.recording)
         if lines:
             write_lines(lines, self.run.out / f"strip-{trainer.facts['step']:06d}.png")
 
 
-def _with(about: About, found: dict[str, Any]) -> About:
-    usual = found["errors"]["latent"][ARMS[0]]
-    levels = {"sure": min(usual.values()), "invents": 0.5}  # what the page of play calls sure and invented
-    return replace(about, card={**about.card, "uncertainty": levels, "validation": found})
+def _with_figures(about: About, figures: dict[str, Any]) -> About:
+    latent = figures["errors"]["latent"][ARMS[0]]
+    levels = {
+        "sure": min(latent.values()),
+        "invents": 0.5,
+    }  # levels at which the page of play says certain and inventing
+    return replace(about, card={**about.card, "uncertainty": levels, "validation": figures})

@@ -10,8 +10,8 @@ import torch
 
 from ...core.errors import DatasetError, TrainingError
 from ...data import ClipCache, Clips, ClipsConfig
-from ..feeds import Streamed
-from ..objectives.latent_actions import Codes
+from ..feeds import ClipStream
+from ..objectives.latent_actions import LatentActionsObjective
 from ..objectives.latent_model import LatentModel
 from ..recording import Recording
 from ..run_folder import load_run, resume_file
@@ -23,37 +23,33 @@ WHY = "latent actions are learned from pictures"
 
 
 @dataclass(frozen=True)
-class LatentConfig:
-    """Settings of a training run.
+class LatentActionsConfig:
+    """Settings of a training run."""
 
-    Args:
-        codes: Number of actions to learn.
-        stride: Rows between the two frames that are compared. Choose it so that the motion is a pixel or more, but no longer
-            than a key is held.
-        size: Height and width in pixels at which frames are compared.
-        steps: Training steps.
-        batch: Pairs of frames per step.
-        learning_rate: Highest learning rate.
-        save_every_s: Seconds between saves.
-        strip_every_s: Seconds between pictures of what each code does.
-        seed: Random seed.
-        device: cpu, cuda or auto.
-    """
-
+    # Number of actions to learn.
     codes: int = 8
+    # Rows between the two frames of a pair. Choose it so that the motion is a pixel or more, but no longer than a key is pressed.
     stride: int = 2
+    # Height and width in pixels at which frames are compared.
     size: tuple[int, int] = (48, 64)
+    # Training steps.
     steps: int = 1800
+    # Pairs of frames per step.
     batch: int = 16
+    # Peak learning rate.
     learning_rate: float = 2e-3
+    # Seconds between saves.
     save_every_s: float = 60.0
+    # Seconds between pictures of the effect of each code.
     strip_every_s: float = 120.0
+    # Random seed.
     seed: int = 0
+    # cpu, cuda or auto.
     device: str = "auto"
 
 
-def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig, report: Report) -> dict:
-    """Trains, or goes on with, the run in `out`; every 20th episode is held out, as `train video` does. Returns its facts."""
+def train_latent_actions(data: str | Path, out: str | Path, config: LatentActionsConfig, report: Report) -> dict:
+    """Trains, or resumes, the run in `out`; every 20th episode is held out, as in `train video`. Returns the facts of the run."""
     if any(length < 32 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 32 or more.")
     if not 2 <= config.codes <= 64 or config.stride < 1 or config.steps < 1 or config.batch < 1:
@@ -69,12 +65,12 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
     run = Run.of(out, config, report, device, frames=recording.cache.length)
     torch.manual_seed(config.seed)
     model = LatentModel(config.codes, config.stride, config.size, device)
-    objective = Codes(model, config.learning_rate)
+    objective = LatentActionsObjective(model, config.learning_rate)
     clips = Clips(
         recording.cache,
         ClipsConfig(2, ("rgb",), config.batch, stride=config.stride, seed=config.seed, episodes=recording.seen),
     )
-    trainer = Trainer(run, STAGE, Streamed(clips, lambda found, now: found["rgb"]), objective, config.steps)
+    trainer = Trainer(run, STAGE, ClipStream(clips, lambda rows, now: rows["rgb"]), objective, config.steps)
 
     def draw() -> None:
         draw_strip(model, recording, config.seed, run.out / f"strip-{trainer.facts['step']:06d}.png")
@@ -85,7 +81,7 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentConfig
 
 
 def load_latent(run: str | Path, device: str = "auto") -> LatentModel:
-    """The model of a training run; TrainingError where the folder holds none."""
+    """The model of a training run; TrainingError if the folder has none."""
     path = resume_file(Path(run), STAGE)
     facts = load_run(path, {}, {})
     if facts is None or "codes" not in facts["recipe"]:
@@ -97,7 +93,7 @@ def load_latent(run: str | Path, device: str = "auto") -> LatentModel:
 
 
 def pictures(data: str | Path, size: tuple[int, int], report: Report) -> ClipCache:
-    """The clip cache of a recording that has pictures; DatasetError where it has none."""
+    """The clip cache of a recording; DatasetError if it has no pictures."""
     return Recording.open(data, size, report, why=WHY).cache
 
 
@@ -108,14 +104,14 @@ def frames_at(cache: ClipCache, rows: np.ndarray) -> torch.Tensor:
 
 
 def pair_rows(cache: ClipCache, episodes: list[int], stride: int) -> np.ndarray:
-    """Rows of `episodes` whose episode goes on for `stride` rows more."""
+    """Rows of `episodes` that have `stride` rows after them in their episode."""
     rows = [np.arange(start, max(start, stop - stride)) for start, stop in (cache.episodes[i] for i in episodes)]
     return np.concatenate([np.zeros(0, np.int64), *rows])
 
 
 def draw_strip(model: LatentModel, recording: Recording, seed: int, path: Path) -> None:
-    """Eight held-out moments from left to right; from above: the frame, what followed, the outcome of the inferred code,
-    of a random one, and then of each code in turn, three times over so that its motion is plain to see."""
+    """Eight held-out pairs from left to right; from above: the frame, the next, the prediction for the inferred code, for a random
+    one, and then for each code, applied three times so that its motion is visible."""
     cache, stride = recording.cache, model.stride
     unseen = pair_rows(cache, list(recording.held_out), stride)
     rows = unseen if len(unseen) else pair_rows(cache, recording.seen, stride)

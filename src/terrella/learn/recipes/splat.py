@@ -26,9 +26,12 @@ from ..trainer import Report
 from .splat_views import SplatFit, read_views
 
 RESUME = "resume.safetensors"
-LOOK_S, LOOK_SHARE, LOOKED_AT = 2.0, 20, 4  # seconds between looks, at most a twentieth of the time; pictures of one
-HELD_OUT = 8  # every so-manyth picture is kept from the fit, to measure it
-
+LOOK_S, LOOK_SHARE, LOOKED_AT = (
+    2.0,
+    20,
+    4,
+)  # seconds between previews, which take at most 1/20 of the time; their test pictures
+HELD_OUT = 8  # every 8th picture is held out to measure the fit
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
 
@@ -36,113 +39,124 @@ Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
 def fit_splat(
     data: str | Path, out: str | Path, config: SplatFit, report: Report | None = None, watch: Watch | None = None
 ) -> dict[str, Any]:
-    """Fits, saves OUT/world, and goes on where an earlier run stopped. Returns the figures on held-out pictures (dB, with half the
-    width of their 95% interval) beside the baseline of the nearest picture of the fit.
+    """Fits, or resumes, a world of Gaussians and saves it to OUT/world. Returns PSNR on held-out pictures (dB, with half the width
+    of the 95% interval) beside the baseline of the nearest picture of the fit.
 
-    watch: called every few seconds with what gives the world as it is then, and `step`, `steps` and `db` of a few kept pictures.
+    watch: called every few seconds with a function that gives the current world, and `step`, `steps` and `db` of a few held-out
+    pictures.
     """
     out, began = Path(out), time.monotonic()
+    _check(config)
+    views, spec, left_out = read_views(data, out, config)
+    held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
+    seen, tested = views.at(~held), views.at(held)
+    try:
+        fit = Fit(seen, config.fit)
+    except ContractError as error:
+        raise TrainingError(f"{data}: {error}") from error
+    recipe = {
+        "data": str(data),
+        **{name: str(value) for name, value in asdict(config).items() if name != "save_every_s"},
+    }
+    _restore(out / RESUME, fit, recipe)
+    finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
+    if not finished:
+        check_free(out / "world")
+
+    def preview() -> float:
+        """Calls `watch`; returns the time of the next preview."""
+        if watch is None:
+            return math.inf
+        start, now = time.monotonic(), fit.gaussians.each(lambda part: part.detach().clone())
+        db = float(psnr(now, tested.at(torch.arange(len(tested))[:: max(len(tested) // LOOKED_AT, 1)])).mean())
+        facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
+        watch(lambda: _world(now, seen, spec, config, {}), facts)
+        return start + max(LOOK_S, LOOK_SHARE * (time.monotonic() - start))
+
+    try:
+        _run(fit, config, report, preview, lambda: _save(out / RESUME, fit, recipe))
+    except KeyboardInterrupt:
+        _save(out / RESUME, fit, recipe)
+        raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command goes on.") from None
+    preview()
+    figures = _figures(fit, seen, tested)
+    if not finished:  # else it may have been edited since
+        _save(out / RESUME, fit, recipe)
+        card = {"data": str(data), "left_out": left_out, **figures}
+        save_splat(_world(fit.gaussians, seen, spec, config, card), out / "world")
+    return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
+
+
+def _check(config: SplatFit) -> None:
     if config.frames < 16 or (config.episodes is not None and config.episodes < 1):
         raise TrainingError("--frames is 16 or more, --episodes 1 or more.")
     if not 1e-4 <= config.scale <= 1e4 or not 32 <= config.longest <= 4096:
         raise TrainingError("--scale is from 0.0001 to 10,000, --longest from 32 to 4096.")
-    views, spec, left_out = read_views(data, out, config)
-    held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
-    kept, asked = views.at(~held), views.at(held)
-    try:
-        fit = Fit(kept, config.fit)
-    except ContractError as error:
-        raise TrainingError(f"{data}: {error}") from error
-    told = {"data": str(data), **{name: str(value) for name, value in asdict(config).items() if name != "save_every_s"}}
-    _restore(out / RESUME, fit, told)
-    finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
-    if not finished:
-        check_free(out / "world")
-    saved, looked, error = time.monotonic(), -math.inf, 0.0
-
-    def look() -> float:
-        """Has the fit watched, and says when next."""
-        if watch is None:
-            return math.inf
-        start, now = time.monotonic(), fit.gaussians.each(lambda part: part.detach().clone())
-        db = float(psnr(now, asked.at(torch.arange(len(asked))[:: max(len(asked) // LOOKED_AT, 1)])).mean())
-        facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
-        watch(lambda: _world(now, kept, spec, config, {}), facts)
-        return start + max(LOOK_S, LOOK_SHARE * (time.monotonic() - start))
-
-    try:
-        while fit.done < config.fit.steps:
-            if time.monotonic() > looked:
-                looked = look()
-            error = 0.95 * error + 0.05 * fit.step() if error else fit.step()
-            if report:
-                report(
-                    fit.done, config.fit.steps, f"{len(fit.leaves['means']):,} Gaussians, colours off by {error:.3f}"
-                )
-            if time.monotonic() - saved > config.save_every_s:
-                _save(out / RESUME, fit, told)
-                saved = time.monotonic()
-    except KeyboardInterrupt:
-        _save(out / RESUME, fit, told)
-        raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command goes on.") from None
-    look()
-    figures = _figures(fit, kept, asked)
-    if not finished:  # else it may have been edited since
-        _save(out / RESUME, fit, told)
-        save_splat(
-            _world(fit.gaussians, kept, spec, config, {"data": str(data), "left_out": left_out, **figures}),
-            out / "world",
-        )
-    return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
-def _figures(fit: Fit, kept: PosedViews, asked: PosedViews) -> dict[str, Any]:
-    near = nearest_views(kept, asked)
-    copied = torch.stack([decibels(kept.rgb[one].float() - truth.float()) for one, truth in zip(near, asked.rgb)])
-    found = psnr(fit.gaussians, asked)
-    both = {"held_out_db": found, "nearest_picture_db": copied}
+def _run(
+    fit: Fit, config: SplatFit, report: Report | None, preview: Callable[[], float], save: Callable[[], None]
+) -> None:
+    """All steps of the fit that are left."""
+    saved, next_preview, error = time.monotonic(), -math.inf, 0.0
+    while fit.done < config.fit.steps:
+        if time.monotonic() > next_preview:
+            next_preview = preview()
+        error = 0.95 * error + 0.05 * fit.step() if error else fit.step()
+        if report:
+            words = f"{len(fit.leaves['means']):,} Gaussians, colour error {error:.3f}"
+            report(fit.done, config.fit.steps, words)
+        if time.monotonic() - saved > config.save_every_s:
+            save()
+            saved = time.monotonic()
+
+
+def _figures(fit: Fit, seen: PosedViews, tested: PosedViews) -> dict[str, Any]:
+    near = nearest_views(seen, tested)
+    copied = torch.stack([decibels(seen.rgb[one].float() - truth.float()) for one, truth in zip(near, tested.rgb)])
+    both = {"held_out_db": psnr(fit.gaussians, tested), "nearest_picture_db": copied}
     figures = {
         name: [round(float(v.mean()), 2), round(float(1.96 * v.std() / len(v) ** 0.5), 2)] for name, v in both.items()
     }
     return {
         **figures,
-        "held_out": len(asked),
-        "pictures": len(kept),
+        "held_out": len(tested),
+        "pictures": len(seen),
         "gaussians": len(fit.gaussians),
         "steps": fit.done,
     }
 
 
 def _world(
-    gaussians: Gaussians, kept: PosedViews, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
+    gaussians: Gaussians, seen: PosedViews, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
 ) -> SplatWorld:
-    """The world of a fit, in which one is as tall as the recording's camera was over its floor."""
+    """The world of a fit, with a walker whose eyes are as high above the floor as the recording's camera."""
     gaussians = gaussians.at(gaussians.opacities > 0.01)
-    eye = kept.pose[:, :3]
+    eye = seen.pose[:, :3]
     below = Occupancy.of(gaussians).floor(eye, Walker(eye_m=0.5, step_m=0.0))
     tall = float((eye[:, 2] - below).median())
     body = Walker(eye_m=tall, step_m=min(0.45, 0.4 * tall)) if 0.3 < tall < 3 else Walker()
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
-    starts = kept.pose[:: max(len(kept) // 64, 1)]
-    made = SplatConfig(kept.camera, kept.size, body=body)
+    starts = seen.pose[:: max(len(seen) // 64, 1)]
+    made = SplatConfig(seen.camera, seen.size, body=body)
     return SplatWorld(config.name, gaussians, observed, starts, made, {"game": str(spec.get("name", "")), **card})
 
 
-def _save(path: Path, fit: Fit, told: dict[str, str]) -> None:
+def _save(path: Path, fit: Fit, recipe: dict[str, str]) -> None:
     replace_whole(
-        path, lambda file: save_file({k: v.contiguous() for k, v in fit.state().items()}, file, metadata=told)
+        path, lambda file: save_file({k: v.contiguous() for k, v in fit.state().items()}, file, metadata=recipe)
     )
 
 
-def _restore(path: Path, fit: Fit, told: dict[str, str]) -> None:
+def _restore(path: Path, fit: Fit, recipe: dict[str, str]) -> None:
     if not path.exists():
         return
     try:
         with safe_open(str(path), "pt") as file:
-            said = dict(file.metadata() or {})
+            saved = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError) as error:
         raise TrainingError(f"{path} cannot be read ({error}); remove it, or give another --out.") from error
-    if said != told:
+    if saved != recipe:
         raise TrainingError(f"{path} is of a fit with other settings; remove it, or give another --out.")
     fit.restore(tensors)

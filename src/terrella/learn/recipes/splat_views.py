@@ -1,4 +1,4 @@
-"""What space fit fits: a recording, or pictures, with or without poses and depth, as posed views with depth."""
+"""Inputs of `space fit`: a recording or pictures, with or without poses and depth, as posed views with depth."""
 
 from __future__ import annotations
 
@@ -22,37 +22,34 @@ from ...space.pictures.posed import FEWEST, to_views
 from ...space.stereo import with_depth
 
 DEPTH_FILE, PICTURES = "depth.safetensors", "pictures"
-KNOWN = 0.08  # share of the pixels whose depth neighbours agree on: with less the poses are wrong, or nothing overlaps
+AGREEMENT = 0.08  # share of pixels whose depth agrees between views: with less the poses are wrong, or nothing overlaps
 
 
 @dataclass(frozen=True)
 class SplatFit:
-    """Settings of a fit.
+    """Settings of a fit."""
 
-    Args:
-        name: Name of the world.
-        frames: Pictures that are taken of the recording, the folder or the video, spread evenly over what is asked for.
-        episodes: The first so many episodes are used. Default: all.
-        box: Corners x0 y0 x1 y1 in metres: only pictures taken within, one room say.
-        scale: Metres of a unit of the poses. Default: 1, and where COLMAP found them, such that the middle of what is seen is
-            3 m away: pictures alone do not say how large anything is.
-        longest: Pixels of the longer side of pictures; larger ones are made smaller. Recordings stay as they are.
-        save_every_s: Seconds between saves.
-    """
-
+    # Name of the world.
     name: str = "place"
+    # Pictures taken from the recording, the folder or the video, evenly spread.
     frames: int = 300
+    # Number of episodes to use, from the first. Default: all.
     episodes: int | None = None
+    # Corners x0 y0 x1 y1 in metres: only pictures taken within, such as those of one room.
     box: tuple[float, float, float, float] | None = None
+    # Metres per unit of the poses. Default: 1; with poses from COLMAP such that the median depth is 3 m, for pictures alone have
+    # no scale.
     scale: float = 1.0
+    # Pixels of the longer side of pictures; larger ones are scaled down. Recordings keep their size.
     longest: int = 480
+    # Seconds between saves.
     save_every_s: float = 20.0
     fit: FitConfig = field(default_factory=FitConfig)
 
 
 def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedViews, Mapping[str, Any], list[str]]:
-    """Views with depth, what a recording says of its world, and the pictures that were left out; DatasetError where they are no
-    views of one place. Depth that had to be found, and poses, are kept in `out`."""
+    """Views with depth, the facts of a recording's world, and the pictures that were left out; DatasetError if they are no views of
+    one place. Estimated depth and poses are cached in `out`."""
     path, spec, left_out = Path(data), {}, []
     if is_pictures(path):
         shots, unplaced = posed_pictures(path, out / PICTURES, config.frames)
@@ -72,7 +69,7 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
     views = views.at(rows)
     if not bool((views.depths(torch.arange(0, len(views), max(len(views) // 20, 1))) > 0).any()):
         views = _with_depth(views, points, out / DEPTH_FILE, f"{data} {replace(config, fit=FitConfig())}")
-        if float((views.depth < FAR_M).float().mean()) < KNOWN:
+        if float((views.depth < FAR_M).float().mean()) < AGREEMENT:
             raise DatasetError(
                 f"the pictures of {data} do not agree on any surface: their poses are wrong, or they overlap too little, or they "
                 "were all taken from one spot."
@@ -80,21 +77,21 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
     return views, spec, left_out
 
 
-def _with_depth(views: PosedViews, points: torch.Tensor | None, path: Path, told: str) -> PosedViews:
-    """The views with depth by stereo, which is read again where it was found before."""
+def _with_depth(views: PosedViews, points: torch.Tensor | None, path: Path, key: str) -> PosedViews:
+    """The views with depth by stereo, cached in the file `path` under `key`."""
     try:
         with safe_open(str(path), "pt") as file:
-            if (file.metadata() or {}).get("told") == told and len(depth := file.get_tensor("depth")) == len(views):
+            if key in (file.metadata() or {}).values() and len(depth := file.get_tensor("depth")) == len(views):
                 return replace(views, depth=depth)
     except (OSError, SafetensorError):
-        pass  # not yet
-    found = with_depth(views, points)
-    replace_whole(path, lambda file: save_file({"depth": found.depth}, file, metadata={"told": told}))
-    return found
+        pass  # not cached yet
+    estimated = with_depth(views, points)
+    replace_whole(path, lambda file: save_file({"depth": estimated.depth}, file, metadata={"settings": key}))
+    return estimated
 
 
 def _recorded(data: str | Path, config: SplatFit) -> tuple[PosedViews, Mapping[str, Any]]:
-    """Pictures of a recording, and what it says of its world; DatasetError where it has no poses or lens."""
+    """Pictures of a recording, and the facts of its world; DatasetError if it has no poses or lens."""
     dataset = Dataset(data)
     missing = [name for name in ("rgb", "pose") if not dataset.has(name)]
     lens = dataset.camera_models.get("rgb")
@@ -104,7 +101,7 @@ def _recorded(data: str | Path, config: SplatFit) -> tuple[PosedViews, Mapping[s
             "plain pictures, or a video, poses are found."
         )
     names = ["rgb", "pose", *(["depth"] if dataset.has("depth") else [])]
-    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    arrays: dict[str, list[np.ndarray]] = {name: [] for name in names}
     episodes = range(len(dataset.episodes))[: config.episodes]
     poses = [dataset.episode(number, ["pose"])["pose"] for number in episodes]
     inside = [np.flatnonzero(_within(pose * config.scale, config.box)) for pose in poses]
@@ -117,10 +114,10 @@ def _recorded(data: str | Path, config: SplatFit) -> tuple[PosedViews, Mapping[s
         some = rows[chosen[(chosen >= first) & (chosen < first + len(rows))] - first]
         first += len(rows)
         if len(some):
-            arrays = dataset.episode(number, names)
-            for name, parts in found.items():
-                parts.append(arrays[name][some])
-    whole = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in found.items()}
+            episode = dataset.episode(number, names)
+            for name, parts in arrays.items():
+                parts.append(episode[name][some])
+    whole = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in arrays.items()}
     rgb, pose = whole["rgb"], whole["pose"]
     depth = whole["depth"].float() if "depth" in whole else torch.full((len(rgb), 1, 1), FAR_M)
     depth = torch.where(depth.isfinite() & (depth < 65), depth, FAR_M)

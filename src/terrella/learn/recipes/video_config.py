@@ -1,0 +1,95 @@
+"""Settings of `train video`, and the kind of world that a recording allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ...core.errors import DatasetError
+from ...worlds.config import VideoConfig
+from ...worlds.objects import ROWS
+from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, has_channel
+
+WIDTHS = (32, 56, 88, 128)  # channels of a U-Net
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of a training run."""
+
+    # Name of the world.
+    name: str = "world"
+    # Height and width of its frames in pixels. Default: those of the recording, scaled down to at most 96 x 128 pixels in all.
+    size: tuple[int, int] | None = None
+    # Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
+    geometry: bool = True
+    # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88 128, and
+    # without depth 48 64 96.
+    channels: tuple[int, ...] = ()
+    # Number of past frames that a world without geometry sees.
+    frames: int = 4
+    # Training steps of the model that predicts reward, termination and vitals.
+    outcome_steps: int = 1500
+    # Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a recording with object
+    # instances. 0 draws them like everything else.
+    objects_steps: int = 2500
+    # Learn what moves (monsters, doors, pick-ups), if a recording with depth and poses marks it.
+    moving: bool = True
+    # Flow steps a frame. With more than one the whole flow from noise to frame is learned, so that a frame is a sample and not a
+    # mean: a teacher for `train distil`.
+    flow_steps: int = 1
+    # Training steps of the generator. Training ends after these or after `hours`, whichever comes first.
+    steps: int = 8000
+    # Hours of training, of all stages together, earlier runs included; learning rates decay over them.
+    hours: float = 24.0
+    # Frames per step. Default: 8 on a CPU, 64 on a GPU.
+    batch: int | None = None
+    # Peak learning rate of the generator. Default: 8e-4, and without depth 2e-3.
+    learning_rate: float | None = None
+    # Training steps of the motion model.
+    motion_steps: int = 6000
+    # Number of recorded keyframes that the world keeps in memory.
+    keyframes: int = 640
+    # A box x0 y0 x1 y1 of the map in metres that training never sees, to score new places.
+    keep_out: Box | None = None
+    # Step from which a critic judges sharpness.
+    critic_from: int = 1500
+    # Weight of the critic, relative to the loss.
+    critic_weight: float = 0.3
+    # Training steps of the depth and odometry estimator. 0 leaves it out.
+    estimator_steps: int = 2500
+    # Predicted frames from which the uncertainty is learned. 0 leaves it out.
+    uncertainty_frames: int = 9000
+    # Seconds between saves.
+    save_every_s: float = 120.0
+    # Seconds between pictures of truth and prediction.
+    strip_every_s: float = 300.0
+    # Random seed.
+    seed: int = 0
+    # cpu, cuda or auto.
+    device: str = "auto"
+
+
+def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:
+    """The kind of world that can be learned from a recording."""
+    cache, controls = recording.cache, recording.controls
+    posed = config.geometry and recording.posed
+    moving = posed and config.moving and THINGS in cache.arrays
+    objects = moving and has_channel(cache, OBJECTS) and has_channel(cache, INSTANCES) and config.objects_steps > 0
+    if objects and cache.arrays[OBJECTS].shape[1:] != (ROWS, 4):
+        raise DatasetError(
+            f"{recording.name} lists objects as {cache.arrays[OBJECTS].shape[1:]}, and {(ROWS, 4)} is read: number and place "
+            f"of up to {ROWS}. Record it so, or train with --objects-steps 0."
+        )
+    height, width = cache.rgb.shape[1:3]
+    return VideoConfig(
+        tuple(cache.world["camera"]) if posed else (1.0, 1.0, 0.5, 0.5),
+        controls.numbers,
+        (height, width),
+        config.channels or WIDTHS,
+        slots=3 if posed else config.frames,
+        geometry=posed,
+        steps=config.flow_steps,
+        residual=not posed and config.flow_steps == 1,
+        moving=moving,
+        objects=objects,
+    )

@@ -1,0 +1,192 @@
+"""Worlds of frames alone: recordings without depth or poses. Stages: scroll, outcome, then a codec, or a flow as a teacher."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ...core.errors import DatasetError, TrainingError
+from ...space.mosaic import recalled
+from ...worlds.codec import COARSE, Codec, CodecConfig
+from ...worlds.config import VideoConfig
+from ...worlds.frame_history import FrameHistory, StartClips
+from ...worlds.learned import LearnedWorld
+from ...worlds.outcome import ConstantConfig
+from ..budget import Stage
+from ..feeds import codec_feed, frames_feed
+from ..moves import CodecStatistics, frequent_moves, mosaics, overlay, palette
+from ..objectives.codec import CodecObjective, Spans
+from ..objectives.flow import Flow
+from ..objectives.scroll import learn_scroll
+from ..objectives.stress import FRAMES, USUAL, choose_stress
+from ..objectives.uncertainty import dreaming_seconds
+from ..recording import Recording
+from ..run_folder import resume_file
+from ..trainer import Feed, Run, Trainer
+from .video_config import TrainConfig
+from .video_parts import VideoParts, flow_objective
+
+MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
+PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched
+REMEMBERED = 64  # steps before a start from which its mosaic is made
+CHANGED_SHARE, MAX_STRESS = (
+    0.4,
+    16.0,
+)  # pixels that change are weighted up to this share of the loss, at most by this factor
+
+
+class CodecRecipe:
+    """A codec: each pixel stays, is fetched from an earlier frame or from the mosaic, or is painted in a palette colour."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+        self.parts = _flat_parts(run, recording, config, video)
+        self.video = self.parts.video
+        if self.video.slots < 2:
+            raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
+        self.objective = self._objective()
+        self.starts: StartClips | None = None  # made once
+
+    def _objective(self) -> CodecObjective:
+        """With the vocabulary of moves and colours of the recording, which the run's folder keeps."""
+        run, config, recording = self.parts.run, self.parts.config, self.parts.recording
+        plain = self.video.generator
+        statistics = CodecStatistics.read(run.out, run.recipe)
+        if statistics is None or statistics.over.shape != plain.size:
+            statistics = codec_statistics(recording, config.seed)
+            statistics.write(run.out, run.recipe)
+        sizes = len(statistics.moves), len(statistics.palette)
+        settings = CodecConfig(plain.size, plain.slots, plain.context, *sizes)
+        levels = int(np.log2(min(plain.size) // COARSE)) + 1  # as many as a small frame has room for
+        codec = Codec(replace(settings, channels=(config.channels or settings.channels)[:levels]))
+        codec.moves[1:], codec.palette[:] = statistics.moves, statistics.palette
+        codec.stress.fill_(statistics.stress**USUAL)
+        ranges = recording.cache.episodes
+        lengths = np.array([np.diff(ranges[number])[0] for number in recording.seen] or [0])
+        spans = Spans.fitting(lengths, self.video.slots)
+        return CodecObjective(codec, config.learning_rate or 2e-3, spans, statistics.stress, statistics.over)
+
+    def feed(self, batch: int) -> Feed:
+        return codec_feed(self.parts.recording, self.video, self.objective, batch, self.parts.config.seed)
+
+    def preparations(self) -> list[Stage]:
+        return [Stage("scroll", 0.1, self._learn_scroll), *self.parts.outcome_stages()]
+
+    def _learn_scroll(self) -> None:
+        run, codec = self.parts.run, self.objective.generator
+        if not resume_file(run.out, "flow").exists():  # else the codec has begun to train with the scroll that it holds
+            learn_scroll(run, self.objective.scroll, self.parts.recording, codec.moves, self.video.slots)
+        self.objective.freeze_scroll()
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        codec, over = self.objective.generator, self.objective.over
+        moves = codec.moves.cpu()
+        if self.starts is None:
+            self.starts = _starts(self.parts)
+            rows = _start_rows(self.parts)
+            self.starts = replace(self.starts, known=_mosaics_before(self.parts, rows, moves, over))
+        whole = tuple((int(x), int(y)) for x, y in moves)
+        scene = FrameHistory(replace(self.video.frames, moves=whole), self.starts, over)
+        return _flat_world(self.parts, trainer, self.objective, scene)
+
+    def tuning_s(self, world: LearnedWorld) -> float:
+        return dreaming_seconds(world, self.parts.recording, FRAMES)
+
+    def tune(self, world: LearnedWorld) -> dict:
+        """How much the draw favours change is chosen by rollouts of recorded episodes."""
+        objective = self.objective
+        assert isinstance(world.generator, Codec)
+        power = choose_stress(world, world.generator, self.parts.recording, objective.stress, self.parts.config.seed)
+        objective.smooth.module.stress.copy_(world.generator.stress)
+        return {"taken_back": power}
+
+
+class FlatFlowRecipe:
+    """A flow of several steps a frame: the teacher of a world of frames alone."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+        self.parts = _flat_parts(run, recording, config, video)
+        self.video = self.parts.video
+        self.objective = flow_objective(self.video, config)
+        self.starts: StartClips | None = None  # made once
+
+    def feed(self, batch: int) -> Feed:
+        return frames_feed(self.parts.recording, None, self.video, batch, self.parts.config.seed, None)
+
+    def preparations(self) -> list[Stage]:
+        return self.parts.outcome_stages()
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        self.starts = self.starts or _starts(self.parts)
+        return _flat_world(self.parts, trainer, self.objective, FrameHistory(self.video.frames, self.starts, None))
+
+    def tuning_s(self, world: LearnedWorld) -> float:
+        return 0.0
+
+    def tune(self, world: LearnedWorld) -> dict:
+        return {}
+
+
+def _flat_parts(run: Run, recording: Recording, config: TrainConfig, video: VideoConfig) -> VideoParts:
+    if config.keep_out is not None:
+        raise DatasetError(
+            f"without depth and poses no part of the map of {recording.name} can be kept out; drop --keep-out."
+        )
+    return VideoParts(run, recording.require_rows(), config, video)
+
+
+def _flat_world(
+    parts: VideoParts, trainer: Trainer, objective: Flow | CodecObjective, scene: FrameHistory
+) -> LearnedWorld:
+    return LearnedWorld(
+        parts.about(trainer, (objective.generator,), 0),
+        scene=scene,
+        generator=copy.deepcopy(objective.smooth.module).cpu().float(),
+        outcome=parts.trained_outcome(ConstantConfig(parts.median_reward)),
+    )
+
+
+def codec_statistics(recording: Recording, seed: int) -> CodecStatistics:
+    """The moves and colours of a recording, how rarely its pixels change, and what stays while it scrolls."""
+    rng = np.random.default_rng(seed)
+    rows = recording.rows_within(1, 0)
+    rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
+    before, after = recording.rgb(rows - 1), recording.rgb(rows)
+    change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
+    most = max(32, PAIR_PIXELS // before[0, 0].numel())  # pairs: each is matched at 625 displacements
+    some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
+    moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
+    over = overlay(before, after, F.pad(moves, (0, 0, 1, 0)))
+    return CodecStatistics(moves, colours, float(np.clip(CHANGED_SHARE / change.mean(), 1, MAX_STRESS)), over)
+
+
+def _start_rows(parts: VideoParts) -> np.ndarray:
+    """About 32 rows, evenly spread, each with a whole history before it and a valid step after it."""
+    slots, recording = parts.video.slots, parts.recording
+    since = np.arange(recording.cache.length) - recording.start
+    rows = np.flatnonzero(parts.happened.real & (since >= slots))
+    if not len(rows):
+        raise DatasetError(f"no episode is longer than the {slots} frames of history that one begins with.")
+    return rows[:: max(1, len(rows) // 32)]
+
+
+def _starts(parts: VideoParts) -> StartClips:
+    """The histories with which episodes of the world begin."""
+    slots, recording, video = parts.video.slots, parts.recording, parts.video
+    rows = _start_rows(parts)
+    frames = rows[:, None] - np.arange(slots)
+    starts = StartClips.of(recording.rgb(frames.ravel()).view(*frames.shape, 3, *video.size), video.actions)
+    actions = recording.actions_before(rows, np.arange(1, slots + 1))
+    return replace(starts, actions=actions, vitals=torch.from_numpy(parts.happened.vitals[rows]))
+
+
+def _mosaics_before(parts: VideoParts, rows: np.ndarray, moves: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
+    """The mosaics of the episodes of `rows` at these rows: uint8 [n, 4, H, W]."""
+    recording, past = parts.recording, rows[:, None] - np.arange(REMEMBERED, 0, -1)
+    real = torch.from_numpy(past >= recording.start[rows][:, None])
+    frames = recording.rgb(np.maximum(past, 0).ravel()).unflatten(0, past.shape)
+    nowhere = torch.zeros(len(rows), 2, dtype=torch.int64)
+    return recalled(mosaics(frames, moves, over, real), parts.video.size, nowhere)

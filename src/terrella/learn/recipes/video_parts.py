@@ -1,0 +1,134 @@
+"""What the recipes of video worlds share: the recording, the outcome model, and what a world's card says."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from torch import nn
+
+from ...worlds.config import VideoConfig
+from ...worlds.folder import with_kept
+from ...worlds.generator import UNet
+from ...worlds.learned import About, LearnedWorld
+from ...worlds.outcome import ConstantConfig, ConstantOutcome, FrameOutcome
+from ..budget import Stage
+from ..objectives.codec import CodecObjective
+from ..objectives.flow import Flow
+from ..objectives.outcome import Happenings, OutcomeObjective, learn_outcome
+from ..recording import Recording
+from ..trainer import Feed, Run, Trainer
+from .video_config import TrainConfig
+
+
+class VideoRecipe(Protocol):
+    """What differs between worlds with depth and poses and worlds of frames alone."""
+
+    @property
+    def parts(self) -> VideoParts: ...
+
+    @property
+    def objective(self) -> Flow | CodecObjective:
+        """What the generator learns by."""
+        ...
+
+    def feed(self, batch: int) -> Feed:
+        """Batches for the generator."""
+        ...
+
+    def preparations(self) -> Sequence[Stage]:
+        """The stages before the generator, in order."""
+        ...
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        """The world as it now is, on the CPU; a copy, for the weights train on."""
+        ...
+
+    def tuning_s(self, world: LearnedWorld) -> float:
+        """Seconds that `tune` will take, by a trial."""
+        ...
+
+    def tune(self, world: LearnedWorld) -> dict:
+        """Sets what is chosen by rollouts of the trained world. Returns facts."""
+        ...
+
+
+def flow_objective(video: VideoConfig, config: TrainConfig) -> Flow:
+    rate = config.learning_rate or 8e-4
+    return Flow(UNet(video.generator), config.flow_steps, rate, config.critic_from, config.critic_weight)
+
+
+class VideoParts:
+    """A recording, the kind of world to learn from it, and its outcome model, if there is anything for one to learn."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+        self.run, self.recording, self.config = run, recording, config
+        self.facts: dict = {}  # of the stages so far, for the world's card
+        self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable)
+        self.outcome: FrameOutcome | None = None
+        if self.happened.is_informative and (video.moving or not video.geometry):
+            begins = _first_vitals(self.happened.vitals, recording)
+            video = replace(video, vitals=begins)
+            self.outcome = FrameOutcome(replace(self.happened.config(), begins=begins)).to(run.device)
+        self.video = video
+
+    def outcome_stages(self) -> list[Stage]:
+        outcome = self.outcome
+        if outcome is None:
+            return []
+
+        def learn() -> None:
+            objective = OutcomeObjective(outcome, self.recording.rgb, self.happened)
+            self.facts |= learn_outcome(self.run, objective, self.config.outcome_steps)
+
+        return [Stage("outcome", 0.08, learn)]
+
+    def trained_outcome(self, constant: ConstantConfig) -> FrameOutcome | ConstantOutcome:
+        """A copy of the outcome model on the CPU; without one, the constant."""
+        return ConstantOutcome(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()
+
+    @property
+    def median_reward(self) -> float:
+        return float(np.median(self.happened.reward))
+
+    def about(self, trainer: Trainer, modules: Sequence[nn.Module], keyframes: int) -> About:
+        """Name, controls, limits and card of the world; `modules` are those whose parameters the card counts."""
+        recording, cache = self.recording, self.recording.cache
+        kept = with_kept(cache.world, self.run.out / "world")
+        names = kept.get("action_names") or cache.action_names  # of a choice, the recording names each
+        assert recording.controls is not None  # a recording without actions was refused
+        return About(
+            self.config.name,
+            recording.controls,
+            kept.get("dt_s", 1 / cache.fps),
+            tuple(names),
+            kept.get("keys", {}),
+            self._card(trainer, modules, keyframes),
+            ignored=recording.ignored,
+            idle=tuple(kept.get("idle", ())),
+            max_episode_steps=kept.get("max_episode_steps"),
+        )
+
+    def _card(self, trainer: Trainer, modules: Sequence[nn.Module], keyframes: int) -> dict:
+        recording, source = self.recording, self.recording.dataset
+        name = recording.cache.world.get("name", source.root.name)
+        return {
+            "what": f"Learned from {source.length:,} frames of {name}",
+            "game": recording.cache.world.get("name"),
+            "data": f"{recording.usable.sum():,} frames, {len(recording.seen)} episodes",
+            "steps": trainer.steps_done,
+            "hours": round(trainer.facts["seconds"] / 3600, 2),
+            "keep_out": self.config.keep_out,
+            "keyframes": keyframes,
+            "parameters": sum(weight.numel() for module in modules for weight in module.parameters()),
+            **self.facts,
+        }
+
+
+def _first_vitals(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:
+    """The median of the vitals [N, V] at the first rows of episodes."""
+    first = np.unique(recording.start[recording.usable])
+    return tuple(float(value) for value in np.median(vitals[first], 0))

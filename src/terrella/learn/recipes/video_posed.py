@@ -1,0 +1,105 @@
+"""Worlds of places: recordings with depth and poses. Stages: motion, outcome, objects, estimator, then a U-Net over a Glimpse."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from ...worlds.body import Motion, MotionBody
+from ...worlds.config import VideoConfig
+from ...worlds.keyframe_scene import KeyframeScene
+from ...worlds.learned import LearnedWorld
+from ...worlds.objects import STARTS, Billboards, BillboardsConfig
+from ...worlds.outcome import ConstantConfig
+from ..budget import Stage
+from ..feeds import frames_feed
+from ..objectives.estimator import learn_estimator
+from ..objectives.motion import learn_motion
+from ..objectives.objects import learn_objects
+from ..recording import Recording, choose_keyframes, open_views
+from ..trainer import Feed, Run, Trainer
+from .video_config import TrainConfig
+from .video_parts import VideoParts, flow_objective
+
+
+class PosedRecipe:
+    """A generator over a memory of keyframes, a body that slides along walls and, where they were recorded, objects."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+        if config.keep_out is not None:
+            recording = replace(recording, usable=Recording.of(recording.cache, recording.seen, config.keep_out).usable)
+        recording = recording.require_rows()
+        self.objects = Billboards(BillboardsConfig(video.actions, video.history)) if video.objects else None
+        self.parts = VideoParts(run, recording, config, video)
+        self.video = self.parts.video
+        rows = np.flatnonzero(recording.usable)
+        picks = choose_keyframes(np.asarray(recording.cache.pose), rows, config.keyframes)
+        self.memory = recording.sharp_keyframes(picks, self.video.camera)
+        self.objective = flow_objective(self.video, config)
+        self.motion = Motion(self.video.motion)
+
+    def feed(self, batch: int) -> Feed:
+        dream = self.objective.dream if self.video.steps == 1 else None  # a teacher sees recorded frames alone
+        return frames_feed(self.parts.recording, self.memory, self.video, batch, self.parts.config.seed, dream)
+
+    def preparations(self) -> list[Stage]:
+        stages = [Stage("motion", 0.08, self._learn_motion), *self.parts.outcome_stages()]
+        if self.objects is not None:
+            stages.append(Stage("objects", 0.1, self._learn_objects))
+        if self.parts.config.estimator_steps:
+            stages.append(Stage("estimator", 0.12, self._learn_estimator))
+        return stages
+
+    def _learn_motion(self) -> None:
+        parts = self.parts
+        parts.facts |= learn_motion(parts.run, self.motion, parts.recording, self.memory, parts.config.motion_steps)
+
+    def _learn_objects(self) -> None:
+        parts, recording = self.parts, self.parts.recording
+        assert self.objects is not None
+        starts, rgb, camera = recording.pose(self._first_rows()), recording.dataset.rgb_at, self.video.camera
+        parts.facts |= learn_objects(
+            parts.run, self.objects, recording, rgb, starts, camera, parts.config.objects_steps
+        )
+
+    def _learn_estimator(self) -> None:
+        learn_estimator(self.parts.run, self.parts.recording, self.parts.config.estimator_steps)
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        parts, recording, video = self.parts, self.parts.recording, self.video
+        ends = parts.happened.done & np.array(recording.cache.action_valid)
+        usual = parts.median_reward
+        terminal = _terminal_reward(parts.happened.reward - usual, ends)
+        starts = open_views(self.memory, 32)
+        if video.moving:  # monsters wait where episodes begin, and the player is well
+            first = self._first_rows()
+            starts = recording.sharp_keyframes(first, video.camera) if len(first) else starts
+        fitted = {name: parts.facts[name] for name in ("body_m", "short")}
+        return LearnedWorld(
+            parts.about(trainer, (self.objective.generator, self.motion), len(self.memory)),
+            scene=KeyframeScene(video.keyframes, self.memory, starts),
+            generator=copy.deepcopy(self.objective.smooth.module).cpu().float(),
+            body=MotionBody(copy.deepcopy(self.motion), replace(video.motion, **fitted)),
+            objects=copy.deepcopy(self.objects),
+            outcome=parts.trained_outcome(ConstantConfig(usual, terminal)),
+        )
+
+    def tuning_s(self, world: LearnedWorld) -> float:
+        return 0.0
+
+    def tune(self, world: LearnedWorld) -> dict:
+        return {}
+
+    def _first_rows(self) -> np.ndarray:
+        """About STARTS first rows of episodes."""
+        recording = self.parts.recording
+        first = np.intersect1d(recording.start, np.flatnonzero(recording.usable))
+        return first[:: max(1, len(first) // STARTS)][:STARTS]
+
+
+def _terminal_reward(extra: np.ndarray, ends: np.ndarray) -> float:
+    """Mean reward above the usual in the last steps of an episode (games may pay a step or two before its end)."""
+    rows = np.flatnonzero(ends)
+    return float(np.mean([extra[max(row - 3, 0) : row + 1].sum() for row in rows])) if len(rows) else 0.0

@@ -1,0 +1,206 @@
+"""The trainer on a toy objective: exact resume at every step, honest logs, rates, limits and failures."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tests.learn.stopping import logged, quiet, saved_facts
+from torch import nn
+
+from terrella.core.errors import TrainingError
+from terrella.learn import trainer as module
+from terrella.learn.budget import Budget, Stage
+from terrella.learn.trainer import Ema, Loss, Run, Trainer, adamw, warmup_cosine
+
+STEPS = 7
+
+
+class Walk:
+    """A feed with a position of its own, as clips of a recording have; each batch depends on all before it."""
+
+    def __init__(self):
+        self.at = 1.0
+
+    def batch(self, now):
+        self.at = (self.at * 1.7 + 0.3) % 5
+        return torch.full((3, 4), self.at) + torch.from_numpy(now.rng.standard_normal((3, 4))).float()
+
+    def state(self):
+        return {"at": self.at}
+
+    def resume(self, state):
+        self.at = state["at"]
+
+
+class Toy:
+    """Two losses a step, each with a learner of its own: dropout, noise, a schedule, an average and a buffer."""
+
+    def __init__(self, scale: float = 1.0):
+        torch.manual_seed(0)
+        self.scale, self.begun = scale, []
+        self.body = nn.Sequential(nn.Linear(4, 8), nn.Dropout(0.3), nn.BatchNorm1d(8), nn.Linear(8, 2))
+        self.head, self.smooth = nn.Linear(2, 1), Ema(self.body, 0.99)
+        self.modules = {"body": self.body, "head": self.head, "smooth": self.smooth}
+        rate = warmup_cosine(1e-2, 3, 0.1)
+        self.learners = {"body": adamw((self.body,), rate, average=self.smooth), "head": adamw((self.head,), rate)}
+
+    def losses(self, batch, now):
+        self.begun.append(now.step)
+        code = self.body(batch)
+        yield Loss("body", self.scale * (code - now.randn(3, 2)).square().mean(), {"code": code.mean()})
+        off = (self.head(self.body(batch).detach()) - batch.mean()).abs().mean()
+        yield Loss("head", off, {"off": off})
+
+
+@dataclass(frozen=True)
+class Settings:
+    rate: float = 0.1
+    hours: float = 24.0
+    save_every_s: float = 1e9
+    strip_every_s: float = 1e9
+    seed: int = 3
+
+
+def trainer_in(out: Path, steps: int = STEPS, objective: Toy | None = None, report=quiet, **settings) -> Trainer:
+    run = Run.of(out, Settings(**settings), report, free=("hours",))
+    return Trainer(run, "toy", Walk(), objective or Toy(), steps)
+
+
+def stop_in_step(monkeypatch, at: int, with_signal: bool = True) -> None:
+    """Ctrl-C within step `at`, once; or an exception that cuts the step short."""
+    original = Trainer._step
+
+    def step(self, number):
+        parts = original(self, number)
+        if number == at:
+            monkeypatch.setattr(Trainer, "_step", original)
+            if not with_signal:
+                raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
+        return parts
+
+    monkeypatch.setattr(Trainer, "_step", step)
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    whole, resumed = (load_file(out / "resume-toy.safetensors") for out in (one, other))
+    assert whole.keys() == resumed.keys() and any("optimiser" in name for name in whole)
+    for name in whole:
+        assert torch.equal(whole[name], resumed[name]), name
+    assert logged(one, "toy") == logged(other, "toy")
+    assert saved_facts(one, "toy")["feed"] == saved_facts(other, "toy")["feed"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole")
+    trainer_in(out).train()
+    return out
+
+
+@pytest.mark.parametrize("at", range(STEPS))
+def test_a_run_that_is_stopped_in_any_step_resumes_exactly(at, whole, tmp_path, monkeypatch):
+    """Weights, averages, buffers, both optimisers, the feed and the log: to the bit."""
+    stop_in_step(monkeypatch, at)
+    with pytest.raises(KeyboardInterrupt, match=f"{at + 1} steps of 'toy' are saved"):
+        trainer_in(tmp_path).train()
+    assert saved_facts(tmp_path, "toy")["step"] == at + 1, "the step under way ended and was saved"
+    resumed = trainer_in(tmp_path)
+    assert resumed.steps_done == at + 1
+    resumed.train()
+    assert_same_run(whole, tmp_path)
+
+
+def test_a_run_that_is_stopped_in_every_step_resumes_exactly(whole, tmp_path, monkeypatch):
+    for at in range(STEPS):
+        stop_in_step(monkeypatch, at)
+        with pytest.raises(KeyboardInterrupt):
+            trainer_in(tmp_path).train()
+    assert trainer_in(tmp_path).finished
+    assert_same_run(whole, tmp_path)
+
+
+def test_a_step_that_is_cut_short_is_done_again(whole, tmp_path, monkeypatch):
+    """A second Ctrl-C, or a kill: what the step did to weights is forgotten."""
+    stop_in_step(monkeypatch, 2, with_signal=False)
+    first, second = Toy(), Toy()
+    with pytest.raises(KeyboardInterrupt):
+        trainer_in(tmp_path, objective=first, save_every_s=-1.0).train()
+    trainer_in(tmp_path, objective=second).train()
+    assert first.begun == [0, 1, 2] and second.begun == [2, 3, 4, 5, 6]
+    assert_same_run(whole, tmp_path)
+
+
+def test_the_log_repeats_no_step_after_a_kill(whole, tmp_path):
+    """What a killed run logged after its last save is dropped, and a line that was cut."""
+    trainer_in(tmp_path).train()
+    path = tmp_path / "log.jsonl"
+    lines = path.read_text()
+    path.write_text(lines + json.dumps({"stage": "toy", "step": 99, "off": 0.5}) + '\n{"stage": "to')
+    assert trainer_in(tmp_path).finished
+    assert path.read_text() == lines
+
+
+def test_a_finished_run_does_no_step_more(whole):
+    objective = Toy()
+    before = (whole / "resume-toy.safetensors").read_bytes()
+    trainer_in(whole, objective=objective).train()
+    assert not objective.begun and (whole / "resume-toy.safetensors").read_bytes() == before
+
+
+def test_facts_are_computed_once(tmp_path):
+    trainer_in(tmp_path).train()
+    assert trainer_in(tmp_path).compute_once("figures", lambda: {"error": 1}) == {"error": 1}
+    assert trainer_in(tmp_path).compute_once("figures", lambda: {"error": 2}) == {"error": 1}
+
+
+def test_other_settings_and_foreign_files_are_refused(whole, tmp_path):
+    with pytest.raises(TrainingError, match=r"other settings \(rate 0.1, not 0.2"):
+        trainer_in(whole, rate=0.2)
+    assert trainer_in(whole, hours=1.0, save_every_s=5.0).finished, "hours and saves may change"
+    (tmp_path / "resume-toy.safetensors").write_bytes(b"not a run at all")
+    with pytest.raises(TrainingError, match="resume-toy.safetensors is not a run of this recipe"):
+        trainer_in(tmp_path)
+
+
+def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path):
+    broken = Toy(float("nan"))
+    with pytest.raises(TrainingError, match="the loss is not a number at step 0"):
+        trainer_in(tmp_path, objective=broken).train()
+    assert not (tmp_path / "resume-toy.safetensors").exists()
+    objective = Toy()
+    trainer_in(tmp_path, 3, objective).train()
+    good = (tmp_path / "resume-toy.safetensors").read_bytes()
+    with pytest.raises(TrainingError, match="the loss is not a number at step 3"):
+        trainer_in(tmp_path, STEPS, Toy(float("nan"))).train()
+    assert (tmp_path / "resume-toy.safetensors").read_bytes() == good
+
+
+def test_progress_says_step_and_rate(tmp_path):
+    lines = []
+    trainer_in(tmp_path, 40, report=lambda done, total, words="": lines.append((done, total, words))).train()
+    assert [(done, total) for done, total, _ in lines] == [(0.5, 1.0), (1.0, 1.0)]
+    assert lines[1][2].startswith("toy: step 40, ") and "steps/s, code " in lines[1][2]
+
+
+def test_a_stage_without_a_share_ends_with_the_hours(tmp_path, monkeypatch):
+    """So that its progress has an end, too."""
+    monkeypatch.setattr(module, "LOG_EVERY", 1)
+    lines = []
+    report = lambda done, total, words="": lines.append(done)  # noqa: E731
+    trainer = trainer_in(tmp_path, 10**9, report=report, hours=0.5 / 3600)
+    assert trainer.limit_s == pytest.approx(0.5)
+    trainer.train()
+    assert trainer.finished and lines == sorted(lines) and 0 < lines[0] < 1 == lines[-1]
+
+
+def test_a_stage_takes_at_most_its_share(tmp_path):
+    budget = Budget(tmp_path, 2.0)
+    budget.divide([Stage("motion", 0.1, lambda: None), Stage("flow", None, lambda: None)])
+    assert budget.most_s("motion") == pytest.approx(720) and budget.most_s("flow") == 7200
