@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.latent_actions import agreement, examine_latent, shown_shift
+from lab.latent_actions import agreement, examine_latent, shown_shift
 from tests.learn.stopping import goes_on_exactly, quiet
 
 from terrella.core.errors import DatasetError, TrainingError
