@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__
 
 if TYPE_CHECKING:
+    from .act.planning import SearchConfig
     from .core import Spec, State, World, check_world, make_rng, rollout
     from .core.env import as_env
     from .learn.recipes.latent import LatentTraining
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from .workflows.transfer import TransferConfig, TransferResult, transfer
 
 _NAMES = {
+    ".act.planning": ("SearchConfig",),
     ".core": ("Spec", "State", "World", "check_world", "make_rng", "rollout"),
     ".core.env": ("as_env",),
     ".learn.recipes.latent": ("LatentTraining",),

@@ -53,7 +53,7 @@ def test_one_policy_in_a_world_alone(capsys, tmp_path):
     words = ["idle", "--in", BLIND, *QUICK, "--out", str(tmp_path)]
     assert main(["evaluate", *words]) == 0
     said = capsys.readouterr().out
-    assert "In the dream the best of 1 is idle" in said and "random (floor)" in said
+    assert "In the dream the best of 1 is idle" in said and "random (baseline)" in said
     assert main(["evaluate", *words, "--real", BLIND]) == 2
     assert "other settings (real None" in capsys.readouterr().err
 

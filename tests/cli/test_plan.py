@@ -8,7 +8,7 @@ import pytest
 from tests.cli.tiny import NAME
 
 import terrella
-from terrella.act.planning import Planner, SearchConfig
+from terrella.act.planning import Planner
 from terrella.cli import main
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
@@ -140,7 +140,7 @@ def test_a_plan_that_is_stopped_keeps_the_episodes_that_are_done(capsys, tmp_pat
 
 def test_planning_from_python(tmp_path):
     lines = []
-    search = SearchConfig("tree", samples=6, iterations=2, horizon=4)
+    search = terrella.SearchConfig("tree", samples=6, iterations=2, horizon=4)
     config = terrella.PlanConfig("observation=20", within=0.001, search=search, episodes=2, steps=24, out=tmp_path)
     result = terrella.plan(BLIND, config, progress=lines.append)
     assert result.planner["success"].value == 1 and len(result.episodes) == 2 and result.page.is_file()

@@ -24,7 +24,7 @@ from .goals import REWARD, read_goal
 from .opening import Device, EnvironmentConfig, device_of, load_named
 from .progress import Progress, silent, stage
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real
-from .results import jsonable, table_lines
+from .results import folder_name, jsonable, table_lines
 
 
 @dataclass(frozen=True)
@@ -73,25 +73,25 @@ class EvaluateResult:
 
 
 def evaluate(
-    policies: Sequence[str], world: str, config: EvaluateConfig | None = None, *, progress: Progress = silent
+    policies: Sequence[str], world: str | Path, config: EvaluateConfig | None = None, *, progress: Progress = silent
 ) -> EvaluateResult:
     """Evaluates policies in a world and in the real environment from the same starts: does the world rank them as reality does?
 
     policies: names as in `load_policy`: random, plan:samples=16, a folder, ...; acting at random is evaluated as well. The page
     and evaluate.json are left in a folder; stopped at any time, the same call continues.
     """
-    config = config or EvaluateConfig()
+    config, inside = config or EvaluateConfig(), str(world)
     if config.episodes < 1 or (config.steps is not None and config.steps < 1) or not config.within > 0:
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     if not policies:
         raise TerrellaError("name one policy or more: random, idle, plan, constant:VALUE, a folder, or FILE.py:NAME.")
     names = tuple(dict.fromkeys(policies))
-    study = _open(world, config, progress)
+    study = _open(inside, config, progress)
     every = names if RANDOM in names else (*names, RANDOM)
     for name in every:  # a policy that does not fit is refused before anything is played
         study.spec.check_channels(observed_channels(study.load(name), study.spec))
-    folder = config.out or Path("evaluations") / (re.sub(r"[^\w.-]+", "-", world.strip("/:")) or "world")
-    log = EvaluationLog(folder, _settings(world, config, study), {name: fingerprint(name) for name in every})
+    folder = Path(config.out or f"evaluations/{folder_name(inside)}")
+    log = EvaluationLog(folder, _settings(inside, config, study), {name: fingerprint(name) for name in every})
     _play(study, log, every, config.episodes, progress)
     return _result(log, names, config, folder)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -35,3 +36,8 @@ def table_lines(heads: list[str], rows: list[list[str]]) -> list[str]:
     """Rows of text under their heads, in columns."""
     widths = [max(len(row[at]) for row in [heads, *rows]) for at in range(len(heads))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in [heads, *rows]]
+
+
+def folder_name(world: str) -> str:
+    """The name of a world as a folder's name."""
+    return re.sub(r"[^\w.-]+", "-", world.strip("/:")) or "world"

@@ -128,7 +128,7 @@ def transfer(
         )
     experiment = _experiment(config)
     check_pair(experiment)
-    folder = config.out or Path("transfers") / config.sim.partition(":")[2].replace("/", "-")
+    folder = Path(config.out or "transfers/" + config.sim.partition(":")[2].replace("/", "-"))
     claim_folder(folder, experiment)
     progress(f"the real one is frozen: sha256 {experiment.hash}")
     seeds = range(config.seed, config.seed + config.seeds)

@@ -76,7 +76,7 @@ def transfer_to_recording(
     check_recording(dataset, opened.spec)
     world = fitted_simulator(opened)
     learned, held = _halves(read_trials(dataset, world), count)
-    folder = out or Path("transfers") / recording.name
+    folder = Path(out or f"transfers/{recording.name}")
     worlds: dict[str, World] = {"simulator": world}
     if randomise is not None:
         rough = Randomised(world, read(randomise))
