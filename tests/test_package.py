@@ -22,6 +22,15 @@ def test_every_promised_name_is_there(name):
     assert name in dir(terrella)
 
 
+def test_learn_is_a_room_that_is_called_as_a_workflow():
+    from terrella.core.errors import TerrellaError
+    from terrella.learn.trainer import Trainer
+
+    assert terrella.learn.trainer.Trainer is Trainer
+    with pytest.raises(TerrellaError, match="--minutes"):
+        terrella.learn("gym:CartPole-v1", terrella.LearnConfig(minutes=0))
+
+
 def test_other_names_are_not():
     with pytest.raises(AttributeError, match="no_such_name"):
         terrella.no_such_name  # noqa: B018

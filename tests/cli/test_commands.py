@@ -54,8 +54,12 @@ def help_of(command: str, capsys) -> str:
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_the_options_are_as_promised(command, capsys):
-    found = set(re.findall(r"^\W+(?:-h, )?(--[a-z][\w-]*)", help_of(command, capsys), re.MULTILINE)) - {"--help"}
+    shown = help_of(command, capsys)
+    found = set(re.findall(r"^\W+(?:-h, )?(--[a-z][\w-]*)", shown, re.MULTILINE)) - {"--help"}
     assert " ".join(sorted(found)) == OPTIONS[command]
+    for option in re.split(r"\n  (?=--[a-z])", shown)[1:]:
+        text = re.sub(r"^--\S+( [A-Z{\[]\S*( \.\.\.\]\])?)?|\(default:.*|\(required\).*", "", " ".join(option.split()))
+        assert len(text.strip()) > 10, f"{option.split()[0]} says nothing"
 
 
 def test_train_promises_its_main_options(capsys):
