@@ -199,7 +199,7 @@ def test_keys_set_on_the_page_are_kept_in_the_worlds_folder_and_told_in_recordin
         assert (str(tmp_path / "one") in kept_in) == bool(kept_in) == kept
         sink_factory().close()
 
-    monkeypatch.setattr("terrella.serve.serve", serve)
+    monkeypatch.setattr("terrella.workflows.play.serve", serve)
     save_world(place(Controls(CHOICE, (0.0,), (1.0,))), tmp_path / "one")
     assert main(["play", str(tmp_path / "one"), "--record", str(tmp_path / "set"), "--device", "cpu", *more]) == 0
     assert (load_world(tmp_path / "one").spec.keys == {"KeyX": [1.0]}) == kept

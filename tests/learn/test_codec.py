@@ -14,7 +14,7 @@ from terrella.learn import feeds
 from terrella.learn.moves import STATISTICS, CodecStatistics, frequent_moves, mosaics, overlay, palette
 from terrella.learn.objectives.codec import RECORDED, ClipMaker, CodecClips, CodecObjective, Spans
 from terrella.learn.trainer import TrainStep
-from terrella.space.mosaic import recalled
+from terrella.space.mosaic import read_mosaic
 from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.controls import Controls
 
@@ -92,12 +92,12 @@ def test_a_mosaic_is_made_of_the_real_part_of_a_clip():
     before, after = scrolling(3, 0, 2)
     moves, real = torch.tensor([[0, 0], [3, 0]]), torch.tensor([[True, True], [False, False]])
     made = mosaics(torch.stack([before, after], 1), moves, NONE, real)
-    known = recalled(made, SIZE, torch.tensor([[0, 0], [0, 0]]))
+    known = read_mosaic(made, SIZE, torch.tensor([[0, 0], [0, 0]]))
     assert torch.equal(known[0, :3, 8:], after[0, :, 8:]) and not known[1].any()
-    gone = recalled(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
+    gone = read_mosaic(made, SIZE, torch.tensor([[-3, 0], [0, 0]]))  # a step back, the left edge is as it was
     assert torch.equal(gone[0, :3, 8:], before[0, :, 8:])
     without = mosaics(torch.stack([before, after], 1), moves, LINE, real)[0]
-    known = recalled(without[None], SIZE, torch.zeros(1, 2, dtype=torch.int64))[0, 3] > 0
+    known = read_mosaic(without[None], SIZE, torch.zeros(1, 2, dtype=torch.int64))[0, 3] > 0
     assert torch.equal(known, ~LINE), "what lies over it never enters it"
 
 
@@ -153,7 +153,7 @@ def test_half_of_a_batch_is_dreamt_once_recorded_frames_are_known(monkeypatch, b
     def loss(shown, mosaic, move, context, target, before, count, now):
         seen.append(count)
         assert torch.equal(target, truth[:, 3 + len(seen)])
-        known = recalled(mosaic, SIZE, torch.zeros(batch, 2, dtype=torch.int64))[:, 3] > 0
+        known = read_mosaic(mosaic, SIZE, torch.zeros(batch, 2, dtype=torch.int64))[:, 3] > 0
         assert torch.equal(known, ~LINE.expand(batch, -1, -1)) and not move.any()
         drawn = torch.full_like(target[:count], len(seen))
         if len(seen) > 1:

@@ -12,7 +12,7 @@ from tests.learn.stopping import goes_on_exactly, quiet
 from terrella.core.errors import DatasetError
 from terrella.learn.objectives.objects import learn_objects
 from terrella.learn.trainer import Run
-from terrella.space.billboards import PICTURE, painted
+from terrella.space.billboards import PICTURE, paint_billboards
 from terrella.space.camera import planar_pose
 from terrella.worlds.objects import LOOK, NUMBER, PLACE, Billboards, BillboardsConfig
 
@@ -41,7 +41,7 @@ def toy() -> SimpleNamespace:
             box = torch.tensor([0.8, 0.8, 0.0, 0.4] if shot else [0.4, 0.4, 0.0, 1.6])
             behind = torch.full((1, 3, *SIZE), 0.3), torch.full((1, *SIZE), 9.0)
             cards = torch.from_numpy(objects[row, None, :1, 1:]), look[None, None], box[None, None]
-            rgb, depth, seen = painted(*behind, cards, torch.ones(1, 1).bool(), pose(1), CAMERA)
+            rgb, depth, seen = paint_billboards(*behind, cards, torch.ones(1, 1).bool(), pose(1), CAMERA)
             pictures.append((rgb[0].permute(1, 2, 0) * 255).byte().numpy())
             depths.append(depth[0].numpy())
             marks.append(seen[0].numpy())

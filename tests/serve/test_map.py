@@ -10,7 +10,7 @@ import torch
 
 from terrella.core import check_world
 from terrella.core.errors import ProtocolError
-from terrella.serve.chart import knows_share, mapped, tinted
+from terrella.serve.chart import has_known_share, map_kind, tint_invented
 from terrella.serve.protocol import Show, parse_message
 from terrella.serve.timeline import Timeline
 
@@ -32,14 +32,14 @@ def test_show_is_read_and_junk_is_refused():
 
 def test_a_chart_tells_where_the_camera_and_the_keyframes_are():
     timeline = Timeline([Mapped()], seed=0)
-    first = timeline.chart()
+    first = timeline.map_event()
     assert first["world"] == 0 and len(first["places"]) == 4 and first["known"] == 0.5 and len(first["camera"]) == 3
     timeline.step(["KeyW"])
-    second = timeline.chart()
+    second = timeline.map_event()
     assert second["places"] == first["places"] and second["camera"][0] == pytest.approx(0.1)
     for _ in range(20):
         timeline.step(["ArrowLeft"])
-    third = timeline.chart()
+    third = timeline.map_event()
     assert third["places"][4:] == [0.5, 0.0, 0.7, 2.0]
     assert third["camera"][2] != second["camera"][2]
 
@@ -48,26 +48,26 @@ def test_the_past_has_its_own_map():
     timeline = Timeline([Mapped()], seed=0)
     for _ in range(45):
         timeline.step([])
-    assert len(timeline.chart()["places"]) == 3 * 4
+    assert len(timeline.map_event()["places"]) == 3 * 4
     timeline.stand_at(3)
-    assert len(timeline.chart()["places"]) == 4
+    assert len(timeline.map_event()["places"]) == 4
 
 
 def test_a_world_without_these_channels_has_no_map():
-    assert not mapped(Panorama().spec) and not knows_share(Panorama().spec)
+    assert not map_kind(Panorama().spec) and not has_known_share(Panorama().spec)
     timeline = Timeline([Panorama()], seed=0)
-    assert timeline.chart() is None and timeline.images(timeline.shown, invented=True) == timeline.shown.images
+    assert timeline.map_event() is None and timeline.images(timeline.shown, invented=True) == timeline.shown.images
 
 
 def test_of_two_worlds_the_dream_is_drawn():
-    assert Timeline([Panorama(), Mapped()], seed=0).chart()["world"] == 1
+    assert Timeline([Panorama(), Mapped()], seed=0).map_event()["world"] == 1
 
 
 def test_what_is_known_keeps_its_colours_and_the_rest_turns_amber():
     rgb = torch.tensor([40, 90, 200], dtype=torch.uint8).expand(1, 4, 6, 3)
     known = torch.zeros(1, 4, 6)
     known[..., 3:] = 1
-    out = tinted(rgb, known)
+    out = tint_invented(rgb, known)
     assert torch.equal(out[..., 3:, :], rgb[..., 3:, :])
     red, _, blue = out[0, 0, 0].tolist()
     assert red > blue, "a blue wall turns amber"

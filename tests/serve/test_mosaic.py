@@ -14,7 +14,7 @@ from PIL import Image
 from websockets.sync.client import connect
 
 from terrella.core import check_world
-from terrella.serve.chart import FINEST, MOSAIC, PLACES, mapped
+from terrella.serve.chart import FINEST, MOSAIC, PLACES, map_kind
 from terrella.serve.timeline import Timeline
 
 from .flat import Flat
@@ -37,13 +37,13 @@ def test_the_fake_keeps_the_contract():
 
 
 def test_the_kind_of_map_follows_from_the_channels():
-    assert mapped(Flat().spec) == MOSAIC and mapped(Mapped().spec) == PLACES and mapped(Panorama().spec) == ""
-    assert Timeline([Panorama(), Flat()], seed=0).mapped == MOSAIC and Timeline([Panorama()], seed=0).mapped == ""
+    assert map_kind(Flat().spec) == MOSAIC and map_kind(Mapped().spec) == PLACES and map_kind(Panorama().spec) == ""
+    assert Timeline([Panorama(), Flat()], seed=0).map_kind == MOSAIC and Timeline([Panorama()], seed=0).map_kind == ""
 
 
 def test_at_first_it_is_the_picture():
     timeline = Timeline([Flat()], seed=0)
-    mosaic = timeline.chart()["mosaic"]
+    mosaic = timeline.map_event()["mosaic"]
     assert mosaic["size"] == mosaic["view"] == (WIDTH, HEIGHT)
     image, seen = decoded(mosaic)
     shown = timeline.worlds[0].render(timeline.shown.states[0], ("rgb",))["rgb"][0].numpy()
@@ -54,7 +54,7 @@ def test_what_was_seen_lies_where_it_was_and_the_rest_is_clear():
     timeline = Timeline([Flat()], seed=0)
     for _ in range(10):
         timeline.step(["ArrowRight"])
-    mosaic, went = timeline.chart()["mosaic"], 10 * PIXELS_PER_STEP
+    mosaic, went = timeline.map_event()["mosaic"], 10 * PIXELS_PER_STEP
     assert mosaic["size"] == (WIDTH + 2 * went, HEIGHT), "its middle is the picture"
     image, seen = decoded(mosaic)
     assert image.shape[:2] == seen.shape == (HEIGHT, WIDTH + 2 * went)
@@ -66,14 +66,14 @@ def test_the_past_has_its_own_mosaic():
     for _ in range(10):
         timeline.step(["ArrowRight"])
     timeline.stand_at(0)
-    assert timeline.chart()["mosaic"]["size"] == (WIDTH, HEIGHT)
+    assert timeline.map_event()["mosaic"]["size"] == (WIDTH, HEIGHT)
 
 
 def test_a_large_one_is_thinned():
     timeline = Timeline([Flat(size=(96, 400))], seed=0)
     for _ in range(150):
         timeline.step(["ArrowRight"])
-    mosaic = timeline.chart()["mosaic"]
+    mosaic = timeline.map_event()["mosaic"]
     image, seen = decoded(mosaic)
     assert mosaic["size"][0] == 1000 and image.shape[1] == seen.shape[1] == 500 <= FINEST
 

@@ -14,9 +14,9 @@ import torch
 from terrella.cli import main
 from terrella.library import load
 from terrella.serve.http_server import make_server, open_port
-from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundled
+from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundle_script
 from terrella.space.camera import planar_pose
-from terrella.space.edits import edited
+from terrella.space.edits import apply_edits
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import rasterise
 from terrella.workflows.splat_places import compared_scene, unedited_scene
@@ -96,7 +96,7 @@ def rows(means) -> np.ndarray:
 
 
 def test_modules_become_one_script():
-    script = bundled(PAGE / "app.js")
+    script = bundle_script(PAGE / "app.js")
     assert "\nimport " not in script and "\nexport " not in script
     assert script.index("const m_scene") < script.index("const m_edits") < script.index("const m_editor")
     assert set(script.split()) >= {"m_" + file.stem for file in PAGE.glob("*.js")} - {"m_app"}
@@ -125,7 +125,7 @@ def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
 def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
     page, place = opened(exported(tmp_path, 3000)), world(3000)
     page.evaluate("edits => { terrella.story.replay(edits); }", EDITS)
-    there, here = page.evaluate(COLUMNS), edited(place.gaussians, EDITS, place.objects)
+    there, here = page.evaluate(COLUMNS), apply_edits(place.gaussians, EDITS, place.objects)
     assert len(there["seen"]) == len(here.gaussians) < 3040
     assert np.abs(rows(there["means"]) - rows(here.gaussians.means)).max() < 1e-6
     seen = torch.where(here.origin < 0, 0, place.provenance[here.origin])
@@ -198,7 +198,7 @@ def test_bodies_move_as_they_do_in_python(tmp_path, opened):
     rng = torch.Generator().manual_seed(1)
     points = torch.tensor([-0.5, -0.5, 1.2]) + torch.tensor([5.0, 5.0, 1.5]) * torch.rand(300, 3, generator=rng)
     wish = 0.6 * torch.rand(300, 3, generator=rng) - 0.3
-    for solid in (place.occupancy, Occupancy.of(edited(place.gaussians, EDITS[:1]).gaussians)):
+    for solid in (place.occupancy, Occupancy.of(apply_edits(place.gaussians, EDITS[:1]).gaussians)):
         theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
         mine = torch.cat([solid.moved(points, wish, body), solid.floor(points, body)[:, None]], 1)
         assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
@@ -234,7 +234,7 @@ def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser
     assert page.evaluate("[terrella.story.scene.length, terrella.drawing.stands, terrella.idle]") == [500, 8, False]
     page.close()
     page = opened((tmp_path / "whole.html").as_uri())
-    after = edited(world(4000).gaussians, EDITS[:1])
+    after = apply_edits(world(4000).gaussians, EDITS[:1])
     assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(after.gaussians.means))
     assert page.evaluate("!terrella.story.unsaved && !document.getElementById('edit').hidden")
     assert main(["space", "export", str(merged(tmp_path, 4000)), str(tmp_path / "both.html")]) == 0

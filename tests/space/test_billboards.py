@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from terrella.core import make_rng
-from terrella.space.billboards import PICTURE, cut_out, painted, painted_slowly
+from terrella.space.billboards import PICTURE, cut_out, paint_billboards, paint_billboards_slowly
 from terrella.space.camera import planar_pose
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
@@ -29,7 +29,7 @@ def paint(places, pictures, pose=None, wall_m: float = 9.0, there=None):
     boxes = BOX.expand(1, places.shape[1], 4)
     there = torch.ones(places.shape[:2]).bool() if there is None else there
     behind = torch.full((1, 3, *SIZE), 0.4), torch.full((1, *SIZE), wall_m)
-    return painted(
+    return paint_billboards(
         *behind, (places, torch.stack(pictures)[None], boxes), there, camera_at() if pose is None else pose, CAMERA
     )
 
@@ -100,6 +100,6 @@ def test_the_kernel_paints_as_the_slow_way_does():
         rgb, depth = torch.rand(2, 3, *SIZE, generator=rng), 2 + 4 * torch.rand(2, *SIZE, generator=rng)
         there = torch.rand(2, 5, generator=rng) < 0.8
         given = rgb, depth, (places, pictures, boxes), there, camera_at().expand(2, 7), CAMERA
-        quick, slow = painted(*given), painted_slowly(*given)
+        quick, slow = paint_billboards(*given), paint_billboards_slowly(*given)
         assert torch.allclose(quick[0], slow[0], atol=1e-3) and torch.allclose(quick[1], slow[1])
         assert torch.equal(quick[2], slow[2]) and (slow[2] > 0).any()

@@ -8,7 +8,7 @@ import torch
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
-from terrella.space.edits import edited
+from terrella.space.edits import apply_edits
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import save_splat, world_of
 
@@ -23,7 +23,7 @@ def test_what_is_not_selected_stays():
     chosen = scene.means[:, 0] >= 3
     for deed in ({"do": "move", "by": [1, 0, 0]}, {"do": "turn", "degrees": 30}, {"do": "scale", "factor": 2},
                  {"do": "recolour", "colour": [1, 0, 0]}, {"do": "delete"}):  # fmt: skip
-        done = edited(scene, [{"select": BOX, **deed}])
+        done = apply_edits(scene, [{"select": BOX, **deed}])
         after, origin, kept = done.gaussians, done.origin, done.origin >= 0
         assert torch.equal(origin[kept], (~chosen).nonzero()[:, 0])
         assert all(torch.equal(a[kept], b[~chosen]) for a, b in zip(parts(after), parts(scene)))
@@ -34,30 +34,30 @@ def test_there_and_back_is_nothing():
     scene = cloud(60, 2)
     for there, back in (({"do": "move", "by": [1, 2, 0]}, {"do": "move", "by": [-1, -2, 0]}),
                         ({"do": "turn", "degrees": 70}, {"do": "turn", "degrees": -70})):  # fmt: skip
-        moved = edited(scene, [{"select": {"all": True}, **there}]).gaussians
-        after = edited(moved, [{"select": {"all": True}, **back}]).gaussians
+        moved = apply_edits(scene, [{"select": {"all": True}, **there}]).gaussians
+        after = apply_edits(moved, [{"select": {"all": True}, **back}]).gaussians
         offset = after.means - scene.means
         assert not torch.allclose(moved.means, scene.means, atol=0.1)
         assert (offset - offset.mean(0)).abs().max() < 1e-4  # a turn's middle is that of what is turned
         assert torch.allclose(after.sh, scene.sh, atol=1e-4) and torch.allclose(after.scales, scene.scales)
-    both = edited(scene, [{"select": BOX, "do": "duplicate", "by": [0, 5, 0]}])
+    both = apply_edits(scene, [{"select": BOX, "do": "duplicate", "by": [0, 5, 0]}])
     assert len(both.gaussians) == 60 + int((both.origin < 0).sum())
     assert torch.equal(both.gaussians.means[:60], scene.means)
 
 
 def test_objects_and_brushes_are_selected():
     scene, objects = cloud(60), torch.arange(60, dtype=torch.int32) % 3
-    twice = edited(scene, [{"select": {"object": 2}, "do": "duplicate", "by": [0, 0, 9]}], objects)
+    twice = apply_edits(scene, [{"select": {"object": 2}, "do": "duplicate", "by": [0, 0, 9]}], objects)
     assert (twice.objects == 3).sum() == 20 and torch.equal(twice.objects[:60], objects)
-    less = edited(scene, [{"select": {"object": 2}, "do": "delete"}], objects)
+    less = apply_edits(scene, [{"select": {"object": 2}, "do": "delete"}], objects)
     assert len(less.gaussians) == 40 and not (less.objects == 2).any()
     dabs = [[*scene.means[k].tolist(), 0.01] for k in (3, 5)]
-    apart = edited(scene, [{"select": {"sphere": dab}, "do": "recolour", "colour": [1, 0, 0]} for dab in dabs])
-    brush = edited(scene, [{"select": {"brush": sum(dabs, [])}, "do": "recolour", "colour": [1, 0, 0]}])
+    apart = apply_edits(scene, [{"select": {"sphere": dab}, "do": "recolour", "colour": [1, 0, 0]} for dab in dabs])
+    brush = apply_edits(scene, [{"select": {"brush": sum(dabs, [])}, "do": "recolour", "colour": [1, 0, 0]}])
     assert set((brush.origin < 0).nonzero()[:, 0].tolist()) == {58, 59} and len(brush.gaussians) == 60
     assert sorted(brush.gaussians.means[58:, 0].tolist()) == sorted(apart.gaussians.means[58:, 0].tolist())
     with pytest.raises(ContractError):
-        edited(scene, [{"select": {"object": 0}, "do": "delete"}], objects)
+        apply_edits(scene, [{"select": {"object": 0}, "do": "delete"}], objects)
 
 
 @pytest.mark.parametrize("edit", [
@@ -70,17 +70,17 @@ def test_objects_and_brushes_are_selected():
 ])  # fmt: skip
 def test_what_is_no_edit(edit):
     with pytest.raises(ContractError):
-        edited(cloud(60), [edit])
+        apply_edits(cloud(60), [edit])
 
 
 def test_edits_that_ruin_a_place_together_are_refused(monkeypatch):
     monkeypatch.setattr("terrella.space.edits.MOST_GAUSSIANS", 10_000)
     grow = {"select": {"all": True}, "do": "scale", "factor": 1e25}
     with pytest.raises(ContractError, match="out of all numbers"):
-        edited(cloud(60), [grow, grow])
+        apply_edits(cloud(60), [grow, grow])
     twice = {"select": {"all": True}, "do": "duplicate", "by": [0, 0, 0]}
     with pytest.raises(ContractError, match="at most"):
-        edited(cloud(60), [twice] * 30)
+        apply_edits(cloud(60), [twice] * 30)
 
 
 def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):

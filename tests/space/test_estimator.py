@@ -10,7 +10,7 @@ import torch
 from terrella.core import make_rng
 from terrella.core.errors import CheckpointError
 from terrella.space.camera import yaw
-from terrella.space.estimator import Estimator, EstimatorConfig, load_estimator, normalised, save_estimator
+from terrella.space.estimator import Estimator, EstimatorConfig, load_estimator, normalise, save_estimator
 from terrella.space.keyframes import Keyframes
 from terrella.space.recognise import recognise, thumbnails
 
@@ -46,8 +46,8 @@ def test_depth_stays_within_the_range_of_the_recordings_whatever_is_shown(estima
 
 def test_exposure_and_white_balance_change_nothing(estimator):
     rgb = pictures(1).float() / 255
-    plain = normalised(rgb)
-    tinted = normalised(rgb * torch.tensor([0.9, 0.5, 0.7])[:, None, None] + 0.05)
+    plain = normalise(rgb)
+    tinted = normalise(rgb * torch.tensor([0.9, 0.5, 0.7])[:, None, None] + 0.05)
     assert torch.allclose(plain, tinted, atol=0.12)
 
 

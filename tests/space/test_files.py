@@ -15,7 +15,7 @@ from terrella.core.errors import DatasetError
 from terrella.space.camera import rotation
 from terrella.space.files import read_scene, spz, write_scene
 from terrella.space.raster import rasterise
-from terrella.space.raster.move import quaternion, turned
+from terrella.space.raster.move import quaternion_of, transform
 
 from .test_raster import LENS, POSES, cloud, parts
 
@@ -43,8 +43,8 @@ def test_a_turned_scene_looks_the_same_from_a_turned_camera():
     scene, turn = cloud(80, 3), torch.tensor([0.7, 0.3, -0.5, 0.4])
     turn = turn / turn.norm()
     rot = rotation(torch.cat([torch.zeros(3), turn]))
-    assert torch.allclose(quaternion(rot), turn, atol=1e-5)
-    moved = turned(scene, rot, 2.0, torch.tensor([1.0, 2, 3]))
+    assert torch.allclose(quaternion_of(rot), turn, atol=1e-5)
+    moved = transform(scene, rot, 2.0, torch.tensor([1.0, 2, 3]))
     pose = torch.cat([torch.tensor([1.0, 2, 3]), turn])[None]
     there, here = rasterise(moved, pose, LENS, (32, 32)), rasterise(scene, POSES[:1], LENS, (32, 32))
     assert (there.rgb - here.rgb).abs().mean() < 1e-3 and torch.allclose(

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from terrella.core import make_rng
-from terrella.space.billboards import PICTURE, painted
+from terrella.space.billboards import PICTURE, paint_billboards
 from terrella.space.camera import FAR_M, planar_pose, rotation
 from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
 from terrella.space.kernels_numba.recall import pick as pick_kernel
@@ -194,4 +194,4 @@ def test_everything_runs_on_another_device():
         torch.ones(2, 3, 4, device="meta"),
     )
     there = torch.ones(2, 3, dtype=torch.bool, device="meta")
-    assert painted(rgb.float(), depth, boards, there, pose, CAMERA)[2].device.type == "meta"
+    assert paint_billboards(rgb.float(), depth, boards, there, pose, CAMERA)[2].device.type == "meta"

@@ -16,7 +16,7 @@ from terrella.space.files import AXES
 from terrella.space.files.glb import encode_gaussians, encode_mesh
 from terrella.space.mesh import Mesh, collider_mesh, fused
 from terrella.space.occupancy import Occupancy
-from terrella.space.raster.move import turned
+from terrella.space.raster.move import transform
 from terrella.space.solids import Solids
 
 from .test_fitting import room
@@ -61,7 +61,7 @@ def test_axes_come_out_as_the_guide_says(tool):
 
 def test_gaussians_keep_what_they_are():
     some = room(count=50)
-    doc, found = parts(encode_gaussians(turned(some, torch.tensor(AXES["rub"]).float()), "g"))
+    doc, found = parts(encode_gaussians(transform(some, torch.tensor(AXES["rub"]).float()), "g"))
     assert doc["extensionsUsed"] == ["KHR_gaussian_splatting"] and doc["meshes"][0]["primitives"][0]["mode"] == 0
     own = "KHR_gaussian_splatting:"
     assert np.allclose(found[f"{own}SCALE"], some.scales) and np.allclose(found[f"{own}OPACITY"][:, 0], some.opacities)

@@ -7,18 +7,18 @@ import torch.nn.functional as F
 
 from terrella.core import make_rng
 from terrella.space.matching import (
-    explained,
-    explained_slowly,
-    explains,
-    explains_slowly,
-    fetched,
-    half_a_pixel,
-    half_a_pixel_slowly,
-    scrolled,
-    voted,
-    voted_slowly,
+    edge_shares,
+    edge_shares_slowly,
+    gather_sources,
+    half_pixel_bounds,
+    half_pixel_bounds_slowly,
+    majority_colours,
+    majority_colours_slowly,
+    scroll_index,
+    source_shares,
+    source_shares_slowly,
 )
-from terrella.space.mosaic import MOST, blank, recalled, remembered, remembered_slowly
+from terrella.space.mosaic import MOST, empty_mosaic, read_mosaic, update_mosaic, update_mosaic_slowly
 
 NONE = torch.zeros(16, 24, dtype=torch.bool)  # nothing lies over the mosaic
 MOVES = torch.tensor([[0, 0], [3, 0], [-3, 0], [0, 2], [0, -2], [1, 1]])
@@ -37,15 +37,15 @@ def test_kernels_are_as_their_slow_twins():
     frames = torch.stack([view(whole, 20, 20)[0], view(whole, 23, 20)[0], view(whole, 24, 21)[0]])[None]
     truth = view(whole, 17, 20).clone()
     truth[..., 4:8, 4:8] = 30
-    for fast, slow in zip(explained(frames, truth, MOVES), explained_slowly(frames, truth, MOVES)):
+    for fast, slow in zip(source_shares(frames, truth, MOVES), source_shares_slowly(frames, truth, MOVES)):
         assert torch.allclose(fast, slow, atol=5e-4), "what is cut off is worth e ** -8"
-    assert torch.allclose(explains(frames[:, 0], truth, MOVES), explains_slowly(frames[:, 0], truth, MOVES))
-    assert torch.equal(half_a_pixel(frames[0]), half_a_pixel_slowly(frames[0]))
-    mosaic, some = blank(1, (16, 24)), torch.rand(16, 24, generator=make_rng(3)) < 0.2
+    assert torch.allclose(edge_shares(frames[:, 0], truth, MOVES), edge_shares_slowly(frames[:, 0], truth, MOVES))
+    assert torch.equal(half_pixel_bounds(frames[0]), half_pixel_bounds_slowly(frames[0]))
+    mosaic, some = empty_mosaic(1, (16, 24)), torch.rand(16, 24, generator=make_rng(3)) < 0.2
     for move in MOVES[:4]:
         for frame in (frames[:, 0], truth, truth):
-            slow = remembered_slowly(mosaic, frame, move[None], some)
-            mosaic = remembered(mosaic, frame, move[None], some)
+            slow = update_mosaic_slowly(mosaic, frame, move[None], some)
+            mosaic = update_mosaic(mosaic, frame, move[None], some)
             assert torch.equal(mosaic, slow)
 
 
@@ -55,7 +55,7 @@ def test_what_scrolls_by_part_of_a_pixel_is_explained():
     views = [
         F.avg_pool2d(255 * fine[..., x : x + 96].clamp(0, 1), 4).to(torch.uint8) for x in (20, 17)
     ]  # 3/4 of a pixel
-    share, _ = explained(views[0][:, None], views[1], torch.tensor([[0, 0], [1, 0], [3, 0]]))
+    share, _ = source_shares(views[0][:, None], views[1], torch.tensor([[0, 0], [1, 0], [3, 0]]))
     nothing, exact, far = share[..., 1:-1, 4:-4].mean((0, 2, 3))
     assert exact > 0.95 and far < 0.6 and nothing < 0.8
 
@@ -64,44 +64,46 @@ def test_a_scroll_is_found_and_a_still_picture_stands():
     whole = map_()
     one = view(whole, 30, 20)
     for number, (x, y) in enumerate(MOVES.tolist()):
-        assert scrolled(one, view(whole, 30 - x, 20 - y), MOVES).item() == number
-    assert scrolled(one, torch.full_like(one, 9), MOVES).item() == 0, "nothing explains a plain picture"
-    assert torch.equal(fetched(one[:, None], torch.ones(1, 16, 24, dtype=torch.int64), MOVES)[..., 3:], one[..., :-3])
+        assert scroll_index(one, view(whole, 30 - x, 20 - y), MOVES).item() == number
+    assert scroll_index(one, torch.full_like(one, 9), MOVES).item() == 0, "nothing explains a plain picture"
+    assert torch.equal(
+        gather_sources(one[:, None], torch.ones(1, 16, 24, dtype=torch.int64), MOVES)[..., 3:], one[..., :-3]
+    )
 
 
 def test_what_left_the_picture_is_recalled_where_it_comes_back():
-    whole, mosaic, x = map_(), blank(1, (16, 24)), 20
-    mosaic = remembered(mosaic, view(whole, x, 20), MOVES[:1], NONE)
+    whole, mosaic, x = map_(), empty_mosaic(1, (16, 24)), 20
+    mosaic = update_mosaic(mosaic, view(whole, x, 20), MOVES[:1], NONE)
     for way, steps in ((2, 8), (1, 7)):  # the camera goes 24 pixels to the right, and 21 back
         for _ in range(steps):
             before, x = x, x - int(MOVES[way, 0])
-            found = scrolled(view(whole, before, 20), view(whole, x, 20), MOVES)
-            mosaic = remembered(mosaic, view(whole, x, 20), MOVES[found], NONE)
-    known = recalled(mosaic, (16, 24), MOVES[1:2])  # one step more, and it is where it was
+            found = scroll_index(view(whole, before, 20), view(whole, x, 20), MOVES)
+            mosaic = update_mosaic(mosaic, view(whole, x, 20), MOVES[found], NONE)
+    known = read_mosaic(mosaic, (16, 24), MOVES[1:2])  # one step more, and it is where it was
     assert torch.equal(known[:, :3], view(whole, 20, 20)) and (known[:, 3] > 0).all()
-    assert (recalled(mosaic, (16, 24), torch.tensor([[0, 16]]))[:, 3] == 0).all(), "above it nothing was seen"
+    assert (read_mosaic(mosaic, (16, 24), torch.tensor([[0, 16]]))[:, 3] == 0).all(), "above it nothing was seen"
 
 
 def test_what_passes_leaves_no_trace():
-    whole, mosaic = map_(), blank(1, (16, 24))
+    whole, mosaic = map_(), empty_mosaic(1, (16, 24))
     still = torch.zeros(1, 2, dtype=torch.int64)
     for step in range(24):
         frame = view(whole, 20, 20).clone()
         if 6 <= step < 16:
             frame[..., 5:9, step : step + 4] = 255
-        mosaic = remembered(mosaic, frame, still, NONE)
-    known = recalled(mosaic, (16, 24), still)
+        mosaic = update_mosaic(mosaic, frame, still, NONE)
+    known = read_mosaic(mosaic, (16, 24), still)
     assert torch.equal(known[:, :3], view(whole, 20, 20)) and known[:, 3].max() == MOST
 
 
 def test_what_lies_over_a_mosaic_is_no_part_of_it():
-    whole, mosaic, over = map_(), blank(1, (16, 24)), NONE.clone()
+    whole, mosaic, over = map_(), empty_mosaic(1, (16, 24)), NONE.clone()
     over[:3], over[8:11, 10:13] = True, True  # a status line, and the walker in the middle
     for step in range(8):
         frame = view(whole, 20 + 3 * step, 20).clone()
         frame[..., over] = 255
-        mosaic = remembered(mosaic, frame, MOVES[2][None] * min(step, 1), over)
-    known = recalled(mosaic, (16, 24), MOVES[:1])
+        mosaic = update_mosaic(mosaic, frame, MOVES[2][None] * min(step, 1), over)
+    known = read_mosaic(mosaic, (16, 24), MOVES[:1])
     assert torch.equal(known[0, :3, 3:], view(whole, 41, 20)[0, :, 3:]), (
         "the ground under the walker is what was seen before"
     )
@@ -115,13 +117,16 @@ def test_what_most_sources_are_like_is_drawn():
     share = torch.zeros(1, len(MOVES) + 1, 16, 24)
     share[:, 0], share[:, 1], share[:, 2], share[:, 3] = 0.2, 0.4, 0.2, 0.2
     painted = torch.zeros(1, 3, 16, 24, dtype=torch.uint8)
-    assert (voted(frames, share, painted, MOVES, 1.0) == 100).all()
+    assert (majority_colours(frames, share, painted, MOVES, 1.0) == 100).all()
     share[:, 1] = 0.7
-    drawn = voted(frames, share, painted, MOVES, 1.0)
+    drawn = majority_colours(frames, share, painted, MOVES, 1.0)
     assert (drawn[..., 8, 15] == 255).all() and drawn.int().sum() == 100 * 3 * 16 * 24 + 155 * 3
-    assert torch.equal(voted(frames, share, painted, MOVES, 9.0), frames[:, 0]), "what stays counts for more"
+    assert torch.equal(majority_colours(frames, share, painted, MOVES, 9.0), frames[:, 0]), "what stays counts for more"
     frames = view(map_(), 20, 20)[:, None].expand(2, 2, 3, 16, 24) // 64 * 20
     share = torch.rand(2, len(MOVES) + 2, 16, 24, generator=make_rng(1)).pow(3)
     painted = map_(2, (16, 24)).expand(2, 3, 16, 24)
-    fast, slow = (how(frames, share / share.sum(1, keepdim=True), painted, MOVES, 2.0) for how in (voted, voted_slowly))
+    fast, slow = (
+        how(frames, share / share.sum(1, keepdim=True), painted, MOVES, 2.0)
+        for how in (majority_colours, majority_colours_slowly)
+    )
     assert (fast == slow).all(1).float().mean() > 0.995

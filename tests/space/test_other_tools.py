@@ -19,7 +19,7 @@ from terrella.space.camera import planar_pose, rotation
 from terrella.space.files import AXES, read_scene
 from terrella.space.raster import Gaussians, rasterise
 from terrella.space.raster.gaussians import Y0, plain_sh
-from terrella.space.raster.move import turned
+from terrella.space.raster.move import transform
 from terrella.worlds.folder import open_world
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import save_splat
@@ -125,7 +125,7 @@ def nearest(mine: torch.Tensor, theirs: torch.Tensor) -> tuple[torch.Tensor, tor
 
 def agree(found: dict, axes: str, off_m: float, off_colour: float) -> None:
     """What a tool found is our place: each of our Gaussians lies beside one of theirs, alike in colour, opacity and spread."""
-    mine = turned(place().gaussians, torch.tensor(AXES[axes]).float())
+    mine = transform(place().gaussians, torch.tensor(AXES[axes]).float())
     means = torch.tensor(found["means"]).view(-1, 3)
     assert len(means) == COUNT
     away, row = nearest(mine.means, means)
@@ -228,7 +228,7 @@ def test_files_of_gsply_open_in_ours(ours, tmp_path, name):
 
 def test_a_ply_in_gsplats_layout_opens_in_ours(tmp_path):
     """As gsplat's `export_splats` writes it: no normals, harmonics channel by channel, logits, logarithms, turns not normed."""
-    scene = turned(place().gaussians, torch.tensor(AXES["rdf"]).float())
+    scene = transform(place().gaussians, torch.tensor(AXES["rdf"]).float())
     rest = torch.zeros(COUNT, 45)
     names = [
         "x", "y", "z", *(f"f_dc_{k}" for k in range(3)), *(f"f_rest_{k}" for k in range(45)), "opacity",

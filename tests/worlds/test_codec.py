@@ -9,8 +9,8 @@ import torch
 
 from terrella.core import check_world, make_rng
 from terrella.data import Layout
-from terrella.space.matching import SAME, fetched
-from terrella.space.mosaic import blank, recalled, remembered
+from terrella.space.matching import SAME, gather_sources
+from terrella.space.mosaic import empty_mosaic, read_mosaic, update_mosaic
 from terrella.worlds.codec import HIDDEN, Codec, CodecConfig, CodecInputs, shared_chance
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
@@ -82,7 +82,7 @@ def test_what_lies_over_what_scrolls_is_no_part_of_the_mosaic_but_of_the_map():
     given = made.look(state, before)
     assert given.over is not None and given.mosaic is not None
     assert torch.equal(given.over, made.scene.over.expand(2, -1, -1))
-    known = recalled(given.mosaic, SIZE, torch.zeros(2, 2, dtype=torch.int64))[:, 3] > 0
+    known = read_mosaic(given.mosaic, SIZE, torch.zeros(2, 2, dtype=torch.int64))[:, 3] > 0
     assert not known[:, :4].any() and known[:, 4:].all()
     seen = made.render(state, ("rgb", "mosaic"))
     top, left = ((whole - part) // 2 for whole, part in zip(seen["mosaic"].shape[1:3], SIZE))
@@ -97,10 +97,14 @@ def test_what_lies_over_what_scrolls_is_seen_to_stay_where_both_would_explain_it
     made, over = codec(), NONE.clone()
     over[:4] = True
     frames = pictures(1)
-    frames[:, 0] = fetched(frames[:, 1:], torch.ones(1, *SIZE, dtype=torch.int64), MOVES)  # two pixels to the right
+    frames[:, 0] = gather_sources(
+        frames[:, 1:], torch.ones(1, *SIZE, dtype=torch.int64), MOVES
+    )  # two pixels to the right
     frames[..., :8, :] = 90  # of one colour, which every move explains
     for shown, stays in ((NONE, False), (over, True)):
-        went = made.seen(frames, blank(1, SIZE), shown[None], torch.ones(1, dtype=torch.int64)).went[0, :2, :2, 4:-4]
+        went = made.seen(frames, empty_mosaic(1, SIZE), shown[None], torch.ones(1, dtype=torch.int64)).went[
+            0, :2, :2, 4:-4
+        ]
         assert ((went[0] > 0.5) == stays).all() and ((went[1] > 0.5) != stays).all()
 
 
@@ -121,7 +125,7 @@ def test_an_untrained_one_stands_still_to_the_last_bit():
 def shown(made: Codec, batch: int = 1, seed: int = 0) -> CodecInputs:
     """Frames, and a mosaic that holds the newest of them but for its upper half."""
     frames = pictures(batch, seed)
-    mosaic = remembered(blank(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64), NONE)
+    mosaic = update_mosaic(empty_mosaic(batch, SIZE), frames[:, 0], torch.zeros(batch, 2, dtype=torch.int64), NONE)
     mosaic[:, :, : mosaic.shape[2] // 2] = 0
     return made.seen(frames, mosaic, NONE.expand(batch, -1, -1), torch.arange(batch) % len(MOVES))
 
@@ -136,7 +140,7 @@ def test_pixels_are_fetched_from_where_the_sources_say():
     seen = shown(made)
     height, width = SIZE
     for source in range(made.sources):
-        found = fetched(seen.sources, torch.full((1, *SIZE), source), made.moves)
+        found = gather_sources(seen.sources, torch.full((1, *SIZE), source), made.moves)
         for v, u in ((0, 0), (5, 7), (height - 1, width - 1)):
             slot = max(0, source - len(MOVES) + 1)
             x, y = MOVES[source].tolist() if slot == 0 else (0, 0)
@@ -155,7 +159,7 @@ def test_what_the_mosaic_does_not_know_is_not_fetched_from_it():
 
 def test_what_lies_outside_of_the_picture_is_as_the_mosaic_knows_it():
     made, frames = codec(wild=False), pictures(1)
-    mosaic = torch.full_like(blank(1, SIZE), 200)
+    mosaic = torch.full_like(empty_mosaic(1, SIZE), 200)
     seen = made.seen(frames, mosaic, NONE[None], torch.tensor([1]))  # all goes two pixels to the right
     choices, features = made.choices(seen, torch.zeros(1, 36 + 2 * SLOTS))
     share = choices.softmax(1)[0]
@@ -166,7 +170,7 @@ def test_what_lies_outside_of_the_picture_is_as_the_mosaic_knows_it():
 def test_what_lies_over_what_scrolls_neither_goes_along_nor_hides_it():
     made, frames, over = codec(wild=False), pictures(1), NONE.clone()
     over[:4], over[8:12, 10:14] = True, True
-    mosaic = torch.full_like(blank(1, SIZE), 200)
+    mosaic = torch.full_like(empty_mosaic(1, SIZE), 200)
     seen = made.seen(frames, mosaic, over[None], torch.tensor([1]))  # all goes two pixels to the right
     assert torch.equal(seen.known[0, 0], ~over), "the mosaic is not asked for what it is no part of"
     made.choice.bias.data[made.sources] = 9.0  # everything else is painted
@@ -195,7 +199,7 @@ def test_what_is_likelier_painted_has_a_colour_of_the_palette():
     drawn = made.drawn(seen, choices, torch.randn(2, HIDDEN, *SIZE, generator=make_rng(1)))
     colours = drawn[0, :, :4].flatten(1).T
     assert ((colours[:, None].int() - made.palette.int()).abs().amax(-1) <= SAME).any(1).all()
-    there = fetched(seen.sources, torch.ones(2, *SIZE, dtype=torch.int64), made.moves)
+    there = gather_sources(seen.sources, torch.ones(2, *SIZE, dtype=torch.int64), made.moves)
     assert like(drawn[0, :, 4:], there[0, :, 4:]) and like(drawn[1], there[1])
 
 
@@ -230,7 +234,7 @@ def test_the_stress_on_what_changes_is_taken_back():
     choices = torch.full((1, made.sources + 1, *SIZE), -20.0)
     choices[:, 0], choices[:, 1] = 0.0, 2.0
     features = torch.zeros(1, HIDDEN, *SIZE)
-    moved = fetched(seen.sources, torch.ones(1, *SIZE, dtype=torch.int64), made.moves)
+    moved = gather_sources(seen.sources, torch.ones(1, *SIZE, dtype=torch.int64), made.moves)
     assert like(made.drawn(seen, choices, features), moved)
     made.stress.fill_(16.0)
     assert torch.equal(made.drawn(seen, choices, features), seen.sources[:, 0])

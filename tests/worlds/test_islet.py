@@ -7,7 +7,7 @@ import torch
 
 import terrella
 from terrella.core import World
-from terrella.space.matching import scrolled
+from terrella.space.matching import scroll_index
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_it_is_a_world_of_pictures_and_says_how_it_is_played(world):
 def test_the_picture_scrolls_as_it_is_told(world, action, way):
     """More often than in any other way; at the border of the island, and against trees, it stands."""
     moves, seen = world.scene.moves, walked(world, action, 10)
-    went = torch.stack([moves[scrolled(one, other, moves)] for one, other in zip(seen, seen[1:])])
+    went = torch.stack([moves[scroll_index(one, other, moves)] for one, other in zip(seen, seen[1:])])
     moved = went[(went != 0).any(2)]
     assert len(moved) > 10 and (moved == torch.tensor(way)).all(1).float().mean() > 0.7
 

@@ -13,7 +13,7 @@ from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
 from terrella.serve.place_frames import NAMES, FrameRenderer
 from terrella.space.camera import planar_pose
-from terrella.space.edits import edited
+from terrella.space.edits import apply_edits
 from terrella.space.occupancy import Walker
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
@@ -173,6 +173,6 @@ def test_what_cannot_be_merged(two, capsys):
     line = {"do": "merge", "place": 7, "by": [0, 0, 0], "degrees": 0}
     source = source_of(path / "a")
     with pytest.raises(ContractError, match="names a `place`"):
-        edited(source.gaussians, [line], source.objects, other_of(path / "a"))
+        apply_edits(source.gaussians, [line], source.objects, other_of(path / "a"))
     with pytest.raises(ContractError, match="needs the other place"):
-        edited(source.gaussians, [line])
+        apply_edits(source.gaussians, [line])

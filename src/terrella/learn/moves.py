@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F
 
 from ..core.files import write_json
-from ..space.matching import fetched, half_a_pixel, scrolled
-from ..space.mosaic import blank, remembered
+from ..space.matching import gather_sources, half_pixel_bounds, scroll_index
+from ..space.mosaic import empty_mosaic, update_mosaic
 
 REACH, NEAR = 24, 5  # pixels of the longest move in a step, and those up to which all moves are tried at full size
 BLOCK = 8  # pixels
@@ -112,7 +112,7 @@ def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> t
     """The pixels bool [H, W] that stay while the picture scrolls from `before` to `after` (uint8 [N, 3, H, W]), such as a status
     line or a player in the middle: those which, with their neighbourhood, are better explained by staying than by scrolling more
     often than the reverse. Holes are filled."""
-    scroll = scrolled(before, after, moves)
+    scroll = scroll_index(before, after, moves)
     scrolls = scroll > 0
     if scrolls.sum() < FEWEST:
         return torch.zeros(before.shape[-2:], dtype=torch.bool)
@@ -130,7 +130,7 @@ def _stay_or_scroll(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels of `after` that are explained by staying, and by the `scroll` [N]: bool [N, H, W] each."""
     along = scroll[:, None, None].expand(-1, *before.shape[-2:])
-    least, most = (fetched(bound[:, None], along, moves).int() for bound in half_a_pixel(before).unbind(1))
+    least, most = (gather_sources(bound[:, None], along, moves).int() for bound in half_pixel_bounds(before).unbind(1))
     goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
     return (before.int() - after.int()).abs().amax(1) <= SAME, goes
 
@@ -138,10 +138,10 @@ def _stay_or_scroll(
 def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
     """Mosaics [B, 4, H', W'] of frames uint8 [B, T, 3, H, W], the oldest first; only of frames that are `real` bool [B, T], and
     without the pixels `over` [H, W]."""
-    mosaic = blank(len(frames), (frames.shape[-2], frames.shape[-1]), frames.device)
+    mosaic = empty_mosaic(len(frames), (frames.shape[-2], frames.shape[-1]), frames.device)
     for step in range(frames.shape[1]):
         before, now = frames[:, max(step - 1, 0)], frames[:, step]
-        joined = remembered(mosaic, now, moves[scrolled(before, now, moves)], over)
+        joined = update_mosaic(mosaic, now, moves[scroll_index(before, now, moves)], over)
         mosaic = torch.where(real[:, step, None, None, None], joined, mosaic)
     return mosaic
 

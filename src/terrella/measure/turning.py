@@ -13,7 +13,7 @@ from gymnasium import spaces
 from ..core.spec import Spec
 from ..core.world import World
 from ..space.camera import yaw
-from ..space.matching import scrolled
+from ..space.matching import scroll_index
 from .clips import Clip
 from .rollouts import fold_context
 
@@ -60,7 +60,7 @@ def scrolling_actions(
             state = state if step == 0 else world.imagine(state, action.expand(len(clips), *action.shape), rng)
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
         steps = (
-            torch.stack([moves[scrolled(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0)
+            torch.stack([moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0)
             / TRIAL_STEPS
         )
         went.append(steps[steps.abs().sum(1).argmax()])

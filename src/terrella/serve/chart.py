@@ -27,26 +27,26 @@ EVERY_S = {PLACES: 0.1, MOSAIC: 0.25}  # between two maps
 FINEST, QUALITY = 640, 85  # of the JPEG of a mosaic: most pixels across, and quality
 
 
-def mapped(spec: Spec) -> str:
+def map_kind(spec: Spec) -> str:
     """The kind of map that the world has; "" for none."""
     if {"pose", "places"} <= set(spec.channels):
         return PLACES
     return MOSAIC if {"rgb", "mosaic"} <= set(spec.channels) else ""
 
 
-def knows_share(spec: Spec) -> bool:
+def has_known_share(spec: Spec) -> bool:
     return "known" in spec.channels
 
 
-def chart(world: World, state: State) -> dict:
+def map_event(world: World, state: State) -> dict:
     """The map of the first entry of `state`, in the form that protocol.encode_event documents."""
-    return {PLACES: _places, MOSAIC: _mosaic}[mapped(world.spec)](world, state)
+    return {PLACES: _places, MOSAIC: _mosaic}[map_kind(world.spec)](world, state)
 
 
 def _places(world: World, state: State) -> dict:
     """camera: [x, y, heading], to the millimetre. known: the share of the picture that comes from memory (None if the world has no
     such channel). places: x, y, heading and kind of each, to the centimetre, in one flat list without empty slots."""
-    wanted = ["pose", "places", *(["known"] if knows_share(world.spec) else [])]
+    wanted = ["pose", "places", *(["known"] if has_known_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     held = seen["places"][seen["places"][:, 3] > 0]
     return {
@@ -80,7 +80,7 @@ def _margin(seen: np.ndarray, least: int) -> int:
     return min(empty, (len(seen) - least) // 2)
 
 
-def tinted(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+def tint_invented(rgb: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     """rgb uint8 [B, H, W, 3] with the pixels that are not `known` ([B, H, W] in 0..1) tinted in amber."""
     picture = rgb.float()
     brightness = picture @ torch.tensor([0.299, 0.587, 0.114], device=rgb.device)

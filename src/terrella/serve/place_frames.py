@@ -11,7 +11,7 @@ import simplejpeg
 import torch
 
 from ..core.errors import ServeError
-from ..space.edits import Contents, Edit, edited
+from ..space.edits import Contents, Edit, apply_edits
 from ..space.raster import Gaussians, rasterise
 
 NAMES = ("x", "y", "z", "heading", "pitch", "wide", "tall", "width", "height")
@@ -51,7 +51,7 @@ class FrameRenderer:
         with self._alone, torch.no_grad():
             text = json.dumps(list(edits := self._edits()))
             if text != self._done:
-                self._scene, self._done = edited(self._source, edits, self._objects, self._other).gaussians, text
+                self._scene, self._done = apply_edits(self._source, edits, self._objects, self._other).gaussians, text
             lens = (0.5 / wide, 0.5 / tall, 0.5, 0.5)
             seen = rasterise(self._scene, pose, lens, (round(height), round(width))).rgb[0]
         picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous()

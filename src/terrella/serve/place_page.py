@@ -24,7 +24,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
-from ..space.edits import Edit, merges
+from ..space.edits import Edit, merges_of
 from ..space.files.compressed import packed_quats
 from ..space.occupancy import Occupancy, Walker, samples
 from ..space.raster import Gaussians
@@ -76,7 +76,7 @@ class PlacePage:
         self._packed, *parts = packed_place(place, first)
         self._data, self._rest = (base64.b64encode(part).decode() for part in parts)
         self._style = (WEB / "style.css").read_text("utf-8") + (PAGE / "place.css").read_text("utf-8")
-        self._script = f"(async () => {{\n'use strict';\n{bundled(PAGE / 'app.js')}}})();"
+        self._script = f"(async () => {{\n'use strict';\n{bundle_script(PAGE / 'app.js')}}})();"
         self.policy = (
             f"default-src 'none'; script-src {_hash(self._script)}; worker-src blob:; style-src {_hash(self._style)}; "
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
@@ -89,7 +89,7 @@ class PlacePage:
         watch:  the address of newer states of a place that is being fitted, which cannot be edited meanwhile.
         frames: the address that draws for browsers that cannot.
         """
-        place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges(edits)}.values())
+        place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
@@ -136,7 +136,7 @@ def packed_place(place: PlaceScene, first: int) -> tuple[dict[str, Any], bytes, 
     return {"count": count, "first": first, "solid": solid}, early, late
 
 
-def bundled(path: Path) -> str:
+def bundle_script(path: Path) -> str:
     """A script with all its imports from its own folder as one script: each module is a function that returns its exports."""
     order: list[Path] = []
 
@@ -228,7 +228,7 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
             if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
             lines = [json.loads(line) for line in posted_edits["lines"].splitlines() if line]
-            if any(_merge_key(edit) not in page.merged for edit in merges(lines)):
+            if any(_merge_key(edit) not in page.merged for edit in merges_of(lines)):
                 raise ServeError(
                     "this page merges only the place that it was opened beside: `terrella space view PLACE --beside OTHER`."
                 )

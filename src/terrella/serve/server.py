@@ -24,7 +24,7 @@ from ..core.world import World
 from . import protocol
 from .actions import axes_of
 from .agent import Agents, agents_of
-from .chart import knows_share, mapped
+from .chart import has_known_share, map_kind
 from .clip import make_clip
 from .guard import RateLimit
 from .http_server import application, serve_page
@@ -155,8 +155,8 @@ def _describe(world: World, label: str) -> dict:
         "scored": "reward" in spec.channels,
         "vitals": vitals(spec),
         "uncertainty": uncertainty_levels(spec),
-        "mapped": mapped(spec),
-        "knows_share": knows_share(spec),
+        "mapped": map_kind(spec),
+        "knows_share": has_known_share(spec),
         "card": protocol.plain(spec.card),
     }
 

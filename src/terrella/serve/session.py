@@ -279,7 +279,7 @@ class Session:
         moment = replace(moment, images=images, flags=moment.flags | protocol.REPLAY * timeline.rewound)
         past = timeline.history.oldest_step, timeline.history.newest.step
         await self._deliver(protocol.encode_frame(moment, self._sent, *past, controls, made_ms, time.time()))
-        if self._show.map and timeline.mapped and (time.perf_counter() >= self._chart_due or timeline.rewound):
+        if self._show.map and timeline.map_kind and (time.perf_counter() >= self._chart_due or timeline.rewound):
             await self._chart(timeline)
         if self._show.futures and timeline.driver.on and time.perf_counter() >= self._futures_due:
             await self._futures(timeline)
@@ -294,8 +294,8 @@ class Session:
             await self._event("futures", **futures)
 
     async def _chart(self, timeline: Timeline) -> None:
-        self._chart_due = time.perf_counter() + EVERY_S[timeline.mapped]
-        chart = await self._extra(timeline.chart)
+        self._chart_due = time.perf_counter() + EVERY_S[timeline.map_kind]
+        chart = await self._extra(timeline.map_event)
         if chart is not None:
             large = {name: chart.pop(name) for name in ("places", "mosaic") if name in chart}
             changed = {name: value for name, value in large.items() if value != self._charted.get(name)}

@@ -16,7 +16,7 @@ from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import World, make_rng
 from .agent import Agents, agents_of
-from .chart import chart, mapped, tinted
+from .chart import map_event, map_kind, tint_invented
 from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
@@ -100,9 +100,9 @@ class Timeline:
         return self.shown.step < self.history.newest.step
 
     @property
-    def mapped(self) -> str:
-        """The kind of map that `chart` returns; "" for none."""
-        return next((kind for world in reversed(self.worlds) if (kind := mapped(world.spec))), "")
+    def map_kind(self) -> str:
+        """The kind of map that `map_event` returns; "" for none."""
+        return next((kind for world in reversed(self.worlds) if (kind := map_kind(world.spec))), "")
 
     def pictures(self) -> list[tuple[bytes, ...]]:
         """The JPEGs of the recent past, oldest first, up to the moment shown, as far back as the same cameras were shown."""
@@ -113,13 +113,13 @@ class Timeline:
         return [tuple(image.jpeg for image in images) for images in past[first:]]
 
     @torch.inference_mode()
-    def chart(self) -> dict | None:
+    def map_event(self) -> dict | None:
         """The map at the moment shown, of the last world that has one, as the page gets it; None if none has."""
-        number = max((at for at, world in enumerate(self.worlds) if mapped(world.spec)), default=None)
+        number = max((at for at, world in enumerate(self.worlds) if map_kind(world.spec)), default=None)
         if number is None:
             return None
         state = (self.shown.states or self._states)[number]
-        return {"world": number, "step": self.shown.step, **chart(self.worlds[number], state)}
+        return {"world": number, "step": self.shown.step, **map_event(self.worlds[number], state)}
 
     @torch.inference_mode()
     def consider(self) -> dict | None:
@@ -145,7 +145,7 @@ class Timeline:
                 known = "known" + name.removeprefix("rgb")
                 tint = invented and known in world.spec.channels
                 seen = world.render(state, (name, known) if tint else (name,))
-                picture = tinted(seen[name], seen[known]) if tint else seen[name]
+                picture = tint_invented(seen[name], seen[known]) if tint else seen[name]
                 images.append(Image(number, camera, encode_jpeg(picture)))
         return tuple(images)
 

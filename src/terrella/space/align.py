@@ -1,7 +1,7 @@
-"""Direct alignment: the level motion between two pictures that makes the first, carried by its depth, look like the second.
+"""Direct alignment: the planar motion between two pictures, found by warping the first with its depth onto the second.
 
 Dense visual odometry (Steinbruecker et al. 2011; Kerl et al. 2013) with three unknowns: Gauss-Newton on differences of
-brightness, from coarse to fine, with weights that let go of what does not fit (occlusions, things that move).
+brightness, coarse to fine, with robust weights for outliers (occlusions, moving objects).
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import torch.nn.functional as F
 
 from .camera import Intrinsics, rays
 
-_ROUNDS = {8: 5, 4: 4, 2: 4, 1: 2}  # steps of the search, by how many pixels a side become one
-_HELD = 0.2  # how strongly a motion is drawn towards none
+_ROUNDS = {8: 5, 4: 4, 2: 4, 1: 2}  # steps of the search at each downscaling factor
+_HELD = 0.2  # strength of the prior for no motion
 
 
 def align(
     before: torch.Tensor, after: torch.Tensor, depth: torch.Tensor, camera: Intrinsics, pace: torch.Tensor
 ) -> torch.Tensor:
-    """before and after [B, 3, H, W] of any scale of brightness; depth [B, H, W] metres of the first; pace [3] how far usual
-    steps go -> [B, 3]: metres forward, metres to the left (in the frame of the first), radians to the left.
+    """before and after [B, 3, H, W] at any scale of brightness; depth [B, H, W] metres of the first; pace [3], the usual size of
+    a step -> [B, 3]: metres forward, metres to the left (in the frame of the first), radians to the left.
 
-    Standing still, turning and walking are tried coarsely, and the one is followed that fits best.
+    Starts from no motion, both turns, and steps forward and back at the coarsest level, and refines the best of them.
     """
     grey = [picture.float().mean(1, keepdim=True) for picture in (before, after)]
     starts = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], device=depth.device) * 0.7 * pace
@@ -46,8 +46,8 @@ def _round(
     motion: torch.Tensor,
     pace: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """One step of Gauss-Newton: pictures [B, 1, h, w], depth [B, h, w], motion [B, 3] -> a better motion, and how badly the
-    one given fits [B]."""
+    """One step of Gauss-Newton: pictures [B, 1, h, w], depth [B, h, w], motion [B, 3] -> a better motion, and the error of the
+    given one [B]."""
     fx, fy, cx, cy = camera
     height, width = depth.shape[-2:]
     points = depth[..., None] * rays(camera, height, width, depth.device)
@@ -60,9 +60,9 @@ def _round(
     grid = torch.stack([u, v], -1) * 2 - 1
     slopes = torch.cat([_slope(second, 3) * width, _slope(second, 2) * height], 1)
     seen = F.grid_sample(torch.cat([second, slopes], 1), grid, padding_mode="border", align_corners=False)
-    there, slope_u, slope_v = seen.unbind(1)
+    warped, slope_u, slope_v = seen.unbind(1)
     here, _ = _even(first[:, 0], inside)
-    there, contrast = _even(there, inside)
+    warped, contrast = _even(warped, inside)
     slope_u, slope_v = slope_u / contrast, slope_v / contrast
     # how u and v change as the camera moves forward, to the left, and turns
     d_ahead = torch.stack([-c.expand_as(ahead), -s.expand_as(ahead), left], -1)
@@ -70,12 +70,12 @@ def _round(
     d_u = -fx * (d_left * safe[..., None] - left[..., None] * d_ahead) / safe[..., None] ** 2
     d_v = fy * up[..., None] * d_ahead / safe[..., None] ** 2
     change = slope_u[..., None] * d_u + slope_v[..., None] * d_v
-    off = there - here
+    off = warped - here
     spread = (off.abs() * inside).sum((1, 2)) / inside.sum((1, 2)).clamp_min(1)
     weight = inside / (1 + (off / (2 * spread[:, None, None] + 1e-3)) ** 2)
     flat, rest, weight = change.flatten(1, 2), off.flatten(1), weight.flatten(1)
     normal = (flat * weight[..., None]).mT @ flat
-    held = _HELD * (spread**2 * weight.sum(1) ** 0.5)[:, None] / pace**2  # what cannot be seen keeps near to no motion
+    held = _HELD * (spread**2 * weight.sum(1) ** 0.5)[:, None] / pace**2  # unobservable components stay near zero
     damped = normal + torch.diag_embed(1e-3 * normal.diagonal(dim1=1, dim2=2) + 1e-6 + held)
     step = torch.linalg.solve(damped, -(flat * (weight * rest)[..., None]).sum(1) - held * motion)
     missing = 1 - inside.flatten(1).float().mean(1)
@@ -83,7 +83,7 @@ def _round(
 
 
 def _even(grey: torch.Tensor, inside: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """grey [B, h, w] with mean 0 and contrast 1 over the pixels `inside`, that both pictures see; and what its contrast was
+    """grey [B, h, w] with mean 0 and contrast 1 over the pixels `inside`, which both pictures show; and its contrast before
     [B, 1, 1]."""
     count = inside.sum((1, 2), keepdim=True).clamp_min(1)
     grey = grey - (grey * inside).sum((1, 2), keepdim=True) / count
@@ -92,7 +92,7 @@ def _even(grey: torch.Tensor, inside: torch.Tensor) -> tuple[torch.Tensor, torch
 
 
 def _slope(picture: torch.Tensor, axis: int) -> torch.Tensor:
-    """Central differences a pixel along `axis`."""
+    """Central differences per pixel along `axis`."""
     padded = F.pad(picture, (1, 1, 0, 0) if axis == 3 else (0, 0, 1, 1), mode="replicate")
     length = picture.shape[axis]
     return (padded.narrow(axis, 2, length) - padded.narrow(axis, 0, length)) / 2

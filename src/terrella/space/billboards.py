@@ -1,7 +1,7 @@
-"""Billboards: what stands in a place, as upright pictures that face the camera: cut out of frames, and painted into them.
+"""Billboards: objects as upright pictures that face the camera, cut out of frames and painted into them.
 
-A billboard has a place, its feet (x, y, z in metres, world frame), and a look: a picture [4, *PICTURE] (rgb and cover in [0, 1])
-and its box [4], how far it reaches to the left, the right, below and above of its feet, in metres across the line of sight.
+A billboard has a place, that of its feet (x, y, z in metres, world frame), a picture [4, *PICTURE] (rgb and cover in [0, 1])
+and a box [4], its extent to the left, to the right, below and above its feet, in metres across the line of sight.
 """
 
 from __future__ import annotations
@@ -16,20 +16,19 @@ from .kernels_numba.paint import TOUCHED, paint_views
 from .views import arrays, over_views
 
 PICTURE = (48, 32)  # rows and columns of a billboard's picture
-NEAREST_M = 0.25  # of a billboard that is still painted
-BEHIND_M = 0.4  # by which a billboard may stand behind the surface that a frame shows: its feet are in the floor
+NEAREST_M = 0.25  # nearer billboards are not painted
+BEHIND_M = 0.4  # a billboard this far behind the visible surface is still painted, because its feet are in the floor
 
 
 class Cutout(NamedTuple):
-    """n billboards that frames show: view and row [n], which frame and which row of its list; picture [n, 4, *PICTURE]; box
-    [n, 4]; pixels [n], how many show it; whole [n] bool, seen all of it: not cut off by the frame's edge or hidden in part."""
+    """n billboards that frames show."""
 
-    view: torch.Tensor
-    row: torch.Tensor
-    picture: torch.Tensor
-    box: torch.Tensor
-    pixels: torch.Tensor
-    whole: torch.Tensor
+    view: torch.Tensor  # int64 [n], the frame
+    row: torch.Tensor  # int64 [n], the row in the frame's list of billboards
+    picture: torch.Tensor  # float32 [n, 4, *PICTURE]
+    box: torch.Tensor  # float32 [n, 4]
+    pixels: torch.Tensor  # int64 [n], how many pixels show it
+    whole: torch.Tensor  # bool [n], neither cut off by the frame's edge nor partly hidden
 
 
 def cut_out(
@@ -40,14 +39,14 @@ def cut_out(
     pose: torch.Tensor,
     camera: Intrinsics,
 ) -> Cutout:
-    """The billboards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], which of the places [B, K, 3] is seen at a pixel,
-    counted from 1 (0: none); depth [B, h, w] metres; pose [B, 7]."""
+    """The billboards in frames: rgb uint8 [B, 3, H, W]; instances [B, h, w], the number of the place [B, K, 3] seen at a pixel,
+    from 1 (0: none); depth [B, h, w] metres; pose [B, 7]."""
     height, width = rgb.shape[-2:]
-    there, depth = (
+    numbered, depth = (
         F.interpolate(part[:, None].float(), (height, width), mode="nearest-exact")[:, 0] for part in (instances, depth)
     )
     numbers = torch.arange(1, places.shape[1] + 1, device=rgb.device)
-    masks = there[:, None] == numbers[:, None, None]
+    masks = numbered[:, None] == numbers[:, None, None]
     view, row = masks.flatten(2).any(-1).nonzero(as_tuple=True)
     masks = masks[view, row]
     if not len(view):
@@ -74,54 +73,56 @@ def cut_out(
     return Cutout(view, row, picture, box, masks.flatten(1).sum(1), ~(cut | hidden))
 
 
-def painted(
+def paint_billboards(
     rgb: torch.Tensor,
     depth: torch.Tensor,
     billboards: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    there: torch.Tensor,
+    present: torch.Tensor,
     pose: torch.Tensor,
     camera: Intrinsics,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Frames with billboards in them, each hidden by what is nearer: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
-    which billboard is seen at a pixel, counted from 1 (uint8 [B, H, W], 0: none).
+    """Frames with billboards painted into them, behind nearer surfaces: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
+    the number of the billboard seen at a pixel, from 1 (uint8 [B, H, W], 0: none).
 
-    rgb and depth are what stands behind; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; there
-    [B, K] bool, which of them there are.
+    rgb and depth are the background; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; present
+    [B, K] bool says which of them exist.
     """
     if rgb.device.type != "cpu":
-        return painted_slowly(rgb, depth, billboards, there, pose, camera)
-    order, there, sides, far = _placed(billboards, there, pose, camera, depth.shape[-2:])
+        return paint_billboards_slowly(rgb, depth, billboards, present, pose, camera)
+    order, present, sides, far = _placed(billboards, present, pose, camera, depth.shape[-2:])
     rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
-    given = arrays(order, there, billboards[1], sides.double(), far.double(), depth + BEHIND_M)
+    given = arrays(order, present, billboards[1], sides.double(), far.double(), depth + BEHIND_M)
     parts = [*given, *arrays(rgb, onto, instances)]
     over_views(len(rgb), lambda first, last: paint_views(first, last, *parts))
     return rgb, onto, instances
 
 
-def _placed(billboards, there, pose, camera, size) -> tuple[torch.Tensor, ...]:
-    """Of billboards seen in pictures of `size`: their order [B, K], the nearest last, which are in front [B, K], the sides of
-    their boxes [B, K, 4] in pixels (left, right, top, bottom) and how far they are [B, K]."""
+def _placed(billboards, present, pose, camera, size) -> tuple[torch.Tensor, ...]:
+    """Billboards in pictures of `size`: their order [B, K], the nearest last; which are in front of the camera [B, K]; the sides
+    of their boxes [B, K, 4] in pixels (left, right, top, bottom); and their depths [B, K]."""
     (places, _, boxes), (height, width) = billboards, size
     where, ahead = project(places, pose, camera)
-    there = there & (ahead > NEAREST_M)
-    far = torch.where(there, ahead, 1.0)
+    present = present & (ahead > NEAREST_M)
+    far = torch.where(present, ahead, 1.0)
     sides = torch.stack(
         [where[..., 0] * width - boxes[..., 0] / far * camera[0] * width,
          where[..., 0] * width + boxes[..., 1] / far * camera[0] * width,
          where[..., 1] * height - boxes[..., 3] / far * camera[1] * height,
          where[..., 1] * height + boxes[..., 2] / far * camera[1] * height], -1
     )  # fmt: skip
-    return far.argsort(dim=1, descending=True, stable=True), there, sides, far
+    return far.argsort(dim=1, descending=True, stable=True), present, sides, far
 
 
-def painted_slowly(rgb, depth, billboards, there, pose, camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The same as `painted`, in plain tensor algebra, of all views one billboard at a time; the way on a GPU."""
+def paint_billboards_slowly(
+    rgb, depth, billboards, present, pose, camera
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The same as `paint_billboards`, in plain tensor algebra, of all views one billboard at a time; also for GPUs."""
     height, width = depth.shape[-2:]
-    order, there, sides, far = _placed(billboards, there, pose, camera, (height, width))
+    order, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
     pictures = billboards[1]
     hides, instances = depth + BEHIND_M, torch.zeros_like(depth, dtype=torch.uint8)
     quarters = torch.tensor([0.25, 0.75], device=rgb.device)
-    # two places along either side of a pixel
+    # two samples along each side of a pixel
     u = (torch.arange(width, device=rgb.device)[:, None] + quarters).flatten()
     v = (torch.arange(height, device=rgb.device)[:, None] + quarters).flatten()
     for rank in order.unbind(1):
@@ -129,24 +130,24 @@ def painted_slowly(rgb, depth, billboards, there, pose, camera) -> tuple[torch.T
         left, right, top, bottom = sides[view, rank].clamp(-1e6, 1e6)[..., None].unbind(1)
         a, b = (u - left) / (right - left).clamp_min(1e-6), (v - top) / (bottom - top).clamp_min(1e-6)
         grid = torch.stack(torch.broadcast_tensors(a[:, None] * 2 - 1, b[:, :, None] * 2 - 1), -1)
-        found = F.grid_sample(pictures[view, rank], grid, padding_mode="border", align_corners=False)
-        mask = (found[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1)[:, None]
-        shown = (far[view, rank][:, None, None] < hides) & there[view, rank][:, None, None]
+        drawn = F.grid_sample(pictures[view, rank], grid, padding_mode="border", align_corners=False)
+        mask = (drawn[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1)[:, None]
+        shown = (far[view, rank][:, None, None] < hides) & present[view, rank][:, None, None]
         cover = F.avg_pool2d(mask.float(), 2) * shown[:, None]
-        rgb = rgb * (1 - cover) + F.avg_pool2d(found[:, :3] * mask, 2) * shown[:, None]
+        rgb = rgb * (1 - cover) + F.avg_pool2d(drawn[:, :3] * mask, 2) * shown[:, None]
         depth = torch.where(cover[:, 0] > 0.5, far[view, rank][:, None, None], depth)
         instances = torch.where(cover[:, 0] > TOUCHED, (rank + 1)[:, None, None].to(torch.uint8), instances)
     return rgb, depth, instances
 
 
 def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The first and the last that is True in each of [n, L]: [n] each."""
+    """The indices of the first and the last True in each row of [n, L]: [n] each."""
     whole = line.float()
     return whole.argmax(1), line.shape[1] - 1 - whole.flip(1).argmax(1)
 
 
 def _onto(left, right, top, bottom) -> torch.Tensor:
-    """The affine map [n, 2, 3] from [-1, 1] onto a box of the image, whose sides are given in 0..1."""
+    """The affine map [n, 2, 3] from [-1, 1] to a box of the image with sides in 0..1."""
     zero = torch.zeros_like(left)
     across = torch.stack([right - left, zero, right + left - 1], 1)
     along = torch.stack([zero, bottom - top, bottom + top - 1], 1)

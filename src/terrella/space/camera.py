@@ -10,12 +10,12 @@ import torch
 
 Intrinsics = tuple[float, float, float, float]
 
-NEAR_M = 0.05  # nearer surfaces are not seen
-FAR_M = 100.0  # deeper than any depth: "nothing is known there"
-SAME = 0.06  # depths that differ by less than this share are of one surface
+NEAR_M = 0.05  # nearer surfaces are not drawn
+FAR_M = 100.0  # the depth of pixels where nothing is known
+SAME = 0.06  # depths that differ by less than this share belong to one surface
 
 _STAY = torch.eye(3)
-_TURN = torch.tensor(  # a rotation less the identity, of the products ww, wx, wy, wz, xw, ... of a unit quaternion
+_TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a unit quaternion to its rotation minus the identity
     [
         [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, -2], [0, 2, 0]],
          [[0, 0, 2], [0, 0, 0], [-2, 0, 0]], [[0, -2, 0], [2, 0, 0], [0, 0, 0]]],
@@ -60,7 +60,7 @@ def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> to
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
     """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N].
 
-    Points behind the camera come back with depth <= 0 and meaningless coordinates.
+    Points behind the camera have depth <= 0 and meaningless coordinates.
     """
     fx, fy, cx, cy = camera
     local = (points - pose[..., None, :3]) @ rotation(pose)

@@ -26,7 +26,7 @@ import torch
 from ..core.errors import ContractError
 from .raster import Gaussians, join
 from .raster.gaussians import plain_sh
-from .raster.move import turned
+from .raster.move import transform
 
 SELECTIONS = {"box": 6, "sphere": 4, "brush": 4, "plane": 4, "object": 1, "all": 0}  # and how many numbers each takes
 ACTIONS = {
@@ -60,7 +60,7 @@ class Edited:
     raised: tuple[int, ...] = ()
 
 
-def edited(
+def apply_edits(
     gaussians: Gaussians,
     edits: Sequence[Edit],
     objects: torch.Tensor | None = None,
@@ -80,7 +80,7 @@ def edited(
             belong = torch.where(came.objects > 0, came.objects + raised[-1], 0).int()
             known += len(done)
         else:
-            chosen = selected(gaussians, edit, objects)
+            chosen = select(gaussians, edit, objects)
             done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
             fresh = torch.full((len(done),), -1)
         if edit["do"] == "duplicate":
@@ -96,12 +96,12 @@ def edited(
     return Edited(gaussians, origin, objects, tuple(raised))
 
 
-def merges(edits: Sequence[Edit]) -> list[Edit]:
+def merges_of(edits: Sequence[Edit]) -> list[Edit]:
     """Those that bring another place."""
     return [edit for edit in edits if edit.get("do") == "merge"]
 
 
-def placed_boxes(boxes: torch.Tensor, edit: Edit) -> torch.Tensor | None:
+def merged_boxes(boxes: torch.Tensor, edit: Edit) -> torch.Tensor | None:
     """Upright boxes [K, 6] (low and high corners) of a merged place; None where it was turned by no quarter."""
     quarters = edit["degrees"] / 90
     if quarters != round(quarters):
@@ -123,7 +123,7 @@ def _placed(some: Gaussians, edit: Edit) -> Gaussians:
     return there
 
 
-def selected(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:
+def select(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:
     """Which Gaussians an edit is about: bool [N]; ContractError where it is about none, or not understood."""
     chosen = edit.get("select")
     if not isinstance(chosen, Mapping) or len(chosen) != 1 or next(iter(chosen)) not in SELECTIONS:
@@ -166,7 +166,7 @@ def _done(some: Gaussians, edit: Edit) -> Gaussians:
     if action == "scale":
         if not float(numbers) > 0:
             raise ContractError("a place is scaled by a factor above 0.")
-        grown = turned(some, torch.eye(3), float(numbers))
+        grown = transform(some, torch.eye(3), float(numbers))
         return replace(grown, means=((means - middle) * float(numbers) + middle).float())
     if action == "recolour":
         if numbers.min() < 0 or numbers.max() > 1:
@@ -181,7 +181,7 @@ def _turned(some: Gaussians, degrees: float, middle: torch.Tensor, to: torch.Ten
     x, y, z = (some.means.double() - middle).unbind(1)
     around = torch.stack([c * x - s * y, s * x + c * y, z], 1) + to
     rot = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return replace(turned(some, rot), means=around.float())
+    return replace(transform(some, rot), means=around.float())
 
 
 def _numbers(given: Any, count: int, name: str) -> torch.Tensor:

@@ -67,7 +67,7 @@ class Estimator(nn.Module):
 
     def depth(self, rgb: torch.Tensor) -> torch.Tensor:
         """Pictures, uint8 [B, 3, H, W] of any size -> metres along the optical axis [B, H, W], near_m to far_m."""
-        seen = self._metres(self.depth_code(normalised(self._seen(rgb))))
+        seen = self._metres(self.depth_code(normalise(self._seen(rgb))))
         near = F.interpolate(1 / seen[:, None], rgb.shape[-2:], mode="bilinear", align_corners=False)[:, 0]
         return (1 / near).clamp(self.config.near_m, self.config.far_m)
 
@@ -85,7 +85,7 @@ class Estimator(nn.Module):
         white = (self.looks(rgb) - self.usual) @ self.spread
         return white.norm(dim=1) / self.reach
 
-    # -- inside, and for training: pictures are float [B, 3, *size] in 0..1, or the same `normalised` --------------
+    # -- inside, and for training: pictures are float [B, 3, *size] in 0..1, or the same `normalise` --------------
 
     def depth_code(self, plain: torch.Tensor) -> torch.Tensor:
         """A normalised picture -> depth as a share of the way from near to far, logarithmic: [B, h, w] in 0..1."""
@@ -100,7 +100,7 @@ class Estimator(nn.Module):
         """Of pictures, uint8 [B, 3, H, W], how much their two finest maps vary, the mean and contrast of each colour and the
         logarithm of its differences along either axis: [B, D]."""
         picture = self._seen(rgb)
-        kept, _ = self._encode(normalised(picture))
+        kept, _ = self._encode(normalise(picture))
         steps = [picture.diff(dim=axis).abs().mean((2, 3)).clamp_min(1e-3).log() for axis in (2, 3)]
         light = [part.flatten(1) for part in _light(picture)]
         return torch.cat([kept[0].std((2, 3)), kept[1].std((2, 3)), *light, *steps], 1)
@@ -165,7 +165,7 @@ class _Block(nn.Module):
         return x + self.second(F.silu(self.even[1](x)))
 
 
-def normalised(picture: torch.Tensor) -> torch.Tensor:
+def normalise(picture: torch.Tensor) -> torch.Tensor:
     """A picture [B, 3, H, W] less its mean and over its contrast: exposure and white balance say nothing of space."""
     mean, scale = _light(picture)
     return (picture - mean) / scale
@@ -182,7 +182,7 @@ def half_weights(network: nn.Module) -> dict[str, torch.Tensor]:
     return {name: value.half() if name in learned else value for name, value in network.state_dict().items()}
 
 
-def restored(network: Network, weights: Mapping[str, torch.Tensor]) -> Network:
+def load_weights(network: Network, weights: Mapping[str, torch.Tensor]) -> Network:
     """`network` with weights of a file."""
     network.load_state_dict(
         {name: part.float() if part.dtype == torch.half else part for name, part in weights.items()}
@@ -206,7 +206,7 @@ def load_estimator(path: str | Path) -> Estimator:
             raise CheckpointError(f"{path} holds no estimator; make one with `terrella train estimator`.")
         settings: dict[str, Any] = about["config"]
         settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-        return restored(Estimator(EstimatorConfig(**settings)), load_file(str(path)))
+        return load_weights(Estimator(EstimatorConfig(**settings)), load_file(str(path)))
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         first = str(error).splitlines()[0]
         raise CheckpointError(f"{path} is no estimator that can be read ({first}); train it again.") from error

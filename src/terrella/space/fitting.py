@@ -1,7 +1,7 @@
-"""Fits Gaussians to posed pictures with depth (stereo.py finds it where there is none): they begin on the surfaces that depth
-shows, descend along their gradients, and those that fade move to where the pictures are still wrong.
+"""Fits Gaussians to posed pictures with depth (stereo.py estimates missing depth).
 
-Densifying by error and relocating what has faded follow Kheradmand et al. 2024 (3DGS as MCMC), with places from depth.
+They start on the surfaces in the depth images and are optimised by gradient descent. Adding Gaussians where the error is large
+and relocating transparent ones follow Kheradmand et al. 2024 (3DGS as MCMC), with positions from depth.
 """
 
 from __future__ import annotations
@@ -16,20 +16,19 @@ from .camera import FAR_M, Intrinsics, rotation, unproject
 from .raster import Drawing, Gaussians, rasterise
 from .raster.gaussians import plain_sh
 
-EVERY = 50  # steps from one round of adding and moving to the next
-FADED = 0.02  # opacity below which a Gaussian is moved
-SHARE = 0.06  # of all Gaussians that may be added or moved in a round
+EVERY = 50  # steps between two rounds of adding and relocating
+FADED = 0.02  # Gaussians below this opacity are relocated
+SHARE = 0.06  # of all Gaussians, the most that are added or relocated in a round
 _RATES = {"means": 1.5e-4, "quats": 1e-3, "scales": 1e-2, "opacities": 3e-2, "sh": 5e-3}  # means: times the mean depth
 
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Posed pictures with depth: rgb uint8 [T, 3, H, W]; depth float32 [T, h, w] metres, 0 or FAR_M where nothing is known; pose
-    [T, 7]; the camera's intrinsics."""
+    """Posed pictures with depth."""
 
-    rgb: torch.Tensor
-    depth: torch.Tensor
-    pose: torch.Tensor
+    rgb: torch.Tensor  # uint8 [T, 3, H, W]
+    depth: torch.Tensor  # float32 [T, h, w], metres; 0 or FAR_M where unknown
+    pose: torch.Tensor  # float32 [T, 7]
     camera: Intrinsics
 
     def __len__(self) -> int:
@@ -43,26 +42,30 @@ class PosedViews:
         return replace(self, rgb=self.rgb[rows], depth=self.depth[rows], pose=self.pose[rows])
 
     def depths(self, rows: torch.Tensor) -> torch.Tensor:
-        """Depth of some of them at the size of the pictures: [n, H, W], 0 where nothing is known."""
-        depth = resized(self.depth[rows], self.size)
+        """Depth of some views at the size of the pictures: [n, H, W], 0 where unknown."""
+        depth = resize_depth(self.depth[rows], self.size)
         return torch.where((depth > 0) & (depth < FAR_M) & depth.isfinite(), depth, 0.0)
 
 
-def resized(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Depth [n, h, w] at another size, the nearest pixel's."""
+def resize_depth(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Depth [n, h, w] resized by nearest neighbour."""
     return F.interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """gaussians: how many at most; steps: of descent, one picture each; degree: of the harmonics of colours, 0 to 3;
-    depth_weight: how much a metre's share of depth counts beside colours in 0..1; seed: of the order of the pictures."""
+    """Settings of the optimisation."""
 
     gaussians: int = 40_000
+    """Gaussians, at most."""
     steps: int = 2000
+    """Steps of gradient descent, one picture each."""
     degree: int = 0
+    """Degree of the spherical harmonics of colours, 0 to 3."""
     depth_weight: float = 0.05
+    """Weight of the relative depth error, beside the error of colours in 0..1."""
     seed: int = 0
+    """Seed of the order of the pictures."""
 
     def __post_init__(self):
         if self.gaussians < 100 or self.steps < 1 or self.degree not in range(4):
@@ -70,7 +73,7 @@ class FitConfig:
 
 
 class Fit:
-    """A fit under way: `step()` until `done` is config.steps; `state()` and `restore` make it go on exactly where it was."""
+    """A fit in progress: call `step()` until `done` equals config.steps. `state()` and `restore` resume it exactly."""
 
     def __init__(self, views: PosedViews, config: FitConfig):
         self.views, self.config, self.done = views, config, 0
@@ -91,7 +94,7 @@ class Fit:
         return _scene(self.leaves)
 
     def step(self) -> float:
-        """One picture; the mean absolute error of its colours."""
+        """One step on one picture; returns the mean absolute error of its colours."""
         rng = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.done // len(self.views))
         row = torch.randperm(len(self.views), generator=rng)[self.done % len(self.views)][None]
         leaves = {name: leaf.detach().requires_grad_() for name, leaf in self.leaves.items()}
@@ -106,13 +109,13 @@ class Fit:
         return error
 
     def state(self) -> dict[str, torch.Tensor]:
-        """All that the rest depends on, as tensors."""
+        """Everything that the rest of the fit depends on, as tensors."""
         groups = {"leaf": self.leaves, "first": self.first, "second": self.second}
         tensors = {f"{group}.{name}": part.clone() for group, parts in groups.items() for name, part in parts.items()}
         return {**tensors, "done": torch.tensor([self.done])}
 
     def restore(self, state: dict[str, torch.Tensor]) -> None:
-        """Goes on from what `state` gave."""
+        """Goes on from the result of `state`."""
         for group, parts in (("leaf", self.leaves), ("first", self.first), ("second", self.second)):
             parts.update({name: state[f"{group}.{name}"].clone() for name in parts})
         self.done = int(state["done"])
@@ -127,7 +130,7 @@ class Fit:
         return loss, float(off.detach().abs().mean())
 
     def _descend(self, grads: dict[str, torch.Tensor]) -> None:
-        """Adam (Kingma and Ba 2015), each kind of numbers at its own rate, those of places falling to a hundredth."""
+        """Adam (Kingma and Ba 2015), with a learning rate for each parameter; that of the means decays to a hundredth."""
         step, share = self.done + 1, self.done / self.config.steps
         for name, grad in grads.items():
             rate = _RATES[name] * (self.mean_depth_m if name == "means" else 1.0)
@@ -140,7 +143,7 @@ class Fit:
             self.leaves[name] = self.leaves[name].addcdiv(first, scale, value=-rate / (1 - 0.9**step))
 
     def _improve(self) -> None:
-        """New Gaussians where some pictures are most wrong, in the place of faded ones and as long as there is room for more."""
+        """Adds Gaussians where the error of some pictures is largest: first in place of transparent ones, then as new ones."""
         rng = torch.Generator().manual_seed(self.config.seed * 7919 + self.done)
         faded = (self.leaves["opacities"].sigmoid() < FADED).nonzero()[:, 0]
         room = self.config.gaussians - len(self.leaves["means"])
@@ -159,8 +162,8 @@ class Fit:
             self.first[name], self.second[name] = (torch.cat([m[name], blank]) for m in (self.first, self.second))
 
     def _where_wrong(self, rows: torch.Tensor, count: int, rng: torch.Generator) -> dict[str, torch.Tensor]:
-        """`count` Gaussians of the size of a pixel, drawn by the squared error of pictures `rows`, as far away as depth
-        says, or else what is drawn there; fewer where nothing is."""
+        """At most `count` Gaussians of the size of a pixel, sampled by the squared error of pictures `rows`, at the recorded depth
+        or else the rendered one."""
         seen = rasterise(self.gaussians, self.views.pose[rows], self.views.camera, self.views.size)
         truth, depth = self.views.rgb[rows].float() / 255, self.views.depths(rows)
         drawn = torch.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp_min(0.5), 0.0)
@@ -184,18 +187,18 @@ def _scene(leaves: dict[str, torch.Tensor]) -> Gaussians:
 
 
 def from_depth(views: PosedViews, count: int, seed: int = 0) -> Gaussians:
-    """About `count` Gaussians on the surfaces that depth shows, one for each little cube, those of near surfaces smaller."""
+    """At most `count` Gaussians on the surfaces in the depth images, one per voxel; voxels of near surfaces are smaller."""
     rng = torch.Generator().manual_seed(seed)
-    found = []
+    parts = []
     for row in torch.arange(0, len(views), max(len(views) // 200, 1)):
         truth, depth = views.rgb[row : row + 1].float() / 255, views.depths(row[None])
         known = (depth.flatten() > 0).nonzero()[:, 0]
         some = known[torch.randperm(len(known), generator=rng)[: max(6 * count // len(views), 2000)]]
-        found.append(_of_pixels(truth, depth, views.pose[row : row + 1], views.camera, some, 0.7))
-    points = Gaussians(*(torch.cat([getattr(one, name) for one in found]) for name in vars(found[0])))
+        parts.append(_of_pixels(truth, depth, views.pose[row : row + 1], views.camera, some, 0.7))
+    points = Gaussians(*(torch.cat([getattr(one, name) for one in parts]) for name in vars(parts[0])))
     side = points.scales.amin(1).clamp_min(1e-3)
     wide = 1.0
-    while True:  # wider cubes until few enough are left
+    while True:  # grow the voxels until few enough are left
         level = (side * wide).log2().ceil()
         cube = torch.cat([(points.means / 2 ** level[:, None]).floor(), level[:, None]], 1).long()
         _, place, many = torch.unique(cube, dim=0, return_inverse=True, return_counts=True)
@@ -217,7 +220,7 @@ def from_depth(views: PosedViews, count: int, seed: int = 0) -> Gaussians:
 def _of_pixels(
     rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, picked: torch.Tensor, opacity: float
 ) -> Gaussians:
-    """A Gaussian for each of the pixels `picked` (numbers of [n, H, W] laid flat), as wide as a pixel is there."""
+    """A Gaussian for each of the pixels `picked` (indices into the flattened [n, H, W]), as wide as the pixel at its depth."""
     points = unproject(depth, pose, camera).reshape(-1, 3)[picked]
     far, width = depth.flatten()[picked], depth.shape[-1]
     colours = rgb.permute(0, 2, 3, 1).reshape(-1, 3)[picked]
@@ -229,13 +232,13 @@ def _of_pixels(
 
 
 def psnr(gaussians: Gaussians, views: PosedViews) -> torch.Tensor:
-    """How well pictures come out, in dB: [T]."""
-    found = []
+    """PSNR of the rendered views, in dB: [T]."""
+    scores = []
     with torch.no_grad():
         for row in torch.arange(len(views)):
             seen = rasterise(gaussians, views.pose[row][None], views.camera, views.size).rgb
-            found.append(decibels((seen.clamp(0, 1) * 255).round() - views.rgb[row].float()))
-    return torch.stack(found) if found else torch.zeros(0)
+            scores.append(decibels((seen.clamp(0, 1) * 255).round() - views.rgb[row].float()))
+    return torch.stack(scores) if scores else torch.zeros(0)
 
 
 def decibels(off: torch.Tensor) -> torch.Tensor:
@@ -243,8 +246,8 @@ def decibels(off: torch.Tensor) -> torch.Tensor:
     return 10 * (255**2 / off.square().mean().clamp_min(1e-6)).log10()
 
 
-def nearest_views(kept: PosedViews, asked: PosedViews) -> torch.Tensor:
-    """The kept picture whose camera stands and looks most like that of each asked one: rows [T]; a metre counts as 0.5 rad."""
-    apart = torch.cdist(asked.pose[:, :3], kept.pose[:, :3])
-    ahead, other = rotation(asked.pose)[..., 0], rotation(kept.pose)[..., 0]
+def nearest_views(kept: PosedViews, others: PosedViews) -> torch.Tensor:
+    """For each view of `others`, the view of `kept` with the most similar pose: rows [T]. A metre counts as 0.5 rad."""
+    apart = torch.cdist(others.pose[:, :3], kept.pose[:, :3])
+    ahead, other = rotation(others.pose)[..., 0], rotation(kept.pose)[..., 0]
     return (apart + 2 * (ahead @ other.T).clamp(-1, 1).acos()).argmin(1)

@@ -1,6 +1,6 @@
-"""The floor plan that depth images draw: straight walls at the camera's height, and how a body slides along them.
+"""Floor plans from depth images: straight walls at the camera's height, and bodies that slide along them.
 
-World frame, metres; a body is an upright box with sides along x and y, as in Doom and Quake.
+World frame, metres; a body is an axis-aligned upright box, as in Doom and Quake.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from .views import arrays, each_view, over_views
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 on the map
 
-WALLS = 16  # of a keyframe that are kept at most, those seen by most columns
-NOWHERE = 1e6  # where the unused ones are
-FEWEST = 4  # columns that make a wall; of a far one more are needed, for its ends are uncertain
-NEARBY_M, FEWEST_FAR = 4.0, 12
-SEEN_M = 50.0  # beyond it depth says "nothing there" as often as "a wall"
-STRAIGHT = 0.004  # 1 / depth along a wall is a straight line, up to this share
-GAP_M = 0.5  # columns farther apart do not join: no body fits through less
+WALLS = 16  # walls kept per keyframe at most, those seen by most columns
+NOWHERE = 1e6  # coordinate of unused walls
+FEWEST = 4  # columns that make a wall
+NEARBY_M, FEWEST_FAR = 4.0, 12  # walls farther than this need more columns, because their ends are uncertain
+SEEN_M = 50.0  # depth beyond this is unreliable
+STRAIGHT = 0.004  # largest relative deviation of 1 / depth along a wall from a straight line
+GAP_M = 0.5  # columns farther apart do not join; no body fits through less
 
 
 def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
     """Depth [K, h, w] (0: nothing known) from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
 
-    On the horizon the inverse depth of a flat wall is linear in the column; each run of columns on one line is a wall,
-    and where two runs meet they are drawn to their corner. What is farther than SEEN_M, or so far that neighbouring columns
-    lie half a metre apart (32 m for a wall seen head-on by 128 columns over 90 degrees), is left for a nearer look.
+    On the horizon the inverse depth of a flat wall is linear in the column. Each run of columns on one line is a wall, and
+    two runs that meet are extended to their corner. Walls farther than SEEN_M, or so far that neighbouring columns are half a
+    metre apart (32 m for a wall seen head-on by 128 columns over 90 degrees), are left out.
     """
     width, row = depth.shape[-1], horizon(camera, depth.shape[-2])
     columns = torch.arange(width, dtype=torch.float64, device=depth.device)
@@ -54,17 +54,17 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
 
 
 def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """Runs of columns on which inverse depth [K, w] is a line of `left` [w] (float64 both), neighbours less than GAP_M apart
-    and nothing beyond SEEN_M: [K, n, 4] = first, stop, slope, level; zeros after the last."""
+    """Runs of columns on which inverse depth [K, w] is linear in `left` [w] (float64 both), with neighbours less than GAP_M
+    apart and depths below SEEN_M: [K, n, 4] = first, stop, slope, level; zeros after the last."""
     if inverse.device.type != "cpu":
         return straight_runs_slowly(inverse, left)
-    found = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
-    each_view(straight_runs_kernel, arrays(inverse, found), *arrays(left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
-    return found
+    runs = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
+    each_view(straight_runs_kernel, arrays(inverse, runs), *arrays(left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
+    return runs
 
 
 def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """The same as `straight_runs`: how far a run goes from every column, then the runs taken from left to right."""
+    """The same as `straight_runs`: the longest run from every column, then a choice of runs from left to right."""
     count, width = inverse.shape
     near, far = 1 / inverse, left / inverse
     joins = (near.diff(dim=1).square() + far.diff(dim=1).square()).sqrt() <= GAP_M
@@ -93,7 +93,7 @@ def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Ten
 
 
 def _corners(first, stop, slope, level, left) -> torch.Tensor:
-    """Both ends [2, K, n] of runs [K, n]: their outer columns, or the corner with the neighbour that they run into."""
+    """Both ends [2, K, n] of runs [K, n]: their outer columns, or the corner with a neighbour that they meet."""
     last = len(left) - 1
     begin, end = left[first.clamp_max(last)], left[(stop - 1).clamp_min(0)]
     one, other = slice(None, -1), slice(1, None)
@@ -113,10 +113,10 @@ def _apart(one, other, slope, level) -> torch.Tensor:
 
 
 def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-    """The walls [K, n, 4] that keyframes at `pose` [K, 7] saw, brought into agreement: [S, 4].
+    """The walls [K, n, 4] that keyframes at `pose` [K, 7] saw, merged into one floor plan: [S, 4].
 
-    Each is laid on the mean line of all that lie on one line with it, the longer and nearer ones counting more, and ends
-    where that crosses another wall, if it ended within 4 cm of it. From millimetres off, walls come to tenths of one.
+    Each wall is moved to the mean line of all collinear walls, weighted by length and nearness, and its ends to the crossing
+    with another wall within 4 cm. This reduces errors from millimetres to tenths of a millimetre.
     """
     real = walls[..., 0] < NOWHERE
     origin = pose[:, None, :2].expand(-1, walls.shape[1], -1)[real].double()
@@ -135,8 +135,7 @@ def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
 
 
 def _mean_line(start, end, all_starts, all_ends, weight) -> tuple[torch.Tensor, torch.Tensor]:
-    """Walls [n, 2] each laid on the weighted mean line of those [N, 2] that are within 3 cm and 1 degree of its own, and
-    not more than 6 m away along it."""
+    """Walls [n, 2] moved to the weighted mean line of those [N, 2] within 3 cm and 1 degree, at most 6 m away along it."""
     length, along, across, middle = _frame(start, end)
     others_length, others_along, _, others_middle = _frame(all_starts, all_ends)
     apart = others_middle - middle[:, None]
@@ -144,7 +143,7 @@ def _mean_line(start, end, all_starts, all_ends, weight) -> tuple[torch.Tensor, 
     gap = (apart * along[:, None]).sum(-1).abs() - (length[:, None] + others_length) / 2
     sine, cosine = across @ others_along.T, along @ others_along.T
     share = weight * ((sine.abs() < 0.02) & (off.abs() < 0.03) & (gap < 6.0))
-    turn = share * others_length**2  # a long wall knows its direction better
+    turn = share * others_length**2  # long walls have more precise directions
     turned = along + across * ((turn * sine * cosine.sign()).sum(1) / turn.sum(1))[:, None]
     turned = turned / turned.norm(dim=1, keepdim=True)
     middle = middle + across * ((share * off).sum(1) / share.sum(1))[:, None]
@@ -152,7 +151,7 @@ def _mean_line(start, end, all_starts, all_ends, weight) -> tuple[torch.Tensor, 
 
 
 def _ended(start, end, all_starts, all_ends, reach_m: float = 0.04) -> torch.Tensor:
-    """Walls [n, 2] with their ends moved to the nearest crossing with one of the walls [N, 2] not more than 4 cm off."""
+    """Walls [n, 2] with their ends moved to the nearest crossing with a wall [N, 2] within `reach_m`."""
     _, along, _, _ = _frame(start, end)
     others_length, others_along, others_across, _ = _frame(all_starts, all_ends)
     crossing = along @ others_across.T
@@ -168,7 +167,7 @@ def _ended(start, end, all_starts, all_ends, reach_m: float = 0.04) -> torch.Ten
 
 
 def _frame(start: torch.Tensor, end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Of walls [n, 2]: length [n], unit direction [n, 2], unit normal [n, 2] and middle [n, 2]."""
+    """Length [n], unit direction [n, 2], unit normal [n, 2] and middle [n, 2] of walls [n, 2]."""
     length = (end - start).norm(dim=1)
     along = (end - start) / length[:, None]
     return length, along, torch.stack([-along[:, 1], along[:, 0]], 1), (start + end) / 2
@@ -178,23 +177,23 @@ def slide(
     walls: torch.Tensor, places: torch.Tensor, wish: torch.Tensor, half_m: float, short: float = 0.0,
     own: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """How bodies of half width `half_m` at `places` [B, 2] move when they wish to by `wish` [B, 2], among walls [S, 4] that
-    all share and walls of their `own` [B, n, 4].
+    """The motion of bodies of half width `half_m` at `places` [B, 2] that try to move by `wish` [B, 2], among walls [S, 4] that
+    all share and `own` walls [B, n, 4].
 
-    At a wall the rest of the wish goes on along it, twice at most; `short` is the share of the wish by which a body
-    stops short of the wall. Returns the displacement [B, 2] and what is left of the wish, the momentum [B, 2].
+    At a wall the rest of the motion continues along it, twice at most. A body stops `short` (a share of the wish) of a wall.
+    Returns the displacement [B, 2] and the remaining motion, the momentum [B, 2].
     """
     own = walls.new_zeros(len(places), 0, 4) if own is None else own
     if places.device.type != "cpu":
         return slide_slowly(walls, places, wish, half_m, short, own)
-    moved, left = torch.zeros(2, len(places), 2, dtype=torch.float64)
-    parts = [*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, moved.numpy(), left.numpy()]
+    went, left = torch.zeros(2, len(places), 2, dtype=torch.float64)
+    parts = [*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, went.numpy(), left.numpy()]
     over_views(len(places), lambda first, last: slide_kernel(first, last, *parts))
-    return moved.to(wish), left.to(wish)
+    return went.to(wish), left.to(wish)
 
 
 def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same as `slide`, in plain tensor algebra; the way on a GPU."""
+    """The same as `slide`, in plain tensor algebra, also for GPUs."""
     whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1).double()
     whole = F.pad(whole, (0, 0, 0, 1), value=NOWHERE)
     place, rest = places.double(), wish.double()
@@ -210,8 +209,8 @@ def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor,
 
 
 def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """At which share [B] of the move [B, 2] a box around the origin first touches a wall [B, S, 4] (2: none), and the direction
-    [B, 2] along which it may go on: kernels_numba/walls.first_touch."""
+    """The share [B] of the move [B, 2] at which a box around the origin first touches a wall [B, S, 4] (2: none), and the
+    direction [B, 2] in which it can go on: see kernels_numba/walls.first_touch."""
     a, b = walls.split(2, -1)
     length = (b - a).norm(dim=-1, keepdim=True)
     across = torch.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], -1) / length.clamp_min(1e-9)
@@ -239,17 +238,17 @@ def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[
 
 
 def horizon(camera: Intrinsics, height: int) -> int:
-    """The row of an image of `height` rows that looks level."""
+    """The row of the horizon in an image of `height` rows."""
     return min(int(camera[3] * height), height - 1)
 
 
 def sees_into(
     box: Box, level: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, deep_m: float = 0.5
 ) -> torch.Tensor:
-    """Whether posed depth images, of which `level` [K, w] is the row of the horizon, show what lies in the box on the map
-    and more than `deep_m` metres from its sides: bool [K]; pose [K, 7]."""
+    """Whether posed depth images show points in a box on the map, more than `deep_m` metres from its sides: bool [K]. `level`
+    [K, w] are their rows of the horizon; pose [K, 7]."""
     x0, y0, x1, y1 = box
-    flat = (camera[0], camera[1], camera[2], 0.5)  # of a picture of that row alone
+    flat = (camera[0], camera[1], camera[2], 0.5)  # of a picture of that row only
     x, y = unproject(level[:, None], pose, flat)[:, 0, :, :2].unbind(-1)
     inside = (x > x0 + deep_m) & (x < x1 - deep_m) & (y > y0 + deep_m) & (y < y1 - deep_m)
     return inside.any(1)

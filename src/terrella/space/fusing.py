@@ -1,6 +1,6 @@
-"""Fusing: one posed picture with depth changes a scene of Gaussians at once, with no fit (as surfels do in Keller et al. 2013).
+"""Fuses one posed picture with depth into a scene of Gaussians, without a fit (like the surfels of Keller et al. 2013).
 
-How much each Gaussian counts at a picture's pixels is the gradient of that picture by its colour: one drawing gives all sums.
+The weight of each Gaussian at each pixel is the gradient of the picture by its colour, so that one rendering gives all sums.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from .fitting import FADED
 from .raster import Gaussians, rasterise
 from .raster.gaussians import Y0, plain_sh
 
-SIDES = (4, 2, 1)  # pixels: new Gaussians stand for squares of them, the largest in which colours and depths are alike
-ALIKE = 0.06  # of colours in 0..1
-ENOUGH = 0.1  # pixels' worth: what counted for less was not seen
-MOST = 400.0  # the weight beyond which a colour no longer gets surer, so that it follows what changes
-OPACITY, WIDE = 0.9, 0.6  # of new ones; their deviation in shares of their square
-BEFORE = 0.5  # of the depth that a picture shows: what is drawn nearer is seen through (a fit is no finer than that)
+SIDES = (4, 2, 1)  # pixels: a new Gaussian covers a square, the largest with similar colours and depths
+ALIKE = 0.06  # the largest difference of similar colours in 0..1
+ENOUGH = 0.1  # a Gaussian with a smaller sum of weights, in pixels, was not seen
+MOST = 400.0  # the largest weight of a colour, so that colours keep following changes
+OPACITY, WIDE = 0.9, 0.6  # of new Gaussians; their standard deviation as a share of their square
+BEFORE = 0.5  # a Gaussian nearer than this share of the recorded depth is seen through (fits are no more precise)
 
 
 def fuse(
     scene: Gaussians, weight: torch.Tensor, spare: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor,
     pose: torch.Tensor, camera: Intrinsics,
 ) -> tuple[Gaussians, torch.Tensor, torch.Tensor]:  # fmt: skip
-    """The scene after a picture rgb float32 [3, H, W] in 0..1 with depth [H, W] in metres (0: unknown, FAR_M: nothing there) from
-    pose [7]; the weights [N]; and which Gaussians the picture showed: bool [N].
+    """The scene after a picture rgb float32 [3, H, W] in 0..1 with depth [H, W] in metres (0: unknown, FAR_M: empty) from pose [7];
+    the weights [N]; and which Gaussians the picture showed: bool [N].
 
-    weight [N]: in how many pixels' worth each was seen so far. Colours become running means by it; what the picture sees through
-    fades; what it shows and the scene does not takes the place of those among `spare` [S] that have faded.
+    weight [N] is the sum of pixels in which each Gaussian was seen so far; colours are running means with it. Gaussians that the
+    picture sees through fade. New surfaces replace transparent Gaussians among `spare` [S].
     """
     size = (rgb.shape[-2], rgb.shape[-1])
     with torch.inference_mode(False), torch.enable_grad():
@@ -39,7 +39,7 @@ def fuse(
         grey = rasterise(replace(scene, sh=bare), pose[None], camera, size)
         with torch.no_grad():
             drawn = rasterise(scene, pose[None], camera, size)
-            same, through, new = _told_apart(drawn.alpha[0], drawn.depth[0], depth)
+            same, through, new = _classify(drawn.alpha[0], drawn.depth[0], depth)
             sums = torch.stack([same, through, torch.zeros_like(same)]).float()
             off = (rgb - drawn.rgb[0]) * same
         (counts,) = torch.autograd.grad(grey.rgb[0], bare, sums, retain_graph=True)
@@ -63,16 +63,16 @@ def fuse(
     return Gaussians(**parts), weight, seen.index_fill(0, free, True)
 
 
-def _told_apart(alpha: torch.Tensor, depth: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Of each pixel [H, W]: whether scene and picture show the same surface there, the picture one behind it, or one that the
-    scene lacks. An edge may be a pixel off."""
-    known, there = truth > 0, alpha > 0.5
+def _classify(alpha: torch.Tensor, depth: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """For each pixel [H, W], whether scene and picture show the same surface, the picture one behind it, or one that the scene
+    lacks. Edges may be off by a pixel."""
+    known, drawn = truth > 0, alpha > 0.5
     mean = depth / alpha.clamp_min(0.5)
-    nearest = -_widest(torch.where(there, -mean, -FAR_M))
+    nearest = -_widest(torch.where(drawn, -mean, -FAR_M))
     behind = -_widest(torch.where(known, -truth, -FAR_M))
-    new = known & (truth < FAR_M) & (~there | (truth < (1 - SAME) * nearest))
-    through = known & there & (mean < BEFORE * behind)
-    return known & there & ~new & ~through, through, new
+    new = known & (truth < FAR_M) & (~drawn | (truth < (1 - SAME) * nearest))
+    through = known & drawn & (mean < BEFORE * behind)
+    return known & drawn & ~new & ~through, through, new
 
 
 def _widest(picture: torch.Tensor) -> torch.Tensor:
@@ -80,7 +80,7 @@ def _widest(picture: torch.Tensor) -> torch.Tensor:
 
 
 def _seen_through(scene, agreed, gone, depth, pose, camera) -> torch.Tensor:
-    """The share [N] in which Gaussians were seen through, of those that lie before what is seen at their own middle."""
+    """The share [N] by which Gaussians were seen through, 0 for those behind the recorded surface."""
     height, width = depth.shape
     where, ahead = project(scene.means, pose, camera)
     column = (where[:, 0] * width).clamp(0, width - 1).nan_to_num().long()
@@ -90,10 +90,10 @@ def _seen_through(scene, agreed, gone, depth, pose, camera) -> torch.Tensor:
 
 
 def _of_squares(rgb, depth, new, pose, camera) -> tuple[Gaussians, torch.Tensor]:
-    """Gaussians for the pixels `new` [H, W], the largest squares first, and for how many pixels each stands."""
+    """Gaussians for the pixels `new` [H, W], the largest squares first, and how many pixels each covers."""
     height, width = depth.shape
     layers = torch.cat([unproject(depth, pose, camera).permute(2, 0, 1), rgb, depth[None]])
-    found, sides, left = [], [], new.clone()
+    means, sides, left = [], [], new.clone()
     for side in SIDES:
         rows, columns = height // side, width // side
         cut = slice(0, rows * side), slice(0, columns * side)
@@ -102,9 +102,9 @@ def _of_squares(rgb, depth, new, pose, camera) -> tuple[Gaussians, torch.Tensor]
         spread = squares.amax(3) - squares.amin(3)
         whole &= (spread[..., 3:6].amax(2) < ALIKE) & (spread[..., 6] < SAME * squares[..., 6, :].amin(2)) | (side == 1)
         left[cut] &= ~whole.repeat_interleave(side, 0).repeat_interleave(side, 1)
-        found.append(squares.mean(3)[whole])
-        sides.append(torch.full((len(found[-1]),), float(side)))
-    one, side = torch.cat(found), torch.cat(sides)
+        means.append(squares.mean(3)[whole])
+        sides.append(torch.full((len(means[-1]),), float(side)))
+    one, side = torch.cat(means), torch.cat(sides)
     scales = (WIDE * side * one[:, 6] / (camera[0] * width)).clamp_min(1e-3)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(one), 1)
     fresh = Gaussians(

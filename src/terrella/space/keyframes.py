@@ -144,7 +144,7 @@ def retrieve(
 
 
 def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tensor:
-    """The same as `retrieve`, in plain tensor algebra; the way on a GPU."""
+    """The same as `retrieve`, in plain tensor algebra, also for GPUs."""
     half, batch, some = (size[0] // 2, size[1] // 2), len(pose), slice(_GRID // 2, None, _GRID)
     both = [(part.expand(batch, *part.shape), mine[rows] if len(mine) else mine.expand(batch, *mine.shape))
             for part, mine in ((shared.coarse, own.coarse), (shared.depth, own.depth), (shared.pose, own.pose))]  # fmt: skip
@@ -218,7 +218,7 @@ def look(
 
 
 def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
-    """The same as `look`, in plain tensor algebra; the way on a GPU."""
+    """The same as `look`, in plain tensor algebra, also for GPUs."""
     batch, there, mine = len(pose), picks >= 0, picks >= len(shared)
     if not picks.shape[1] or not len(shared) + len(own):
         nothing = pose.new_zeros(batch, slots, 3, *size)

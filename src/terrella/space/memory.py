@@ -198,7 +198,7 @@ class Memory:
         return share
 
     def covered_slowly(self, held: Held, views: torch.Tensor) -> torch.Tensor:
-        """The same as `covered`, in plain tensor algebra; the way on a GPU."""
+        """The same as `covered`, in plain tensor algebra, also for GPUs."""
         rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
         keys, count = self._keyframes(held), self.capacity
         points, pose = keys.coarse[rows][:, :, ::_EVERY, :3], keys.pose[rows]

@@ -1,6 +1,6 @@
-"""Which little cubes of a place are solid, and how bodies walk and fly among them: read off its Gaussians.
+"""An occupancy grid of a place, computed from its Gaussians, and how walkers move in it.
 
-World frame, metres, z up. A body is an upright round column; its place is where its eye is.
+World frame, metres, z up. A walker is an upright cylinder; its place is the position of its eye.
 """
 
 from __future__ import annotations
@@ -15,36 +15,35 @@ from .camera import rotation
 from .raster import Gaussians
 
 MOST_CELLS = 24_000_000
-SOLID = 0.3  # opacity of a Gaussian that stops bodies
-_SAMPLES = 32  # points of a Gaussian that are looked at
-_FEWEST = 6  # of them in a cube make it solid, those of a Gaussian wider than a cube counted for as many cubes
-_PARTS = 6  # short steps into which a long one is cut
-_DEEPEST_M = 8.0  # floors lower than this below the feet are not looked for
+SOLID = 0.3  # Gaussians above this opacity are obstacles
+_SAMPLES = 32  # sample points of a Gaussian
+_FEWEST = 6  # samples that make a cell solid; those of a Gaussian wider than a cell count once per cell that it covers
+_PARTS = 6  # a move is checked in this many parts
+_DEEPEST_M = 8.0  # deeper floors below the feet are ignored
 
 
 @dataclass(frozen=True)
 class Walker:
-    """radius and height of the eye above the feet; up to which height it steps onto things; headroom above the eye; all metres."""
+    """The size of a body that walks, in metres."""
 
     radius_m: float = 0.25
-    eye_m: float = 1.6
-    step_m: float = 0.45
-    head_m: float = 0.15
+    eye_m: float = 1.6  # height of the eye above the feet
+    step_m: float = 0.45  # it steps onto what is at most this high
+    head_m: float = 0.15  # headroom above the eye
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """solid bool [X, Y, Z] from `origin` [3] on, cubes of `cell_m`; top float32 [X, Y, Z], how high the
-    surface in a solid cube is."""
+    """A grid of cubic cells."""
 
-    origin: torch.Tensor
+    origin: torch.Tensor  # float32 [3], its low corner
     cell_m: float
-    solid: torch.Tensor
-    top: torch.Tensor
+    solid: torch.Tensor  # bool [X, Y, Z]
+    top: torch.Tensor  # float32 [X, Y, Z], height of the surface in a solid cell
 
     @staticmethod
     def of(gaussians: Gaussians, cell_m: float = 0.1) -> Occupancy:
-        """The cubes that opaque Gaussians fill, wider ones than asked where the place is very large."""
+        """The cells that opaque Gaussians fill. In a very large place cells are wider than `cell_m`."""
         some = gaussians.at(gaussians.opacities > SOLID)
         if not len(some):
             return Occupancy(torch.zeros(3), cell_m, torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(1, 1, 1))
@@ -69,7 +68,7 @@ class Occupancy:
         return Occupancy(low, cell_m, (count >= _FEWEST).view(shape), top.view(shape))
 
     def blocked(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
-        """Whether a body at `place` [B, 3] stands in something: bool [B]. What is as low as a step does not count."""
+        """Whether walkers at `place` [B, 3] overlap a solid cell: bool [B]. Cells as low as a step do not count."""
         angle = torch.arange(8) * (math.pi / 4)
         ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * body.radius_m, torch.zeros(1, 2)])
         low, high = -body.eye_m + body.step_m, body.head_m
@@ -81,13 +80,12 @@ class Occupancy:
         return (self.solid[cells] & inside).any(1)
 
     def floor(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
-        """How high the floor under a body is [B]; its feet where there is none."""
+        """Height of the floor under walkers [B]; without one, the feet."""
         level = self.surface(place, body)
         return torch.where(level.isnan(), place[:, 2] - body.eye_m, level)
 
     def surface(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
-        """How high the highest surface up to a step above a body's feet is [B], the mean of what lies around; nan where there is
-        none."""
+        """Height of the highest surface up to a step above the feet [B], averaged over the neighbouring cells; nan without one."""
         feet = place[:, 2] - body.eye_m
         deep = math.ceil((_DEEPEST_M + body.step_m) / self.cell_m)
         down = body.step_m - torch.arange(deep) * self.cell_m
@@ -103,21 +101,20 @@ class Occupancy:
         return torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
 
     def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
-        """Where bodies at `place` [B, 3] come that wish to go by `wish` [B, 3]: along walls, through nothing; [B, 3]. Whoever
-        stands in something already may leave it."""
+        """Where walkers at `place` [B, 3] end up that try to move by `wish` [B, 3], sliding along walls: [B, 3]. Those that
+        overlap a solid cell may leave it."""
         stuck = self.blocked(place, body)
-        return slide(lambda there: (self.blocked(there, body) & ~stuck).float(), place, wish)
+        return slide(lambda at: (self.blocked(at, body) & ~stuck).float(), place, wish)
 
     def _cells(self, points: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
-        """Indices of the cubes in which points [..., 3] are, and whether they are in the grid."""
+        """Indices of the cells of points [..., 3], and whether they are in the grid."""
         at = ((points - self.origin) / self.cell_m).floor().long()
         size = torch.tensor(self.solid.shape)
         return at.clamp_min(0).minimum(size - 1).unbind(-1), ((at >= 0) & (at < size)).all(-1)
 
 
 def extent(means: torch.Tensor, cell_m: float = 0.1) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Between which corners [3] the cubes around places [N, 3] lie, and how wide a cube is: as wide as asked, or wider where they
-    would be too many."""
+    """The corners [3] of a grid around points [N, 3], and its cell size: `cell_m`, or larger to keep within MOST_CELLS."""
     step = max(len(means) // 1_000_000, 1)
     low, high = torch.quantile(means[::step], torch.tensor([0.001, 0.999]), dim=0)
     low, high = low - 0.5, high + 0.5
@@ -125,21 +122,21 @@ def extent(means: torch.Tensor, cell_m: float = 0.1) -> tuple[torch.Tensor, torc
 
 
 def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:
-    """Places [B, 3] moved by `wish` [B, 3] in short steps, none of which goes deeper into anything (`depth` [B] says how deep a
-    place is): the whole step, or along one axis after the other."""
+    """Places [B, 3] moved by `wish` [B, 3] in short steps that never increase the penetration `depth` [B]: each step as a whole, or
+    along one axis after the other."""
     here = depth(place)
     for _ in range(_PARTS):
         step = wish / _PARTS
         for axes in ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)):
-            there = place + step * step.new_tensor(axes)
-            deep = depth(there)
+            target = place + step * step.new_tensor(axes)
+            deep = depth(target)
             free = deep <= here
-            place, here = torch.where(free[:, None], there, place), torch.where(free, deep, here)
+            place, here = torch.where(free[:, None], target, place), torch.where(free, deep, here)
             step = torch.where(free[:, None], step * (1 - step.new_tensor(axes)), step)
     return place
 
 
 def samples() -> torch.Tensor:
-    """Points [n, 3] at which each Gaussian is looked at, in its deviations."""
+    """Sample points [n, 3] of a Gaussian, in standard deviations."""
     noise = torch.randn(_SAMPLES, 3, generator=torch.Generator().manual_seed(0))
     return noise * (1.2 / noise.norm(dim=1, keepdim=True).clamp_min(1.2))

@@ -42,7 +42,7 @@ def patch_count(size: tuple[int, int], stride: int) -> int:
 
 
 def patches_slowly(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
-    """The same as `patches`, in plain tensor algebra; the way on a GPU."""
+    """The same as `patches`, in plain tensor algebra, also for GPUs."""
     points = unproject(depth, pose, camera)
     across, down = _shorter_difference(points, -2), _shorter_difference(points, -3)
     first = stride // 2
@@ -82,7 +82,7 @@ def cast_slowly(
     patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], chunk: int = 512
 ) -> torch.Tensor:
     """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9], FAR_M where it sees none, by trying every patch
-    on every pixel; the way on a GPU."""
+    on every pixel; also for GPUs."""
     turn = rotation(pose)
     centre = torch.einsum("bji,bnj->bni", turn, patch[..., :3] - pose[:, None, :3])
     across, down = (torch.einsum("bji,bnj->bni", turn, patch[..., k : k + 3]) for k in (3, 6))

@@ -48,7 +48,7 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
 
 def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
-    """The same as `fill_holes`, in plain tensor algebra; the way on a GPU and for gradients."""
+    """The same as `fill_holes`, in plain tensor algebra, also for GPUs and gradients."""
     near = least_around(depth)
     count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
     depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
@@ -117,7 +117,7 @@ def carry_unknown(
 
 
 def carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera) -> torch.Tensor:
-    """The same as `carry_unknown`, in plain tensor algebra; the way on a GPU and for gradients."""
+    """The same as `carry_unknown`, in plain tensor algebra, also for GPUs and gradients."""
     colour, agreement, _ = warp(
         rgb.float().div(255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera
     )
@@ -144,7 +144,7 @@ def carry_things(
 
 
 def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) -> torch.Tensor:
-    """The same as `carry_things`, in plain tensor algebra; the way on a GPU and for gradients."""
+    """The same as `carry_things`, in plain tensor algebra, also for GPUs and gradients."""
     height, width = depth.shape[-2:]
     flat = _flattened(depth, things)
     points = unproject(flat, pose, camera).flatten(1, 2)

@@ -1,4 +1,4 @@
-"""The views of a batch, shared out over threads: for kernels that hold no lock of Python's."""
+"""Runs kernels that release the GIL over the views of a batch, on several threads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _POOL = ThreadPoolExecutor(os.cpu_count() or 1, "views")
 
 
 def over_views(batch: int, work: Callable[[int, int], object]) -> None:
-    """Calls work(first, last) for parts of range(batch), on as many threads as torch may use. Parts must not call this."""
+    """Calls work(first, last) for parts of range(batch), on as many threads as torch may use. `work` must not call this."""
     threads = min(torch.get_num_threads(), batch)
     bounds = [batch * part // max(threads, 1) for part in range(threads + 1)]
     others = [_POOL.submit(work, *part) for part in zip(bounds[1:], bounds[2:])]
@@ -34,5 +34,5 @@ def each_view(kernel: Callable[..., object], views: Sequence[Any], *shared: Any)
 
 
 def arrays(*parts: torch.Tensor) -> list[Any]:
-    """Tensors of the CPU as contiguous arrays, for kernels."""
+    """CPU tensors as contiguous NumPy arrays, for kernels."""
     return [part.detach().contiguous().numpy() for part in parts]

@@ -22,7 +22,7 @@ from ..space.layout import BuiltPlace, ParsedText, build, parse_text, read_layou
 from ..space.layout.meshes import of_triangles
 from ..space.occupancy import Walker
 from ..space.raster import Gaussians
-from ..space.raster.move import turned
+from ..space.raster.move import transform
 from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from ..worlds.splat_folder import save_splat, world_of
@@ -102,7 +102,7 @@ def import_space(file: Path, out: Path, config: ImportSpaceConfig, *, progress: 
     for warning in caught:
         progress(f"{file}: {warning.message}")
     if config.scale != 1:
-        gaussians = turned(gaussians, torch.eye(3), config.scale)
+        gaussians = transform(gaussians, torch.eye(3), config.scale)
     save_splat(world_of(gaussians, file.stem, {"file": file.name}, _splat_config(config.size)), out)
     facts = {"gaussians": len(gaussians), "world": str(out)}
     return SpaceResult(facts, (f"{len(gaussians):,} Gaussians; terrella play {out}",))

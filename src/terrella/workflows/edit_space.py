@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.errors import CheckpointError, TerrellaError
 from ..library import folder_of
-from ..space.edits import ACTIONS, Edit, edited
+from ..space.edits import ACTIONS, Edit, apply_edits
 from ..space.occupancy import extent
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merging, other_of, read_edits, write_edits
 from .progress import Progress, silent
@@ -82,7 +82,7 @@ def edit_space(world: str, config: EditSpaceConfig, *, progress: Progress = sile
     else:
         opened = open_splat(world)
         new = undone[-1] if config.redo else _new_edit(folder, config)
-        edited(opened.gaussians, [new], opened.objects, other_of(folder))  # raises if it cannot be done
+        apply_edits(opened.gaussians, [new], opened.objects, other_of(folder))  # raises if it cannot be done
         write_edits(folder, [*edits, new], undone[:-1] if config.redo else ())
     return _result(world, config, progress)
 

@@ -24,7 +24,7 @@ from ..space.files.glb import encode_gaussians, encode_mesh
 from ..space.files.spz import Version
 from ..space.mesh import collider_mesh, fused, viewpoints
 from ..space.raster import rasterise
-from ..space.raster.move import turned
+from ..space.raster.move import transform
 from ..worlds.splat import SplatWorld
 from ..worlds.splat_folder import read_edits
 from .splat_places import SpaceResult, open_splat, unedited_scene
@@ -100,7 +100,7 @@ def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[b
 def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
     rot = torch.tensor(AXES["rub"], dtype=torch.float32)
     if config.kind == "gaussians":
-        return encode_gaussians(turned(world.gaussians, rot), world.name), {"gaussians": len(world.gaussians)}
+        return encode_gaussians(transform(world.gaussians, rot), world.name), {"gaussians": len(world.gaussians)}
     if not 0.005 <= config.cell <= 10:
         raise TerrellaError("--cell is from 0.005 to 10 metres.")
     if config.kind == "collider":

@@ -14,8 +14,16 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..space.matching import FEW, clearest, explained, explains, fetched, preferred, voted
-from ..space.mosaic import recalled
+from ..space.matching import (
+    FEW,
+    clear_index,
+    edge_shares,
+    gather_sources,
+    majority_colours,
+    prefer_scroll,
+    source_shares,
+)
+from ..space.mosaic import read_mosaic
 from .generator import Block, Conditioning, down_and_up, encode_depth
 
 COARSE = 4  # side in pixels of the squares that the trunk sees; choices are made for each pixel
@@ -137,21 +145,21 @@ class Codec(nn.Module):
         if conditioning.mosaic is None:
             return conditioning
         frames, context = _frames(conditioning), conditioning.context
-        went = [explains(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
+        went = [edge_shares(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
         logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
         return replace(conditioning, scroll=least_off(logits, self.moves))
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:
         """The inputs where most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over bool [B, H, W]: pixels that
         are no part of it."""
-        memory = recalled(mosaic, self.config.size, self.moves[move])
+        memory = read_mosaic(mosaic, self.config.size, self.moves[move])
         known = (memory[:, 3:] > 0) & ~over[:, None]
-        last = clearest(explains(frames[:, 1], frames[:, 0], self.moves))
+        last = clear_index(edge_shares(frames[:, 1], frames[:, 0], self.moves))
         along, last = (torch.where(over, 0, one[:, None, None]) for one in (move, last))
-        scrolled = fetched(frames, along, self.moves)
+        scrolled = gather_sources(frames, along, self.moves)
         sources = torch.cat([frames, torch.where(known, memory[:, :3], scrolled)[:, None]], 1)
-        went, _ = explained(frames[:, 1:2], frames[:, 0], self.moves)
-        went = self._carried(preferred(went, last))
+        went, _ = source_shares(frames[:, 1:2], frames[:, 0], self.moves)
+        went = self._carried(prefer_scroll(went, last))
         return CodecInputs(sources, scrolled, known, along, over, went, self.common_colours(scrolled))
 
     def choices(self, seen: CodecInputs, context: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -212,7 +220,7 @@ class Codec(nn.Module):
             painted[paints] = self.palette[self.colours(seen, features, paints).argmax(1)]
         else:
             painted = self.palette[self.colours(seen, features).argmax(1)].view(*share[:, -1].shape, 3)
-        return voted(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
+        return majority_colours(seen.sources, share, painted.permute(0, 3, 1, 2), self.moves, self.stress)
 
     def _beyond(self, over: torch.Tensor) -> torch.Tensor:
         """bool [B, moves + 1, H, W]: pixels that each move would fetch from outside of the last frame, or from what lies `over` it

@@ -21,7 +21,7 @@ from torch import nn
 
 from ..core.errors import CheckpointError
 from ..core.spec import Spec
-from ..space.estimator import Estimator, EstimatorConfig, half_weights, restored
+from ..space.estimator import Estimator, EstimatorConfig, half_weights, load_weights
 from ..space.keyframes import Keyframes
 from . import splat_folder
 from .body import Motion, MotionBody
@@ -246,7 +246,7 @@ def _plain(config: Any) -> dict | None:
 
 
 def _network(kind: type) -> Make:
-    return lambda config, weights, remembered: restored(kind(config), weights)
+    return lambda config, weights, remembered: load_weights(kind(config), weights)
 
 
 def _weights(name: str, part: Any) -> Tensors:
@@ -273,7 +273,7 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
 
 # By part and kind: its settings, and how it is made from them, its weights and the memory.
 KINDS: dict[str, dict[str, tuple[type, Make]]] = {
-    "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(restored(Motion(config), weights)))},
+    "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(load_weights(Motion(config), weights)))},
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
     "generator": {"unet": (GeneratorConfig, _network(UNet)), "codec": (CodecConfig, _network(Codec))},
     "objects": {"billboards": (BillboardsConfig, _network(Billboards))},

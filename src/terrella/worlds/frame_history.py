@@ -19,8 +19,8 @@ from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics
 from ..space.keyframes import Glimpse, Keyframes
-from ..space.matching import scrolled
-from ..space.mosaic import PICTURES, blank, held_in, remembered
+from ..space.matching import scroll_index
+from ..space.mosaic import PICTURES, empty_mosaic, update_mosaic, write_mosaic
 from .config import HistoryConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
@@ -85,7 +85,7 @@ class FrameHistory:
         clips = StartClips(*(part[pick] for part in vars(self.starts).values()))
         seen = {"frames": clips.frames, "actions": clips.actions.flip(1), "vitals": clips.vitals}
         if self.config.moves:
-            seen["mosaic"] = held_in(blank(len(pick), self.config.size, self.device), clips.known)
+            seen["mosaic"] = write_mosaic(empty_mosaic(len(pick), self.config.size, self.device), clips.known)
         return Evidence(len(pick), self.device, None, seen), pick
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
@@ -106,8 +106,8 @@ class FrameHistory:
             if "mosaic" in evidence.seen:
                 seen["mosaic"] = evidence.seen["mosaic"]
             elif prior is None:
-                seen["mosaic"] = blank(evidence.batch, self.config.size, self.device)
-            seen["scroll"] = scrolled(frames[:, 1], frames[:, 0], self.moves)
+                seen["mosaic"] = empty_mosaic(evidence.batch, self.config.size, self.device)
+            seen["scroll"] = scroll_index(frames[:, 1], frames[:, 0], self.moves)
         return State(seen) if prior is None else prior.replace(**seen)
 
     # -- a step -------------------------------------------------------------------------------------------------------
@@ -141,13 +141,13 @@ class FrameHistory:
     def _joined(self, state: State) -> torch.Tensor:
         """The mosaic with the newest frame in its middle. A state's mosaic lags by a frame, which evidence may still replace. It
         scrolls by the move that was drawn: new ground is often too plain to estimate the move from."""
-        return remembered(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]], self.over)
+        return update_mosaic(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]], self.over)
 
     def _whole(self, state: State) -> torch.Tensor:
         """The mosaic; where it is empty, what lies over it."""
         frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
         joined, none = self._joined(state), torch.zeros_like(self.over)
-        return torch.where(joined[:, 3:] > 0, joined, remembered(state["mosaic"], frame, move, none))
+        return torch.where(joined[:, 3:] > 0, joined, update_mosaic(state["mosaic"], frame, move, none))
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         shown = {}

@@ -19,7 +19,7 @@ from torch import nn
 from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
-from ..space.billboards import PICTURE, Cutout, cut_out, painted
+from ..space.billboards import PICTURE, Cutout, cut_out, paint_billboards
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import NOWHERE
 from .generator import DrawnFrame
@@ -203,14 +203,14 @@ class Billboards(nn.Module):
     def painted(
         self, billboards: torch.Tensor, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Frames with billboards [B, K, COLUMNS] in them, as space/billboards.painted gives them."""
+        """Frames with billboards [B, K, COLUMNS] in them, as space/billboards.paint_billboards gives them."""
         look = billboards[..., LOOK].long()
         visible = (billboards[..., NUMBER] > 0) & (look != NONE)
         look = look.clamp_min(0)
         light = billboards[..., LIGHT, None].expand(-1, -1, 3)
         lit = torch.cat([light, torch.ones_like(light[..., :1])], -1)[..., None, None]
         pictures = (self.pictures[look].float() / 255 * lit).clamp_max(1)
-        return painted(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), visible, pose, camera)
+        return paint_billboards(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), visible, pose, camera)
 
     def bodies(self, state: State, half_m: float) -> torch.Tensor:
         """The sides [B, 4 K, 4] of those billboards that stop a body of half width `half_m` at the pose of `state`, as walls

@@ -18,10 +18,10 @@ from ..core.spec import PLACES_UNIT, POSE, POSE_UNIT, WALKABLE, Camera, Spec
 from ..core.state import State
 from ..core.world import Observation
 from ..space.camera import Intrinsics, rotation, yaw
-from ..space.fitting import resized
+from ..space.fitting import resize_depth
 from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Drawing, Gaussians, rasterise
-from ..space.raster.move import multiplied
+from ..space.raster.move import multiply_quaternions
 from ..space.solids import Solids
 from ..space.walkable import walkable
 from .additions import OBSERVED, Additions
@@ -204,7 +204,7 @@ class SplatWorld:
             raise ObservationError(
                 f"depth is [{len(pose)}, h, w] in metres, 0 where unknown; got {tuple(depth.shape)}."
             )
-        deep = resized(depth, self.config.size)
+        deep = resize_depth(depth, self.config.size)
         return self.added.observed(state, rgb, deep, self.config.camera, lambda one, at: self._ridden(one, state, at))
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
@@ -277,7 +277,7 @@ class SplatWorld:
         (rows, on), poses = self._riders, state["bodies"][entry]
         off = scene.means[rows] - self.rigid.rest[on, :3]
         means = (rotation(poses)[on] @ off[..., None])[..., 0] + poses[on, :3]
-        quats = multiplied(poses[on, 3:], scene.quats[rows])
+        quats = multiply_quaternions(poses[on, 3:], scene.quats[rows])
         ridden = {"means": scene.means.index_copy(0, rows, means), "quats": scene.quats.index_copy(0, rows, quats)}
         return replace(scene, **ridden)
 

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from ..core.errors import CheckpointError, ContractError
 from ..core.files import not_written
 from ..space.camera import planar_pose
-from ..space.edits import Edit, Edited, edited, merges, placed_boxes
+from ..space.edits import Edit, Edited, apply_edits, merged_boxes, merges_of
 from ..space.files import replace_whole
 from ..space.occupancy import Walker
 from ..space.raster import Gaussians
@@ -106,8 +106,8 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
 
 def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], SplatWorld]) -> SplatWorld:
     """A world after edits."""
-    after = edited(source.gaussians, edits, source.objects, other)
-    merged = [other(edit) for edit in merges(edits)]
+    after = apply_edits(source.gaussians, edits, source.objects, other)
+    merged = [other(edit) for edit in merges_of(edits)]
     provenance = torch.cat([source.provenance, *(one.provenance for one in merged)])
     provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
     card, names = dict(source.card), source.object_names
@@ -124,8 +124,8 @@ def _solids(
 ) -> SolidBoxes | None:
     """Boxes and bodies after edits; None where edits moved what they describe, or a place has none: then Gaussians stop bodies."""
     solids, bodies = [source.solids], [source.bodies]
-    for edit, one, lift in zip(merges(edits), merged, after.raised):
-        boxes = placed_boxes(one.solids, edit)
+    for edit, one, lift in zip(merges_of(edits), merged, after.raised):
+        boxes = merged_boxes(one.solids, edit)
         solids.append(torch.zeros(0, 6) if boxes is None else boxes)
         bodies.append(torch.where(one.bodies > 0, one.bodies + lift, 0).int())
     if len(merged) < len(edits) or not all(len(part) for part in solids):
@@ -159,7 +159,7 @@ def merging(path: Path, other: Path, by: Sequence[float] = (0, 0, 0), degrees: f
 
 def _within(path: Path) -> list[Path]:
     """The folders of a world and of all worlds merged into it."""
-    return [path, *(one for edit in merges(read_edits(path)) for one in _within((path / edit["place"]).resolve()))]
+    return [path, *(one for edit in merges_of(read_edits(path)) for one in _within((path / edit["place"]).resolve()))]
 
 
 def _digest(path: Path) -> str:
@@ -219,7 +219,7 @@ def checked_edits(path: Path, text: str) -> list[Edit]:
     source = source_of(path)
     try:
         edits = parse_edits(text)
-        edited(source.gaussians, edits, source.objects, other_of(path))
+        apply_edits(source.gaussians, edits, source.objects, other_of(path))
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise ContractError(f"these are no edits ({error}); give the lines of a world.edits.jsonl.") from error
     return edits

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 
 from ...core.errors import DatasetError
-from ...space.matching import CLEAR, explained, preferred, scrolled
-from ...space.mosaic import remembered
+from ...space.matching import CLEAR, prefer_scroll, scroll_index, source_shares
+from ...space.mosaic import update_mosaic
 from ...worlds.codec import Codec, CodecInputs, Scroll
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
@@ -125,13 +125,13 @@ class CodecObjective:
         slots, over = self.generator.config.slots, self.over.to(now.device)
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown, mosaic, moves = recorded[:, :slots].flip(1), batch.mosaic.to(now.device), self.generator.moves
-        scroll = scrolled(shown[:, 1], shown[:, 0], moves)
+        scroll = scroll_index(shown[:, 1], shown[:, 0], moves)
         half = len(recorded) // 2 * (now.step * self.losses_per_batch >= RECORDED)  # the other half stays recorded
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
-            mosaic = remembered(mosaic, shown[:, 0], moves[scroll], over)
-            scroll = scrolled(shown[:, 0], truth, moves)
+            mosaic = update_mosaic(mosaic, shown[:, 0], moves[scroll], over)
+            scroll = scroll_index(shown[:, 0], truth, moves)
             count = half if step + 1 < recorded.shape[1] else 0
             loss, drawn = self._loss(shown, mosaic, scroll, context, truth, before, count, now)
             yield loss
@@ -147,10 +147,10 @@ class CodecObjective:
         shows = torch.from_numpy(now.rng.random(len(shown)) >= BLIND).to(now.device)[:, None, None, None]
         seen = seen._replace(went=seen.went * shows)
         choices, features = codec.choices(seen, context)
-        share, stays = explained(shown, truth, codec.moves)
+        share, stays = source_shares(shown, truth, codec.moves)
         share, memory = (
-            preferred(share, seen.along),
-            explained(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known,
+            prefer_scroll(share, seen.along),
+            source_shares(seen.sources[:, -1:], truth, codec.moves[:1])[0] * seen.known,
         )
         # What the last frame explains need not be fetched from the mosaic.
         within = share[:, : codec.config.moves + 1].amax(1, keepdim=True)

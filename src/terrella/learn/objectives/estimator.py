@@ -14,7 +14,7 @@ from ...core.errors import DatasetError
 from ...core.world import make_rng
 from ...data import ClipCache
 from ...space.camera import yaw
-from ...space.estimator import Estimator, EstimatorConfig, normalised
+from ...space.estimator import Estimator, EstimatorConfig, normalise
 from ...space.floorplan import Box
 from ..feeds import RandomBatches
 from ..recording import Recording
@@ -51,7 +51,7 @@ class EstimatorObjective:
 
     def losses(self, batch: tuple[torch.Tensor, torch.Tensor], now: TrainStep) -> Iterator[Loss]:
         picture, depth = (part.to(now.device) for part in batch)
-        off = self.estimator.depth_code(normalised(picture)) - self.estimator.code(depth)
+        off = self.estimator.depth_code(normalise(picture)) - self.estimator.code(depth)
         slopes = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
         reach = math.log(self.estimator.config.far_m / self.estimator.config.near_m)
         yield Loss("estimator", off.abs().mean() + 0.5 * slopes, {"depth_off": reach * off.abs().mean()})

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ...space.matching import clearest, explains
+from ...space.matching import clear_index, edge_shares
 from ...worlds.codec import Scroll, least_off
 from ...worlds.generator import context_thumbnail
 from ..feeds import RandomBatches
@@ -50,10 +50,10 @@ class ScrollObjective:
         self.scroll, self.recording, self.moves, self.slots = scroll, recording, moves, slots
         rows = np.arange(1, recording.cache.length)
         parts = [rows[first : first + _ROWS] for first in range(0, len(rows), _ROWS)]
-        explained = [explains(recording.rgb(part - 1), recording.rgb(part), moves) for part in parts]
+        explained = [edge_shares(recording.rgb(part - 1), recording.rgb(part), moves) for part in parts]
         self.explained = torch.cat([torch.zeros(1, len(moves)), *explained])
         self.rows = recording.rows_within(slots, LENGTH - 1)  # at which a clip may begin
-        scrolls = clearest(self.explained).numpy() > 0
+        scrolls = clear_index(self.explained).numpy() > 0
         self.scrolls = np.lib.stride_tricks.sliding_window_view(scrolls, LENGTH).mean(1)[self.rows]
         self.modules = {"scroll": scroll}
         self.learners = {"scroll": adamw((scroll,), warmup_cosine(2e-3, 20), decay=0.05)}
@@ -95,4 +95,4 @@ class ScrollObjective:
 
 def one_hot_clearest(explained: torch.Tensor) -> torch.Tensor:
     """What moves explain [B, n, moves], as if the clearest explained all."""
-    return F.one_hot(clearest(explained.flatten(0, 1)), explained.shape[2]).float().unflatten(0, explained.shape[:2])
+    return F.one_hot(clear_index(explained.flatten(0, 1)), explained.shape[2]).float().unflatten(0, explained.shape[:2])

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ...core.errors import DatasetError, TrainingError
-from ...space.mosaic import recalled
+from ...space.mosaic import read_mosaic
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
 from ...worlds.frame_history import FrameHistory, StartClips
@@ -189,4 +189,4 @@ def _mosaics_before(parts: VideoParts, rows: np.ndarray, moves: torch.Tensor, ov
     real = torch.from_numpy(past >= recording.start[rows][:, None])
     frames = recording.rgb(np.maximum(past, 0).ravel()).unflatten(0, past.shape)
     nowhere = torch.zeros(len(rows), 2, dtype=torch.int64)
-    return recalled(mosaics(frames, moves, over, real), parts.video.size, nowhere)
+    return read_mosaic(mosaics(frames, moves, over, real), parts.video.size, nowhere)

@@ -12,7 +12,7 @@ from ...core.errors import DatasetError
 from ...core.files import not_written, replacing
 from ..edits import FARTHEST_M
 from ..raster import Gaussians
-from ..raster.move import turned
+from ..raster.move import transform
 from . import compressed, ply, sog, spz
 from .gltf_scene import GLTF_ENDINGS, read_gltf
 
@@ -73,7 +73,7 @@ def _sound(found: Gaussians, path: Path, axes: str) -> Gaussians:
             f"{lost:,} of its {len(sound):,} Gaussians are left out: not finite, farther than 10 km, or with a quaternion of 0.",
             stacklevel=3,
         )
-    return turned(found.at(sound), _axes(axes).T)
+    return transform(found.at(sound), _axes(axes).T)
 
 
 def write_scene(
@@ -87,7 +87,7 @@ def write_scene(
         raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
     if kind == "compressed" and path.suffix.lower() != ".ply":
         raise DatasetError(f"{path}: the compressed kind is one of .ply; SPZ is compressed by itself.")
-    there = turned(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
+    there = transform(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
     if path.suffix.lower() == ".spz":
         data = spz.encode(there, version)
     else:

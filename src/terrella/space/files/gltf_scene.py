@@ -13,7 +13,7 @@ from PIL import Image
 
 from ...core.errors import DatasetError
 from ..raster import Gaussians, join
-from ..raster.move import turned
+from ..raster.move import transform
 from .gltf import Gltf, open_gltf
 
 MOST_FACES, MOST_NODES, MOST_LIGHTS, MOST_PICTURES = 2_000_000, 100_000, 64, 256
@@ -244,4 +244,4 @@ def _gaussians(file: Gltf, matrix: np.ndarray, attributes: dict[str, Any]) -> Ga
     rot = matrix[:3, :3] / max(scale, 1e-9)
     if not np.allclose(rot @ rot.T, np.eye(3), atol=1e-3):
         raise ValueError("its Gaussians are mirrored, or scaled by another factor along each axis")
-    return turned(found, torch.from_numpy(rot).float(), scale, torch.from_numpy(matrix[:3, 3]).float())
+    return transform(found, torch.from_numpy(rot).float(), scale, torch.from_numpy(matrix[:3, 3]).float())

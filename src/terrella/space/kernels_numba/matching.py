@@ -1,4 +1,4 @@
-"""How pictures go on in pictures: pixels that a displacement explains, the scroll of most of a picture, and the mosaic."""
+"""Kernels of matching.py and mosaic.py: pixels that a displacement explains, the scroll of a picture, and the mosaic."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def around(plane, rows, mean):
-    """Means [H, W] of the 5 x 5 pixels around each of a plane [H, W], as far as they lie in it; overwrites `rows` [H, W + 4]."""
+    """Means [H, W] over the 5 x 5 neighbours of each pixel of a plane [H, W], edges cut off; overwrites `rows` [H, W + 4]."""
     height, width = plane.shape
     for v in range(height):
         first, stop = max(0, v - 2), min(height, v + 3)
@@ -22,8 +22,8 @@ def around(plane, rows, mean):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def half_a_pixel(frame, bounds):
-    """The kernel of matching.half_a_pixel_slowly: frame uint8 [3, H, W]; fills bounds uint8 [2, 3, H, W]."""
+def half_pixel_bounds(frame, bounds):
+    """The kernel of matching.half_pixel_bounds_slowly: frame uint8 [3, H, W]; fills bounds uint8 [2, 3, H, W]."""
     _, height, width = frame.shape
     above, row = np.empty((height, width), np.int32), np.empty(width, np.int32)
     for which in range(2):
@@ -46,8 +46,8 @@ def half_a_pixel(frame, bounds):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def differences(low, high, truth, x, y, most, mean):
-    """The largest and the mean difference [H, W] of the colours of `truth` uint8 [3, H, W] and those x, y away, from `low` to
-    `high` uint8 [3, H, W]."""
+    """The largest and the mean difference [H, W] between the colours of `truth` uint8 [3, H, W] and the range `low` to `high`
+    uint8 [3, H, W] displaced by x, y."""
     _, height, width = truth.shape
     first, stop = min(max(0, x), width), max(min(width, width + x), 0)
     for v in range(height):
@@ -68,9 +68,9 @@ def differences(low, high, truth, x, y, most, mean):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def explained(frames, bounds, truth, share, stays, moves, scales):
-    """The kernel of matching.explained_slowly: frames uint8 [slots, 3, H, W], bounds uint8 [2, 3, H, W] of the first of them, truth
-    uint8 [3, H, W], moves [M, 2]; fills share [sources, H, W] and stays [H, W]."""
+def source_shares(frames, bounds, truth, share, stays, moves, scales):
+    """The kernel of matching.source_shares_slowly: frames uint8 [slots, 3, H, W], bounds uint8 [2, 3, H, W] of the first of them,
+    truth uint8 [3, H, W], moves [M, 2]; fills share [sources, H, W] and stays [H, W]."""
     sources, height, width = share.shape
     sharp, near, never = np.float32(scales[0]), np.float32(scales[1]), np.float32(scales[2])
     differs, rows = np.empty((height, width), np.float32), np.empty((height, width + 4), np.float32)
@@ -99,11 +99,11 @@ def explained(frames, bounds, truth, share, stays, moves, scales):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def explains(before, after, found, moves, same, textured):
-    """The kernel of matching.explains_slowly: before, after uint8 [3, H, W], moves [M, 2]; fills found [M]."""
+def edge_shares(before, after, shares, moves, same, textured):
+    """The kernel of matching.edge_shares_slowly: before, after uint8 [3, H, W], moves [M, 2]; fills shares [M]."""
     _, height, width = after.shape
     count = 0
-    found[:] = 0
+    shares[:] = 0
     for v in range(1, height, 2):
         for u in range(1, width, 2):
             edge = 0
@@ -123,18 +123,18 @@ def explains(before, after, found, moves, same, textured):
                     off = max(off, abs(np.int32(before[c, j - 1, i]) - np.int32(after[c, v - 1, u])))
                     off = max(off, abs(np.int32(before[c, j, i - 1]) - np.int32(after[c, v, u - 1])))
                 if off <= same:
-                    found[k] += 1
+                    shares[k] += 1
     for k in range(len(moves)):
-        found[k] /= max(count, 1)
+        shares[k] /= max(count, 1)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def voted(frames, share, painted, drawn, moves, limits):
-    """The kernel of matching.voted_slowly: frames uint8 [slots, 3, H, W], share [sources + 1, H, W], painted and drawn uint8 [3, H,
-    W]; fills drawn. Sources of one colour are counted as one."""
+def majority_colours(frames, share, painted, drawn, moves, limits):
+    """The kernel of matching.majority_colours_slowly: frames uint8 [slots, 3, H, W], share [sources + 1, H, W], painted and drawn
+    uint8 [3, H, W]; fills drawn. Sources of the same colour are merged."""
     last, height, width = share.shape[0] - 1, share.shape[1], share.shape[2]
     same, few, equal, stress = np.int32(limits[0]), np.float32(limits[1]), np.int32(limits[2]), np.float32(limits[3])
-    colour, worth = np.empty((last + 1, 3), np.int32), np.empty(last + 1, np.float32)
+    colour, weight = np.empty((last + 1, 3), np.int32), np.empty(last + 1, np.float32)
     for v in range(height):
         for u in range(width):
             count = 0
@@ -153,7 +153,7 @@ def voted(frames, share, painted, drawn, moves, limits):
                     and colour[at, 2] == colour[count, 2]
                 ):
                     at += 1
-                worth[at] = share[k, v, u] + (worth[at] if at < count else np.float32(0))
+                weight[at] = share[k, v, u] + (weight[at] if at < count else np.float32(0))
                 count += at == count
             best, most = 0, np.float32(-1)
             for a in range(count):
@@ -165,7 +165,7 @@ def voted(frames, share, painted, drawn, moves, limits):
                         abs(colour[a, 2] - colour[b, 2]),
                     )
                     if off <= same:
-                        total += worth[b]
+                        total += weight[b]
                     if b == 0:
                         stays = off <= equal
                 total *= stress if stays else np.float32(1)
@@ -176,8 +176,8 @@ def voted(frames, share, painted, drawn, moves, limits):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def remembered(mosaic, frame, move, after, over, same, most):
-    """The kernel of mosaic.remembered_slowly: mosaic and after uint8 [4, H', W'], frame uint8 [3, H, W], move [2], over
+def update_mosaic(mosaic, frame, move, after, over, same, most):
+    """The kernel of mosaic.update_mosaic_slowly: mosaic and after uint8 [4, H', W'], frame uint8 [3, H, W], move [2], over
     bool [H, W]; fills after."""
     _, tall, wide = mosaic.shape
     _, height, width = frame.shape

@@ -17,7 +17,7 @@ from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
 from ..views import over_views
 from .blocks import Blocks, blocks_of
-from .looks import FINE, painted
+from .looks import FINE, texture_colours
 from .room_layout import RoomLayout
 
 TEXEL_M = 0.14
@@ -231,7 +231,7 @@ def _brightness(plan, blocks, boxes, cells, texels, bare, light) -> np.ndarray:
         size = boxes[k, 3:] - boxes[k, :3]
         if axis == 2 and size[1] > size[0]:  # planks run along
             u, v = v, u
-        own[rows] = painted(blocks.looks[k], u, v, float(cells.widths[first].max()), plan.seed + 31 * int(axis))
+        own[rows] = texture_colours(blocks.looks[k], u, v, float(cells.widths[first].max()), plan.seed + 31 * int(axis))
     falls = _between(cells, texels, bare, light, boxes)
     points = cells.points + 0.003 * cells.normals
     sun = _sun(plan, blocks, boxes, points, cells.normals)

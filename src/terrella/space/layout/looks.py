@@ -72,7 +72,7 @@ def look_of(words: str, usual: str = "paint") -> Look:
     return Look(material, (rgb[0], rgb[1], rgb[2]))
 
 
-def painted(look: Look, u: np.ndarray, v: np.ndarray, step: float, seed: int) -> np.ndarray:
+def texture_colours(look: Look, u: np.ndarray, v: np.ndarray, step: float, seed: int) -> np.ndarray:
     """Colours [N, 3] of a surface at places u, v [N] metres, the mean over little squares of side `step`."""
     pattern, offsets = _PATTERNS.get(look.material), (-step / 4, step / 4)
     shade = np.ones(len(u))

@@ -9,7 +9,7 @@ from ..camera import rotation
 from ..files.gltf_scene import GltfScene
 from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
-from ..raster.move import multiplied
+from ..raster.move import multiply_quaternions
 from .bake import FINEST_M, OPACITY, THIN_M, exposed
 from .mesh_light import falling
 from .mesh_solids import solids_of
@@ -82,6 +82,6 @@ def _flat(corners: np.ndarray, normals: np.ndarray, opacities: np.ndarray) -> Ga
     mean, off = (xx + yy) / 2, (((xx - yy) / 2).square() + xy.square()).sqrt()
     wide = _WIDE * torch.stack([mean + off, (mean - off).clamp_min(0)], 1).sqrt()
     scales = torch.cat([wide.clamp_min(THIN_M), torch.full((len(up), 1), THIN_M)], 1)
-    quats = multiplied(lying, torch.stack([half.cos(), zero, zero, half.sin()], 1))
+    quats = multiply_quaternions(lying, torch.stack([half.cos(), zero, zero, half.sin()], 1))
     grey = plain_sh(torch.full((len(up), 3), 0.5))
     return Gaussians(middle - THIN_M * way, quats, scales, OPACITY * torch.from_numpy(opacities).float(), grey)

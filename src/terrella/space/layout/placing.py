@@ -29,7 +29,7 @@ class FurnitureRequest(Protocol):
     side: str
 
 
-def furnished(
+def furnish_room(
     layout: dict[str, Any], number: int, asked: Sequence[FurnitureRequest], following: bool, seed: int
 ) -> list[str]:
     """Puts what is asked for into room `number` of a layout, and a door to the next room; what found no place."""

@@ -15,7 +15,7 @@ from typing import Any
 from ...core.errors import ContractError
 from . import looks
 from .furniture import KINDS, SAME
-from .placing import furnished
+from .placing import furnish_room
 from .room_layout import RoomLayout, read_layout
 
 ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in metres, and looks
@@ -116,7 +116,7 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     left_out: list[str] = []
     for at, asked in enumerate(rooms):
         following = at + 1 < len(rooms)
-        left_out += furnished(layout, at, asked.things, following, seed)
+        left_out += furnish_room(layout, at, asked.things, following, seed)
     return ParsedText(read_layout(layout), layout, tuple(unknown), tuple(left_out))
 
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from ...core.errors import DatasetError
 from ..camera import FAR_M, rotation
 from ..fitting import PosedViews
-from ..raster.move import multiplied, quaternion
+from ..raster.move import multiply_quaternions, quaternion_of
 from .reading import blurred, read_picture, sharpness
 
 FEWEST = 16  # pictures of a fit
@@ -68,7 +68,7 @@ def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
     good = np.isfinite(rot).all() and np.isfinite(place).all() and np.abs(place).max() < 1e6
     if not good or np.abs(rot.T @ rot - np.eye(3)).max() > 0.01 or np.linalg.det(rot) < 0:
         raise DatasetError(f"{where}: its pose is no rotation and a place of finite numbers; mend or remove it.")
-    return torch.cat([torch.from_numpy(place).float(), quaternion(torch.from_numpy(rot))])
+    return torch.cat([torch.from_numpy(place).float(), quaternion_of(torch.from_numpy(rot))])
 
 
 def levelled(shots: Shots) -> Shots:
@@ -82,7 +82,7 @@ def levelled(shots: Shots) -> Shots:
     some = points[:: max(len(points) // 2000, 1)] if len(points) else place
     scale = MIDDLE_M / max(float(torch.cdist(place, some).median()), 1e-6)
     middle = place.median(0).values
-    pose = torch.cat([(place - middle) * scale, multiplied(quaternion(rot), shots.pose[:, 3:])], 1)
+    pose = torch.cat([(place - middle) * scale, multiply_quaternions(quaternion_of(rot), shots.pose[:, 3:])], 1)
     return Shots(shots.files, shots.lenses, pose, (points - middle) * scale, False)
 
 

@@ -10,20 +10,22 @@ from .gaussians import Gaussians
 from .slow import harmonics
 
 
-def turned(gaussians: Gaussians, rot: torch.Tensor, scale: float = 1.0, shift: torch.Tensor | None = None) -> Gaussians:
+def transform(
+    gaussians: Gaussians, rot: torch.Tensor, scale: float = 1.0, shift: torch.Tensor | None = None
+) -> Gaussians:
     """Every point p becomes scale * rot p + shift; rot [3, 3] a rotation, shift [3]."""
     if scale == 1 and shift is None and torch.equal(rot, torch.eye(3)):
         return gaussians
     means = scale * gaussians.means @ rot.T
     if shift is not None:
         means = means + shift
-    spun = multiplied(quaternion(rot), gaussians.quats)
+    spun = multiply_quaternions(quaternion_of(rot), gaussians.quats)
     return replace(
         gaussians, means=means, quats=spun, scales=gaussians.scales * scale, sh=_turned_sh(gaussians.sh, rot)
     )
 
 
-def multiplied(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+def multiply_quaternions(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """The rotation `one` [4] after each of `other` [N, 4], as quaternions w, x, y, z."""
     a, b, c, d = one.unbind(-1)
     w, x, y, z = other.unbind(-1)
@@ -36,7 +38,7 @@ def multiplied(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     return torch.stack(parts, -1)
 
 
-def quaternion(rot: torch.Tensor) -> torch.Tensor:
+def quaternion_of(rot: torch.Tensor) -> torch.Tensor:
     """The quaternion [4] w, x, y, z of a rotation matrix, by the largest of its squares (Shepperd 1978)."""
     m = rot.double()
     t = m.trace()

@@ -1,0 +1,133 @@
+"""Serves the page of a world, or of a game and a learned world side by side, with an agent that may drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from .. import library
+from ..act.explorer import Explorer
+from ..core.errors import ServeError, TerrellaError
+from ..core.policy import Policy, Random
+from ..core.world import World, make_rng
+from ..data import Layout, Recorder
+from ..serve import ServeConfig, SinkFactory, read_picture, serve
+from ..serve.agent import Agents
+from ..serve.guard import is_loopback
+from .key_keeper import KeyKeeper
+from .opening import ControlsConfig, Device, Fast, load_named
+from .page_agents import PageAgents
+from .progress import Progress, silent
+
+
+@dataclass(frozen=True)
+class PlayConfig:
+    """How a world is played."""
+
+    image: Path | None = None
+    """Start from this picture (any image file). Pictures can also be dropped on the page."""
+    compare: bool = False
+    """Show the real game beside the learned world, under the same actions. --truth GAME names the game."""
+    truth: str | None = None
+    """The real game that --compare shows; default: the game that the world learned, else doom:my_way_home."""
+    memory: bool = True
+    """Play a learned world without its keyframes."""
+    remember: bool = False
+    """Add a spatial memory to a world that has none."""
+    estimator: str | None = None
+    """Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one."""
+    memory_mb: float | None = None
+    """Size limit of the spatial memory in MiB; default: as the world was saved, or 16."""
+    randomise: Path | None = None
+    """A TOML or JSON file of distributions, from which each episode draws masses, friction, delay and more."""
+    agent: str = ""
+    """Who drives if the page lets it: plan, explorer, random, the folder of a learned policy, or MODULE:NAME; default: a planner
+    if the world has a reward, else the explorer. A planner seeks the goals that are set on the page."""
+    agent_ms: float = 30.0
+    """Time for a planner's decision, in milliseconds."""
+    policy: Literal["explore", "random"] | None = None
+    """A script that acts from the beginning, whenever nobody touches the controls."""
+    record: Path | None = None
+    """Folder of a dataset to which the page can record."""
+    device: Device = "auto"
+    fast: Fast = False
+
+
+def play(
+    name: str,
+    config: PlayConfig | None = None,
+    controls: ControlsConfig | None = None,
+    page: ServeConfig | None = None,
+    *,
+    on_ready: Callable[[str, list[World]], None] | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Serves the page of a world until interrupted.
+
+    name:     as `terrella list` shows it, or the path of a checkpoint.
+    on_ready: called with the address to open, and the worlds on the page, the learned world last.
+    """
+    config, controls, page = config or PlayConfig(), controls or ControlsConfig(), page or ServeConfig()
+    _check(config)
+    learned = load_named(
+        name, config.device, config.memory, config.fast, progress=progress, remember=config.remember,
+        estimator=config.estimator, memory_mb=config.memory_mb, randomise=config.randomise,
+    )  # fmt: skip
+    picture = None if config.image is None else _first_picture(config.image, learned)
+    worlds = [_game_beside(learned, config.truth, progress), learned] if config.compare else [learned]
+    worlds = [controls.of(world) for world in worlds]
+    folder = library.folder_for_keys(name) if is_loopback(page.host) and not config.compare else None
+    keeper = KeyKeeper(worlds[0].spec, folder, learned.spec)
+    serve(
+        worlds, page, policy=_driver(worlds, config), picture=picture, sink_factory=_sink(worlds[0], keeper, config.record),
+        keep=keeper, kept_in=keeper.place, on_ready=lambda address: on_ready and on_ready(address, worlds),
+    )  # fmt: skip
+
+
+def _check(config: PlayConfig) -> None:
+    if config.policy is not None and config.agent:
+        raise TerrellaError("--policy and --agent both say who drives; give one of them.")
+    if not config.agent_ms > 0:
+        raise TerrellaError("--agent-ms is a time above 0.")
+    if config.compare and config.image is not None:
+        raise TerrellaError("--image cannot be compared with a game, which cannot start from it; leave --compare out.")
+    if config.record is not None and config.record.exists() and not config.record.is_dir():
+        raise TerrellaError(f"--record {config.record}: that is a file; give a folder.")
+
+
+def _driver(worlds: list[World], config: PlayConfig) -> Policy | Agents:
+    if config.policy is not None:
+        return Explorer(worlds[0].spec) if config.policy == "explore" else Random(worlds[0].spec, (3, 40))
+    return PageAgents(worlds[0], worlds[1] if config.compare else None, config.agent, config.agent_ms).agents()
+
+
+def _sink(world: World, keeper: KeyKeeper, folder: Path | None) -> SinkFactory | None:
+    if folder is None:
+        return None
+    layout = Layout.of(world.spec)
+    return lambda: Recorder(folder, keeper.with_keys(layout), "play")
+
+
+def _first_picture(path: Path, world: World) -> torch.Tensor:
+    """The picture of an image file at the world's size. The world observes it once, so that errors are raised now."""
+    if "rgb" not in world.spec.observes:
+        raise ServeError(f"{world.spec.name} takes no pictures, so it cannot start from one; leave --image out.")
+    height, width = world.spec.channels["rgb"].shape[:2]
+    picture = read_picture(path, (height, width))
+    world.observe({"rgb": picture[None]}, None, make_rng(0))
+    return picture
+
+
+def _game_beside(learned: World, name: str | None, progress: Progress) -> World:
+    """The real game, at the picture size of the learned world; by default the game that it learned."""
+    known = str(learned.spec.card.get("game"))
+    name = name or (known if library.is_truth(known) else library.GAME)
+    shape = learned.spec.channels["rgb"].shape if "rgb" in learned.spec.channels else None
+    sizes = ("size", "depth_size") if name.startswith("doom") else ("size",)
+    if library.is_truth(known) and name != known:
+        progress(f"{learned.spec.name} learned {known}, and is compared with {name}.")
+    return library.load(name, **(dict.fromkeys(sizes, shape[:2]) if shape and library.is_truth(name) else {}))
