@@ -16,6 +16,13 @@ from ..workflows.transfer import transfer as run_transfer
 from .say import Json, say, show
 
 Inside = Annotated[str, arg(name="in", help="The world to evaluate them in: a name of `terrella list`, or a path.")]
+Policies = Annotated[
+    tuple[str, ...],
+    arg(
+        help="random, idle, explorer, constant:VALUE, plan, plan:samples=16,horizon=12, the folder of a learned policy, or "
+        "MODULE:NAME or FILE.py:NAME of your own. NAME@0.3 takes a random action with probability 0.3."
+    ),
+]
 STOPPED = 130
 
 
@@ -32,23 +39,19 @@ def plan(world: Positional[str], config: PlanConfig, json: Json = False) -> int:
     return STOPPED if outcome.stopped else 0
 
 
-def evaluate(policies: Positional[tuple[str, ...]], inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
+def evaluate(policies: Positional[Policies], inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
     """Evaluate policies in a world and in the real environment, from the same starts: does the world rank them as reality does?
 
     A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
-
-    Args:
-        policies: random, idle, explorer, constant:VALUE, plan, plan:samples=16,horizon=12, the folder of a learned policy, or
-            MODULE:NAME or FILE.py:NAME of your own. NAME@0.3 takes a random action with probability 0.3.
     """
     show(run_evaluate(policies, inside, config, progress=say), json)
 
 
 def transfer(config: TransferConfig, json: Json = False) -> None:
-    """Carry policies from a simulator over to a "real" robot that differs, and measure what helps: domain randomisation, system
-    identification, or a model of a few real episodes.
+    """Transfer policies from a simulator to a "real" robot that differs, and measure which methods help.
 
-    A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
+    The methods are domain randomisation, system identification, and a model that is fitted to a few real episodes. A folder
+    receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
     """
     show(run_transfer(config, progress=say), json)
 

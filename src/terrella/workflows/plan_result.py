@@ -44,30 +44,20 @@ class PlanResult:
     divergence: Mapping[str, Sequence[float]]
     """channel -> distance of the dream from reality, by step of the filmed episode."""
     page: Path
+    """All of it to look at."""
     film: Path | None
+    """Dream and reality side by side; None where there are no pictures."""
     stopped: bool = False
     """Whether Ctrl-C ended it early."""
 
     def to_json(self) -> dict[str, Any]:
-        return jsonable(
-            {
-                **self.settings,
-                "planner": _plain(self.planner),
-                "random": _plain(self.random),
-                "difference": _plain(self.difference),
-                "curve": [
-                    {
-                        "with": point.label,
-                        "imagined": point.imagined,
-                        **_plain(figures_of(point.played, self.settings["seed"])),
-                    }
-                    for point in self.curve
-                ],
-                "stopped": self.stopped,
-                "page": self.page,
-                "film": self.film or "",
-            }
-        )
+        arms = {name: _plain(getattr(self, name)) for name in ("planner", "random", "difference")}
+        seed, ends = self.settings["seed"], {"stopped": self.stopped, "page": self.page, "film": self.film or ""}
+        curve = [
+            {"with": point.label, "imagined": point.imagined, **_plain(figures_of(point.played, seed))}
+            for point in self.curve
+        ]
+        return jsonable({**self.settings, **arms, "curve": curve, **ends})
 
     def summary(self) -> str:
         return "\n".join([*self.lines, f"the page: {self.page}"])

@@ -1,4 +1,4 @@
-"""`transfer`: carries policies from a simulator over to a "real" robot that differs, and measures what helps."""
+"""`transfer`: transfers policies from a simulator to a "real" robot that differs, and measures which methods help."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def _result(experiment: TransferExperiment, folder: Path, seeds: Mapping[int, Ma
     identified = tuple(one["identified"] for one in seeds.values() if one.get("identified"))
     result = TransferResult(scores, experiment, tuple(seeds), identified, folder / "transfer.html")
     facts = {**asdict(experiment), "seeds": list(seeds), "identified": list(identified)}
-    title = f"{experiment.sim}, carried over to {experiment.real}"
+    title = f"{experiment.sim}, transferred to {experiment.real}"
     result.page.write_text(transfer_page(title, scores, facts), encoding="utf-8")
     write_json(folder / "transfer.json", {name: one for name, one in result.to_json().items() if name != "page"})
     return result

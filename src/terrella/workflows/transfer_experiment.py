@@ -75,7 +75,7 @@ def open_robot(name: str, gap: str, dial: float, look: str = "") -> World:
 def check_robot(name: str) -> None:
     if not name.startswith("mujoco:"):
         raise TerrellaError(
-            f"policies are carried over between robots in MuJoCo; '{name}' is no mujoco:NAME or mujoco:FILE.xml."
+            f"policies are transferred between robots in MuJoCo; '{name}' is no mujoco:NAME or mujoco:FILE.xml."
         )
 
 
