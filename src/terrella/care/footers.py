@@ -213,13 +213,11 @@ def _footer_group(group: list[Chunk], leaves: list[tuple[str, str]], rows: int, 
         about: thrift.Struct = {
             1: (thrift.I32, _TYPES.index(kind)),
             2: (thrift.LIST, (thrift.I32, sorted({3, *(page.encoding for page in chunk)}))),
-            3: (thrift.LIST, (thrift.BINARY, [part.encode() for part in _parts(path)])),
-            4: (thrift.I32, codec),
+            3: (thrift.LIST, (thrift.BINARY, [part.encode() for part in _parts(path)])), 4: (thrift.I32, codec),
             5: (thrift.I64, sum(page.values for page in data)),
             6: (thrift.I64, sum(page.header + page.unpacked for page in chunk)),
-            7: (thrift.I64, chunk[-1].end - chunk[0].at),
-            9: (thrift.I64, data[0].at),
-        }
+            7: (thrift.I64, chunk[-1].end - chunk[0].at), 9: (thrift.I64, data[0].at),
+        }  # fmt: skip
         if chunk[0].kind == DICTIONARY:
             about[11] = (thrift.I64, chunk[0].at)
         columns.append({2: (thrift.I64, chunk[0].at), 3: (thrift.STRUCT, about)})

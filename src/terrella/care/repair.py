@@ -149,16 +149,12 @@ class _Mender:
     def _layout(self) -> Layout:
         source, ours = self.source, ("version", "world", "sensors", "streams", "terminal")
         return _SameLayout(
-            fps=whole_rate(source.fps),
-            sensors=sensors_of(self.features, source.known),
-            streams=self.streams,
+            fps=whole_rate(source.fps), sensors=sensors_of(self.features, source.known), streams=self.streams,
             clock=TIME in self.features,
             pictures="png" if any(feature["dtype"] == "image" for feature in self.features.values()) else "video",
-            robot=str(source.info.get("robot_type") or ("terrella" if source.ours else "")),
-            world=source.world,
-            facts={key: value for key, value in source.about.items() if key not in ours},
-            kept=self.features,
-        )
+            robot=str(source.info.get("robot_type") or ("terrella" if source.ours else "")), world=source.world,
+            facts={key: value for key, value in source.about.items() if key not in ours}, kept=self.features,
+        )  # fmt: skip
 
     # -- which rows ---------------------------------------------------------------------------------------------
 

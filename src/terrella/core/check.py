@@ -18,16 +18,10 @@ from .world import Observation, World, make_rng
 
 # Kinds of channels with a fixed meaning: dtype, and number of axes of one entry.
 _WELL_KNOWN = {
-    "rgb": (np.uint8, 3),
-    "depth": (np.float32, 2),
-    "pose": (np.float32, 1),
-    "reward": (np.float32, 0),
-    "done": (np.bool_, 0),
-    "known": (np.float32, 2),
-    "places": (np.float32, 2),
-    "mosaic": (np.uint8, 3),
+    "rgb": (np.uint8, 3), "depth": (np.float32, 2), "pose": (np.float32, 1), "reward": (np.float32, 0),
+    "done": (np.bool_, 0), "known": (np.float32, 2), "places": (np.float32, 2), "mosaic": (np.uint8, 3),
     "instruction": (np.float32, 1),
-}
+}  # fmt: skip
 
 
 def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
@@ -39,13 +33,9 @@ def check_world(world: World, seed: int = 0, steps: int = 3) -> list[str]:
     if not isinstance(world, World) or not isinstance(world.spec, Spec):
         raise ContractError("a World has `spec` (a terrella.Spec) and the verbs start, observe, imagine, render.")
     laws = [
-        _spec_is_valid,
-        _starts_and_renders,
-        _refuses_other_batches,
-        _acts_deterministically,
-        _refuses_junk,
+        _spec_is_valid, _starts_and_renders, _refuses_other_batches, _acts_deterministically, _refuses_junk,
         _observes,
-    ]
+    ]  # fmt: skip
     if world.spec.differentiable:
         laws.append(_gradients_reach_the_action)
     if world.spec.forkable:

@@ -14,19 +14,10 @@ from .similar import did_you_mean
 from .spec import CHOICE, Spec, can_idle, idle_name, neutral_action, shape_of
 
 _CODES = {
-    **{name: f"Arrow{name.title()}" for name in ("up", "down", "left", "right")},
-    "space": "Space",
-    " ": "Space",
-    "enter": "Enter",
-    "return": "Enter",
-    "\r": "Enter",
-    "tab": "Tab",
-    "shift": "ShiftLeft",
-    "ctrl": "ControlLeft",
-    "control": "ControlLeft",
-    "esc": "Escape",
-    "escape": "Escape",
-}
+    **{name: f"Arrow{name.title()}" for name in ("up", "down", "left", "right")}, "space": "Space", " ": "Space",
+    "enter": "Enter", "return": "Enter", "\r": "Enter", "tab": "Tab", "shift": "ShiftLeft", "ctrl": "ControlLeft",
+    "control": "ControlLeft", "esc": "Escape", "escape": "Escape",
+}  # fmt: skip
 _PYGAME = {1073741903: "ArrowRight", 1073741904: "ArrowLeft", 1073741905: "ArrowDown", 1073741906: "ArrowUp"}
 _WORDS = {
     **dict.fromkeys(("up", "forward", "forwards", "north", "ahead", "accelerate", "gas", "throttle", "faster"), "Up"),

@@ -22,24 +22,9 @@ if TYPE_CHECKING:
     from .recording import RecordOptions, record
 
 __all__ = [
-    "ClipCache",
-    "Clips",
-    "ClipsConfig",
-    "Coverage",
-    "Dataset",
-    "Episode",
-    "Layout",
-    "Readings",
-    "RecordOptions",
-    "Recorder",
-    "Sensor",
-    "Source",
-    "Take",
-    "check_game",
-    "coverage",
-    "record",
-    "split",
-]
+    "ClipCache", "Clips", "ClipsConfig", "Coverage", "Dataset", "Episode", "Layout", "Readings", "RecordOptions",
+    "Recorder", "Sensor", "Source", "Take", "check_game", "coverage", "record", "split",
+]  # fmt: skip
 
 
 def __getattr__(name: str):

@@ -131,23 +131,16 @@ def facts_of(spec: Spec) -> dict[str, object]:
     low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
     limits = {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
     return {
-        "name": spec.name,
-        "dt_s": spec.dt_s,
-        "camera": list(spec.camera) if spec.camera else None,
+        "name": spec.name, "dt_s": spec.dt_s, "camera": list(spec.camera) if spec.camera else None,
         "cameras": {channel: _camera_json(camera) for channel, camera in spec.cameras.items()},
-        "action_space": str(spec.action),
-        "action_shape": list(shape_of(spec.action)),
-        "action_names": list(spec.action_names),
-        "action_units": list(spec.action_units),
-        "action_mode": spec.action_mode,
-        "action_frame": spec.action_frame,
+        "action_space": str(spec.action), "action_shape": list(shape_of(spec.action)),
+        "action_names": list(spec.action_names), "action_units": list(spec.action_units),
+        "action_mode": spec.action_mode, "action_frame": spec.action_frame,
         "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
-        "idle": [float(number) for number in spec.idle],
-        "max_episode_steps": spec.max_episode_steps,
-        "units": dict(spec.units),
-        "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
+        "idle": [float(number) for number in spec.idle], "max_episode_steps": spec.max_episode_steps,
+        "units": dict(spec.units), "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
         **limits,
-    }
+    }  # fmt: skip
 
 
 def _camera_json(camera: Camera) -> dict[str, object]:

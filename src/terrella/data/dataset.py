@@ -23,13 +23,9 @@ from .storage.remote import Files, LocalFiles, open_files
 from .storage.tables import RowsOf, ValuesOf, read_rows, read_whole
 
 TASK = "task_index"
-_FIXED = {
-    "action": ACTION,
-    "action_valid": ACTION_VALID,
-    "reward": REWARD,
-    "done": DONE,
-    "task": TASK,
-}  # array -> feature
+_FIXED = {  # array -> feature
+    "action": ACTION, "action_valid": ACTION_VALID, "reward": REWARD, "done": DONE, "task": TASK,
+}  # fmt: skip
 
 
 class Dataset:

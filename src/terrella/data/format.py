@@ -145,16 +145,12 @@ def sensor_from_json(name: str, stated: Mapping) -> Sensor:
         raise ValueError(f"{name} is of kind {stated['kind']!r}")
     rate = stated.get("rate_hz")
     return Sensor(
-        name,
-        stated["kind"],
-        tuple(int(n) for n in stated["shape"]),
+        name, stated["kind"], tuple(int(n) for n in stated["shape"]),
         str(np.dtype(stated["dtype"])) if stated["dtype"] != "string" else "string",
         tuple(str(n) for n in stated.get("names", ())),
-        {str(key): str(unit) for key, unit in dict(stated.get("units", {})).items()},
-        str(stated.get("frame", "")),
-        None if rate is None else float(rate),
-        dict(stated.get("facts", {})),
-    )
+        {str(key): str(unit) for key, unit in dict(stated.get("units", {})).items()}, str(stated.get("frame", "")),
+        None if rate is None else float(rate), dict(stated.get("facts", {})),
+    )  # fmt: skip
 
 
 def whole_rate(fps: float) -> float:

@@ -27,14 +27,10 @@ ROW, WORDS = 0, 0xFFFF  # kinds of journal records; streams are numbered from 1
 def staging_facts(layout: Layout, number: int, task: str, start_ns: int) -> dict:
     """The first record of the journal of episode `number`: all facts that are needed to read it."""
     return {
-        "episode": number,
-        "task": task,
-        "start_ns": start_ns,
-        "fps": layout.fps,
-        "pictures": layout.pictures,
+        "episode": number, "task": task, "start_ns": start_ns, "fps": layout.fps, "pictures": layout.pictures,
         "rows": {name: sensor_json(sensor) for name, sensor in layout.rows.items()},
         "streams": {name: sensor_json(sensor) for name, sensor in layout.streams.items()},
-    }
+    }  # fmt: skip
 
 
 def pack_row(values: Mapping[str, np.ndarray], given: Sequence[bool], sensors: Sequence[Sensor]) -> list:

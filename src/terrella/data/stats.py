@@ -49,12 +49,9 @@ def _merge_two(a: Summary, b: Summary) -> Summary:
     mean = (a["mean"] * n + b["mean"] * m) / (n + m)
     spread = (n * (a["std"] ** 2 + (a["mean"] - mean) ** 2) + m * (b["std"] ** 2 + (b["mean"] - mean) ** 2)) / (n + m)
     return {
-        "min": np.minimum(a["min"], b["min"]),
-        "max": np.maximum(a["max"], b["max"]),
-        "mean": mean,
-        "std": np.sqrt(spread),
-        "count": np.array([n + m]),
-    }
+        "min": np.minimum(a["min"], b["min"]), "max": np.maximum(a["max"], b["max"]), "mean": mean,
+        "std": np.sqrt(spread), "count": np.array([n + m]),
+    }  # fmt: skip
 
 
 def to_json(stats: Mapping[str, Summary]) -> dict:

@@ -287,20 +287,13 @@ class Writer:
 
     def _info(self, episodes: int, rows: int, tasks: int) -> dict:
         return {
-            "codebase_version": VERSION,
-            "robot_type": self.layout.robot,
-            "total_episodes": episodes,
-            "total_frames": rows,
-            "total_tasks": tasks,
-            "chunks_size": FILES_PER_CHUNK,
-            "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": 200,
-            "fps": self.layout.fps,
-            "splits": {"train": f"0:{episodes}"},
+            "codebase_version": VERSION, "robot_type": self.layout.robot, "total_episodes": episodes,
+            "total_frames": rows, "total_tasks": tasks, "chunks_size": FILES_PER_CHUNK, "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200, "fps": self.layout.fps, "splits": {"train": f"0:{episodes}"},
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH if any(f["dtype"] == "video" for f in self.features.values()) else None,
             "features": self.features,
-        }
+        }  # fmt: skip
 
 
 def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:

@@ -27,15 +27,9 @@ INSTRUCTION = "instruction"
 _FORMAT = 3
 _FETCHING = 4  # episodes of a remote recording that are fetched at once
 _TYPES = {
-    "rgb": np.uint8,
-    "depth": np.float16,
-    "pose": np.float32,
-    "action": np.float32,
-    "action_valid": np.bool_,
-    "reward": np.float32,
-    "done": np.bool_,
-    "task": np.int64,
-}
+    "rgb": np.uint8, "depth": np.float16, "pose": np.float32, "action": np.float32, "action_valid": np.bool_,
+    "reward": np.float32, "done": np.bool_, "task": np.int64,
+}  # fmt: skip
 _NUMBERS = {"float64": "float32"} | {
     name: name
     for name in ("float16", "float32", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool")
