@@ -173,7 +173,7 @@ def test_a_column_that_is_mostly_missing_is_no_reason_to_drop_rows(recording, so
     change(recording, "next.reward", lambda v: [float("nan")] * 20 + v[20:])
     said = repair(recording, tmp_path / "out")
     assert [episode.length for episode in Dataset(tmp_path / "out").episodes] == [30, 30, 30, 10]
-    assert any("next.reward is not finite in 20 of 30 rows, which are kept" in sentence for sentence in said)
+    assert any("next.reward is not finite in 20 of 30 rows, which stay" in sentence for sentence in said)
 
 
 def test_twins_are_kept_both(recording, tmp_path):
@@ -253,7 +253,7 @@ def test_a_killed_strangers_recording_is_found_again_by_its_pages(recording, tmp
     assert {fault.file for fault in doctor(root)} == {"meta/episodes", "data/chunk-000/file-000.parquet"}
     said = check(root, tmp_path / "out", ALL, whole)
     assert any("100 rows were recovered from its pages" in sentence for sentence in said)
-    assert any("4 episodes were found in the videos" in sentence for sentence in said)
+    assert any("4 episodes were located in the videos" in sentence for sentence in said)
 
 
 def test_a_row_group_that_cannot_be_read_costs_its_episode_alone(recording, tmp_path):

@@ -109,7 +109,7 @@ def test_a_file_in_use_stays_and_a_cache_full_of_them_says_so(remote, tmp_path):
             with pytest.raises(DatasetError, match="full of files in use"):
                 files.local(name(3))
     files.local(name(3))
-    with pytest.raises(DatasetError, match="10,000 bytes and 9,999 may be kept"):
+    with pytest.raises(DatasetError, match="10,000 bytes, and only 9,999 fit"):
         Files(remote, tmp_path, budget_bytes=9_999).local(name(4))
 
 
@@ -150,7 +150,7 @@ def test_silence_and_refusal_are_told(remote, tmp_path, monkeypatch):
 
 
 def test_a_missing_package_and_an_unknown_scheme_are_told(tmp_path, monkeypatch):
-    with pytest.raises(DatasetError, match="no address that can be read"):
+    with pytest.raises(DatasetError, match="not a valid address"):
         Files("nonsense://x", tmp_path)
 
     def missing(*arguments, **options):

@@ -115,9 +115,8 @@ def _stretches(runs: Sequence[EpisodeMotion]) -> list[EpisodeMotion]:
         for begin, end in zip(edges, edges[1:]):
             if end - begin >= 8:
                 keep = slice(begin - FARTHEST, end + FARTHEST + 1)
-                stretches.append(
-                    EpisodeMotion(run.action[keep], run.motion[begin - FARTHEST : end + FARTHEST], run.state[keep])
-                )
+                motion = run.motion[begin - FARTHEST : end + FARTHEST]
+                stretches.append(EpisodeMotion(run.action[keep], motion, run.state[keep]))
     return stretches
 
 

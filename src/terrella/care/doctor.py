@@ -151,9 +151,8 @@ def _counts(folder: Survey, busy: bool) -> Iterator[Fault]:
         before = -1
         for number in folder.episodes:
             if number != before + 1:
-                lost = (
-                    f"episode {before + 1} is" if number == before + 2 else f"episodes {before + 1} to {number - 1} are"
-                )
+                one = number == before + 2
+                lost = f"episode {before + 1} is" if one else f"episodes {before + 1} to {number - 1} are"
                 yield Fault("meta/episodes", None, f"{lost} not listed", FROM_ROWS)
             before = number
         if count != len(folder.episodes):
@@ -175,9 +174,8 @@ def _counts(folder: Survey, busy: bool) -> Iterator[Fault]:
 
 
 def _duplicates(folder: Survey, rows: RowFacts, shown: FilmFacts) -> Iterator[Fault]:
-    observed = any(
-        name.startswith("observation.") and f["dtype"] not in ("video", "image") for name, f in folder.features.items()
-    )
+    plain = [name for name, feature in folder.features.items() if feature["dtype"] not in ("video", "image")]
+    observed = any(name.startswith("observation.") for name in plain)
     pictured = any(feature["dtype"] in ("video", "image") for feature in folder.features.values())
     numbers = {
         number: seen.digest.hexdigest()
@@ -226,6 +224,4 @@ def _interrupted(folder: Survey) -> Iterator[Fault]:
         return
     shown = "".join(f", {count} frames of {name}" for name, count in frames.items())
     what = f"an interrupted episode lies here that is not part of the recording: {rows} whole rows{shown}"
-    yield Fault(
-        _STAGING, None, what, f"record into the folder again, or use --repair; both keep its first {whole} rows"
-    )
+    yield Fault(_STAGING, None, what, f"record into the folder again, or use --repair: both keep {whole} rows")

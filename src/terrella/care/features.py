@@ -73,9 +73,7 @@ def mended_features(
         elif feature["dtype"] != "image" and name not in AUTOMATIC:
             kinds = list(dict.fromkeys(form.field(name).type for form in forms if name in form.names))
             if len(kinds) == 1 and (changed := _retyped(feature, kinds[0])) != feature:
-                notes.append(
-                    f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, which info.json now states"
-                )
+                notes.append(f"'{name}' is {changed['dtype']} {changed['shape']} in the rows, as info.json now states")
                 mended[name] = changed
     for name in AUTOMATIC:
         mended.setdefault(name, {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None})

@@ -74,9 +74,7 @@ def _film(
         end = begin + episode.length
         if begin < needed:
             what = f"episode {episode.number} begins at frame {begin}, which belongs to the episode before it"
-            yield Fault(
-                file, episode.start, what, "use --repair, which computes again where the episodes lie in the video"
-            )
+            yield Fault(file, episode.start, what, "use --repair, which finds the episodes in the video again")
         needed = max(needed, end)
         if end > count:
             what = f"the video has {count} frames, but episode {episode.number} needs {end}"

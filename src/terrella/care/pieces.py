@@ -14,11 +14,9 @@ import pyarrow as pa
 from ..core.errors import DatasetError
 from ..data.features import decode_picture
 from ..data.format import AUTOMATIC, to_numpy
-from ..data.storage.tables import BROKEN, damaged_table, open_parquet
+from ..data.storage.tables import BATCH_BYTES, BROKEN, TEXT_ROWS, damaged_table, open_parquet
 from .survey import Survey
 
-_BATCH = 64 << 20  # bytes of one batch of numbers
-_TEXTS = 16  # rows of texts or pictures in a batch; their length is not known before
 _LARGEST = 4 << 30  # most bytes of numbers that a row group may unpack to
 _REPEATED = 256 << 20  # the same of texts and pictures, which compress without limit
 _A_BYTE = 4  # unpacked bytes of texts and pictures allowed for each byte of a larger file
@@ -36,7 +34,7 @@ def read_batches(
     try:
         file = open_parquet(path)
         few = max(_REPEATED, _A_BYTE * path.stat().st_size)
-        step, most = (_TEXTS, few) if texts else (max(1, _BATCH // wide), _LARGEST)
+        step, most = (TEXT_ROWS, few) if texts else (max(1, BATCH_BYTES // wide), _LARGEST)
     except BROKEN as error:
         raise damaged_table(path, error) from error
     with file:
@@ -202,9 +200,7 @@ def _unmeasured(table: Table, rows: np.ndarray, number: int, notes: list[str]) -
     for name, missing in table.missing.items():
         here = missing[rows]
         if here.mean() > 0.5:
-            notes.append(
-                f"episode {number}: {name} is not finite in {int(here.sum())} of {len(rows)} rows, which are kept"
-            )
+            notes.append(f"episode {number}: {name} is not finite in {int(here.sum())} of {len(rows)} rows, which stay")
         else:
             bad |= here
     return bad

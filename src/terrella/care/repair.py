@@ -99,9 +99,8 @@ class _Mender:
         self._ask(pieces, [end - begin for piece in pieces for begin, end in true_runs(self.footage.shown(piece))])
         self.writer = Writer(self.out, self._layout())
         self.reader = RowReader(self.features)
-        self.stream_mender = StreamMender(
-            source, self.features, self.streams, fresh_folder(self.writer.staging), self.notes
-        )
+        staging = fresh_folder(self.writer.staging)
+        self.stream_mender = StreamMender(source, self.features, self.streams, staging, self.notes)
         try:
             for done, piece in enumerate(pieces, 1):
                 self._put(piece)
@@ -112,9 +111,7 @@ class _Mender:
             self._recover()
             self.writer.tidy(0)
             if not self.writer.episodes:
-                raise DatasetError(
-                    f"nothing of {source.root} could be kept: {'; '.join(self.notes) or 'it has no rows'}."
-                )
+                raise DatasetError(f"nothing of {source.root} can be kept: {'; '.join(self.notes) or 'no rows'}.")
         finally:
             self.writer.close()
             for folder in (self.writer.staging, self.out / _REBUILT, self.out / _INTERRUPTED):
@@ -211,9 +208,7 @@ class _Mender:
             self.why[piece.number] = message_of(error)
             return False
         for camera in anew:
-            what = (
-                f"the video of {camera} from frame {piece.frame} on is encoded again, because a copy cannot begin there"
-            )
+            what = f"the video of {camera} from frame {piece.frame} on is encoded again, not copied"
             self.notes.append(f"episode {piece.number}: {what}")
         self.kept.setdefault(piece.number, []).append((piece.frame, piece.frame + piece.count))
         return True

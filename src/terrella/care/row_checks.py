@@ -105,9 +105,7 @@ def _file(
                 facts.broken.add(file)
                 row = None if first is None else first + at
                 what = str(table).split(";")[0].removeprefix(f"the table {survey.path(file)} ")
-                yield Fault(
-                    file, row, f"{count} rows from row {at} of the file cannot be read: the table {what}", RESTORE
-                )
+                yield Fault(file, row, f"{count} rows from row {at} on are unreadable: the table {what}", RESTORE)
             else:
                 yield from _batch(survey, file, at, table, facts, sampled)
     except (DatasetError, OSError, pa.ArrowException, ValueError):
@@ -331,9 +329,7 @@ def constant_columns(survey: Survey, facts: RowFacts) -> tuple[list[Fault], list
             continue
         values = summary["min"].tolist()
         if len(still) == len(values):
-            what = (
-                f"the {name} is {values if len(values) <= 16 else values[:16]} in all {int(summary['count'][0])} rows"
-            )
+            what = f"the {name} is {values[:16]} in all {int(summary['count'][0])} rows"
             if name == ACTION:
                 faults.append(Fault("data", None, what, "check that actions are recorded, and record again"))
             else:

@@ -129,9 +129,7 @@ class StreamMender:
                         f"episode {number}: {int((~keep).sum())} readings of stream {name} were out of order and left out"
                     )
             except BROKEN as error:
-                self.notes.append(
-                    f"episode {number}: stream {name} cannot be read ({message_of(error)}) and is left out"
-                )
+                self.notes.append(f"episode {number}: stream {name} is left out ({message_of(error)})")
         return streams, films
 
     def _stream_film(self, name: str, sensor: Sensor, film: str, wanted: np.ndarray) -> np.ndarray:

@@ -261,9 +261,7 @@ def _fps(root: Path, info: Mapping, data: list[str], films: list[str], faults: l
             what, declared = f"{declared:g} frames a second are not possible", None
             raise ValueError(what)
     except BROKEN as error:
-        faults.append(
-            Fault(INFO, None, f"fps: {error}", "use --repair, which takes it from the timestamps of the rows")
-        )
+        faults.append(Fault(INFO, None, f"fps: {error}", "use --repair, which takes it from the timestamps"))
     rows, shown = _rate_of_rows(root, data), _rate_of_films(root, films)
     if declared is None:
         return whole_rate(rows or shown or 1.0)

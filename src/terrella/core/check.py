@@ -77,9 +77,7 @@ def _check_observation(world: World, seen: Observation, channels: Sequence[str],
         space, tensor = world.spec.channels[name], seen[name]
         _require(isinstance(tensor, torch.Tensor), f"channel '{name}' is not a tensor.")
         want = (batch, *shape_of(space))
-        _require(
-            tuple(tensor.shape) == want, f"channel '{name}' has shape {tuple(tensor.shape)}, its spec says {want}."
-        )
+        _require(tuple(tensor.shape) == want, f"channel '{name}' has shape {tuple(tensor.shape)}, not {want}.")
         rows = tensor.cpu().numpy()
         _require(rows.dtype == space.dtype, f"channel '{name}' is {rows.dtype}, its spec says {space.dtype}.")
         _require(all(space.contains(np.asarray(row)) for row in rows), f"channel '{name}' leaves its space {space}.")
@@ -96,9 +94,7 @@ def _spec_is_valid(world: World, seed: int, steps: int) -> None:
     for name, space in spec.channels.items():
         dtype, axes = _WELL_KNOWN.get(kind_of(name), (None, 0))
         fits = dtype is None or (dtype_of(space) == dtype and len(shape_of(space)) == axes)
-        _require(
-            fits, f"channel '{name}' must be {np.dtype(dtype)} with {axes} axes after the batch; its space is {space}."
-        )
+        _require(fits, f"channel '{name}' must be {np.dtype(dtype)} of {axes} axes, without the batch; it is {space}.")
     for what, names in (("observes", spec.observes), ("may_observe", spec.may_observe), ("units", spec.units)):
         strangers = sorted(set(names) - set(spec.channels))
         _require(not strangers, f"spec.{what} names {strangers}, which are not among spec.channels.")
@@ -227,9 +223,7 @@ def _observes(world: World, seed: int, steps: int) -> None:
         seen = _copy(world.render(state, names))
         for prior in (state, None):
             posterior = world.observe(seen, prior, rng)
-            _require(
-                isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the evidence's batch."
-            )
+            _require(isinstance(posterior, State) and posterior.batch == 1, "observe gives a State of the same batch.")
             _check_observation(world, world.render(posterior, channels), channels, 1)
             _require(_same(held, state), "observe must leave the prior that it was given unchanged.")
     if world.spec.observes:

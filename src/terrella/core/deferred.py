@@ -129,9 +129,7 @@ class Pick:
             return {name: self.sources[0][name][:0] for name in names}
         kinds = {name: {tuple(source[name].shape[1:]) for source in self.sources} for name in names}
         for name in (name for name in names if len(kinds[name]) > 1):
-            raise ContractError(
-                f"'{name}' has the shapes {sorted(kinds[name])} in these states; join those of one world."
-            )
+            raise ContractError(f"'{name}' has the shapes {sorted(kinds[name])} here; join states of one world.")
         return {name: torch.cat([source[name] for source in self.sources])[self.index] for name in names}
 
 

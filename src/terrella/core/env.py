@@ -44,9 +44,7 @@ class WorldEnv(VectorEnv):
         spec = world.spec
         most, max_steps = spec.max_batch, spec.max_episode_steps if max_steps is None else max_steps
         if num_envs < 1 or (most is not None and num_envs > most):
-            raise TerrellaError(
-                f"{spec.name} holds 1 to {most or 'any number of'} episodes at once; num_envs is {num_envs}."
-            )
+            raise TerrellaError(f"{spec.name} holds 1 to {most or 'any number of'} episodes; num_envs is {num_envs}.")
         max_steps = np.inf if max_steps is None else max_steps
         if not max_steps >= 1:
             raise TerrellaError(f"max_steps is a number of steps from 1 on, or math.inf for no end; got {max_steps}.")
@@ -91,9 +89,7 @@ class WorldEnv(VectorEnv):
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
         valid = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
         if not valid or not mask.any():
-            raise TerrellaError(
-                f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, one or more of them True."
-            )
+            raise TerrellaError(f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, not all False.")
         self._restart(None if mask.all() else self.state, mask)
         return self._observations(self._look()), {}
 
@@ -103,9 +99,7 @@ class WorldEnv(VectorEnv):
         state, actions = self.state, torch.as_tensor(np.asarray(actions))
         fresh = self._ended.copy()
         if fresh.any() and self.autoreset_mode == AutoresetMode.DISABLED:
-            raise TerrellaError(
-                f"environments {np.flatnonzero(fresh).tolist()} have ended: reset them with a reset_mask first."
-            )
+            raise TerrellaError(f"environments {np.flatnonzero(fresh).tolist()} have ended: reset them first.")
         self.world.spec.check_action(actions, self.num_envs)
         if not fresh.all():
             self._state = state = self.world.imagine(state, actions, self._rng)

@@ -272,9 +272,7 @@ def with_controls(
     if rests != spec.idle and own == default_keys(spec.action, spec.action_names, spec.idle):
         own = default_keys(spec.action, spec.action_names, rests)
     how = spec.card.get("how")
-    card = (
-        {**spec.card, "how": {**how, **({"keys": "as given"} if given else {})}} if isinstance(how, dict) else spec.card
-    )
+    card = {**spec.card, "how": {**how, **({"keys": "given"} if given else {})}} if isinstance(how, dict) else spec.card
     return replace(spec, keys=given or own, idle=rests, card=card)
 
 

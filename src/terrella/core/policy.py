@@ -40,9 +40,7 @@ def act(
     """`policy.act` with its contract checked: ContractError for a memory or an action of another batch."""
     held = _batch_of(memory)
     if held is not None and held != batch:
-        raise ContractError(
-            f"the policy's memory holds {held} episodes, not {batch}; call policy.begin({batch}, rng) first."
-        )
+        raise ContractError(f"the policy's memory holds {held} episodes, not {batch}; call begin({batch}, rng) first.")
     action, memory = policy.act(observation, memory, rng)
     action = torch.as_tensor(action)
     if tuple(action.shape) != (batch, *shape_of(spec.action)):
@@ -97,9 +95,7 @@ class Replay:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         step = int(memory[0]) if len(memory) else 0
         if step >= len(self.actions):
-            raise ContractError(
-                f"the {len(self.actions)} actions to replay are used up; give more, or take fewer steps."
-            )
+            raise ContractError(f"the {len(self.actions)} actions to replay are used up; give more, or step less.")
         return self.actions[step], memory + 1
 
 

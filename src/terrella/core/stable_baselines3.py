@@ -37,9 +37,8 @@ class WorldVecEnv(VecEnv):
         self._first = int(action.start) if isinstance(action, spaces.Discrete) else 0
         self._actions = np.zeros(0)
         shown = self.env.single_observation_space
-        seen = (
-            spaces.Dict({k: _space(v) for k, v in shown.items()}) if isinstance(shown, spaces.Dict) else _space(shown)
-        )
+        several = isinstance(shown, spaces.Dict)
+        seen = spaces.Dict({k: _space(v) for k, v in shown.items()}) if several else _space(shown)
         super().__init__(num_envs, seen, spaces.Discrete(action.n) if isinstance(action, spaces.Discrete) else action)
 
     def reset(self):
@@ -72,9 +71,7 @@ class WorldVecEnv(VecEnv):
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
-        raise TerrellaError(
-            f"{self.env.world.spec.name} has no '{method_name}': its episodes are one batch of a World."
-        )
+        raise TerrellaError(f"{self.env.world.spec.name} has no '{method_name}': its episodes are a batch of a World.")
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]

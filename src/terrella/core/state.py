@@ -187,9 +187,8 @@ class State(Mapping):
     def to(self, device) -> State:
         """The state on another device, with its rows in arenas there."""
         target = torch.device(device)
-        state = self.into(
-            {name: Arena(arena.parts, target) for name, arena in self._arenas.items() if arena.device != target}
-        )
+        away = {name: arena for name, arena in self._arenas.items() if arena.device != target}
+        state = self.into({name: Arena(arena.parts, target) for name, arena in away.items()})
         return State({name: tensor.to(target) for name, tensor in state.items()}, state.arenas)
 
     def narrowed(self, rows: torch.Tensor) -> State:
@@ -207,9 +206,8 @@ class State(Mapping):
         """Writes one safetensors file that includes the rows pointed at."""
         tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.items()}
         for name, arena in self._arenas.items():
-            rows, place = torch.unique(
-                torch.cat([tensors[name].new_zeros(1), tensors[name].flatten()]), return_inverse=True
-            )
+            with_zero = torch.cat([tensors[name].new_zeros(1), tensors[name].flatten()])
+            rows, place = torch.unique(with_zero, return_inverse=True)
             tensors[name] = place[1:].view(tensors[name].shape)
             for part in arena.parts:
                 tensors[f"{_ARENA}{name}:{part}"] = arena.read(part)[rows[1:].to(arena.device)].cpu()
@@ -249,9 +247,7 @@ class State(Mapping):
         for name in self._tensors:
             kinds = {tuple(state[name].shape[1:]) for state in states if name in state._tensors}
             if len(kinds) > 1:
-                raise ContractError(
-                    f"'{name}' has the shapes {sorted(kinds)} in these states; join those of one world."
-                )
+                raise ContractError(f"'{name}' has the shapes {sorted(kinds)} here; join states of one world.")
         late = {name for state in states if state.deferred is not None for name in state if name not in state._tensors}
         tensors = {name: combine(*(state[name] for state in states)) for name in self if name not in late}
         if not late:

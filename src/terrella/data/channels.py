@@ -69,14 +69,10 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
     for channel in channels:
         feature = POSE if channel == "pose" and "state" in channels else feature_of(channel)
         if not NAME.fullmatch(feature):
-            raise DatasetError(
-                f"the channel '{channel[:100]}' cannot name a file; use letters, digits, '.', '_' and '-'."
-            )
+            raise DatasetError(f"the channel '{channel[:100]}' is no file name; use letters, digits, '.', '_' and '-'.")
         for other, taken in features.items():
             if taken.lower() == feature.lower():
-                raise DatasetError(
-                    f"the channels '{other}' and '{channel}' would both be {feature}; rename one of them."
-                )
+                raise DatasetError(f"the channels '{other}' and '{channel}' would both be {feature}; rename one.")
         features[channel] = feature
     return features
 
@@ -171,9 +167,7 @@ def cameras_of(world: Mapping, size: Sequence[int] = (1, 1)) -> dict[str, Camera
             for channel, about in dict(world["cameras"]).items()
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(
-            f"the cameras in meta/terrella.json cannot be read ({error}); restore it from a copy."
-        ) from error
+        raise DatasetError(f"the cameras in meta/terrella.json are damaged ({error}); restore that file.") from error
 
 
 def _numbers(values: Any, count: int, kind: type = float) -> Any:

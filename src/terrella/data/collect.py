@@ -229,9 +229,7 @@ class LocalWorkers:
         pipe.close()
         self._deaths[number] += 1
         if self._deaths[number] == MOST_DEATHS:
-            return [
-                (number, f"episode {number} ended its worker {MOST_DEATHS} times (killed, crashed, or out of memory)")
-            ]
+            return [(number, f"episode {number} ended its worker {MOST_DEATHS} times (killed, crashed, out of memory)")]
         self._waiting.appendleft(number)
         self._launch()
         return []

@@ -133,9 +133,7 @@ class Dataset:
         episode, camera = self._episode(number), self._camera(camera)
         count = episode.length - first if count is None else count
         if not 0 <= first <= first + count <= episode.length:
-            raise DatasetError(
-                f"episode {number} of {self.root} has {episode.length} rows, not {first} to {first + count}."
-            )
+            raise DatasetError(f"episode {number} has {episode.length} rows, not {first} to {first + count}.")
         pictures = self._pictures(episode, camera)
         return (pictures[i] for i in range(first, first + count))
 

@@ -95,9 +95,7 @@ class Layout:
     def _feature(self, sensor: Sensor) -> dict:
         shape, names = list(sensor.shape), list(sensor.names) or None
         if not shape or min(shape) < 1:
-            why = (
-                "this world has nothing to drive" if sensor.name == "action" else "a row needs numbers of a fixed shape"
-            )
+            why = "this world has no actions" if sensor.name == "action" else "a row needs numbers of a fixed shape"
             raise DatasetError(f"{sensor.name} has shape {tuple(shape)}: {why}.")
         if sensor.kind == "points":
             raise DatasetError(f"{sensor.name} has any number of points, which no row can hold: keep it as a stream.")
@@ -188,9 +186,7 @@ def checked_name(path: str) -> str:
     """A relative path that stays in its folder; else DatasetError."""
     parts = path.replace("\\", "/").split("/")
     if not path or path.startswith(("/", "~")) or ".." in parts or "\0" in path or ":" in parts[0] or len(path) > 1000:
-        raise DatasetError(
-            f"the path {path[:200]!r} leads out of the dataset; a recording names only files of its own."
-        )
+        raise DatasetError(f"the path {path[:200]!r} leads out of the dataset; name files within it.")
     return path
 
 
@@ -204,9 +200,7 @@ def path_inside(root: Path, name: str) -> Path:
     parts = Path(home).parts
     blobs = [Path(*parts[:at], "blobs") for at, part in enumerate(parts) if part == "snapshots"]
     if not any(real.startswith(f"{folder}{os.sep}".replace("//", "/")) for folder in (home, *blobs)) and real != home:
-        raise DatasetError(
-            f"{path} is a link that leads out of the dataset, to {real}; put the file itself there to read it."
-        )
+        raise DatasetError(f"{path} is a link that leads out of the dataset, to {real}; put the file itself there.")
     return path
 
 

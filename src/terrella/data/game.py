@@ -28,9 +28,7 @@ def check_game(dataset: Dataset, spec: Spec) -> str:
         why = "holds no actions"
     elif len(dataset.action_names) != int(np.prod(shape_of(spec.action))):
         why = f"has the actions {', '.join(dataset.action_names)}, which are not those of {spec.name} ({ours})"
-    elif any(
-        np.shape(about[name]) != np.shape(mine[name]) or not np.allclose(about[name], mine[name]) for name in limits
-    ):
+    elif any(not _close(about[name], mine[name]) for name in limits):
         why = f"has actions in {theirs}, which are not those of {spec.name} ({ours})"
     elif named and spec.action_names and (learned is None or game != learned) and named.isdisjoint(spec.action_names):
         why = f"has the actions {', '.join(sorted(named))}, which are not those of {spec.name} ({', '.join(spec.action_names)})"
@@ -38,6 +36,9 @@ def check_game(dataset: Dataset, spec: Spec) -> str:
         why = f"holds no pictures, which {spec.name} observes"
     if why:
         raise DatasetError(f"{dataset.root} {why}: score and train a world on recordings of its own game.")
-    return (
-        f"{dataset.root} is of {game}; {spec.name} learned {learned}." if game and learned and game != learned else ""
-    )
+    differs = game and learned and game != learned
+    return f"{dataset.root} is of {game}; {spec.name} learned {learned}." if differs else ""
+
+
+def _close(a: Any, b: Any) -> bool:
+    return np.shape(a) == np.shape(b) and np.allclose(a, b)

@@ -138,9 +138,8 @@ class EpisodeTable(Sequence[Episode]):
         self._table, self._cameras, self._fps = table, tuple(cameras), fps
         self._data_path, self._video_path = data_path, video_path
         self.starts, self.stops = (_whole(table, f"dataset_{end}_index") for end in ("from", "to"))
-        self._at = {
-            name: _whole(table, name) for name in table.column_names if name.endswith(("/chunk_index", "/file_index"))
-        }
+        numbers = [name for name in table.column_names if name.endswith(("/chunk_index", "/file_index"))]
+        self._at = {name: _whole(table, name) for name in numbers}
         self._from = {name: table[f"videos/{name}/from_timestamp"].to_numpy() for name in cameras}
         for seconds in self._from.values():
             if not np.isfinite(seconds).all() or (seconds < 0).any():

@@ -85,9 +85,7 @@ class RayWorkers:
             self._ray.kill(ready[one])
             self._actors.remove(ready[one])
         if late:
-            warnings.warn(
-                f"{len(late)} of {self.size} workers found no free processor; the others go on.", stacklevel=2
-            )
+            warnings.warn(f"{len(late)} of {self.size} workers found no free processor; others start.", stacklevel=2)
         self.size = len(self._actors)
 
     def ask(self, number: int) -> None:
@@ -104,9 +102,7 @@ class RayWorkers:
             return [(number, self._ray.get(done))]
         except self._ray.exceptions.RayError as error:
             first = (str(error).strip() or type(error).__name__).splitlines()[0]
-            return [
-                (number, f"episode {number} ended its worker {MOST_DEATHS} times, or cannot be played on Ray ({first})")
-            ]
+            return [(number, f"episode {number} ended its worker {MOST_DEATHS} times, or fails on Ray ({first})")]
 
     def close(self) -> None:
         actors = getattr(self, "_actors", [])

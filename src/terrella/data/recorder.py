@@ -111,9 +111,7 @@ class Recorder:
         row = {self.layout.channels.get(name) or feature_of(name): value for name, value in observation.items()}
         unknown = sorted(name for name in row if name not in self.layout.sensors)
         if unknown:
-            raise DatasetError(
-                f"this recording has no place for '{unknown[0]}'; it holds {', '.join(self.layout.sensors)}."
-            )
+            raise DatasetError(f"no place for '{unknown[0]}': this recording holds {', '.join(self.layout.sensors)}.")
         if action is not None:
             row[ACTION] = np.asarray(action, np.float32).reshape(-1)
             row[REWARD] = np.array([reward], np.float32)
@@ -251,9 +249,7 @@ class Recorder:
         if self._journal is None and self.in_flight:
             raise DatasetError(f"an episode of {self.in_flight} rows waits to be committed; end it first.")
         if self._torn:
-            raise DatasetError(
-                f"a row was interrupted; end the episode, which keeps the {self.in_flight} rows before it."
-            )
+            raise DatasetError(f"a row was interrupted; end the episode, which keeps {self.in_flight} rows.")
 
     def _checked(self, row: Mapping[str, np.ndarray | None], time_s: float) -> dict[str, np.ndarray]:
         """Copies of the values of a row, as they are stored."""
@@ -303,15 +299,12 @@ class Recorder:
                 if sensor.kind == "image":
                     self._pictures[name] = []
                 if self._is_video(sensor):
-                    self._videos[name] = Mp4Writer(
-                        growing_film(folder, name), even_size(sensor), layout.fps, self.pressure
-                    )
+                    film = growing_film(folder, name)
+                    self._videos[name] = Mp4Writer(film, even_size(sensor), layout.fps, self.pressure)
             for name, sensor in layout.streams.items():
                 if sensor.kind == "image":
-                    rate = sensor.rate_hz or layout.fps
-                    self._films[name] = Mp4Writer(
-                        growing_film(folder, f"stream-{name}"), even_size(sensor), rate, self.pressure
-                    )
+                    film, rate = growing_film(folder, f"stream-{name}"), sensor.rate_hz or layout.fps
+                    self._films[name] = Mp4Writer(film, even_size(sensor), rate, self.pressure)
             videos = [*self._videos.values(), *self._films.values()]
             self._running += [self._journal.close, *(video.abandon for video in videos)]
         return self._journal

@@ -24,9 +24,7 @@ class RecordOptions:
     """How `record` records."""
 
     fps: float | None = None  # rows a second that the recording states; None takes one over the world's step
-    max_episode_steps: int | None = (
-        None  # steps after which an episode is cut off; None takes the world's own limit, or LONGEST
-    )
+    max_episode_steps: int | None = None  # steps of an episode; None takes the world's limit, or LONGEST
     task: str | None = None  # the instruction of every episode; None makes one of the world's name
     pictures: Literal["video", "png"] = "video"  # how pictures are stored
     live: Watch | None = None  # a viewer that is sent every row while it is recorded

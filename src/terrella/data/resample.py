@@ -13,9 +13,7 @@ from .source import Lazy, Readings, Sensor, Take
 
 Policy = Literal["previous", "nearest", "linear"]
 
-SAME_TIME_S = (
-    1e-4  # times closer than this are equal: many formats store them as float32 (LeRobot has the same tolerance)
-)
+SAME_TIME_S = 1e-4  # closer times are equal: many formats store float32 (LeRobot has the same tolerance)
 _MOST_ROWS = 20_000_000
 _QUATERNION = re.compile(r"(|.*[^a-z])q(?:uat|uaternion)?[_.]?([wxyz])", re.IGNORECASE)
 

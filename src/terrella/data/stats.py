@@ -56,9 +56,7 @@ def _merge_two(a: Summary, b: Summary) -> Summary:
 
 def to_json(stats: Mapping[str, Summary]) -> dict:
     """Plain lists, as meta/stats.json and the stats columns of meta/episodes hold them; JSON knows no infinity."""
-    return {
-        name: {key: np.nan_to_num(value).tolist() for key, value in summary.items()} for name, summary in stats.items()
-    }
+    return {name: {key: np.nan_to_num(value).tolist() for key, value in each.items()} for name, each in stats.items()}
 
 
 def from_json(stated: Mapping) -> dict[str, Summary]:

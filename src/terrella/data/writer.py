@@ -46,9 +46,7 @@ from .source import Sensor
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
 _CHECKED = {"compression": "zstd", "write_page_checksum": True}  # a flipped bit is then an error
-EPISODES_PER_TABLE = (
-    128  # one-row tables of meta/episodes that are merged into one, so that a long dataset opens quickly
-)
+EPISODES_PER_TABLE = 128  # one-row tables of meta/episodes merged into one: a long dataset then opens quickly
 
 
 @dataclass(frozen=True)
@@ -86,9 +84,7 @@ class Writer:
         self.staging = self.root / ".staging"
         for sensor in [*layout.sensors.values(), *layout.streams.values()]:
             if not NAME.fullmatch(sensor.name):
-                raise DatasetError(
-                    f"'{sensor.name[:100]}' is not a valid feature name; use letters, digits, '.', '_' and '-'."
-                )
+                raise DatasetError(f"'{sensor.name[:100]}' is no feature name; use letters, digits, '.', '_' and '-'.")
         for sensor in layout.streams.values():
             if sensor.kind == "image":
                 even_size(sensor)
@@ -139,12 +135,9 @@ class Writer:
         Looks at the newest episodes, or at all from number `first` on.
         """
         newest = max(0, self.episodes // EPISODES_PER_TABLE - 1) * EPISODES_PER_TABLE
-        with suppress(
-            OSError, pa.ArrowException, ValueError, KeyError
-        ):  # many small tables are slower to read, but valid
-            for begin in range(
-                newest if first is None else first, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE
-            ):
+        with suppress(OSError, pa.ArrowException, ValueError, KeyError):  # many small tables are valid, too
+            oldest = newest if first is None else first
+            for begin in range(oldest, self.episodes - EPISODES_PER_TABLE + 1, EPISODES_PER_TABLE):
                 files = [self.root / EPISODES_PATH.format(**file_numbers(begin + i)) for i in range(EPISODES_PER_TABLE)]
                 if files[-1].exists():  # the last one that a merge removes
                     _merge_tables([file for file in files if file.exists()], file_numbers(begin))
@@ -175,9 +168,7 @@ class Writer:
         else:
             strangers = [entry.name for entry in self.root.iterdir() if not entry.name.startswith(".")]
             if strangers not in ([], ["meta"]):
-                raise DatasetError(
-                    f"{self.root} holds other files ({strangers[0]}, ...); record to a new or empty folder."
-                )
+                raise DatasetError(f"{self.root} holds other files ({strangers[0]}, ...); record to an empty folder.")
         self.remove_unfinished()
         self.tidy(first=0)
         if not info.exists():

@@ -94,9 +94,7 @@ def _encode(path: Path, first: int, count: int, fps: float, target: Path) -> Non
             if writer is None:
                 height, width = frame.shape[:2]
                 if height % 2 or width % 2:
-                    raise DatasetError(
-                        f"{path} must be encoded again, but H.264 cannot hold its {height}x{width} pixels."
-                    )
+                    raise DatasetError(f"{path} must be encoded again, which H.264 cannot for {height}x{width} pixels.")
                 writer = Mp4Writer(growing, (height, width), fps)
             writer.add(frame)
         if writer:

@@ -104,9 +104,7 @@ class Files:
         try:
             (self._cache / ".coming").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DatasetError(
-                f"files of {root} cannot be kept in {self._cache} ({error}); name another cache_dir."
-            ) from error
+            raise DatasetError(f"{self._cache} cannot be written ({error}); name another cache_dir.") from error
 
     def __fspath__(self) -> str:
         return self.root
@@ -122,10 +120,8 @@ class Files:
 
     def list(self, folder: str, suffix: str = "") -> list[str]:
         """Sorted names, relative to the root, of the files anywhere under `folder` ("" for all) that end in `suffix`."""
-        where, depth = (
-            f"{self._base}/{checked_name(folder)}" if folder else self._base,
-            len(self._base.strip("/").split("/")),
-        )
+        where = f"{self._base}/{checked_name(folder)}" if folder else self._base
+        depth = len(self._base.strip("/").split("/"))
         try:
             entries = self._ask(f"list {folder}", lambda alive: self._system.find(where, detail=True))
         except FileNotFoundError:
@@ -142,9 +138,7 @@ class Files:
         """The path of a local copy, fetched if there is none. Use it within `holding`, or it may be evicted."""
         facts = self._facts(name)
         if facts is None:
-            raise DatasetError(
-                f"there is no {name} at {self.root}; the recording is not whole, or the address is wrong."
-            )
+            raise DatasetError(f"there is no {name} at {self.root}; it is incomplete, or the address is wrong.")
         size, tag = facts
         mark = hashlib.sha256(f"{self.root}\n{name}\n{size}\n{tag}".encode()).hexdigest()[:24]
         path = self._cache / f"{mark}-{name.rsplit('/', 1)[-1]}"
@@ -189,9 +183,8 @@ class Files:
         folder, _, last = checked_name(name).rpartition("/")
         if folder not in self._listed:
             try:
-                entries = self._ask(
-                    f"list {folder}", lambda alive: self._system.ls(f"{self._base}/{folder}", detail=True)
-                )
+                where = f"{self._base}/{folder}"
+                entries = self._ask(f"list {folder}", lambda alive: self._system.ls(where, detail=True))
             except (FileNotFoundError, NotADirectoryError):
                 entries = []
             files = (about for about in entries if about["type"] == "file")
@@ -245,9 +238,7 @@ class Files:
     def _room(self, name: str, size: int) -> Iterator[Path]:
         """A folder for a file to be fetched; its `size` bytes are reserved until the context ends."""
         if size > self.budget_bytes:
-            raise DatasetError(
-                f"{name} of {self.root} has {size:,} bytes and {self.budget_bytes:,} may be kept here; allow more."
-            )
+            raise DatasetError(f"{name} of {self.root} has {size:,} bytes, and only {self.budget_bytes:,} fit here.")
         deadline = time.monotonic() + self._timeout_s
         while (claim := self._claimed(size)) is None:
             if time.monotonic() > deadline:
@@ -277,9 +268,8 @@ class Files:
         """Bytes in use, after files used longest ago were removed to make room for `size`."""
         # Reservations are counted before files: a file that arrives in between counts twice, never not at all.
         # A reservation without a lock is of a process that was killed.
-        coming = [
-            entry for entry in os.scandir(self._cache / ".coming") if not _let_go(Path(entry.path), shutil.rmtree)
-        ]
+        coming = os.scandir(self._cache / ".coming")
+        coming = [entry for entry in coming if not _let_go(Path(entry.path), shutil.rmtree)]
         files = []
         for entry in os.scandir(self._cache):
             if not entry.name.startswith("."):
@@ -308,9 +298,7 @@ def _file_system(root: str) -> tuple[Any, str, Any]:
         need = f"pip install {_PACKAGES[scheme]}" if scheme in _PACKAGES else "install it"
         raise DatasetError(f"reading {scheme}:// needs a package that is missing ({error}): {need}.") from error
     except ValueError as error:
-        raise DatasetError(
-            f"{root} is no address that can be read ({error}); it begins with hf://, s3:// or file://."
-        ) from error
+        raise DatasetError(f"{root} is not a valid address ({error}); begin with hf://, s3:// or file://.") from error
     except Exception as error:  # every file system has errors of its own
         raise DatasetError(f"{root} cannot be opened ({error}); check the address and your credentials.") from error
 
@@ -318,9 +306,7 @@ def _file_system(root: str) -> tuple[Any, str, Any]:
 def _size_and_mark(root: str, about: dict) -> tuple[int, str]:
     """The size in bytes of a listed file, and a mark that changes when its content does."""
     if not isinstance(about.get("size"), int):
-        raise DatasetError(
-            f"{root} does not state the size of {about.get('name')}; copy the recording to this machine."
-        )
+        raise DatasetError(f"{root} does not state the size of {about.get('name')}; copy it to this machine.")
     for key in ("ETag", "etag", "blob_id", "md5Hash", "LastModified", "last_modified", "mtime", "created"):
         if about.get(key):
             return about["size"], str(about[key])

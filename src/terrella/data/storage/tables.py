@@ -23,8 +23,8 @@ from ..format import to_numpy
 from ..source import Lazy
 
 BROKEN = (OSError, pa.ArrowException, ValueError, KeyError, TypeError, OverflowError, RuntimeError)
-_BATCH = 64 << 20  # most bytes of one batch of numbers
-_TEXTS = 16  # rows of texts or pictures in a batch; their length is not known before
+BATCH_BYTES = 64 << 20  # most bytes of one batch of numbers
+TEXT_ROWS = 16  # rows of texts or pictures in a batch; their length is not known before
 _TABLE = 64  # the same for tables with short rows
 _SLACK = 64 << 20  # bytes that any read may unpack to
 _LONG = 64 << 10  # further bytes for each row with texts: compressed, a text can repeat without end
@@ -59,9 +59,7 @@ def read_rows(
             inside = (index >= start) & (index < stop)
             table = table.filter(pa.array(inside))
             if inside.sum() != stop - start or not np.array_equal(index[inside], np.arange(start, stop)):
-                raise ValueError(
-                    f"it has {int(inside.sum())} of the {stop - start} rows from {start} on, or they are moved"
-                )
+                raise ValueError(f"it has {int(inside.sum())} of {stop - start} rows from {start} on, or they moved")
         return {name: table[name] for name in columns}
     except BROKEN as error:
         raise damaged_table(path, error) from error
@@ -101,7 +99,7 @@ def _features(file: pq.ParquetFile, groups: Sequence[int], columns: list[str], f
         dtype, shape = (features[name]["dtype"], features[name]["shape"]) if name in features else ("int64", [1])
         texts |= dtype in ("image", "string")
         wide += _LONG + 2 * math.prod(shape) if dtype in ("image", "string") else 16 * math.prod(shape)
-    return _bounded(file, groups, columns, _TEXTS if texts else max(1, _BATCH // wide), wide)
+    return _bounded(file, groups, columns, TEXT_ROWS if texts else max(1, BATCH_BYTES // wide), wide)
 
 
 def _table_step(file: pq.ParquetFile, columns: list[str] | None) -> int:
@@ -169,7 +167,7 @@ class ValuesOf(Lazy):
             raise damaged_table(self._path, error) from error
 
     def _read(self, file: pq.ParquetFile, group: int) -> Any:
-        return _bounded(file, [group], [self._column], _TEXTS, _WIDEST)[self._column]
+        return _bounded(file, [group], [self._column], TEXT_ROWS, _WIDEST)[self._column]
 
     def _value(self, row: int) -> Any:
         assert self._group is not None

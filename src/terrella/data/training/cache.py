@@ -68,9 +68,7 @@ class ClipCache:
             if short:
                 raise ValueError(f"{short[0]} has {len(self.arrays[short[0]])} of {self.length} rows")
         except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-            raise DatasetError(
-                f"the cache {path} is damaged ({error}); delete that folder, and it is built again."
-            ) from error
+            raise DatasetError(f"the cache {path} is damaged ({error}); delete it, and it is built again.") from error
         for name in _TYPES:
             setattr(self, name, self.arrays.get(name))
 

@@ -39,24 +39,18 @@ class ClipsConfig:
     seed: int = 0  # seed of the order, which (seed, epoch) alone decide
     shuffle: bool = True  # whether to shuffle the clips of an epoch
     drop_last: bool = True  # whether to leave out the clips of an epoch that do not fill a batch
-    workers: int = (
-        0  # threads that copy batches ahead, from one memory-mapped cache; their number does not change the order
-    )
+    workers: int = 0  # threads that copy batches ahead; their number does not change the order
     rank: int = 0  # this process, of `world_size` that share each epoch
     world_size: int = 1  # processes that share each epoch
     torch: bool = False  # whether batches hold torch tensors instead of numpy arrays, over the same memory
     budget_bytes: int = 8 << 30
     """For a URL, bytes that may be kept on this machine: half for files on the disk, a quarter for each of two windows in
     memory (one is read while the next is fetched). Windows come in shuffled order; clips are shuffled within a window."""
-    cache_dir: str | Path | None = (
-        None  # for a URL, the folder for its files; None takes one under $XDG_CACHE_HOME/terrella
-    )
+    cache_dir: str | Path | None = None  # for a URL, the folder for its files; None is under $XDG_CACHE_HOME
 
     def __post_init__(self):
         if isinstance(self.channels, str) or not self.channels:
-            raise DatasetError(
-                f"channels={self.channels!r} must be names in a sequence, ('rgb', 'action') for example."
-            )
+            raise DatasetError(f"channels={self.channels!r} must be a sequence of names, such as ('rgb', 'action').")
         if self.workers < 0:
             raise DatasetError(f"workers={self.workers} is negative; 0 copies each batch when it is asked for.")
 

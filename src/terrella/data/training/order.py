@@ -87,9 +87,7 @@ class ClipOrder:
             if getattr(self, name) < 1:
                 raise DatasetError(f"{name}={getattr(self, name)} makes no clips; it must be at least 1.")
         if not 0 <= self.rank < self.world_size:
-            raise DatasetError(
-                f"rank={self.rank} must be from 0 to {self.world_size - 1}, for world_size={self.world_size}."
-            )
+            raise DatasetError(f"rank={self.rank} must be from 0 to world_size - 1 = {self.world_size - 1}.")
         if self.seed < 0:
             raise DatasetError(f"seed={self.seed} is negative; give 0 or more.")
 
