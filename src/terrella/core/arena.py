@@ -100,7 +100,7 @@ class Arena:
         if other is self:
             return pointer
         if not self.same_layout(other):
-            raise ContractError(f"the state's memory has the layout {other.parts}, not the world's {self.parts}.")
+            raise ContractError(f"the state's memory has another layout, {other.parts}, than the world's {self.parts}.")
         rows, where = torch.unique(pointer, return_inverse=True)
         rows, where = (rows[1:], where) if len(rows) and rows[0] == 0 else (rows, where + 1)
         new = self.keep({name: other.read(name)[rows].to(self.device) for name in self.parts})
