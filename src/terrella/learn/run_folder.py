@@ -21,10 +21,7 @@ def resume_file(folder: Path, stage: str) -> Path:
 
 
 def save_run(
-    path: Path,
-    modules: Mapping[str, torch.nn.Module],
-    optimisers: Mapping[str, torch.optim.Optimizer],
-    facts: dict,
+    path: Path, modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, torch.optim.Optimizer], facts: dict
 ) -> None:
     """Modules, optimisers and `facts` (JSON) in one file; a kill while saving leaves the last save in place."""
     tensors = {f"{name}/{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
@@ -42,9 +39,7 @@ def save_run(
 
 
 def load_run(
-    path: Path,
-    modules: Mapping[str, torch.nn.Module],
-    optimisers: Mapping[str, torch.optim.Optimizer],
+    path: Path, modules: Mapping[str, torch.nn.Module], optimisers: Mapping[str, torch.optim.Optimizer]
 ) -> dict | None:
     """Restores what `save_run` wrote and returns its facts; None if there is no such file yet."""
     if not path.exists():

@@ -158,12 +158,7 @@ class Run:
 
     @staticmethod
     def of(
-        out: str | Path,
-        config: Any,
-        report: Report,
-        device: torch.device = CPU,
-        free: Sequence[str] = (),
-        **facts: Any,
+        out: str | Path, config: Any, report: Report, device: torch.device = CPU, free: Sequence[str] = (), **facts: Any
     ) -> Run:
         """The run of `config`, a dataclass. A resumed run must have the same settings and `facts`; the device, how often is saved
         and the settings in `free` may change. The stages share the `hours` of the settings, if they have any."""

@@ -23,12 +23,10 @@ QUANTILES, RANGE_DECAY = (0.05, 0.95), 0.99  # between which the range of return
 class ReturnConfig:
     """How returns are computed."""
 
-    # Discount factor, gamma.
-    discount: float = 0.99
+    discount: float = 0.99  # Discount factor, gamma.
     # Lambda, from 0 (one-step bootstrapping) to 1 (the return of the whole rollout).
     td_lambda: float = 0.95
-    # Coefficient of the entropy bonus, in ranges of returns per nat.
-    entropy: float = 3e-4
+    entropy: float = 3e-4  # Coefficient of the entropy bonus, in ranges of returns per nat.
     # Bootstrap from the lowest value in the batch wherever a rollout is no longer trusted, so that the policy stays where the
     # world is accurate (after MOReL, Kidambi et al. 2020).
     cautious: bool = False
@@ -116,10 +114,7 @@ class ActorCritic:
         self.slow, self.range = Ema(critic, SLOW_DECAY), Range()
         self.modules = {"actor": actor, "critic": critic, "slow": self.slow, "range": self.range, **more}
         rate = warmup_cosine(learning_rate, 100, 0.1)
-        self.learners = {
-            "actor": adamw((actor,), rate),
-            "critic": adamw((critic,), rate, average=self.slow),
-        }
+        self.learners = {"actor": adamw((actor,), rate), "critic": adamw((critic,), rate, average=self.slow)}
 
     def losses(self, batch: ImaginedRollouts, now: TrainStep) -> Iterator[Loss]:
         flat = {name: value.flatten(0, 1) for name, value in batch.observations.items()}

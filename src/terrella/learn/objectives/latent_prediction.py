@@ -98,13 +98,8 @@ class LatentPrediction:
             parts["leap"] = self._leap_error(latents, batch, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
         parts |= self._head_losses(real, torch.stack(windows, 1), torch.stack(predicted, 1), latents, batch)
-        weights = {
-            "sigreg": SIGREG,
-            "numbers": NUMBERS_WEIGHT,
-            "reward": OUTCOME_WEIGHT,
-            "done": OUTCOME_WEIGHT,
-            "inverse": INVERSE_WEIGHT,
-        }
+        weights = {"sigreg": SIGREG, "numbers": NUMBERS_WEIGHT, "inverse": INVERSE_WEIGHT}
+        weights |= {"reward": OUTCOME_WEIGHT, "done": OUTCOME_WEIGHT}
         terms = (weights.get(name, 1.0) * part for name, part in parts.items())
         yield Loss("latent", sum(terms, error.new_zeros(())), parts)
         if batch.rgb is not None:

@@ -31,20 +31,13 @@ TEST_STEPS = (1, 5, 25)  # to goals in held-out episodes
 class GoalTraining:
     """Settings of a goal-conditioned policy."""
 
-    # Steps to a goal at most.
-    farthest: int = 50
-    # Width of the networks' layers.
-    hidden: int = 256
-    # Training steps.
-    steps: int = 4000
-    # Samples per step.
-    batch: int = 512
-    # Peak learning rate.
-    learning_rate: float = 1e-3
-    # Seconds between saves.
-    save_every_s: float = 60.0
-    # Random seed.
-    seed: int = 0
+    farthest: int = 50  # Steps to a goal at most.
+    hidden: int = 256  # Width of the networks' layers.
+    steps: int = 4000  # Training steps.
+    batch: int = 512  # Samples per step.
+    learning_rate: float = 1e-3  # Peak learning rate.
+    save_every_s: float = 60.0  # Seconds between saves.
+    seed: int = 0  # Random seed.
 
 
 def train_goals(

@@ -34,19 +34,9 @@ WIDEST = 512  # numbers of a channel at most, to be treated as a vector
 LATENT_WIDEST = 64  # numbers of all vectors at most, to be the latent themselves
 STARTS = 64
 LEAP = 5  # steps at once, by default
-NOT_NUMBERS = (
-    "rgb",
-    "depth",
-    "reward",
-    "done",
-    "uncertainty",
-    "known",
-    "keyframes",
-    "mosaic",
-    "instruction",
-    "latent",
-    "done_probability",
-)
+NO_VECTORS = frozenset(
+    "rgb depth reward done done_probability uncertainty known keyframes mosaic instruction latent".split()
+)  # kinds of channels that are not learned as vectors
 WHY = "a latent world is learned from actions and observations (`terrella train latent-actions` finds actions in pictures)"
 
 
@@ -54,8 +44,7 @@ WHY = "a latent world is learned from actions and observations (`terrella train 
 class LatentTraining:
     """Settings of a training run."""
 
-    # Name of the world.
-    name: str = "latent"
+    name: str = "latent"  # Name of the world.
     # Observe the recording's pictures. --no-pictures observes its state vectors alone, and renders nothing.
     pictures: bool = True
     # Observe the recording's state vectors. --no-vectors observes its pictures alone, and still predicts the vectors.
@@ -69,8 +58,7 @@ class LatentTraining:
     latent: int | None = None
     # Past latents and actions that the predictor sees. 1 is enough, and fast, where the vectors contain velocities.
     history: int = 3
-    # Width of the hidden layers.
-    hidden: int = 192
+    hidden: int = 192  # Width of the hidden layers.
     # Predictors in the ensemble, whose disagreement is the uncertainty; with 1 there is none.
     members: int = 3
     # Horizon in steps of the training rollouts. Default: 12, and with pictures 6; fewer where episodes are short.
@@ -80,20 +68,14 @@ class LatentTraining:
     leap: int | None = None
     # Training steps. Training ends after these or after `hours`, whichever comes first. Default: 4000, and with pictures 2500.
     steps: int | None = None
-    # Hours of training, earlier runs included.
-    hours: float = 24.0
+    hours: float = 24.0  # Hours of training, earlier runs included.
     # Clips per step. Default: 128, and with pictures 32.
     batch: int | None = None
-    # Peak learning rate.
-    learning_rate: float = 1e-3
-    # Seconds between saves.
-    save_every_s: float = 60.0
-    # Seconds between pictures of truth and prediction.
-    strip_every_s: float = 300.0
-    # Random seed.
-    seed: int = 0
-    # cpu, cuda or auto.
-    device: str = "auto"
+    learning_rate: float = 1e-3  # Peak learning rate.
+    save_every_s: float = 60.0  # Seconds between saves.
+    strip_every_s: float = 300.0  # Seconds between pictures of truth and prediction.
+    seed: int = 0  # Random seed.
+    device: str = "auto"  # cpu, cuda or auto.
 
 
 def train_latent(data: str | Path, out: str | Path, config: LatentTraining, report: Report) -> dict:
@@ -142,7 +124,7 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
         array = cache.arrays.get(key)
         if (
             array is None
-            or kind_of(channel) in NOT_NUMBERS
+            or kind_of(channel) in NO_VECTORS
             or key in ("action", "action_valid", "task")
             or array.ndim > 2
         ):

@@ -26,26 +26,17 @@ WHY = "latent actions are learned from pictures"
 class LatentActionsConfig:
     """Settings of a training run."""
 
-    # Number of actions to learn.
-    codes: int = 8
+    codes: int = 8  # Number of actions to learn.
     # Rows between the two frames of a pair. Choose it so that the motion is a pixel or more, but no longer than a key is pressed.
     stride: int = 2
-    # Height and width in pixels at which frames are compared.
-    size: tuple[int, int] = (48, 64)
-    # Training steps.
-    steps: int = 1800
-    # Pairs of frames per step.
-    batch: int = 16
-    # Peak learning rate.
-    learning_rate: float = 2e-3
-    # Seconds between saves.
-    save_every_s: float = 60.0
-    # Seconds between pictures of the effect of each code.
-    strip_every_s: float = 120.0
-    # Random seed.
-    seed: int = 0
-    # cpu, cuda or auto.
-    device: str = "auto"
+    size: tuple[int, int] = (48, 64)  # Height and width in pixels at which frames are compared.
+    steps: int = 1800  # Training steps.
+    batch: int = 16  # Pairs of frames per step.
+    learning_rate: float = 2e-3  # Peak learning rate.
+    save_every_s: float = 60.0  # Seconds between saves.
+    strip_every_s: float = 120.0  # Seconds between pictures of the effect of each code.
+    seed: int = 0  # Random seed.
+    device: str = "auto"  # cpu, cuda or auto.
 
 
 def train_latent_actions(data: str | Path, out: str | Path, config: LatentActionsConfig, report: Report) -> dict:

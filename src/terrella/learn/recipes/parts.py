@@ -33,16 +33,11 @@ class EstimatorTraining:
 
     # Height and width of the pictures. The estimator works at half of it.
     size: tuple[int, int] = (96, 128)
-    # Training steps.
-    steps: int = 2500
-    # Pictures per step.
-    batch: int = 16
-    # Peak learning rate.
-    learning_rate: float = 3e-3
-    # A box x0 y0 x1 y1 of the map in metres that training never sees.
-    keep_out: Box | None = None
-    # Random seed.
-    seed: int = 0
+    steps: int = 2500  # Training steps.
+    batch: int = 16  # Pictures per step.
+    learning_rate: float = 3e-3  # Peak learning rate.
+    keep_out: Box | None = None  # A box x0 y0 x1 y1 of the map in metres that training never sees.
+    seed: int = 0  # Random seed.
 
 
 def train_estimator(data: str | Path, out: str | Path, config: EstimatorTraining, report: Report) -> dict:
@@ -67,8 +62,7 @@ class SensesConfig:
     estimator_steps: int = 2500
     # Predicted frames from which the uncertainty is learned. 0 keeps the one that the world has, if any.
     uncertainty_frames: int = 9000
-    # Random seed.
-    seed: int = 0
+    seed: int = 0  # Random seed.
 
 
 def train_uncertainty(
@@ -116,10 +110,8 @@ def learn_senses(
 class ObjectsTraining:
     """Settings of the training of a world's objects."""
 
-    # Training steps.
-    steps: int = 2500
-    # Random seed.
-    seed: int = 0
+    steps: int = 2500  # Training steps.
+    seed: int = 0  # Random seed.
 
 
 def train_objects(

@@ -41,8 +41,7 @@ class Practice:
     sees: tuple[str, ...] = ()
     # Minutes of training, earlier runs included. Default: 5, unless --steps is given.
     minutes: float | None = None
-    # Training steps, each on one batch of rollouts.
-    steps: int | None = None
+    steps: int | None = None  # Training steps, each on one batch of rollouts.
     # "ppo" takes several epochs over each batch (objectives/ppo.py), "actor-critic" one gradient step, as DreamerV3
     # (objectives/actor_critic.py). Default: ppo in a simulator that steps many episodes together, as mujoco: does, else
     # actor-critic.
@@ -51,8 +50,7 @@ class Practice:
     batch: int | None = None
     # Horizon: steps of a rollout. Default: 16, for ppo 24.
     horizon: int | None = None
-    # Discount factor, gamma.
-    discount: float = 0.99
+    discount: float = 0.99  # Discount factor, gamma.
     # Lambda of the lambda-returns (of GAE in ppo), from 0 (one-step bootstrapping) to 1 (the return of the whole rollout).
     td_lambda: float = 0.95
     # Coefficient of the entropy bonus, relative to the range of returns (for ppo to normalised advantages). Default: 3e-4, for
@@ -65,14 +63,10 @@ class Practice:
     trust: float | None = None
     # Where a rollout ends by --trust, bootstrap from the lowest value in the batch instead of the critic's estimate.
     cautious: bool = False
-    # Width of the networks' layers.
-    hidden: int = 128
-    # Peak learning rate.
-    learning_rate: float = 1e-3
-    # Seconds between saves.
-    save_every_s: float = 30.0
-    # Random seed.
-    seed: int = 0
+    hidden: int = 128  # Width of the networks' layers.
+    learning_rate: float = 1e-3  # Peak learning rate.
+    save_every_s: float = 30.0  # Seconds between saves.
+    seed: int = 0  # Random seed.
 
 
 @dataclass(frozen=True)

@@ -27,48 +27,36 @@ from ..trainer import Report, Run, Trainer, hold_then_decay
 class PostTraining:
     """Settings that both trainings share."""
 
-    # Frames per step, or rollouts in parallel.
-    batch: int = 16
-    # Peak learning rate of the generator.
-    learning_rate: float = 3e-4
-    # Weight of the teacher's distribution, if there is a teacher.
-    teacher_weight: float = 1.0
+    batch: int = 16  # Frames per step, or rollouts in parallel.
+    learning_rate: float = 3e-4  # Peak learning rate of the generator.
+    teacher_weight: float = 1.0  # Weight of the teacher's distribution, if there is a teacher.
     # A box x0 y0 x1 y1 of the map in metres that training never sees. Default: the one that was kept out of the world's training.
     keep_out: Box | None = None
-    # Seconds between saves.
-    save_every_s: float = 60.0
-    # Seconds between pictures of truth and prediction.
-    strip_every_s: float = 300.0
-    # Random seed.
-    seed: int = 0
+    save_every_s: float = 60.0  # Seconds between saves.
+    strip_every_s: float = 300.0  # Seconds between pictures of truth and prediction.
+    seed: int = 0  # Random seed.
 
 
 @dataclass(frozen=True)
 class DistilConfig(PostTraining):
     """Settings of a distillation."""
 
-    # Flow steps in which the student draws a frame.
-    flow_steps: int = 1
-    # Training steps.
-    steps: int = 2000
+    flow_steps: int = 1  # Flow steps in which the student draws a frame.
+    steps: int = 2000  # Training steps.
     # Weight of the recorded frames. Alone they blur whatever is not determined.
     truth_weight: float = 0.25
-    # Weight of a patch critic.
-    critic_weight: float = 0.2
+    critic_weight: float = 0.2  # Weight of a patch critic.
 
 
 @dataclass(frozen=True)
 class DreamsConfig(PostTraining):
     """Settings of a training on rollouts of the world itself."""
 
-    # Training steps, each on one batch of rollouts.
-    steps: int = 150
-    # Horizon: frames of a rollout, each of which is one update.
-    horizon: int = 12
+    steps: int = 150  # Training steps, each on one batch of rollouts.
+    horizon: int = 12  # Horizon: frames of a rollout, each of which is one update.
     # Weight of the recorded frames. More is nearer to the recording, and blurs.
     truth_weight: float = 0.05
-    # Weight of a patch critic.
-    critic_weight: float = 1.0
+    critic_weight: float = 1.0  # Weight of a patch critic.
 
 
 def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report) -> dict:

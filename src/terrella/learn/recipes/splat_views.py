@@ -29,10 +29,8 @@ AGREEMENT = 0.08  # share of pixels whose depth agrees between views: with less 
 class SplatFit:
     """Settings of a fit."""
 
-    # Name of the world.
-    name: str = "place"
-    # Pictures taken from the recording, the folder or the video, evenly spread.
-    frames: int = 300
+    name: str = "place"  # Name of the world.
+    frames: int = 300  # Pictures taken from the recording, the folder or the video, evenly spread.
     # Number of episodes to use, from the first. Default: all.
     episodes: int | None = None
     # Corners x0 y0 x1 y1 in metres: only pictures taken within, such as those of one room.
@@ -42,8 +40,7 @@ class SplatFit:
     scale: float = 1.0
     # Pixels of the longer side of pictures; larger ones are scaled down. Recordings keep their size.
     longest: int = 480
-    # Seconds between saves.
-    save_every_s: float = 20.0
+    save_every_s: float = 20.0  # Seconds between saves.
     fit: FitConfig = field(default_factory=FitConfig)
 
 

@@ -16,8 +16,7 @@ WIDTHS = (32, 56, 88, 128)  # channels of a U-Net
 class TrainConfig:
     """Settings of a training run."""
 
-    # Name of the world.
-    name: str = "world"
+    name: str = "world"  # Name of the world.
     # Height and width of its frames in pixels. Default: those of the recording, scaled down to at most 96 x 128 pixels in all.
     size: tuple[int, int] | None = None
     # Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
@@ -25,8 +24,7 @@ class TrainConfig:
     # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88 128, and
     # without depth 48 64 96.
     channels: tuple[int, ...] = ()
-    # Number of past frames that a world without geometry sees.
-    frames: int = 4
+    frames: int = 4  # Number of past frames that a world without geometry sees.
     # Training steps of the model that predicts reward, termination and vitals.
     outcome_steps: int = 1500
     # Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a recording with object
@@ -45,28 +43,20 @@ class TrainConfig:
     batch: int | None = None
     # Peak learning rate of the generator. Default: 8e-4, and without depth 2e-3.
     learning_rate: float | None = None
-    # Training steps of the motion model.
-    motion_steps: int = 6000
-    # Number of recorded keyframes that the world keeps in memory.
-    keyframes: int = 640
+    motion_steps: int = 6000  # Training steps of the motion model.
+    keyframes: int = 640  # Number of recorded keyframes that the world keeps in memory.
     # A box x0 y0 x1 y1 of the map in metres that training never sees, to score new places.
     keep_out: Box | None = None
-    # Step from which a critic judges sharpness.
-    critic_from: int = 1500
-    # Weight of the critic, relative to the loss.
-    critic_weight: float = 0.3
+    critic_from: int = 1500  # Step from which a critic judges sharpness.
+    critic_weight: float = 0.3  # Weight of the critic, relative to the loss.
     # Training steps of the depth and odometry estimator. 0 leaves it out.
     estimator_steps: int = 2500
     # Predicted frames from which the uncertainty is learned. 0 leaves it out.
     uncertainty_frames: int = 9000
-    # Seconds between saves.
-    save_every_s: float = 120.0
-    # Seconds between pictures of truth and prediction.
-    strip_every_s: float = 300.0
-    # Random seed.
-    seed: int = 0
-    # cpu, cuda or auto.
-    device: str = "auto"
+    save_every_s: float = 120.0  # Seconds between saves.
+    strip_every_s: float = 300.0  # Seconds between pictures of truth and prediction.
+    seed: int = 0  # Random seed.
+    device: str = "auto"  # cpu, cuda or auto.
 
 
 def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:

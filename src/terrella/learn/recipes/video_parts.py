@@ -25,35 +25,21 @@ from .video_config import TrainConfig
 
 
 class VideoRecipe(Protocol):
-    """What differs between worlds with depth and poses and worlds of frames alone."""
+    """What differs between worlds with depth and poses and worlds of frames alone.
+
+    preparations: the stages before the generator. world: a copy, on the CPU, of the world as it now is. tune: sets what is chosen
+    by rollouts of the trained world, and returns facts; tuning_s: the seconds that it will take, by a trial.
+    """
 
     @property
     def parts(self) -> VideoParts: ...
-
     @property
-    def objective(self) -> Flow | CodecObjective:
-        """What the generator learns by."""
-        ...
-
-    def feed(self, batch: int) -> Feed:
-        """Batches for the generator."""
-        ...
-
-    def preparations(self) -> Sequence[Stage]:
-        """The stages before the generator, in order."""
-        ...
-
-    def world(self, trainer: Trainer) -> LearnedWorld:
-        """The world as it now is, on the CPU; a copy, for the weights train on."""
-        ...
-
-    def tuning_s(self, world: LearnedWorld) -> float:
-        """Seconds that `tune` will take, by a trial."""
-        ...
-
-    def tune(self, world: LearnedWorld) -> dict:
-        """Sets what is chosen by rollouts of the trained world. Returns facts."""
-        ...
+    def objective(self) -> Flow | CodecObjective: ...
+    def feed(self, batch: int) -> Feed: ...
+    def preparations(self) -> Sequence[Stage]: ...
+    def world(self, trainer: Trainer) -> LearnedWorld: ...
+    def tuning_s(self, world: LearnedWorld) -> float: ...
+    def tune(self, world: LearnedWorld) -> dict: ...
 
 
 def flow_objective(video: VideoConfig, config: TrainConfig) -> Flow:
