@@ -11,6 +11,7 @@ from tests.learn.stopping import quiet
 from terrella.act import Explorer
 from terrella.core import make_rng
 from terrella.data import RecordOptions, record
+from terrella.learn.objectives import stress
 from terrella.learn.recipes.post_training import distil, train_dreams
 from terrella.learn.recipes.video import train_video
 from terrella.worlds.folder import load_world
@@ -50,10 +51,23 @@ def bare_run(corridor, tmp_path_factory):
     return trained(tmp_path_factory, corridor, BARE)
 
 
+def fewer_rollouts(patch: pytest.MonkeyPatch) -> None:
+    """Of those by which a codec's stress is chosen (see test_stress.py)."""
+    patch.setattr(stress, "STEPS", (8, 4))
+    patch.setattr(stress, "CLIPS", 3)
+
+
+@pytest.fixture
+def few_rollouts(monkeypatch):
+    fewer_rollouts(monkeypatch)
+
+
 @pytest.fixture(scope="session")
 def flat_run(corridor, tmp_path_factory):
-    """A codec with an uncertainty, of the frames and actions of the same recording."""
-    return trained(tmp_path_factory, corridor, FLAT)
+    """A codec with an uncertainty, of the frames and actions of the same recording, by `few_rollouts`."""
+    with pytest.MonkeyPatch.context() as patch:
+        fewer_rollouts(patch)
+        return trained(tmp_path_factory, corridor, FLAT)
 
 
 @pytest.fixture(scope="session")

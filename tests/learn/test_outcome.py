@@ -117,6 +117,7 @@ def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
         assert ((found["done"] > 0.5) == cache.done[steps]).all()
 
 
+@pytest.mark.usefixtures("few_rollouts")
 def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_path):
     config = TrainConfig(
         size=SIZE, steps=4, batch=2, outcome_steps=8, uncertainty_frames=0, strip_every_s=1e9, channels=(8, 8, 8)

@@ -32,6 +32,7 @@ from terrella.worlds.generator import Conditioning, context_thumbnail
 
 from ..data.layouts import layout_of
 
+pytestmark = pytest.mark.usefixtures("few_rollouts")
 QUICK_FLAT = replace(FLAT, outcome_steps=0, steps=2, uncertainty_frames=0)  # one batch of six gradient steps
 
 

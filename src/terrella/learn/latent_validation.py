@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ..core.errors import DatasetError
 from ..core.state import State
 from ..core.world import World, make_rng
 from ..worlds.latent import LatentWorld
-from ..worlds.latent_network import KNOTS, LatentNetwork
-from .objectives.uncertainty import pool_adjacent_violators, rank_correlation
+from ..worlds.latent_network import KNOTS
+from .objectives.uncertainty import isotonic, rank_correlation
 from .recording import Recording
 
 HORIZONS = (1, 8, 16)
@@ -132,22 +133,9 @@ def calibrate(world: LatentWorld, recording: Recording, horizons: Sequence[int] 
     network, rolled = world.network, open_loop(world, recording, horizons)
     spread = torch.cat([rolled.spread[step][::2] for step in rolled.steps]).cpu()
     error = torch.cat([rolled.latent[ARMS[0], step][::2] for step in rolled.steps]).cpu()
-    _fit(network, spread, error)
-
-
-def _fit(network: LatentNetwork, spread: torch.Tensor, error: torch.Tensor) -> None:
-    bins = [part for part in np.array_split(spread.argsort().numpy(), KNOTS - 1) if len(part)]
-    knots = [0.0, *(float(spread[part].mean()) for part in bins)]
-    errors = [
-        0.0,
-        *pool_adjacent_violators(
-            [float(error[part].clamp(0, 1).mean()) for part in bins], [len(part) for part in bins]
-        ),
-    ]
-    while len(knots) < KNOTS:
-        knots, errors = [*knots, knots[-1]], [*errors, errors[-1]]
-    network.spread.copy_(torch.tensor(knots))
-    network.error.copy_(torch.tensor(errors))
+    knots, errors = isotonic(spread, error.clamp(0, 1), KNOTS - 1)
+    network.spread.copy_(F.pad(knots, (1, 0)))
+    network.error.copy_(F.pad(errors, (1, 0)))
 
 
 @torch.inference_mode()

@@ -279,17 +279,11 @@ def fit_uncertainty(run: Run, seen: DreamFrames, steps: int) -> UncertaintyNetwo
 
 
 def calibrate(uncertainty: UncertaintyNetwork, seen: DreamFrames) -> None:
-    """Isotonic regression (pool adjacent violators) of the error on the network's output, in KNOTS bins of equally many frames; and
-    the levels at which the page of play calls a world certain or inventing."""
-    output = _raw_error(uncertainty, seen).clamp(0, 1)
-    order = output.argsort()
-    bins = [part for part in np.array_split(order.numpy(), KNOTS) if len(part)]
-    knots = [float(output[part].mean()) for part in bins]
-    errors = pool_adjacent_violators([float(seen.error[part].mean()) for part in bins], [len(part) for part in bins])
-    while len(knots) < KNOTS:
-        knots, errors = [*knots, knots[-1]], [*errors, errors[-1]]
-    uncertainty.answers.copy_(torch.tensor(knots))
-    uncertainty.errors.copy_(torch.tensor(errors))
+    """Isotonic regression of the error on the network's output, and the levels at which the page of play calls a world certain or
+    inventing."""
+    answers, errors = isotonic(_raw_error(uncertainty, seen).clamp(0, 1), seen.error, KNOTS)
+    uncertainty.answers.copy_(answers)
+    uncertainty.errors.copy_(errors)
     known = torch.tensor([arm == MEMORY for arm in ARMS])[seen.arm]
     sure = seen.error[known].median() if known.any() else seen.error.quantile(0.25)
     rest = seen.error[~known].quantile(0.6) if (~known).any() else seen.error.quantile(0.9)
@@ -307,6 +301,16 @@ def _raw_error(uncertainty: UncertaintyNetwork, seen: DreamFrames) -> torch.Tens
     """The expected error before calibration [N]."""
     parts = torch.arange(len(seen.error)).split(256)
     return torch.cat([uncertainty(seen.clues[part].float(), seen.situation[part]).mean((1, 2)) for part in parts])
+
+
+def isotonic(values: torch.Tensor, errors: torch.Tensor, bins: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Isotonic regression of errors [N] on values [N], in bins of equally many: mean value and fitted error of each [bins], the
+    last repeated where there are fewer than `bins` values."""
+    parts = [part for part in np.array_split(values.argsort().numpy(), bins) if len(part)]
+    knots = [float(values[part].mean()) for part in parts]
+    fitted = pool_adjacent_violators([float(errors[part].mean()) for part in parts], [len(part) for part in parts])
+    lacking = bins - len(parts)
+    return torch.tensor(knots + knots[-1:] * lacking), torch.tensor(fitted + fitted[-1:] * lacking)
 
 
 def pool_adjacent_violators(values: list[float], weights: list[float]) -> list[float]:
